@@ -1,0 +1,9 @@
+"""The hot loops, one folder per operation. Each has a reference in plain PyTorch that defines it."""
+
+from ._dispatch import Engine as Engine
+from ._dispatch import using as using
+from .composite import composite as composite
+from .hash_encode import HashLevels as HashLevels
+from .hash_encode import hash_encode as hash_encode
+from .march import march as march
+from .spherical_harmonics import spherical_harmonics as spherical_harmonics

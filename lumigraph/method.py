@@ -1,0 +1,84 @@
+"""Method and RayMethod: the only two abstract classes in the house."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from typing import Any, ClassVar
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from .camera import Camera
+from .rays import Rays, Rendering
+from .scene import Batch, Frame, Scene
+
+
+class Method(nn.Module, ABC):
+    """One paper: something that learns from a Scene's batches and can be seen through a Camera.
+
+    frame:  where the scene is (bounds, reach, near distance, background, number of images). A saved run holds it,
+            so that a method can be built again where the photographs are gone.
+    config: the paper's numbers, a frozen dataclass named Config in the method's file
+    All that must survive a resume lives in parameters, buffers and optimizers.
+    """
+
+    Config: ClassVar[type]
+
+    def __init__(self, frame: Frame, config: Any):
+        super().__init__()
+        self.frame, self.config = frame, config
+
+    @classmethod
+    def preset(cls, device: torch.device) -> Any:
+        """The Config to use where the user chose none."""
+        return cls.Config()
+
+    @abstractmethod
+    def batch(self, scene: Scene, generator: torch.Generator) -> Batch:
+        """What one step learns from. All randomness comes from `generator`, on the CPU."""
+
+    @abstractmethod
+    def loss(self, batch: Batch, step: int) -> dict[str, Tensor]:
+        """The terms to minimise, by name; the trainer sums them."""
+
+    @abstractmethod
+    def optimizers(self) -> list[torch.optim.Optimizer]:
+        """Fresh optimizers over the parameters; the trainer calls this once."""
+
+    @abstractmethod
+    def render(self, camera: Camera) -> Rendering:
+        """What one camera sees, (height, width, ...), without gradients, in eval mode."""
+
+    def before_step(self, step: int, progress: float) -> None:
+        """Called ahead of each step. progress is the share of the budget (steps or seconds) spent, in [0, 1]."""
+
+    def after_step(self, step: int) -> None:
+        """Called once the optimizers have stepped."""
+
+    def statistics(self) -> dict[str, float]:
+        """Figures of the last step worth a line in metrics.jsonl, e.g. rays and samples."""
+        return {}
+
+    @property
+    def device(self) -> torch.device:
+        return next(self.parameters()).device
+
+
+class RayMethod(Method):
+    """A Method that sees one ray at a time: write `render_rays`, inherit the rest."""
+
+    rays_per_chunk: int = 16_384
+
+    @abstractmethod
+    def render_rays(self, rays: Rays, background: Float[Tensor, "#ray 3"]) -> Rendering:
+        """What each ray sees, in front of a background colour."""
+
+    @torch.no_grad()
+    def render(self, camera: Camera) -> Rendering:
+        width, height = camera.size[0].tolist()
+        rays = camera.rays(camera.pixels()).to(self.device)
+        background = torch.tensor(self.frame.background, device=self.device)[None]
+        chunks = [slice(i, i + self.rays_per_chunk) for i in range(0, len(rays), self.rays_per_chunk)]
+        parts = [self.render_rays(rays[chunk], background) for chunk in chunks]
+        return Rendering.cat(parts).reshape(height, width)

@@ -1,0 +1,116 @@
+"""Rays, the samples along them, and what was seen: the three nouns that every ray method speaks."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+
+@dataclass(frozen=True)
+class Rays:
+    """Half-lines through the scene.
+
+    origins:     scene units
+    directions:  unit length
+    radius:      pixel footprint's radius at distance one, in scene units (cones, Barron 2021)
+    time:        moment of exposure, if the capture moves
+    image_index: which photograph a ray belongs to, if any (appearance, exposure, pose corrections)
+    """
+
+    origins: Float[Tensor, "ray 3"]
+    directions: Float[Tensor, "ray 3"]
+    radius: Float[Tensor, " ray"]
+    time: Float[Tensor, " ray"] | None = None
+    image_index: Int[Tensor, " ray"] | None = None
+
+    def __len__(self) -> int:
+        return len(self.origins)
+
+    def __getitem__(self, index) -> Rays:
+        """The rays that a slice, mask or index tensor picks."""
+        return Rays(*(None if x is None else x[index] for x in self._fields()))
+
+    def to(self, device: torch.device | str) -> Rays:
+        return Rays(*(None if x is None else x.to(device) for x in self._fields()))
+
+    def at(self, t: Float[Tensor, " ray"]) -> Float[Tensor, "ray 3"]:
+        """The point at distance t along each ray."""
+        return self.origins + t[:, None] * self.directions
+
+    def _fields(self):
+        return self.origins, self.directions, self.radius, self.time, self.image_index
+
+
+@dataclass(frozen=True)
+class Samples:
+    """Intervals along rays, packed end to end: ray r owns samples ray_starts[r] to ray_starts[r + 1].
+
+    Distances are along the ray, in scene units. Dense sampling is the case of equal lengths.
+    """
+
+    t_start: Float[Tensor, " sample"]
+    t_end: Float[Tensor, " sample"]
+    ray_starts: Int[Tensor, " ray_plus_one"]
+
+    def __len__(self) -> int:
+        return len(self.t_start)
+
+    @property
+    def t(self) -> Float[Tensor, " sample"]:
+        """Midpoints."""
+        return 0.5 * (self.t_start + self.t_end)
+
+    @property
+    def length(self) -> Float[Tensor, " sample"]:
+        return self.t_end - self.t_start
+
+    @property
+    def ray_index(self) -> Int[Tensor, " sample"]:
+        """The ray that each sample lies on."""
+        counts = self.ray_starts.diff()
+        rays = torch.arange(len(counts), device=counts.device)
+        return torch.repeat_interleave(rays, counts, output_size=len(self))
+
+    def along(self, rays: Rays) -> tuple[Float[Tensor, "sample 3"], Float[Tensor, "sample 3"]]:
+        """Midpoints as positions, and the direction each is seen along."""
+        ray = self.ray_index
+        directions = rays.directions[ray]
+        return rays.origins[ray] + self.t[:, None] * directions, directions
+
+
+@dataclass(frozen=True)
+class Rendering:
+    """What a camera or a batch of rays saw. Leading axes are (height, width) or (ray,).
+
+    rgb:     as photographed (sRGB-encoded), background already behind it
+    depth:   distance along the ray in scene units, expected over what is opaque; infinity where nothing is
+    opacity: share of light that the scene stops, in [0, 1]
+    extra:   anything else by name, with the same leading axes (normals, features, uncertainty)
+    """
+
+    rgb: Float[Tensor, "*pixels 3"]
+    depth: Float[Tensor, "*pixels"]
+    opacity: Float[Tensor, "*pixels"]
+    extra: dict[str, Tensor] = field(default_factory=dict)
+
+    def with_extra(self, **extra: Tensor) -> Rendering:
+        return replace(self, extra={**self.extra, **extra})
+
+    def reshape(self, *shape: int) -> Rendering:
+        """The same pixels under other leading axes, e.g. (height, width)."""
+        extra = {k: v.reshape(*shape, *v.shape[self.depth.ndim :]) for k, v in self.extra.items()}
+        return Rendering(self.rgb.reshape(*shape, 3), self.depth.reshape(shape), self.opacity.reshape(shape), extra)
+
+    def cpu(self) -> Rendering:
+        extra = {k: v.cpu() for k, v in self.extra.items()}
+        return Rendering(self.rgb.cpu(), self.depth.cpu(), self.opacity.cpu(), extra)
+
+    @staticmethod
+    def cat(parts: list[Rendering]) -> Rendering:
+        """Join renderings of consecutive rays."""
+        extra = {k: torch.cat([p.extra[k] for p in parts]) for k in parts[0].extra}
+        rgb, depth, opacity = (torch.cat([getattr(p, k) for p in parts]) for k in ("rgb", "depth", "opacity"))
+        return Rendering(rgb, depth, opacity, extra)
