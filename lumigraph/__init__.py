@@ -1,0 +1,58 @@
+"""Lumigraph: photographs become radiance fields, and radiance fields become new views."""
+
+from __future__ import annotations
+
+import importlib
+import os
+from typing import TYPE_CHECKING, Any
+
+# OpenMP's threads would otherwise spin after each operation, on cores that Numba's threads are waiting for.
+# It is read when PyTorch is loaded, so it is set before anything here loads it.
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+
+if TYPE_CHECKING:
+    from .camera import Camera as Camera
+    from .capture import open_scene as open_scene
+    from .errors import LumigraphError as LumigraphError
+    from .lens import Lens as Lens
+    from .method import Method as Method
+    from .method import RayMethod as RayMethod
+    from .rays import Rays as Rays
+    from .rays import Rendering as Rendering
+    from .rays import Samples as Samples
+    from .run import Run as Run
+    from .scene import Scene as Scene
+    from .train import fit as fit
+    from .volume import composite as composite
+
+__version__ = "0.1.0"
+
+_homes = {
+    "Camera": "camera",
+    "Lens": "lens",
+    "LumigraphError": "errors",
+    "Method": "method",
+    "RayMethod": "method",
+    "Rays": "rays",
+    "Rendering": "rays",
+    "Run": "run",
+    "Samples": "rays",
+    "Scene": "scene",
+    "composite": "volume",
+    "fit": "train",
+    "open_scene": "capture",
+}
+__all__ = sorted(_homes)
+
+
+def __getattr__(name: str) -> Any:
+    """Load a public name when it is first asked for, so that `lumigraph --help` need not wait for PyTorch."""
+    if name not in _homes:
+        raise AttributeError(f"module 'lumigraph' has no attribute {name!r}")
+    value = getattr(importlib.import_module(f".{_homes[name]}", __name__), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted([*globals(), *__all__])

@@ -1,0 +1,8 @@
+"""What can go wrong in ways that a user can mend."""
+
+
+class LumigraphError(Exception):
+    """A fault in the input or the surroundings, in one sentence: where, what is wrong, what to do.
+
+    The command line prints the sentence and exits with code 2; a program may catch it.
+    """
