@@ -6,3 +6,7 @@ class LumigraphError(Exception):
 
     The command line prints the sentence and exits with code 2; a program may catch it.
     """
+
+
+class LumigraphWarning(UserWarning):
+    """Something that a user should know but that does not stop the work, in one sentence."""

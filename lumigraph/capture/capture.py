@@ -1,0 +1,70 @@
+"""Capture: photographs and what is known about them, as a reader found them, before they become a Scene."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from ..lens import Lens
+
+Pixels = np.ndarray  # uint8, (height, width, 3) or (height, width, 4); alpha last, colours not multiplied by it
+
+
+@dataclass(frozen=True)
+class Shot:
+    """One photograph and where it was taken from.
+
+    name:  unique within the capture, what warnings and reports call it; held-out views are chosen by its order
+    pose:  camera-to-world, (3, 4), in the source's own frame and units; +x right, +y down, +z forward
+    lens:  one lens, for a picture of `size`
+    size:  (width, height) that the lens was calibrated for; None if the source does not say, then the picture's own
+    image: a file, the pixels themselves, or a function that makes them when asked
+    mask:  where the photograph is to be trusted: non-zero is good; a file or (height, width) numbers
+    split: "train", "test" or "val" where the source publishes that. If no shot of a capture has one, every 8th by name
+           is held out
+    time:  moment of exposure
+    depths: (near, far) of what this camera saw, in the source's units
+    """
+
+    name: str
+    pose: Float[np.ndarray, "3 4"]
+    lens: Lens
+    size: tuple[int, int] | None
+    image: Path | Pixels | Callable[[], Pixels]
+    mask: Path | np.ndarray | None = None
+    split: str | None = None
+    time: float | None = None
+    depths: tuple[float, float] | None = None
+
+
+@dataclass(frozen=True)
+class Capture:
+    """Everything a reader knows.
+
+    source:   where it came from: a folder, or "procedural:<name>"
+    shots:    at least two
+    points:   sparse points in the source's frame, from structure from motion; sightings says how many photographs
+              saw each
+    missing:  files that the source lists but that do not exist
+
+    Hints, for captures that know better than what can be found from cameras and points:
+    bounds:   the box of interest ((x, y, z), (x, y, z)), source's frame and units
+    reach:    half-size of the cube around the bounds' centre that holds everything, source's units
+    near:     distance within which nothing is, source's units
+    background: colour behind everything
+    """
+
+    source: str
+    shots: list[Shot]
+    points: Float[np.ndarray, "point 3"] | None = None
+    point_colours: UInt8[np.ndarray, "point 3"] | None = None
+    sightings: np.ndarray | None = None
+    missing: list[str] = field(default_factory=list)
+    bounds: tuple[tuple[float, float, float], tuple[float, float, float]] | None = None
+    reach: float | None = None
+    near: float | None = None
+    background: tuple[float, float, float] | None = None
