@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Self
 
@@ -106,12 +106,14 @@ class Camera:
     @staticmethod
     def cat(cameras: Sequence[Camera]) -> Camera:
         """One batch from several."""
-        time, image_index = (
-            None if any(x is None for x in column) else torch.cat(column)
-            for column in ([c.time for c in cameras], [c.image_index for c in cameras])
-        )
         pose, size = torch.cat([c.pose for c in cameras]), torch.cat([c.size for c in cameras])
-        return Camera(pose, Lens.cat([c.lens for c in cameras]), size, time, image_index)
+        return Camera(
+            pose,
+            Lens.cat([c.lens for c in cameras]),
+            size,
+            join(c.time for c in cameras),
+            join(c.image_index for c in cameras),
+        )
 
 
 def rotate(matrix: Float[Tensor, "#ray 3 _"], vectors: Float[Tensor, "ray 3"]) -> Float[Tensor, "ray 3"]:
@@ -120,6 +122,13 @@ def rotate(matrix: Float[Tensor, "#ray 3 _"], vectors: Float[Tensor, "ray 3"]) -
         return vectors @ matrix[0, :, :3].mT
     x, y, z = vectors[:, :, None].unbind(1)
     return torch.addcmul(torch.addcmul(x * matrix[:, :, 0], y, matrix[:, :, 1]), z, matrix[:, :, 2])
+
+
+def join(parts: Iterable[Tensor | None]) -> Tensor | None:
+    """One tensor from several, or None where any is missing."""
+    columns = list(parts)
+    found = [x for x in columns if x is not None]
+    return torch.cat(found) if len(found) == len(columns) else None
 
 
 def gather(values: Tensor | None, index: Tensor | None, count: int) -> Tensor | None:

@@ -29,6 +29,7 @@ class Lens(ABC):
     """
 
     kinds: ClassVar[dict[str, type[Lens]]] = {}
+    in_pixels: ClassVar[tuple[str, ...]] = ("focal", "centre")  # what scales with the picture
 
     def __init_subclass__(cls) -> None:
         Lens.kinds[cls.__name__.lower()] = cls
@@ -67,20 +68,23 @@ class Lens(ABC):
         down = self.unproject(pixels + half_y, index) - self.unproject(pixels - half_y, index)
         return torch.linalg.cross(across, down).norm(dim=-1)
 
-    def resized(self, scale: Float[Tensor, "#camera 2"]) -> Self:
+    def resized(self, scale: Float[Tensor, "#camera 2"]) -> Lens:
         """The same lens behind a picture with (x, y) scaled pixels."""
-        changed = {name: getattr(self, name) * scale for name in ("focal", "centre", "size") if hasattr(self, name)}
-        return type(self)(**{**self._numbers(), **changed})
+        return type(self)(**{k: v * scale if k in self.in_pixels else v for k, v in self._numbers().items()})
 
     def __len__(self) -> int:
         return len(next(iter(self._numbers().values())))
 
-    def __getitem__(self, index: int | slice | Tensor) -> Self:
+    def __getitem__(self, index: int | slice | Tensor) -> Lens:
         """The lenses of some cameras; an int gives a batch of one."""
         return self._map(lambda x: x[one_or_more(index)])
 
-    def to(self, device: torch.device | str) -> Self:
+    def to(self, device: torch.device | str) -> Lens:
         return self._map(lambda x: x.to(device))
+
+    @property
+    def device(self) -> torch.device:
+        return next(iter(self._numbers().values())).device
 
     def to_json(self) -> dict[str, Any]:
         """Plain lists and a name; `Lens.from_json` turns them back exactly."""
@@ -88,15 +92,18 @@ class Lens(ABC):
 
     @staticmethod
     def from_json(data: dict[str, Any]) -> Lens:
-        numbers = {k: torch.tensor(v, dtype=torch.float32) for k, v in data.items() if k != "kind"}
-        return Lens.kinds[data["kind"]](**numbers)
+        return Lens.kinds[data["kind"]]._from_json(data)
+
+    @classmethod
+    def _from_json(cls, data: dict[str, Any]) -> Lens:
+        return cls(**{k: torch.tensor(v, dtype=torch.float32) for k, v in data.items() if k != "kind"})
 
     @staticmethod
     def cat(lenses: Sequence[Lens]) -> Lens:
-        """One batch from several lenses of one kind."""
+        """One batch from several, which becomes `Mixed` where they are of different kinds."""
         first = lenses[0]
-        if any(type(lens) is not type(first) for lens in lenses):
-            raise TypeError(f"lenses of different kinds in one batch: {sorted({type(x).__name__ for x in lenses})}")
+        if isinstance(first, Mixed) or any(type(lens) is not type(first) for lens in lenses):
+            return mix([one for lens in lenses for one in (lens[i] for i in range(len(lens)))])
         return type(first)(**{k: torch.cat([getattr(lens, k) for lens in lenses]) for k in first._numbers()})
 
     def _numbers(self) -> dict[str, Tensor]:
@@ -202,7 +209,7 @@ class Fisheye(Lens):
     def fold(self) -> Float[Tensor, "camera 1"]:
         """Angle from the axis up to which the distance from the centre only grows, at most pi."""
         theta = torch.linspace(0, math.pi, FOLD_SAMPLES, dtype=torch.float64, device=self.focal.device)
-        distance, _ = stretch(theta, self.distortion.double().T[:, :, None])
+        distance, _ = stretch(theta, self.distortion.double().T[:, :, None].unbind())
         return last_growing(theta, distance).to(self.focal.dtype)
 
     def unproject(self, pixels, index=None):
@@ -261,6 +268,75 @@ class Equirectangular(Lens):
     def solid_angle(self, pixels, directions, index=None):
         level = (1 - directions[:, 1] ** 2).clamp_min(1e-12).sqrt()
         return 2 * math.pi**2 * level / area(self.size, index)
+
+
+@dataclass(frozen=True)
+class Mixed(Lens):
+    """Lenses of several kinds in one batch, as from two sorts of camera at one place.
+
+    parts: one batch of lenses for each kind
+    part:  which of them each camera has; the cameras of one part are in its order
+    """
+
+    parts: tuple[Lens, ...]
+    part: Int[Tensor, " camera"]
+
+    @property
+    def row(self) -> Int[Tensor, " camera"]:
+        """Each camera's place within its part."""
+        mine = self.part[:, None] == torch.arange(len(self.parts), device=self.part.device)
+        return (mine.cumsum(0) - 1).gather(1, self.part[:, None])[:, 0]
+
+    def unproject(self, pixels, index=None):
+        return self._by_part(lambda lens, row, pixels: (lens.unproject(pixels, row),), index, pixels)[0]
+
+    def project(self, points, index=None):
+        pixels, valid = self._by_part(lambda lens, row, points: lens.project(points, row), index, points)
+        return pixels, valid
+
+    def solid_angle(self, pixels, directions, index=None):
+        return self._by_part(lambda lens, row, *x: (lens.solid_angle(*x, row),), index, pixels, directions)[0]
+
+    def resized(self, scale):
+        scale = scale.expand(len(self), 2)
+        return Mixed(tuple(lens.resized(scale[self.part == k]) for k, lens in enumerate(self.parts)), self.part)
+
+    def to(self, device):
+        return Mixed(tuple(lens.to(device) for lens in self.parts), self.part.to(device))
+
+    def to_json(self):
+        return {"kind": "mixed", "parts": [lens.to_json() for lens in self.parts], "part": self.part.tolist()}
+
+    @classmethod
+    def _from_json(cls, data):
+        return cls(tuple(Lens.from_json(part) for part in data["parts"]), torch.tensor(data["part"]))
+
+    def __len__(self) -> int:
+        return len(self.part)
+
+    def __getitem__(self, index: int | slice | Tensor) -> Lens:
+        kept = one_or_more(index)
+        pairs = zip(self.part[kept].tolist(), self.row[kept].tolist(), strict=True)
+        return mix([self.parts[part][row] for part, row in pairs])
+
+    def _by_part(self, ask: Callable[..., tuple[Tensor, ...]], index: Tensor | None, *inputs: Tensor) -> list[Tensor]:
+        """Ask each part about its own rows of the inputs, and put the answers back in their places."""
+        if index is None:
+            index = self.part.new_zeros(len(inputs[0]))
+        part, row = self.part[index], self.row[index]
+        places = [(part == k).nonzero()[:, 0] for k in range(len(self.parts))]
+        answers = [ask(self.parts[k], row[at], *(x[at] for x in inputs)) for k, at in enumerate(places)]
+        order = torch.cat(places).argsort()
+        return [torch.cat(column)[order] for column in zip(*answers, strict=True)]
+
+
+def mix(lenses: Sequence[Lens]) -> Lens:
+    """One batch of single lenses: of their kind if they have one in common, else Mixed."""
+    kinds = sorted({type(lens) for lens in lenses}, key=lambda kind: kind.__name__)
+    parts = tuple(Lens.cat([lens for lens in lenses if type(lens) is kind]) for kind in kinds)
+    if len(parts) == 1:
+        return parts[0]
+    return Mixed(parts, torch.tensor([kinds.index(type(lens)) for lens in lenses], device=parts[0].device))
 
 
 def rows(table: Tensor, index: Tensor | None) -> Tensor:

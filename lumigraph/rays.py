@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 import torch
@@ -29,19 +30,20 @@ class Rays:
     def __len__(self) -> int:
         return len(self.origins)
 
-    def __getitem__(self, index) -> Rays:
+    def __getitem__(self, index: slice | Tensor) -> Rays:
         """The rays that a slice, mask or index tensor picks."""
-        return Rays(*(None if x is None else x[index] for x in self._fields()))
+        return self._map(lambda x: x[index])
 
     def to(self, device: torch.device | str) -> Rays:
-        return Rays(*(None if x is None else x.to(device) for x in self._fields()))
+        return self._map(lambda x: x.to(device))
 
     def at(self, t: Float[Tensor, " ray"]) -> Float[Tensor, "ray 3"]:
         """The point at distance t along each ray."""
         return self.origins + t[:, None] * self.directions
 
-    def _fields(self):
-        return self.origins, self.directions, self.radius, self.time, self.image_index
+    def _map(self, change: Callable[[Tensor], Tensor]) -> Rays:
+        time, image_index = (None if x is None else change(x) for x in (self.time, self.image_index))
+        return Rays(change(self.origins), change(self.directions), change(self.radius), time, image_index)
 
 
 @dataclass(frozen=True)
