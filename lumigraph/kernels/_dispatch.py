@@ -5,9 +5,11 @@ from __future__ import annotations
 import contextlib
 import contextvars
 import importlib
+import os
 from collections.abc import Callable, Iterator
 from typing import Literal
 
+import torch
 from torch import Tensor
 
 Engine = Literal["reference", "cpu", "gpu"]
@@ -29,3 +31,11 @@ def implementation(operation: str, tensor: Tensor) -> Callable:
     """The `run` function of an operation, on the engine that fits the tensor's device."""
     engine = _forced.get() or ("gpu" if tensor.is_cuda else "cpu")
     return importlib.import_module(f"{__package__}.{operation}.{engine}").run
+
+
+def empty(*shape: int, dtype: torch.dtype = torch.float32, device: torch.device | str = "cpu") -> Tensor:
+    """Memory for an engine's output. With LUMIGRAPH_DEBUG set it starts as NaN, so that what is never written shows."""
+    out = torch.empty(shape, dtype=dtype, device=device)
+    if os.environ.get("LUMIGRAPH_DEBUG") and dtype.is_floating_point:
+        out.fill_(torch.nan)
+    return out

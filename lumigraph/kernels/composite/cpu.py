@@ -1,0 +1,77 @@
+"""Numba: one thread takes a run of rays."""
+
+import numpy as np
+import torch
+from numba import njit, prange
+
+from .._dispatch import empty
+
+ONE = np.float32(1)
+
+
+@njit(parallel=True, fastmath=True, cache=True)
+def _forward(tau, values, starts, stop, total, opacity, weights):
+    channels = values.shape[1]
+    for r in prange(len(starts) - 1):
+        through, spent = ONE, np.float32(0)
+        total[r] = 0
+        for i in range(starts[r], starts[r + 1]):
+            if through < stop:
+                weights[i] = 0
+                continue
+            keep = np.exp(-tau[i])
+            w = through * (ONE - keep)
+            weights[i] = w
+            spent += w
+            through *= keep
+            for c in range(channels):
+                total[r, c] += w * values[i, c]
+        opacity[r] = spent
+
+
+@njit(parallel=True, fastmath=True, cache=True)
+def _backward(to_total, to_opacity, to_weights, tau, values, weights, starts, stop, to_tau, to_values):
+    """dL/dtau_i = g_i T_{i+1} - sum_{j>i} g_j w_j, where g_i is what one unit of weight i is worth to the loss."""
+    channels = values.shape[1]
+    for r in prange(len(starts) - 1):
+        behind = np.float32(0)
+        for i in range(starts[r], starts[r + 1]):
+            worth = to_opacity[r] + to_weights[i]
+            for c in range(channels):
+                worth += to_total[r, c] * values[i, c]
+                to_values[i, c] = weights[i] * to_total[r, c]
+            to_tau[i] = worth
+            behind += worth * weights[i]
+        through = ONE
+        for i in range(starts[r], starts[r + 1]):
+            if through < stop:
+                to_tau[i] = 0
+                continue
+            worth = to_tau[i]
+            behind -= worth * weights[i]
+            through *= np.exp(-tau[i])
+            to_tau[i] = worth * through - behind
+
+
+class _Composite(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, tau, values, starts, stop):
+        rays = len(starts) - 1
+        total, opacity, weights = empty(rays, values.shape[1]), empty(rays), empty(len(tau))
+        arrays = (x.detach().numpy() for x in (tau, values, starts))
+        _forward(*arrays, np.float32(stop), total.numpy(), opacity.numpy(), weights.numpy())
+        ctx.save_for_backward(tau, values, weights, starts)
+        ctx.stop = stop
+        return total, opacity, weights
+
+    @staticmethod
+    def backward(ctx, *grads):
+        saved = [x.detach().numpy() for x in ctx.saved_tensors]
+        to_tau, to_values = (empty(*x.shape) for x in ctx.saved_tensors[:2])
+        grads = (g.contiguous().numpy() for g in grads)
+        _backward(*grads, *saved, np.float32(ctx.stop), to_tau.numpy(), to_values.numpy())
+        return to_tau, to_values, None, None
+
+
+def run(tau, values, ray_starts, stop):
+    return _Composite.apply(tau.contiguous(), values.contiguous(), ray_starts.contiguous(), stop)
