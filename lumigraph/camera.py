@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-from typing import Self
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -38,15 +37,15 @@ class Camera:
     def __len__(self) -> int:
         return len(self.pose)
 
-    def __getitem__(self, index: int | slice | Tensor) -> Self:
+    def __getitem__(self, index: int | slice | Tensor) -> Camera:
         """Some of the cameras; an int gives a batch of one."""
         keep = one_or_more(index)
         time, image_index = (None if x is None else x[keep] for x in (self.time, self.image_index))
-        return type(self)(self.pose[keep], self.lens[keep], self.size[keep], time, image_index)
+        return Camera(self.pose[keep], self.lens[keep], self.size[keep], time, image_index)
 
-    def to(self, device: torch.device | str) -> Self:
+    def to(self, device: torch.device | str) -> Camera:
         time, image_index = (None if x is None else x.to(device) for x in (self.time, self.image_index))
-        return type(self)(self.pose.to(device), self.lens.to(device), self.size.to(device), time, image_index)
+        return Camera(self.pose.to(device), self.lens.to(device), self.size.to(device), time, image_index)
 
     @property
     def position(self) -> Float[Tensor, "camera 3"]:
@@ -90,12 +89,12 @@ class Camera:
         pose = rows(self.pose.reshape(-1, 12), index).view(-1, 3, 4)
         return self.lens.project(rotate(pose[:, :, :3].mT, points - pose[:, :, 3]), index)
 
-    def resized(self, factor: float) -> Self:
+    def resized(self, factor: float) -> Camera:
         """Cameras of pictures scaled by a factor. Sizes are rounded; intrinsics follow the rounded sizes exactly."""
         size = (self.size * factor).round().clamp_min(1).to(self.size.dtype)
         return replace(self, size=size, lens=self.lens.resized((size.double() / self.size).to(self.pose.dtype)))
 
-    def transformed(self, similarity: Float[Tensor, "4 4"]) -> Self:
+    def transformed(self, similarity: Float[Tensor, "4 4"]) -> Camera:
         """The cameras in another frame, x' = M x: positions scale, rotations stay rotations."""
         similarity = similarity.to(self.pose)
         scale = torch.linalg.det(similarity[:3, :3]) ** (1 / 3)

@@ -11,7 +11,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
 from functools import cached_property
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -109,7 +109,7 @@ class Lens(ABC):
     def _numbers(self) -> dict[str, Tensor]:
         return {f.name: getattr(self, f.name) for f in fields(self)}  # type: ignore[arg-type]
 
-    def _map(self, change: Callable[[Tensor], Tensor]) -> Self:
+    def _map(self, change: Callable[[Tensor], Tensor]) -> Lens:
         return type(self)(**{k: change(v) for k, v in self._numbers().items()})
 
 
@@ -250,6 +250,7 @@ class Equirectangular(Lens):
     size: (width, height) of the picture in pixels, spanning 360 by 180 degrees
     """
 
+    in_pixels: ClassVar[tuple[str, ...]] = ("size",)
     size: Float[Tensor, "camera 2"]
 
     def unproject(self, pixels, index=None):
