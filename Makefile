@@ -1,0 +1,67 @@
+# `make demo` and `make test` each work as the very first command on a fresh machine.
+# Another interpreter: make demo PYTHON=python3.12. Another build of PyTorch: make demo TORCH='torch==2.13.0 ...'.
+
+PYTHON ?= python3
+TORCH ?= torch==2.13.0
+TESTS ?= tests
+
+BIN := .venv/bin
+PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check
+
+.DELETE_ON_ERROR:
+.PHONY: help demo test check format bench clean
+
+help:
+	@echo 'make demo    photographs to a film and a report in a few minutes'
+	@echo 'make test    all tests'
+	@echo 'make check   formatting, lint, types, tests'
+	@echo 'make format  let the formatter have its way'
+	@echo 'make bench   throughput of every kernel on every engine'
+	@echo 'make clean   remove the virtual environment and all caches'
+
+demo: .venv/.installed
+	$(BIN)/lumigraph demo
+
+test: .venv/.tools
+	$(BIN)/python -m pytest -q --durations=10 $(TESTS)
+
+check: .venv/.tools
+	$(BIN)/ruff format --check .
+	$(BIN)/ruff check .
+	$(BIN)/mypy
+	$(MAKE) --no-print-directory test
+
+format: .venv/.tools
+	$(BIN)/ruff format .
+	$(BIN)/ruff check --fix .
+
+bench: .venv/.installed
+	$(BIN)/lumigraph bench kernels
+
+clean:
+	rm -rf .venv .pytest_cache .mypy_cache .ruff_cache build *.egg-info
+	find lumigraph tests -name __pycache__ -prune -exec rm -rf {} +
+
+# Stamps: each step of the installation is done once, and again when pyproject.toml changes.
+
+.venv/.made:
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null || { echo \
+	"Lumigraph needs Python 3.11 or newer, and $(PYTHON) is $$($(PYTHON) --version 2>/dev/null || echo missing). \
+	Name another one: make $(MAKECMDGOALS) PYTHON=python3.12" >&2; exit 1; }
+	$(PYTHON) -m venv .venv
+	@touch $@
+
+.venv/.torch: .venv/.made
+	@echo 'Installing PyTorch ...'
+	$(PIP) '$(TORCH)'
+	@touch $@
+
+.venv/.installed: .venv/.torch pyproject.toml
+	@echo 'Installing Lumigraph ...'
+	$(PIP) --editable .
+	@touch $@
+
+.venv/.tools: .venv/.installed
+	@echo 'Installing the tools for tests ...'
+	$(PIP) --editable '.[dev]'
+	@touch $@
