@@ -1,0 +1,171 @@
+"""How well a trained method shows views that it has not seen, under a stated protocol."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import torch
+from jaxtyping import Bool, Float
+from PIL import Image
+from torch import Tensor
+
+from .camera import Camera
+from .display import track
+from .errors import LumigraphError
+from .figures import ERROR_GAIN, Row, colour_depth, colour_error, contact_sheet, depth_range
+from .method import Method
+from .metrics import WINDOW, psnr, ssim_map
+from .rays import Rendering
+from .scene import Scene
+
+SHOWN = 8  # views of the contact sheet, evenly spread; the worst one joins them
+WARM_UP_SIZE = 32  # pixels; the first rendering compiles kernels, which is not the view's fault
+
+
+@dataclass(frozen=True)
+class ViewScore:
+    """One view: PSNR in dB, SSIM, and the seconds that rendering it took."""
+
+    name: str
+    psnr: float
+    ssim: float
+    seconds: float
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """All views of a split, and how they were compared. compile_seconds: spent ahead of the first view."""
+
+    views: list[ViewScore]
+    protocol: dict[str, Any]
+    compile_seconds: float
+    shown: dict[str, tuple[Tensor, Rendering]]  # some views' photograph and rendering
+
+    @property
+    def psnr(self) -> float:
+        return mean(view.psnr for view in self.views)
+
+    @property
+    def ssim(self) -> float:
+        return mean(view.ssim for view in self.views)
+
+    @property
+    def seconds_per_view(self) -> float:
+        return mean(view.seconds for view in self.views)
+
+    def to_json(self) -> dict[str, Any]:
+        return {
+            "psnr": self.psnr,
+            "ssim": self.ssim,
+            "protocol": self.protocol,
+            "seconds_per_view": self.seconds_per_view,
+            "render_compile_seconds": self.compile_seconds,
+            "views": [asdict(view) for view in self.views],
+        }
+
+    def contact_sheet(self, title: str) -> Image.Image:
+        """Photograph, rendering, error and depth of the shown views, the worst of all last."""
+        scores = {view.name: view for view in self.views}
+        worst = min(self.views, key=lambda view: view.psnr).name
+        rows = []
+        for name in sorted(self.shown, key=lambda name: (name == worst, list(scores).index(name))):
+            photograph, seen = self.shown[name]
+            label = f"{name} · {scores[name].psnr:.2f} dB · SSIM {scores[name].ssim:.3f}"
+            depth = colour_depth(seen.depth, seen.opacity, depth_range(seen.depth, seen.opacity))
+            pictures = [photograph, seen.rgb, colour_error(photograph, seen.rgb), depth]
+            rows.append(Row(f"worst: {label}" if name == worst and len(self.views) > 1 else label, pictures))
+        return contact_sheet(title, ["photograph", "rendering", f"error × {ERROR_GAIN}", "depth"], rows)
+
+
+def evaluate(
+    method: Method,
+    scene: Scene,
+    split: str = "test",
+    keep: Callable[[str, Rendering], object] = lambda name, rendering: None,
+) -> Evaluation:
+    """Render every view of a split and compare it with its photograph.
+
+    keep: told each view's name and rendering
+    Pixels that the photograph's mask rules out do not count. Raises LumigraphError if the split has no view.
+    """
+    chosen = scene.splits.get(split)
+    if chosen is None or not len(chosen):
+        there = ", ".join(f"{name} ({len(index)} views)" for name, index in scene.splits.items() if len(index))
+        raise LumigraphError(f"{scene.source} has no views in the split {split!r}; choose one of: {there}")
+    views = chosen.tolist()
+    method.eval()
+    compile_seconds = warm_up(method, scene.cameras[views[0]])
+    spread = {views[round(i)] for i in torch.linspace(0, len(views) - 1, min(SHOWN, len(views))).tolist()}
+    scores: list[ViewScore] = []
+    shown: dict[str, tuple[Tensor, Rendering]] = {}
+    worst: dict[str, tuple[Tensor, Rendering]] = {}
+    for index in track(views, "Comparing views", len(views)):
+        camera, image = scene.view(index)
+        photograph = on_background(image, scene.frame.background)
+        begin = time.perf_counter()
+        seen = method.render(camera).cpu()
+        seconds = time.perf_counter() - begin
+        score = compare(scene.names[index], seen.rgb.clamp(0, 1), photograph, scene.images.mask(index), seconds)
+        keep(score.name, seen)
+        if index in spread:
+            shown[score.name] = photograph, seen
+        if all(score.psnr < other.psnr for other in scores):
+            worst = {score.name: (photograph, seen)}
+        scores.append(score)
+    return Evaluation(scores, protocol(scene, split), compile_seconds, shown | worst)
+
+
+def compare(
+    name: str,
+    rgb: Float[Tensor, "height width 3"],
+    photograph: Float[Tensor, "height width 3"],
+    mask: Bool[Tensor, "height width"] | None,
+    seconds: float,
+) -> ViewScore:
+    likeness = ssim_map(rgb, photograph)
+    if mask is None:
+        return ViewScore(name, psnr(rgb, photograph), float(likeness.mean()), seconds)
+    edge = WINDOW // 2
+    inner = likeness[mask[edge:-edge, edge:-edge]]
+    return ViewScore(name, psnr(rgb[mask], photograph[mask]), float(inner.mean()) if len(inner) else 0.0, seconds)
+
+
+def warm_up(method: Method, camera: Camera) -> float:
+    """Render a very small picture, so that what is compiled on first use does not count. Returns the seconds."""
+    begin = time.perf_counter()
+    method.render(camera.resized(min(1.0, WARM_UP_SIZE / int(camera.size.max()))))
+    return time.perf_counter() - begin
+
+
+def on_background(
+    image: Float[Tensor, "height width channel"], background: tuple[float, float, float]
+) -> Float[Tensor, "height width 3"]:
+    """A photograph without its alpha."""
+    if image.shape[-1] == 3:
+        return image
+    rgb, alpha = image[..., :3], image[..., 3:]
+    return alpha * rgb + (1 - alpha) * torch.tensor(background)
+
+
+def protocol(scene: Scene, split: str) -> dict[str, Any]:
+    """All that one must know to compare these figures with others."""
+    index = scene.splits[split]
+    sizes = sorted({f"{width}x{height}" for width, height in scene.cameras.size[index].tolist()})
+    return {
+        "split": split,
+        "views": len(index),
+        "resolution": sizes[0] if len(sizes) == 1 else sizes,
+        "background": list(scene.frame.background) if scene.frame.has_alpha else None,
+        "masked": any(scene.images.mask(int(i)) is not None for i in index),
+        "colours": "sRGB in [0, 1]; renderings clipped, not rounded",
+        "psnr": "per view, then averaged",
+        "ssim": "Wang 2004: Gaussian window 11x11, deviation 1.5, K1 0.01, K2 0.03, windows inside the image",
+    }
+
+
+def mean(values) -> float:
+    found = list(values)
+    return sum(found) / len(found)

@@ -1,0 +1,56 @@
+"""One paper, one file. A method is found by its file's name, which is also what the user types."""
+
+from __future__ import annotations
+
+import ast
+import difflib
+import importlib
+import inspect
+import pkgutil
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from ..errors import LumigraphError
+
+if TYPE_CHECKING:
+    from ..method import Method
+
+
+def available() -> list[str]:
+    """The methods that are installed, as the user types them: instant_ngp.py is `instant-ngp`."""
+    modules = (module.name for module in pkgutil.iter_modules(__path__))
+    return sorted(name.replace("_", "-") for name in modules if not name.startswith("_"))
+
+
+def summary(name: str) -> str:
+    """The first line of a method's file: what it is and who published it. Reads the file without running it."""
+    for folder in __path__:
+        file = Path(folder) / f"{name.replace('-', '_')}.py"
+        if file.exists():
+            return (ast.get_docstring(ast.parse(file.read_text("utf-8"))) or "").partition("\n")[0]
+    return ""
+
+
+def check(name: str) -> str:
+    """The name of an installed method, or LumigraphError naming those there are."""
+    name = name.replace("_", "-")
+    if name not in available():
+        near = difflib.get_close_matches(name, available(), n=1)
+        hint = f"; did you mean {near[0]}?" if near else ""
+        raise LumigraphError(f"No method {name!r} is installed; there are: {', '.join(available()) or 'none'}{hint}")
+    return name
+
+
+def find(name: str) -> type[Method]:
+    """The Method in the file of that name. Raises LumigraphError if there is no such file."""
+    from ..method import Method
+
+    module = importlib.import_module(f"{__name__}.{check(name).replace('-', '_')}")
+    here = [x for x in vars(module).values() if isinstance(x, type) and x.__module__ == module.__name__]
+    (method,) = (x for x in here if issubclass(x, Method) and not inspect.isabstract(x))
+    return method
+
+
+def name_of(method: Method) -> str:
+    """What the user types for a method: the name of the file that holds it."""
+    return type(method).__module__.rpartition(".")[2].replace("_", "-")

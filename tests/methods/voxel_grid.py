@@ -1,0 +1,90 @@
+"""Voxel grid: density and colour at the corners of a cube, the smallest thing that learns a scene. For tests."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import nn
+
+from lumigraph.method import RayMethod
+from lumigraph.rays import Rendering, Samples
+from lumigraph.volume import composite
+
+
+@dataclass(frozen=True)
+class Grids:
+    cells: int = 12
+    channels: tuple[int, ...] = (1, 3)
+
+
+@dataclass(frozen=True)
+class Config:
+    rays: int = 256  # per step
+    samples: int = 24  # per ray
+    learning_rate: float = 0.1  # decays to a tenth
+    momentum: bool = False  # a second kind of optimizer for the colours
+    grids: Grids = Grids()
+
+
+class VoxelGrid(RayMethod):
+    Config = Config
+
+    def __init__(self, frame, config=Config()):
+        super().__init__(frame, config)
+        n, (a, b) = config.grids.cells, config.grids.channels
+        self.density = nn.Parameter(0.1 * torch.randn(1, a, n, n, n))
+        self.colour = nn.Parameter(0.1 * torch.randn(1, b, n, n, n))
+        self.register_buffer("steps", torch.zeros((), dtype=torch.int64))
+
+    def batch(self, scene, generator):
+        batch = scene.sample_rays(self.config.rays, generator)
+        self.jitter = torch.rand(len(batch), 1, generator=generator)
+        return batch
+
+    def render_rays(self, rays, background, jitter=0.5):
+        count = self.config.samples
+        edges = torch.linspace(1.0, 5.0, count + 1).expand(len(rays), -1)
+        step = 4 / count
+        start = (edges[:, :-1] + (jitter - 0.5) * step).reshape(-1)
+        samples = Samples(start, start + step, torch.arange(len(rays) + 1) * count)
+        points, _ = samples.along(rays)
+        grid = torch.cat([self.density, self.colour], 1)
+        values = nn.functional.grid_sample(grid, points.flip(-1)[None, None, None], align_corners=True)[0, :, 0, 0].T
+        inside = (points.abs() < 1).all(-1)
+        density = nn.functional.softplus(10 * values[:, 0] - 2) * inside
+        return composite(samples, density, torch.sigmoid(10 * values[:, 1:]), background)
+
+    def loss(self, batch, step):
+        target = batch.rgb
+        if batch.alpha is not None:
+            target = target * batch.alpha[:, None] + 1 - batch.alpha[:, None]
+        seen = self.render_rays(batch.rays, torch.tensor([self.frame.background]), self.jitter)
+        error = (seen.rgb - target).square().mean()
+        self.mse = error.item()
+        return {"colour": error, "thin": 1e-4 * self.density.abs().mean()}
+
+    def optimizers(self):
+        if not self.config.momentum:
+            self.kept = [torch.optim.Adam([self.density, self.colour], lr=self.config.learning_rate)]
+        else:
+            self.kept = [
+                torch.optim.Adam([self.density], lr=self.config.learning_rate, amsgrad=True),
+                torch.optim.SGD([self.colour], lr=self.config.learning_rate, momentum=0.9),
+            ]
+        return self.kept
+
+    def before_step(self, step, progress):
+        for optimizer in self.kept:
+            for group in optimizer.param_groups:
+                group["lr"] = self.config.learning_rate * 0.1**progress
+
+    def after_step(self, step):
+        self.steps += 1
+
+    def statistics(self):
+        return {"mse": self.mse, "samples": self.config.rays * self.config.samples}
+
+    def render(self, camera) -> Rendering:
+        assert not self.training
+        return super().render(camera)

@@ -1,0 +1,85 @@
+"""A scene of twelve small pictures and a method that learns it in seconds, for tests of what lies around them."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import torch
+from PIL import Image
+
+import lumigraph.methods
+from lumigraph.camera import Camera
+from lumigraph.images import ImageStore
+from lumigraph.lens import Pinhole
+from lumigraph.run import Run, build
+from lumigraph.scene import Frame, Scene
+
+SIZE, FOCAL, DISTANCE = 24, 32.0, 3.0
+
+# What a user would do by putting a file into lumigraph/methods/.
+if (folder := str(Path(__file__).parent / "methods")) not in lumigraph.methods.__path__:
+    lumigraph.methods.__path__.append(folder)
+
+
+def poses(count: int = 12) -> torch.Tensor:
+    """Cameras around the origin, looking at it, z upwards."""
+    angle = torch.arange(count) * (2 * math.pi / count)
+    height = 0.4 + 0.3 * torch.sin(3 * angle)
+    out = torch.stack([height.cos() * angle.cos(), height.cos() * angle.sin(), height.sin()], -1)
+    right = torch.stack([-angle.sin(), angle.cos(), 0 * angle], -1)
+    return torch.stack([right, torch.linalg.cross(-out, right), -out, DISTANCE * out], -1)
+
+
+def picture(pose: torch.Tensor) -> np.ndarray:
+    """A ball of radius 0.6 whose colour is where its surface points; RGBA bytes."""
+    y, x = torch.meshgrid(torch.arange(SIZE) + 0.5, torch.arange(SIZE) + 0.5, indexing="ij")
+    directions = torch.stack([(x - SIZE / 2) / FOCAL, (y - SIZE / 2) / FOCAL, torch.ones_like(x)], -1)
+    directions = torch.nn.functional.normalize(directions, dim=-1) @ pose[:, :3].T
+    origin = pose[:, 3]
+    b = directions @ origin
+    under = b * b - (origin @ origin - 0.36)
+    hit = under > 0
+    surface = origin + (-b - under.clamp_min(0).sqrt())[..., None] * directions
+    rgba = torch.cat([0.5 + surface / 1.2, torch.ones(SIZE, SIZE, 1)], -1) * hit[..., None]
+    return (rgba.clamp(0, 1) * 255).byte().numpy()
+
+
+def scene(count: int = 12) -> Scene:
+    pose, index = poses(count), torch.arange(count)
+    lens = Pinhole(torch.full((count, 2), FOCAL), torch.full((count, 2), SIZE / 2))
+    cameras = Camera(pose, lens, torch.full((count, 2), SIZE), image_index=index)
+    frame = Frame(near=0.1, background=(1.0, 1.0, 1.0), has_alpha=True, image_count=count)
+    splits = {"train": index[index % 4 != 0], "test": index[index % 4 == 0]}
+    images = ImageStore.from_arrays([picture(p) for p in pose])
+    return Scene(cameras, images, frame, splits, [f"ball_{i}" for i in range(count)], "in memory")
+
+
+def method(frame: Frame | None = None, seed: int = 0, **config):
+    kind = lumigraph.methods.find("voxel-grid")
+    return build(kind, frame or scene().frame, kind.Config(**config), torch.device("cpu"), seed)
+
+
+def new_run(folder: Path, **config) -> Run:
+    made = scene()
+    return Run.create(folder, method(made.frame, **config), made)
+
+
+def write_blender(folder: Path, count: int = 12) -> Path:
+    """The same scene as files, in the layout of the Blender data sets."""
+    folder.mkdir(parents=True)
+    flip = torch.diag(torch.tensor([1.0, -1.0, -1.0]))
+    for split in ("train", "test"):
+        frames = []
+        for i, pose in enumerate(poses(count)):
+            if (i % 4 == 0) != (split == "test"):
+                continue
+            Image.fromarray(picture(pose)).save(folder / f"{split}_{i}.png")
+            matrix = torch.eye(4)
+            matrix[:3] = torch.cat([pose[:, :3] @ flip, pose[:, 3:]], 1)
+            frames.append({"file_path": f"./{split}_{i}", "transform_matrix": matrix.tolist()})
+        about = {"camera_angle_x": 2 * math.atan(SIZE / 2 / FOCAL), "frames": frames}
+        (folder / f"transforms_{split}.json").write_text(json.dumps(about))
+    return folder
