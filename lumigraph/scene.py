@@ -1,0 +1,123 @@
+"""Scene: photographs, where they were taken from, and what is known of the space between them."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+import torch
+from jaxtyping import Float, Int, UInt8
+from torch import Tensor
+
+from .camera import Camera
+from .images import ImageStore
+from .rays import Rays
+
+Vector = tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class Frame:
+    """Where a scene is, in plain numbers; all that a method must know to be built, with or without photographs.
+
+    bounds:      two corners of the box of interest, inside [-1, 1]^3
+    reach:       half-size of the cube around the origin that holds everything to be modelled: 1 for an object, a power
+                 of two up to 64 for a room or an unbounded capture
+    near:        distance from a camera at which its rays may begin; nothing is nearer
+    background:  colour behind everything
+    has_alpha:   whether the photographs say how opaque each pixel is
+    image_count: photographs in the scene, held-out ones included
+    source_from_scene: the similarity x_source = M x_scene back to the frame that the capture came in, so that exports
+                 line up with it
+    """
+
+    bounds: tuple[Vector, Vector] = ((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0))
+    reach: float = 1.0
+    near: float = 0.05
+    background: Vector = (0.0, 0.0, 0.0)
+    has_alpha: bool = False
+    image_count: int = 0
+    source_from_scene: tuple[tuple[float, float, float, float], ...] = (
+        (1.0, 0.0, 0.0, 0.0),
+        (0.0, 1.0, 0.0, 0.0),
+        (0.0, 0.0, 1.0, 0.0),
+        (0.0, 0.0, 0.0, 1.0),
+    )
+
+    def to_json(self) -> dict[str, Any]:
+        """Plain numbers and lists; `from_json` turns them back exactly."""
+        return asdict(self)
+
+    @staticmethod
+    def from_json(data: dict[str, Any]) -> Frame:
+        return Frame(**{name: as_tuples(value) for name, value in data.items()})
+
+
+@dataclass(frozen=True)
+class Batch:
+    """Rays, and what the photographs say they saw.
+
+    rgb:   sRGB-encoded, not multiplied by alpha
+    alpha: opacity, where the photographs have it
+    """
+
+    rays: Rays
+    rgb: Float[Tensor, "ray 3"]
+    alpha: Float[Tensor, " ray"] | None = None
+
+    def __len__(self) -> int:
+        return len(self.rgb)
+
+    def to(self, device: torch.device | str) -> Batch:
+        alpha = None if self.alpha is None else self.alpha.to(device)
+        return Batch(self.rays.to(device), self.rgb.to(device), alpha)
+
+
+@dataclass(frozen=True)
+class Scene:
+    """Image i was taken by camera i and is called names[i].
+
+    cameras: in the scene's frame; image_index counts them
+    frame:   bounds, reach, background, and the way back to the source's frame
+    splits:  image numbers by purpose: "train", "test", maybe "val"
+    points:  sparse points in the scene's frame, where structure from motion gave some
+    source:  the folder it came from, or "procedural:<name>"
+    warnings: what the user should know about the capture, one sentence each
+    """
+
+    cameras: Camera
+    images: ImageStore
+    frame: Frame
+    splits: dict[str, Int[Tensor, " image"]]
+    names: list[str]
+    source: str = ""
+    points: Float[Tensor, "point 3"] | None = None
+    point_colours: UInt8[Tensor, "point 3"] | None = None
+    warnings: list[str] = field(default_factory=list)
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    def sample_rays(self, count: int, generator: torch.Generator, split: str = "train") -> Batch:
+        """Random pixels of random photographs: photographs evenly, then their trusted pixels evenly."""
+        drawn = self.images.draw(count, self.splits[split], generator)
+        rays = self.cameras.rays(drawn.xy, drawn.image)
+        rgb = drawn.rgba[:, :3].float().div_(255)
+        alpha = drawn.rgba[:, 3].float().div_(255) if self.images.has_alpha else None
+        return Batch(rays, rgb, alpha)
+
+    def sample_view(
+        self, generator: torch.Generator, split: str = "train"
+    ) -> tuple[Camera, Float[Tensor, "height width channel"]]:
+        """A random whole photograph; its number is the camera's image_index."""
+        choices = self.splits[split]
+        return self.view(int(choices[torch.randint(len(choices), (), generator=generator)]))
+
+    def view(self, index: int) -> tuple[Camera, Float[Tensor, "height width channel"]]:
+        """One photograph and its camera: sRGB-encoded in [0, 1], a fourth channel where the photographs have alpha."""
+        return self.cameras[index], self.images[index].float().div_(255)
+
+
+def as_tuples(value: Any) -> Any:
+    """JSON's lists as tuples, however deep."""
+    return tuple(as_tuples(x) for x in value) if isinstance(value, list | tuple) else value
