@@ -48,7 +48,7 @@ def film_size(camera: Camera, longest: int) -> tuple[int, int]:
     """Even (width, height) in the shape of the first camera's picture, no larger than it, nor than `longest`."""
     width, height = camera.size[0].tolist()
     scale = min(1.0, longest / max(width, height))
-    return tuple(max(2, round(x * scale / 2) * 2) for x in (width, height))  # type: ignore[return-value]
+    return max(2, round(width * scale / 2) * 2), max(2, round(height * scale / 2) * 2)
 
 
 def angle_of_view(cameras: Camera) -> float:
@@ -56,12 +56,8 @@ def angle_of_view(cameras: Camera) -> float:
     angles = []
     for camera in (cameras[i] for i in range(0, len(cameras), max(1, len(cameras) // 16))):
         width, height = camera.size[0].tolist()
-        middle = (
-            [[width / 2, 0.0], [width / 2, float(height)]]
-            if height <= width
-            else [[0.0, height / 2], [float(width), height / 2]]
-        )
-        a, b = camera.lens.unproject(torch.tensor(middle))
+        x, y = (width / 2, 0.0) if height <= width else (0.0, height / 2)  # the middle of an edge, and of the other
+        a, b = camera.lens.unproject(torch.tensor([[x, y], [width - x, height - y]]))
         angles.append(torch.acos((a @ b).clamp(-1, 1)).item())
     return min(max(sorted(angles)[len(angles) // 2], math.radians(NARROWEST)), math.radians(WIDEST))
 
@@ -116,7 +112,7 @@ class Surroundings:
 
     @cached_property
     def polar(self) -> Float[Tensor, "camera 3"]:
-        """Azimuth, elevation and log distance of each camera about the focus; of each direction, if they look outward."""
+        """Azimuth, elevation and log distance of each camera about the focus; of its direction, if all look outward."""
         offset = self.position - self.focus if self.inward else self.forward
         x, y, z = (offset @ self.axes.T).unbind(-1)
         distance = offset.norm(dim=-1).clamp_min(1e-9)

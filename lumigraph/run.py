@@ -58,9 +58,7 @@ class Run:
             raise LumigraphError(f"{self.folder} is not a run: it holds no config.json; `lumigraph train` makes runs")
         self.config: dict[str, Any] = files.read_json(file)
         if not isinstance(self.config, dict) or self.config.get("format") != FORMAT:
-            raise LumigraphError(
-                f"{file} was not written by this version of Lumigraph; open the run with the other one"
-            )
+            raise LumigraphError(f"{file} was not written by this version of Lumigraph; open it with the one that did")
 
     @classmethod
     def create(
@@ -139,7 +137,7 @@ class Run:
         scene = open_scene(source, **self.config["scene"]["options"])
         if not alike(scene.frame.to_json(), self.config["frame"]):
             raise LumigraphError(
-                f"{source} is not what {self.folder} was trained on: its cameras or bounds differ; train a new run on it"
+                f"{source} is not what {self.folder} was trained on, its cameras or bounds differ; train a new run on it"
             )
         return scene
 

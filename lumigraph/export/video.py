@@ -6,7 +6,6 @@ import contextlib
 from collections.abc import Iterator
 from fractions import Fraction
 from pathlib import Path
-from typing import cast
 
 import av
 import numpy as np
@@ -60,7 +59,7 @@ class Film:
         self.container.mux(self.stream.encode(None))
 
     def _begin(self, width: int, height: int) -> VideoStream:
-        stream = cast(VideoStream, self.container.add_stream("libx264", rate=self.fps))
+        stream = self.container.add_stream("libx264", rate=self.fps)
         stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
         stream.options = {"crf": str(self.quality), "preset": "slow"}
         context = stream.codec_context

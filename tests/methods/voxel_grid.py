@@ -30,7 +30,7 @@ class Config:
 class VoxelGrid(RayMethod):
     Config = Config
 
-    def __init__(self, frame, config=Config()):
+    def __init__(self, frame, config):
         super().__init__(frame, config)
         n, (a, b) = config.grids.cells, config.grids.channels
         self.density = nn.Parameter(0.1 * torch.randn(1, a, n, n, n))
