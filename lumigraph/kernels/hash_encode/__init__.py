@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import torch
 from jaxtyping import Float
 from torch import Tensor
 
@@ -59,3 +60,32 @@ def hash_encode(
     coordinate gets no gradient).
     """
     return implementation("hash_encode", points)(points, table, levels)
+
+
+def cases(generator: torch.Generator):
+    """Inputs that every engine must agree on: dense and hashed levels, every border of the cube, and beyond it."""
+    mixed = HashLevels(levels=4, features=2, log2_entries=9, coarsest=3, finest=40)
+    for samples in (0, 1, 63, 129):
+        yield _inputs(samples, mixed, generator)
+    yield _inputs(63, HashLevels(levels=1, features=1, log2_entries=8, coarsest=1), generator)
+    yield _inputs(200, HashLevels(levels=3, features=1, log2_entries=6, coarsest=4, finest=9), generator)
+    yield _inputs(129, HashLevels(levels=2, features=4, log2_entries=12, coarsest=15, finest=2048), generator)
+    _, table, levels = _inputs(0, mixed, generator)
+    yield torch.cartesian_prod(*[torch.tensor([-0.5, 0.0, 0.28125, 1.0, 1.5])] * 3), table, levels
+
+
+def benchmark_case(generator: torch.Generator, size: int = 2**18):
+    """Samples along rays, 64 to a ray, as a training step has them; points ask for no gradient there."""
+    levels = HashLevels(levels=16, features=2, log2_entries=17)
+    ends = torch.rand(size // 64, 2, 1, 3, generator=generator)
+    along = (torch.arange(64) + 0.5)[:, None] / 64
+    points = torch.lerp(ends[:, 0], ends[:, 1], along).reshape(-1, 3)
+    table = 1e-4 * (2 * torch.rand(levels.offsets[-1], levels.features, generator=generator) - 1)
+    return points, table.requires_grad_(), levels
+
+
+def _inputs(samples: int, levels: HashLevels, generator: torch.Generator):
+    """Points are multiples of 2^-12, so that N_l p is exact and no engine's rounding decides which cell holds one."""
+    points = torch.randint(-(2**9), 2**12 + 2**9, (samples, 3), generator=generator) / 2**12
+    table = 2 * torch.rand(levels.offsets[-1], levels.features, generator=generator) - 1
+    return points, table, levels

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import math
+
+import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
@@ -38,3 +41,83 @@ def march(
     """
     run = implementation("march", origins)
     return Samples(*run(origins, directions, t_near, t_far, occupied, density, step, growth, stop))
+
+
+def cases(generator: torch.Generator):
+    """Inputs that every engine must agree on, without rays whose samples hang on an engine's rounding."""
+    for rays, cascades, n, filled, step, growth, stop in [
+        (0, 1, 4, 0.5, 0.1, 0.0, 0.0),
+        (1, 1, 1, 1.0, 0.2, 0.0, 0.0),
+        (9, 1, 8, 0.0, 0.1, 0.0, 0.0),
+        (5, 1, 4, 1.0, 0.02, 0.0, 0.0),
+        (40, 1, 8, 0.2, 0.15, 0.0, 0.0),
+        (24, 1, 8, 0.3, 0.15, 0.0, 0.1),
+        (24, 2, 6, 0.3, 0.2, 0.0, 0.0),
+        (24, 3, 8, 0.3, 0.08, 1 / 8, 0.0),
+        (24, 3, 4, 0.5, 0.12, 1 / 16, 0.1),
+    ]:
+        yield _steady(*_inputs(rays, cascades, n, filled, step, growth, stop, generator))
+
+    # along the axes, also within the faces of the cubes, where a position of exactly 1.0 is outside the finest
+    *_, t_near, t_far, occupied, density, step, growth, stop = _inputs(54, 2, 4, 0.6, 0.17, 0.0, 0.0, generator)
+    directions = torch.cat([torch.eye(3), -torch.eye(3)]).repeat(9, 1)
+    corners = torch.tensor([-1.0, 0.0, 1.0])
+    origins = torch.cartesian_prod(corners, corners).repeat_interleave(6, 0)
+    origins = torch.cat([origins, origins[:, :1]], 1)
+    yield _steady(origins, directions, t_near, t_far, occupied, density, step, growth, stop)
+
+
+def benchmark_case(generator: torch.Generator, size: int = 2**18):
+    """Rays into a cube of 128^3 cells that holds a shell, 1024 steps to its diagonal; 64 times fewer than `size`."""
+    rays = size // 64
+    place = (torch.arange(128) + 0.5) / 64 - 1
+    radius = torch.stack(torch.meshgrid(place, place, place, indexing="ij")).norm(dim=0)
+    occupied = ((radius > 0.5) & (radius < 0.6))[None]
+    origins = 2.5 * torch.nn.functional.normalize(torch.randn(rays, 3, generator=generator), dim=-1)
+    targets = 0.5 * (2 * torch.rand(rays, 3, generator=generator) - 1)
+    directions = torch.nn.functional.normalize(targets - origins, dim=-1)
+    t_near = 0.003 * torch.rand(rays, generator=generator)
+    density = 20.0 * occupied
+    return (
+        origins,
+        directions,
+        t_near,
+        torch.full_like(t_near, 5.0),
+        occupied,
+        density,
+        2 * math.sqrt(3) / 1024,
+        0,
+        1e-4,
+    )
+
+
+def _inputs(rays, cascades, n, filled, step, growth, stop, generator):
+    """Rays from inside and outside the cubes, towards them and past them; some end before they begin."""
+
+    def uniform(*shape):
+        return torch.rand(shape, generator=generator)
+
+    reach = 2.0 ** (cascades - 1)
+    origins = 2 * reach * (2 * uniform(rays, 3) - 1)
+    targets = 1.1 * reach * (2 * uniform(rays, 3) - 1)
+    directions = torch.nn.functional.normalize(targets - origins, dim=-1)
+    t_near = 0.5 * uniform(rays)
+    t_far = torch.where(uniform(rays) < 0.3, torch.inf, t_near + reach * (4 * uniform(rays) - 0.5))
+    occupied = uniform(cascades, n, n, n) < filled
+    density = 8 * uniform(cascades, n, n, n)
+    return origins, directions, t_near, t_far, occupied, density, step, growth, stop
+
+
+def _steady(origins, directions, t_near, t_far, occupied, density, step, growth, stop):
+    """Only the rays that keep their samples when the lattice and `stop` are nudged by more than float32 rounds."""
+    from .reference import run
+
+    def samples(nudge):
+        rays = origins.double(), directions.double(), t_near.double() + nudge, t_far.double()
+        t, _, ray_starts = run(*rays, occupied, density.double(), step, growth, stop * (1 + nudge))
+        return t.split(ray_starts.diff().tolist())
+
+    nudged = zip(*(samples(nudge) for nudge in (-3e-5, 0.0, 3e-5)), strict=True)
+    keep = [len(a) == len(b) == len(c) and bool(((c - a).abs() < step / 2).all()) for a, b, c in nudged]
+    rays = [x[torch.tensor(keep, dtype=torch.bool)] for x in (origins, directions, t_near, t_far)]
+    return *rays, occupied, density, step, growth, stop

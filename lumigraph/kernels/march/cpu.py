@@ -64,6 +64,10 @@ def _walk(o, d, near, far, occupied, density, step, growth, depth_limit, write, 
                 k += 1
                 t0 = t1
                 continue
+            if cascades > 1 and n % 4:  # this cell may reach into the finer cascade
+                k += 1
+                t0 = t1
+                continue
             # Empty: on to the first midpoint that may lie outside this cell.
             leave = far
             for axis in range(3):

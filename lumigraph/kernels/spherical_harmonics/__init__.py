@@ -2,10 +2,18 @@
 
 from __future__ import annotations
 
+from math import pi, sqrt
+
+import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from .._dispatch import implementation
+
+# What makes each polynomial's square integrate to one over the sphere: K_lm, l the band and m the order.
+K00, K1 = sqrt(1 / (4 * pi)), sqrt(3 / (4 * pi))
+K20, K21, K22 = sqrt(5 / (16 * pi)), sqrt(15 / (4 * pi)), sqrt(15 / (16 * pi))
+K30, K31, K32, K33 = sqrt(7 / (16 * pi)), sqrt(21 / (32 * pi)), sqrt(105 / (16 * pi)), sqrt(35 / (32 * pi))
 
 
 def spherical_harmonics(directions: Float[Tensor, "ray 3"], bands: int) -> Float[Tensor, "ray coefficient"]:
@@ -18,3 +26,20 @@ def spherical_harmonics(directions: Float[Tensor, "ray 3"], bands: int) -> Float
     bands:      1 to 4 (degree 0 to 3)
     """
     return implementation("spherical_harmonics", directions)(directions, bands)
+
+
+def cases(generator: torch.Generator):
+    """Inputs that every engine must agree on."""
+    axes = torch.cat([torch.eye(3), -torch.eye(3)])
+    yield axes, 4
+    for rays, bands in [(0, 4), (1, 1), (1, 4), (63, 2), (129, 3), (200, 4)]:
+        yield _directions(rays, generator), bands
+
+
+def benchmark_case(generator: torch.Generator, size: int = 2**18):
+    """As many directions as a training step has samples, for the four bands that Instant-NGP uses."""
+    return _directions(size, generator).requires_grad_(), 4
+
+
+def _directions(rays: int, generator: torch.Generator) -> torch.Tensor:
+    return torch.nn.functional.normalize(torch.randn(rays, 3, generator=generator), dim=-1)

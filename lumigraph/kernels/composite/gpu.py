@@ -1,0 +1,125 @@
+"""Triton: one program takes one ray, a block of samples at a time."""
+
+from __future__ import annotations
+
+import torch
+import triton
+import triton.language as tl
+from torch import Tensor
+
+from .._dispatch import empty
+
+BLOCK = 32  # samples; most rays of a trained scene need one or two blocks
+
+
+@triton.jit
+def _thickness(tau, i, i0, b, before):
+    """Each sample's tau, and the sum of all in front of it. Summing tau_{i-1} keeps the digits that sum - tau_i loses."""
+    t = tl.load(tau + i, mask=i < b, other=0.0)
+    previous = tl.load(tau + i - 1, mask=(i > i0) & (i < b), other=0.0)
+    return t, before + tl.cumsum(previous, 0)
+
+
+@triton.jit
+def _forward(tau, values, ray_starts, total, opacity, weights, stop, C, CHANNELS: tl.constexpr, BLOCK: tl.constexpr):
+    r = tl.program_id(0).to(tl.int64)
+    i0, b = tl.load(ray_starts + r), tl.load(ray_starts + r + 1)
+    c = tl.arange(0, CHANNELS)
+    before, sum_w = 0.0, 0.0
+    sum_wv = tl.zeros([CHANNELS], tl.float32)
+    while (i0 < b) & (tl.exp(-before) >= stop):
+        i = i0 + tl.arange(0, BLOCK)
+        t, in_front = _thickness(tau, i, i0, b, before)
+        transmittance = tl.exp(-in_front)
+        w = tl.where(transmittance < stop, 0.0, transmittance * (1 - tl.exp(-t)))
+        tl.store(weights + i, w, mask=i < b)
+        v = tl.load(values + i[:, None] * C + c[None, :], mask=(i < b)[:, None] & (c < C)[None, :], other=0.0)
+        sum_wv += tl.sum(w[:, None] * v, 0)
+        sum_w += tl.sum(w, 0)
+        before += tl.sum(t, 0)
+        i0 += BLOCK
+    while i0 < b:  # out of sight
+        i = i0 + tl.arange(0, BLOCK)
+        tl.store(weights + i, tl.zeros([BLOCK], tl.float32), mask=i < b)
+        i0 += BLOCK
+    tl.store(total + r * C + c, sum_wv, mask=c < C)
+    tl.store(opacity + r, sum_w)
+
+
+@triton.jit
+def _backward(
+    d_total,
+    d_opacity,
+    d_weights,
+    tau,
+    values,
+    ray_starts,
+    total,
+    opacity,
+    weights,
+    d_tau,
+    d_values,
+    stop,
+    C,
+    CHANNELS: tl.constexpr,
+    BLOCK: tl.constexpr,
+):
+    """With g_i the loss's derivative in w_i:  dL/dtau_i = g_i T_{i+1} - sum_{j>i} g_j w_j,  dL/dv_i = w_i dL/dtotal."""
+    r = tl.program_id(0).to(tl.int64)
+    a, b = tl.load(ray_starts + r), tl.load(ray_starts + r + 1)
+    c = tl.arange(0, CHANNELS)
+    g_total = tl.load(d_total + r * C + c, mask=c < C, other=0.0)
+    g_opacity = tl.load(d_opacity + r)
+
+    # sum of g_j w_j over the whole ray: two of its three parts are at hand
+    behind = tl.sum(g_total * tl.load(total + r * C + c, mask=c < C, other=0.0), 0) + g_opacity * tl.load(opacity + r)
+    for i0 in range(a, b, BLOCK):
+        i = i0 + tl.arange(0, BLOCK)
+        g_w = tl.load(d_weights + i, mask=i < b, other=0.0) * tl.load(weights + i, mask=i < b, other=0.0)
+        behind += tl.sum(g_w, 0)
+
+    before = 0.0
+    for i0 in range(a, b, BLOCK):
+        i = i0 + tl.arange(0, BLOCK)
+        t, in_front = _thickness(tau, i, i0, b, before)
+        w = tl.load(weights + i, mask=i < b, other=0.0)
+        table = i[:, None] * C + c[None, :]
+        there = (i < b)[:, None] & (c < C)[None, :]
+        v = tl.load(values + table, mask=there, other=0.0)
+        tl.store(d_values + table, w[:, None] * g_total[None, :], mask=there)
+        g = tl.sum(v * g_total[None, :], 1) + g_opacity + tl.load(d_weights + i, mask=i < b, other=0.0)
+        after = behind - tl.cumsum(g * w, 0)
+        seen = tl.exp(-in_front) >= stop
+        tl.store(d_tau + i, tl.where(seen, g * tl.exp(-in_front - t) - after, 0.0), mask=i < b)
+        before += tl.sum(t, 0)
+        behind -= tl.sum(g * w, 0)
+
+
+class _Composite(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, tau, values, ray_starts, stop):
+        rays, channels = len(ray_starts) - 1, values.shape[1]
+        shapes = (rays, channels), (rays,), (len(tau),)
+        total, opacity, weights = (empty(*shape, device=tau.device) for shape in shapes)
+        ctx.sizes = {"C": channels, "CHANNELS": max(triton.next_power_of_2(channels), 1), "BLOCK": BLOCK}
+        ctx.stop = stop
+        if rays:
+            _forward[(rays,)](tau, values, ray_starts, total, opacity, weights, stop, **ctx.sizes, num_warps=1)
+        ctx.save_for_backward(tau, values, ray_starts, total, opacity, weights)
+        return total, opacity, weights
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx, *grads):
+        tau, values, ray_starts, *outputs = ctx.saved_tensors
+        d_tau, d_values = (empty(*x.shape, device=x.device) for x in (tau, values))
+        if len(ray_starts) > 1:
+            grads = [g.contiguous() for g in grads]
+            results = d_tau, d_values, ctx.stop
+            grid = (len(ray_starts) - 1,)
+            _backward[grid](*grads, tau, values, ray_starts, *outputs, *results, **ctx.sizes, num_warps=1)
+        return d_tau, d_values, None, None
+
+
+def run(tau: Tensor, values: Tensor, ray_starts: Tensor, stop: float) -> tuple[Tensor, Tensor, Tensor]:
+    return _Composite.apply(tau.contiguous(), values.contiguous(), ray_starts.contiguous(), stop)

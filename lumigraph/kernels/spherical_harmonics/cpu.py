@@ -1,0 +1,82 @@
+"""Numba: threads share the directions."""
+
+from __future__ import annotations
+
+import torch
+from numba import njit, prange
+from torch import Tensor
+
+from .._dispatch import empty
+from . import K00, K1, K20, K21, K22, K30, K31, K32, K33
+
+
+@njit(parallel=True, fastmath=True, cache=True)
+def _forward(directions, bands, out):
+    for r in prange(len(directions)):
+        x, y, z = directions[r, 0], directions[r, 1], directions[r, 2]
+        out[r, 0] = K00
+        if bands > 1:
+            out[r, 1] = -K1 * y
+            out[r, 2] = K1 * z
+            out[r, 3] = -K1 * x
+        if bands > 2:
+            out[r, 4] = K21 * x * y
+            out[r, 5] = -K21 * y * z
+            out[r, 6] = K20 * (3 * z * z - 1)
+            out[r, 7] = -K21 * x * z
+            out[r, 8] = K22 * (x * x - y * y)
+        if bands > 3:
+            out[r, 9] = -K33 * y * (3 * x * x - y * y)
+            out[r, 10] = 2 * K32 * x * y * z
+            out[r, 11] = -K31 * y * (5 * z * z - 1)
+            out[r, 12] = K30 * z * (5 * z * z - 3)
+            out[r, 13] = -K31 * x * (5 * z * z - 1)
+            out[r, 14] = K32 * z * (x * x - y * y)
+            out[r, 15] = -K33 * x * (x * x - 3 * y * y)
+
+
+@njit(parallel=True, fastmath=True, cache=True)
+def _backward(grad, directions, bands, d_directions):
+    for r in prange(len(directions)):
+        x, y, z = directions[r, 0], directions[r, 1], directions[r, 2]
+        g = grad[r]
+        dx = dy = dz = 0.0
+        if bands > 1:
+            dx -= K1 * g[3]
+            dy -= K1 * g[1]
+            dz += K1 * g[2]
+        if bands > 2:
+            dx += K21 * (y * g[4] - z * g[7]) + 2 * K22 * x * g[8]
+            dy += K21 * (x * g[4] - z * g[5]) - 2 * K22 * y * g[8]
+            dz += 6 * K20 * z * g[6] - K21 * (y * g[5] + x * g[7])
+        if bands > 3:
+            sectoral, zonal = 3 * K33 * (x * x - y * y), K31 * (5 * z * z - 1)
+            dx += 2 * K32 * z * (y * g[10] + x * g[14]) - 6 * K33 * x * y * g[9] - sectoral * g[15] - zonal * g[13]
+            dy += 2 * K32 * z * (x * g[10] - y * g[14]) + 6 * K33 * x * y * g[15] - sectoral * g[9] - zonal * g[11]
+            dz += K32 * (2 * x * y * g[10] + (x * x - y * y) * g[14])
+            dz += 3 * K30 * (5 * z * z - 1) * g[12] - 10 * K31 * z * (y * g[11] + x * g[13])
+        d_directions[r, 0] = dx
+        d_directions[r, 1] = dy
+        d_directions[r, 2] = dz
+
+
+class _SphericalHarmonics(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, directions, bands):
+        ctx.save_for_backward(directions)
+        ctx.bands = bands
+        out = empty(len(directions), bands**2)
+        _forward(directions.numpy(), bands, out.numpy())
+        return out
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx, grad):
+        (directions,) = ctx.saved_tensors
+        d_directions = empty(*directions.shape)
+        _backward(grad.contiguous().numpy(), directions.numpy(), ctx.bands, d_directions.numpy())
+        return d_directions, None
+
+
+def run(directions: Tensor, bands: int) -> Tensor:
+    return _SphericalHarmonics.apply(directions.contiguous(), bands)
