@@ -14,7 +14,7 @@ import lumigraph
 # Each floor may know the floors above it in this list, and a room on it knows no other room of its own floor.
 # A new room is a new name here, on the floor where it belongs.
 FLOORS: list[set[str]] = [
-    {"errors"},
+    {"errors", "loops"},
     {"files", "plain", "lens", "rays"},
     {"camera", "images", "kernels", "figures", "metrics"},
     {"volume", "scene"},
@@ -24,6 +24,7 @@ FLOORS: list[set[str]] = [
     {"train"},
     {"commands"},
     {"cli"},
+    {"__main__"},
 ]
 # What the floors alone would let through.
 STRANGERS: list[tuple[str, str]] = [
