@@ -14,14 +14,16 @@ BLOCK = 32  # samples; most rays of a trained scene need one or two blocks
 
 @triton.jit
 def _thickness(tau, i, i0, b, before):
-    """Each sample's tau, and the sum of all in front of it. Summing tau_{i-1} keeps the digits that sum - tau_i loses."""
+    """Each sample's tau, and the sum of all in front of it: of tau_{i-1}, because sum - tau_i would lose digits."""
     t = tl.load(tau + i, mask=i < b, other=0.0)
     previous = tl.load(tau + i - 1, mask=(i > i0) & (i < b), other=0.0)
     return t, before + tl.cumsum(previous, 0)
 
 
 @triton.jit
-def _forward(tau, values, ray_starts, total, opacity, weights, stop, C, CHANNELS: tl.constexpr, BLOCK: tl.constexpr):
+def _forward(
+    tau, values, ray_starts, total, opacity, weights, stop, C: tl.constexpr, CHANNELS: tl.constexpr, BLOCK: tl.constexpr
+):
     r = tl.program_id(0).to(tl.int64)
     i0, b = tl.load(ray_starts + r), tl.load(ray_starts + r + 1)
     c = tl.arange(0, CHANNELS)
@@ -60,7 +62,7 @@ def _backward(
     d_tau,
     d_values,
     stop,
-    C,
+    C: tl.constexpr,
     CHANNELS: tl.constexpr,
     BLOCK: tl.constexpr,
 ):

@@ -41,7 +41,7 @@ def _weight(fraction, corner: tl.constexpr):
     return fraction if corner == 1 else 1 - fraction
 
 
-@triton.jit
+@triton.jit(do_not_specialize=["S"])
 def _forward(
     points,
     table,
@@ -71,7 +71,7 @@ def _forward(
     tl.store(out + i[:, None] * (L * F) + level * F + f[None, :], total, mask=there)
 
 
-@triton.jit
+@triton.jit(do_not_specialize=["S"])
 def _backward_table(
     grad,
     points,
@@ -100,7 +100,7 @@ def _backward_table(
         tl.atomic_add(d_table + entry[:, None] * F + f[None, :], weight[:, None] * g, mask=there, sem="relaxed")
 
 
-@triton.jit
+@triton.jit(do_not_specialize=["S"])
 def _backward_points(
     grad,
     points,

@@ -58,7 +58,7 @@ def _to_face(x, i, d, inverse, scale, n: tl.constexpr):
     return (face - x) * inverse
 
 
-@triton.jit
+@triton.jit(do_not_specialize=["R"])
 def _march(
     origins,
     directions,
@@ -189,6 +189,6 @@ def run(
     if rays:
         _march[grid](*inputs, counts, ray_starts, t_start, t_end, *numbers, WRITE=False, **options)
         torch.cumsum(counts, 0, out=ray_starts[1:])
-        t_start, t_end = empty(2, int(ray_starts[-1]), device=origins.device)
+        t_start, t_end = (empty(int(ray_starts[-1]), device=origins.device) for _ in range(2))
         _march[grid](*inputs, counts, ray_starts, t_start, t_end, *numbers, WRITE=True, **options)
     return t_start, t_end, ray_starts

@@ -24,7 +24,7 @@ K30, K31, K32, K33 = tl.constexpr(_K30), tl.constexpr(_K31), tl.constexpr(_K32),
 BLOCK = 128
 
 
-@triton.jit
+@triton.jit(do_not_specialize=["R"])
 def _forward(directions, out, R, BANDS: tl.constexpr, BLOCK: tl.constexpr):
     r = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
     here = r < R
@@ -53,7 +53,7 @@ def _forward(directions, out, R, BANDS: tl.constexpr, BLOCK: tl.constexpr):
         tl.store(row + 15, x * (x * x - 3 * y * y) * -K33, mask=here)
 
 
-@triton.jit
+@triton.jit(do_not_specialize=["R"])
 def _backward(grad, directions, d_directions, R, BANDS: tl.constexpr, BLOCK: tl.constexpr):
     r = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
     here = r < R
