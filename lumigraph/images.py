@@ -18,10 +18,10 @@ from pathlib import Path
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int, UInt8
-from numba import njit, prange
 from torch import Tensor
 
 from .errors import LumigraphError
+from .loops import look_up
 
 MEMORY_SHARE = 0.4  # of the machine's memory; the rest is for training and everything else that runs
 PIECES = 64  # a batch from a file comes in about so many reads
@@ -148,44 +148,6 @@ class ImageStore:
         inputs = (chance, images, self._first, self._count, self._stride, self._width, *runs, self._rgba)
         look_up(piece, *(x.numpy() for x in (*inputs, drawn.image, drawn.xy, drawn.rgba)))
         return replace(drawn, rgba=drawn.rgba[:, None].view(torch.uint8))
-
-
-@njit(parallel=True, cache=True, error_model="numpy")
-def look_up(
-    piece, chance, images, first, count, stride, width, start, before, ahead, first_run, pixels, image, xy, rgba
-):
-    """Where each random number lands, `piece` neighbours in the store at a time, and the bytes there.
-
-    One number chooses both: the leading part of its 53 bits the image, the rest the pixel.
-    """
-    for p in prange(len(chance)):
-        share = chance[p] * len(images)
-        choice = min(int(share), len(images) - 1)
-        k = images[choice]
-        begin = int((share - choice) * count[k])
-        for i in range(p * piece, min((p + 1) * piece, len(image))):
-            position = begin + i - p * piece
-            pixel = position
-            if piece > 1:  # shuffled
-                position %= count[k]
-                pixel = position * stride[k] % count[k]
-            if len(start):
-                rank = pixel + ahead[k]
-                low, high = first_run[k], first_run[k + 1]
-                while high - low > 1:
-                    middle = (low + high) // 2
-                    if before[middle] <= rank:
-                        low = middle
-                    else:
-                        high = middle
-                pixel = start[low] + rank - before[low]
-                if piece == 1:
-                    position = pixel
-            y = int((pixel + 0.5) / width[k])  # quicker than dividing whole numbers
-            image[i] = k
-            xy[i, 0] = pixel - y * width[k] + 0.5
-            xy[i, 1] = y + 0.5
-            rgba[i] = pixels[first[k] + position]
 
 
 @dataclass(frozen=True)

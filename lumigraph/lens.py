@@ -17,9 +17,13 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from . import loops
+
 FOLD_SAMPLES = 1024  # angles from the axis at which a distortion is tested for folding over
 WIDEST_FLAT = math.radians(89.0)  # flat image planes end here: tan is still harmless in float32
 NEWTON_STEPS = 20  # usually three are enough; more only beside a fold
+SMALL_STEP = 3e-5  # the error left after one this small is about its square
+NO_INDEX = torch.empty(0, dtype=torch.int64)
 
 
 class Lens(ABC):
@@ -162,6 +166,8 @@ class OpenCV(Lens):
         return last_growing(r, bent).to(self.focal.dtype)
 
     def unproject(self, pixels, index=None):
+        if self._by_loop(pixels):
+            return self._unproject_by_loop(pixels, index)
         target = (pixels - rows(self.centre, index)) / rows(self.focal, index)
         target_x, target_y = target.T.contiguous()
         distortion, (limit,) = columns(self.distortion, index), columns(self.fold, index)
@@ -185,9 +191,30 @@ class OpenCV(Lens):
         return pixels, valid & inside
 
     def solid_angle(self, pixels, directions, index=None):
+        if self._by_loop(directions):
+            return self._solid_angle_by_loop(directions, index)
         x, y, z = directions.T.contiguous()
         _, (xx, xy, yy) = bend(x / z, y / z, columns(self.distortion, index))
         return z * z * z / ((xx * yy - xy * xy).clamp_min(1e-3) * area(self.focal, index))
+
+    def _by_loop(self, given: Tensor) -> bool:
+        """Whether the quicker loops on the CPU will do: they know single precision and no gradients."""
+        tensors = (given, *self._numbers().values())
+        return all(x.is_cpu and x.dtype == torch.float32 and not x.requires_grad for x in tensors)
+
+    def _unproject_by_loop(self, pixels: Tensor, index: Tensor | None) -> Tensor:
+        directions = torch.empty(len(pixels), 3)
+        which = NO_INDEX if index is None else index
+        inputs = (pixels, which, self.focal, self.centre, self.distortion, self.fold)
+        # Each ray stops by itself here, so one beside a fold, where steps merely halve, gets no company's extra steps.
+        loops.unbend(*(x.numpy() for x in inputs), NEWTON_STEPS, 0.03 * SMALL_STEP, directions.numpy())
+        return directions
+
+    def _solid_angle_by_loop(self, directions: Tensor, index: Tensor | None) -> Tensor:
+        angle = torch.empty(len(directions))
+        which = NO_INDEX if index is None else index
+        loops.bent_solid_angle(*(x.numpy() for x in (directions, which, self.focal, self.distortion, angle)))
+        return angle
 
 
 @dataclass(frozen=True)
@@ -363,8 +390,8 @@ def one_or_more(index: int | slice | Tensor) -> slice | Tensor:
 
 
 def small(step: Tensor) -> bool:
-    """Whether Newton's method has arrived: the error left is about this step's square."""
-    return not len(step) or step.detach().abs().max().item() < 3e-5
+    """Whether Newton's method has arrived."""
+    return not len(step) or step.detach().abs().max().item() < SMALL_STEP
 
 
 def through_plane(x: Float[Tensor, " ray"], y: Float[Tensor, " ray"]) -> Float[Tensor, "ray 3"]:

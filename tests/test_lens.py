@@ -249,3 +249,16 @@ def test_shapes_at_the_door_are_executed():
         Pinhole(torch.ones(4, 3), torch.ones(4, 2))
     with pytest.raises(Exception, match="centre"):
         Pinhole(torch.ones(4, 2), torch.ones(5, 2))
+
+
+@pytest.mark.parametrize("kind", ["opencv", "fox"])
+def test_the_quick_loop_agrees_with_the_tensors(kind, generator):
+    lens, size = random_lens(kind, generator)
+    pixels, index = random_pixels(size, generator)
+    exact = OpenCV(*(x.double() for x in (lens.focal, lens.centre, lens.distortion)))
+    for which, pixels in ((index, pixels), (None, pixels % size[0])):
+        directions, truth = lens.unproject(pixels, which), exact.unproject(pixels.double(), which)
+        assert lens._by_loop(pixels) and not exact._by_loop(pixels.double())
+        torch.testing.assert_close(directions.double(), truth, rtol=0, atol=1e-6)
+        angle = lens.solid_angle(pixels, directions, which)
+        torch.testing.assert_close(angle.double(), exact.solid_angle(pixels.double(), truth, which), rtol=1e-4, atol=0)
