@@ -1,0 +1,82 @@
+"""Does the kernels' test notice? Faults are written into a copy of an engine, and the same comparison must turn red."""
+
+from __future__ import annotations
+
+import importlib.util
+from pathlib import Path
+from typing import NamedTuple
+
+import numba
+import pytest
+from agreement import assert_agrees, cases, module
+
+
+class Fault(NamedTuple):
+    """In one function of one engine, `old` becomes `new`."""
+
+    operation: str
+    engine: str
+    function: str
+    old: str
+    new: str
+
+
+FAULTS = {
+    # compositing
+    "sign": Fault("composite", "gpu", "_backward", " - after", " + after"),
+    "off-by-one transmittance": Fault("composite", "gpu", "_backward", "tl.exp(-in_front - t)", "tl.exp(-in_front)"),
+    "opacity forgotten": Fault("composite", "gpu", "_backward", "1) + g_opacity +", "1) +"),
+    "gradient behind the stop": Fault("composite", "gpu", "_backward", "tl.where(seen, ", "tl.where(i < b, "),
+    "attenuation forgotten": Fault("composite", "cpu", "_backward", "worth * through - behind", "worth * through"),
+    # hash encoding
+    "corner forgotten": Fault("hash_encode", "gpu", "_backward_table", "tl.static_range(8)", "tl.static_range(7)"),
+    "weight forgotten": Fault("hash_encode", "gpu", "_backward_table", "weight[:, None] * g", "g"),
+    "slope's sign": Fault("hash_encode", "gpu", "_backward_points", "(corner % 2 * 2 - 1)", "(1 - corner % 2 * 2)"),
+    "clamped, yet with gradient": Fault("hash_encode", "gpu", "_backward_points", "where(inside_y", "where(here"),
+    # spherical harmonics
+    "sign in band 3": Fault("spherical_harmonics", "gpu", "_backward", "- sectoral * g15", "+ sectoral * g15"),
+    "never written": Fault(
+        "spherical_harmonics", "gpu", "_backward", "d_directions + 3 * r + 2", "d_directions + 3 * r"
+    ),
+    "term forgotten": Fault("spherical_harmonics", "cpu", "_backward", " - zonal * g[13]", ""),
+    # marching has no backward pass
+    "empty cells counted": Fault("march", "gpu", "_march", "count += kept", "count += held"),
+    "a cell too far": Fault("march", "gpu", "_first_at", "- 0.02)", "+ 1.0)"),
+    "spent, yet going on": Fault("march", "gpu", "_march", "alive &= thickness <= most", "pass"),
+}
+
+
+def seed(fault: Fault, folder, monkeypatch) -> None:
+    """Put a copy of the engine, with the fault in it, in the engine's place."""
+    package = module(fault.operation)
+    engine = importlib.import_module(f"{package.__name__}.{fault.engine}")
+    source = Path(engine.__file__).read_text(encoding="utf-8")
+    before, function = source.split(f"def {fault.function}(", 1)
+    assert function.count(fault.old) >= 1, f"{fault.operation}/{fault.engine}.py no longer says {fault.old!r}"
+    faulty = folder / f"{fault.engine}.py"
+    faulty.write_text(f"{before}def {fault.function}({function.replace(fault.old, fault.new, 1)}", encoding="utf-8")
+
+    spec = importlib.util.spec_from_file_location(f"{package.__name__}.faulty", faulty)
+    copy = importlib.util.module_from_spec(spec)
+    monkeypatch.setattr(numba.config, "DISABLE_JIT", True)  # as plain Python, which spares compiling each copy
+    spec.loader.exec_module(copy)
+    monkeypatch.setattr(engine, "run", copy.run)
+
+
+def compare(fault: Fault) -> None:
+    for inputs in cases(fault.operation):
+        assert_agrees(fault.operation, fault.engine, inputs)
+
+
+@pytest.mark.parametrize("name", FAULTS)
+def test_a_fault_turns_the_test_red(name, tmp_path, monkeypatch):
+    seed(FAULTS[name], tmp_path, monkeypatch)
+    with pytest.raises(AssertionError, match="result"):
+        compare(FAULTS[name])
+
+
+@pytest.mark.parametrize(("operation", "engine"), [("composite", "cpu"), ("spherical_harmonics", "gpu")])
+def test_a_copy_without_a_fault_stays_green(operation, engine, tmp_path, monkeypatch):
+    sound = Fault(operation, engine, "_backward", "", "")
+    seed(sound, tmp_path, monkeypatch)
+    compare(sound)
