@@ -256,9 +256,9 @@ def test_the_quick_loop_agrees_with_the_tensors(kind, generator):
     lens, size = random_lens(kind, generator)
     pixels, index = random_pixels(size, generator)
     exact = OpenCV(*(x.double() for x in (lens.focal, lens.centre, lens.distortion)))
-    for which, pixels in ((index, pixels), (None, pixels % size[0])):
-        directions, truth = lens.unproject(pixels, which), exact.unproject(pixels.double(), which)
-        assert lens._by_loop(pixels) and not exact._by_loop(pixels.double())
+    for which, seen in ((index, pixels), (None, pixels % size[0])):
+        directions, truth = lens.unproject(seen, which), exact.unproject(seen.double(), which)
+        assert lens._by_loop(seen) and not exact._by_loop(seen.double())
         torch.testing.assert_close(directions.double(), truth, rtol=0, atol=1e-6)
-        angle = lens.solid_angle(pixels, directions, which)
-        torch.testing.assert_close(angle.double(), exact.solid_angle(pixels.double(), truth, which), rtol=1e-4, atol=0)
+        angle = lens.solid_angle(seen, directions, which)
+        torch.testing.assert_close(angle.double(), exact.solid_angle(seen.double(), truth, which), rtol=1e-4, atol=0)
