@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import importlib.util
 from pathlib import Path
 from typing import NamedTuple
 
 import numba
 import pytest
-from agreement import assert_agrees, cases, module
+from agreement import assert_agrees, cases, edit_engine
 
 
 class Fault(NamedTuple):
@@ -46,21 +45,16 @@ FAULTS = {
 }
 
 
-def seed(fault: Fault, folder, monkeypatch) -> None:
+def seed(fault: Fault, folder: Path, monkeypatch) -> None:
     """Put a copy of the engine, with the fault in it, in the engine's place."""
-    package = module(fault.operation)
-    engine = importlib.import_module(f"{package.__name__}.{fault.engine}")
-    source = Path(engine.__file__).read_text(encoding="utf-8")
-    before, function = source.split(f"def {fault.function}(", 1)
-    assert function.count(fault.old) >= 1, f"{fault.operation}/{fault.engine}.py no longer says {fault.old!r}"
-    faulty = folder / f"{fault.engine}.py"
-    faulty.write_text(f"{before}def {fault.function}({function.replace(fault.old, fault.new, 1)}", encoding="utf-8")
 
-    spec = importlib.util.spec_from_file_location(f"{package.__name__}.faulty", faulty)
-    copy = importlib.util.module_from_spec(spec)
+    def edit(source: str) -> str:
+        before, function = source.split(f"def {fault.function}(", 1)
+        assert fault.old in function, f"{fault.operation}/{fault.engine}.py no longer says {fault.old!r}"
+        return f"{before}def {fault.function}({function.replace(fault.old, fault.new, 1)}"
+
     monkeypatch.setattr(numba.config, "DISABLE_JIT", True)  # as plain Python, which spares compiling each copy
-    spec.loader.exec_module(copy)
-    monkeypatch.setattr(engine, "run", copy.run)
+    edit_engine(fault.operation, fault.engine, edit, folder, monkeypatch)
 
 
 def compare(fault: Fault) -> None:

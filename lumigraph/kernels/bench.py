@@ -1,0 +1,144 @@
+"""How fast each engine is, next to the reference on the same device, in one run."""
+
+from __future__ import annotations
+
+import importlib
+import platform
+import statistics
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numba
+import torch
+from rich.console import Console
+from rich.table import Table
+from torch import Tensor
+
+from ..files import write_json
+from ..rays import Samples
+from ._dispatch import Engine, using
+
+UNITS = {"hash_encode": "samples", "composite": "samples", "march": "rays", "spherical_harmonics": "directions"}
+PATIENCE = 5.0  # seconds: what takes longer is repeated less often, but three times at least
+
+
+def bench_kernels(
+    operations: Sequence[str] = tuple(UNITS),
+    device: torch.device | str | None = None,
+    size: int = 2**18,
+    repeats: int = 11,
+    output: Path | None = None,
+    console: Console | None = None,
+) -> dict[str, Any]:
+    """Time the engines that a device has, print a table, and return (and write to `output`) what is in it.
+
+    operations: their names; all by default
+    device:     "cpu" for `reference` and `cpu`, "cuda" for `reference` and `gpu`; None for CUDA where there is one
+    size:       samples or directions in each operation's benchmark case; marching takes one ray for every 64
+    repeats:    how many calls each median is taken over, after a first one that is reported by itself
+                because it compiles or loads what was compiled before
+
+    Backward is the gradient in what training differentiates (for hash encoding the table alone), given a gradient
+    of the outputs. Rates are in operations["unit"] per second. Raises LumigraphError if `output` cannot be written.
+    """
+    device = torch.device(device or ("cuda" if torch.cuda.is_available() else "cpu"))
+    fast: Engine = "gpu" if device.type == "cuda" else "cpu"
+    result: dict[str, Any] = {"protocol": _protocol(device, size, repeats), "operations": {}}
+    for name in operations:
+        case = importlib.import_module(f"{__package__}.{name}").benchmark_case
+        inputs = [
+            x.detach().to(device).requires_grad_(x.requires_grad) if isinstance(x, Tensor) else x
+            for x in case(torch.Generator().manual_seed(0), size)
+        ]
+        engines = {engine: _measure(name, engine, inputs, repeats) for engine in (fast, "reference")}
+        ratios = {k: v / engines["reference"][k] for k, v in engines[fast].items() if k.endswith("per_second")}
+        engines[fast] |= {k.replace("per_second", "ratio"): v for k, v in ratios.items()}
+        result["operations"][name] = {"unit": UNITS[name], "count": len(inputs[0]), "engines": engines}
+    _print(result, console or Console())
+    if output is not None:
+        write_json(output, result)
+    return result
+
+
+def _measure(name: str, engine: Engine, inputs: list[Any], repeats: int) -> dict[str, float]:
+    operation = getattr(importlib.import_module(f"{__package__}.{name}"), name)
+    wanted = [x for x in inputs if isinstance(x, Tensor) and x.requires_grad]
+
+    def forward() -> tuple[Tensor, ...]:
+        with using(engine):
+            found = operation(*inputs)
+        if isinstance(found, Samples):
+            return found.t_start, found.t_end
+        return found if isinstance(found, tuple) else (found,)
+
+    first, seconds = _time(forward, inputs[0].device, repeats)
+    row = {"forward_per_second": len(inputs[0]) / seconds, "forward_first_seconds": first}
+    if wanted:
+        outputs = forward()
+        gradients = [torch.randn_like(x) for x in outputs]  # laid out in memory as the outputs are
+
+        def backward() -> tuple[Tensor, ...]:
+            return torch.autograd.grad(outputs, wanted, gradients, retain_graph=True)
+
+        first, seconds = _time(backward, inputs[0].device, repeats)
+        row |= {"backward_per_second": len(inputs[0]) / seconds, "backward_first_seconds": first}
+    return row
+
+
+def _time(call: Callable[[], Any], device: torch.device, repeats: int) -> tuple[float, float]:
+    """Seconds of the first call, and the median of the following ones."""
+
+    def once() -> float:
+        _wait(device)
+        start = time.perf_counter()
+        call()
+        _wait(device)
+        return time.perf_counter() - start
+
+    first, times = once(), [once()]
+    while len(times) < repeats and (len(times) < 3 or sum(times) < PATIENCE):
+        times.append(once())
+    return first, statistics.median(times)
+
+
+def _wait(device: torch.device) -> None:
+    if device.type == "cuda":
+        torch.cuda.synchronize(device)
+
+
+def _protocol(device: torch.device, size: int, repeats: int) -> dict[str, Any]:
+    return {
+        "device": torch.cuda.get_device_name(device) if device.type == "cuda" else platform.processor() or "cpu",
+        "torch": torch.__version__,
+        "torch_threads": torch.get_num_threads(),
+        "numba_threads": numba.get_num_threads(),
+        "dtype": "float32",
+        "size": size,
+        "statistic": f"median of up to {repeats} calls after the first",
+    }
+
+
+def _print(result: dict[str, Any], console: Console) -> None:
+    protocol = result["protocol"]
+    table = Table(
+        "operation",
+        "engine",
+        *(f"{direction}\n{unit}" for direction in ("forward", "backward") for unit in ("million/s", "× ref.")),
+        "first calls\ns",
+        title="Kernels",
+        caption=f"{protocol['device']}, {protocol['torch_threads']} threads, {protocol['dtype']}, "
+        f"{protocol['statistic']}; backward in what training differentiates",
+    )
+    for column in table.columns[2:]:
+        column.justify = "right"
+    for name, operation in result["operations"].items():
+        for engine, row in operation["engines"].items():
+            cells = [f"{name}\n{operation['count']:,} {operation['unit']}" if engine != "reference" else "", engine]
+            for direction in ("forward", "backward"):
+                rate, ratio = row.get(f"{direction}_per_second"), row.get(f"{direction}_ratio")
+                cells += [f"{rate / 1e6:.3g}" if rate else "", f"{ratio:.0f}" if ratio else ""]
+            first = row["forward_first_seconds"] + row.get("backward_first_seconds", 0)
+            table.add_row(*cells, f"{first:.2f}", end_section=engine == "reference")
+    console.print(table)

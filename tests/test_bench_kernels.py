@@ -1,0 +1,32 @@
+"""The kernels' benchmark: what it prints and what it writes."""
+
+from __future__ import annotations
+
+import io
+import json
+
+import pytest
+from agreement import OPERATIONS
+from rich.console import Console
+
+from lumigraph.kernels.bench import UNITS, bench_kernels
+
+
+def test_every_operation_has_a_unit():
+    assert set(UNITS) == set(OPERATIONS)
+
+
+def test_rates_and_ratios(tmp_path):
+    text = io.StringIO()
+    console = Console(file=text, width=100)
+    result = bench_kernels(device="cpu", size=256, repeats=3, output=tmp_path / "bench.json", console=console)
+    assert json.loads((tmp_path / "bench.json").read_text()) == result
+    for name in OPERATIONS:
+        engines = result["operations"][name]["engines"]
+        assert name in text.getvalue()
+        for direction in ("forward", "backward") if name != "march" else ("forward",):
+            rate = engines["cpu"][f"{direction}_per_second"]
+            slow = engines["reference"][f"{direction}_per_second"]
+            assert engines["cpu"][f"{direction}_ratio"] == pytest.approx(rate / slow)
+    assert "backward_per_second" not in result["operations"]["march"]["engines"]["cpu"]
+    assert result["protocol"]["numba_threads"] >= 1

@@ -1,0 +1,69 @@
+"""The Numba engines in debug mode: the same comparison, with every index checked.
+
+Numba checks no index inside parallel loops, and its cache does not know a checked function from an unchecked one, so
+that setting NUMBA_BOUNDSCHECK alone checks nothing. Here copies of the engines are compiled serially, uncached.
+"""
+
+from __future__ import annotations
+
+import numba
+import pytest
+from agreement import OPERATIONS, assert_agrees, cases, edit_engine
+
+# What replaces the hash encoding's vector operations, which are below the level at which Numba could check.
+PLAIN_LANES = """
+from .lanes import BLOCK
+
+
+@njit
+def blend(table, base, entries, weights, i, lanes, out, first, stride):
+    for f in range(len(lanes)):
+        total = ZERO
+        for corner in range(8):
+            total += weights[corner * BLOCK + i] * table[base + entries[corner * BLOCK + i], f]
+        out[first + f * stride] = total
+
+
+@njit
+def spread(grad, first, stride, base, entries, weights, i, lanes, table):
+    for f in range(len(lanes)):
+        for corner in range(8):
+            table[base + entries[corner * BLOCK + i], f] += weights[corner * BLOCK + i] * grad[first + f * stride]
+"""
+
+
+def serial(source: str) -> str:
+    assert "parallel=True" in source and "cache=True" in source
+    source = source.replace("parallel=True", "parallel=False").replace("cache=True", "cache=False")
+    return source.replace("from .lanes import BLOCK, blend, spread\n", PLAIN_LANES)
+
+
+@pytest.fixture(autouse=True)
+def checked(monkeypatch):
+    monkeypatch.setattr(numba.config, "BOUNDSCHECK", 1)
+
+
+@pytest.mark.parametrize("name", OPERATIONS)
+def test_no_index_leaves_its_array(name, tmp_path, monkeypatch):
+    edit_engine(name, "cpu", serial, tmp_path, monkeypatch)
+    for inputs in cases(name):
+        assert_agrees(name, "cpu", inputs)
+
+
+@pytest.mark.parametrize(
+    ("name", "sound", "astray"),
+    [
+        ("composite", "weights[i] = w", "weights[i + 1] = w"),
+        ("hash_encode", "np.int32(resolution - 1))\n", "np.int32(resolution))\n"),  # the point 1.0, a cell too far
+    ],
+    ids=["composite", "hash_encode"],
+)
+def test_an_index_astray_is_noticed(name, sound, astray, tmp_path, monkeypatch):
+    def edit(source: str) -> str:
+        assert sound in source
+        return serial(source).replace(sound, astray, 1)
+
+    edit_engine(name, "cpu", edit, tmp_path, monkeypatch)
+    with pytest.raises(IndexError):
+        for inputs in cases(name):
+            assert_agrees(name, "cpu", inputs)
