@@ -88,7 +88,8 @@ class Run:
             "splits": {name: len(index) for name, index in scene.splits.items()},
             "seed": seed,
             "budget": budget or {},
-            "device": device_name(method.device),
+            "device": str(method.device),
+            "processor": processor(method.device),
             "versions": versions(),
         }
         with files.explained(folder):
@@ -115,6 +116,11 @@ class Run:
 
     def new_method(self, device: torch.device | str = "cpu") -> Method:
         """The run's method as it was before the first step."""
+        if self.method_name not in methods.available():
+            raise LumigraphError(
+                f"{self.folder} is a run of {self.method_name}, a method that is not installed; "
+                f"there are: {', '.join(methods.available())}"
+            )
         kind = methods.find(self.method_name)
         with understood(self.folder / "config.json"):
             config = from_plain(kind.Config, self.config["config"])
@@ -137,7 +143,7 @@ class Run:
         scene = open_scene(source, **self.config["scene"]["options"])
         if not alike(scene.frame.to_json(), self.config["frame"]):
             raise LumigraphError(
-                f"{source} is not what {self.folder} was trained on, its cameras or bounds differ; train a new run on it"
+                f"{source} is not what {self.folder} was trained on: cameras or bounds differ; train a new run on it"
             )
         return scene
 
@@ -348,7 +354,10 @@ def versions() -> dict[str, str]:
     return found
 
 
-def device_name(device: torch.device) -> str:
+def processor(device: torch.device) -> str:
+    """What kind of machine a device is."""
     if device.type == "cuda":
-        return f"{device} ({torch.cuda.get_device_name(device)})"
-    return f"{device} ({torch.get_num_threads()} threads)"
+        return torch.cuda.get_device_name(device)
+    about = Path("/proc/cpuinfo")
+    names = re.findall(r"model name\s*:\s*(.+)", about.read_text("utf-8", errors="replace")) if about.exists() else []
+    return f"{names[0] if names else platform.machine()}, {torch.get_num_threads()} threads"

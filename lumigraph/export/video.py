@@ -20,7 +20,7 @@ from ..files import replacing
 
 
 @contextlib.contextmanager
-def film(path: Path, fps: float = 30.0, quality: int = 17) -> Iterator[Film]:
+def open_video(path: Path, fps: float = 30.0, quality: int = 17) -> Iterator[Video]:
     """A film to add frames to, in order; the file appears once the block ends well.
 
     fps:     frames per second
@@ -30,12 +30,12 @@ def film(path: Path, fps: float = 30.0, quality: int = 17) -> Iterator[Film]:
     with replacing(path) as partial:
         # The index goes first, so that a browser can begin before it has all.
         with av.open(str(partial), "w", format="mp4", options={"movflags": "+faststart"}) as container:
-            begun = Film(path, container, Fraction(fps).limit_denominator(1001), quality)
+            begun = Video(path, container, Fraction(fps).limit_denominator(1001), quality)
             yield begun
             begun.finish()
 
 
-class Film:
+class Video:
     def __init__(self, path: Path, container: OutputContainer, fps: Fraction, quality: int):
         self.path, self.container, self.fps, self.quality = path, container, fps, quality
         self.stream: VideoStream | None = None

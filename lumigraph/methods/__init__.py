@@ -8,12 +8,9 @@ import importlib
 import inspect
 import pkgutil
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Any
 
 from ..errors import LumigraphError
-
-if TYPE_CHECKING:
-    from ..method import Method
 
 
 def available() -> list[str]:
@@ -41,8 +38,8 @@ def check(name: str) -> str:
     return name
 
 
-def find(name: str) -> type[Method]:
-    """The Method in the file of that name. Raises LumigraphError if there is no such file."""
+def find(name: str) -> type[Any]:
+    """The subclass of Method in the file of that name. Raises LumigraphError if there is no such file."""
     from ..method import Method
 
     module = importlib.import_module(f"{__name__}.{check(name).replace('-', '_')}")
@@ -51,6 +48,6 @@ def find(name: str) -> type[Method]:
     return method
 
 
-def name_of(method: Method) -> str:
+def name_of(method: Any) -> str:
     """What the user types for a method: the name of the file that holds it."""
     return type(method).__module__.rpartition(".")[2].replace("_", "-")

@@ -1,0 +1,5 @@
+"""`python -m lumigraph` is `lumigraph`."""
+
+from .cli import main
+
+raise SystemExit(main())

@@ -1,0 +1,117 @@
+"""The command line. Exit code 0 means done, 2 that the input was at fault: one sentence on stderr says how to mend it.
+
+LUMIGRAPH_DEBUG=1 shows where in the code a fault was noticed.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+import warnings
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated, Any
+
+import tyro
+
+from . import __version__, methods
+from .commands.bench import Bench
+from .commands.common import say
+from .commands.demo import Demo
+from .commands.eval import Eval
+from .commands.info import Info
+from .commands.methods import Methods
+from .commands.render import Render
+from .commands.report import Report
+from .commands.resume import Resume
+from .commands.train import Train, with_options_of
+from .errors import LumigraphError
+from .files import refusal
+
+COMMANDS: dict[str, type] = {
+    "demo": Demo,
+    "train": Train,
+    "resume": Resume,
+    "eval": Eval,
+    "render": Render,
+    "report": Report,
+    "info": Info,
+    "methods": Methods,
+    "bench": Bench,
+}
+DESCRIPTION = """Photographs become radiance fields, and radiance fields become new views.
+
+  lumigraph demo                        everything once, in a few minutes
+  lumigraph train instant-ngp PHOTOS    learn a scene from a folder of posed photographs
+  lumigraph eval runs/PHOTOS-instant-ngp-1"""
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run a command. Returns the exit code."""
+    arguments = list(sys.argv[1:] if arguments is None else arguments)
+    if arguments in (["--version"], ["-V"]):
+        print(f"lumigraph {__version__}")
+        return 0
+    warnings.showwarning = lambda message, *_, **__: say(f"warning: {message}")
+    try:
+        return parse(arguments).run()
+    except LumigraphError as error:
+        return refuse(str(error))
+    except KeyboardInterrupt:
+        return refuse("Stopped", code=130)
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # whoever read our output has left
+        return 0
+    except OSError as error:
+        return refuse(refusal(Path(error.filename or "A file"), error))
+    except RuntimeError as error:
+        if type(error).__name__ != "OutOfMemoryError":
+            raise
+        return refuse("The device's memory is full; use a larger --downscale, or --device cpu")
+
+
+def refuse(sentence: str, code: int = 2) -> int:
+    if os.environ.get("LUMIGRAPH_DEBUG"):
+        raise  # only called while a fault is handled
+    say(f"lumigraph: {' '.join(sentence.split())}")
+    return code
+
+
+def parse(arguments: list[str]) -> Any:
+    """The command with its options. Leaves with code 2 if they cannot be understood."""
+    commands = dict(COMMANDS)
+    if arguments[:1] == ["train"]:
+        commands["train"] = train_command(arguments[1:])
+    kinds = [
+        Annotated[kind, tyro.conf.subcommand(name, description=None if arguments[:1] == [name] else brief(kind))]
+        for name, kind in commands.items()
+    ]
+    union: Any = kinds[0]
+    for kind in kinds[1:]:
+        union |= kind
+    return tyro.cli(union, prog="lumigraph", description=DESCRIPTION, args=arguments or ["--help"])
+
+
+def brief(kind: type) -> str:
+    """The first sentence of a command's help."""
+    return (kind.__doc__ or "").strip().partition("\n")[0]
+
+
+def train_command(arguments: list[str]) -> type[Train]:
+    """`train` with the options of the method that the arguments name, if they name one."""
+    there = methods.available()
+    named = [x for x in arguments if x.replace("_", "-") in there]
+    if not named:
+        return Train
+    device, preset = value_of("--device", arguments, "auto"), value_of("--preset", arguments, "auto")
+    return with_options_of(named[0], device, preset)
+
+
+def value_of(name: str, arguments: list[str], default: str) -> str:
+    """What follows an option, before all options are known."""
+    for i, argument in enumerate(arguments):
+        if argument.startswith(f"{name}="):
+            return argument.partition("=")[2]
+        if argument == name and i + 1 < len(arguments):
+            return arguments[i + 1]
+    return default

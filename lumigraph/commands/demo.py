@@ -1,0 +1,70 @@
+"""`lumigraph demo`: everything once, on a scene that the package makes itself."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+from ..errors import LumigraphError
+from .common import choose_device, exit_code, next_free, open_with_warnings, option, say, show
+
+FRAMES = 90
+
+
+@dataclass(frozen=True)
+class Demo:
+    """From photographs to a film and a report in a few minutes: make a scene, train, compare, film.
+
+    The photographs are drawn by a small ray tracer, so that nothing needs to be downloaded.
+    """
+
+    output: Annotated[Path | None, option("RUN", "demo/run-N")] = None
+    """New folder for the run."""
+    seconds: Annotated[float, option("S")] = 60.0
+    """How long to train."""
+    method: Annotated[str, option("METHOD")] = "instant-ngp"
+    """What to train."""
+    scene: Annotated[str, option("SCENE")] = "procedural:still-life"
+    """What to train it on."""
+    frames: Annotated[int, option("N")] = FRAMES
+    """Length of the film."""
+    device: Annotated[str, option("NAME")] = "auto"
+    """auto, cpu, cuda, cuda:1."""
+
+    def run(self) -> int:
+        from .. import methods
+        from ..export.film import film
+        from ..report import write_report
+        from ..run import Run, build, check_new
+        from ..train import fit
+        from .eval import evaluate_run
+        from .render import film_cameras
+
+        if self.frames < 1:
+            raise LumigraphError(f"A film cannot have {self.frames} frames; give --frames a number above 0")
+        kind, device = methods.find(self.method), choose_device(self.device)
+        output = self.output or next_free("demo/run")
+        check_new(output)
+
+        say(f"Photographing {self.scene}")
+        scene = open_with_warnings(self.scene)
+        method = build(kind, scene.frame, kind.preset(device), device, seed=0)
+        run = Run.create(output, method, scene, budget={"seconds": self.seconds})
+        outcome = fit(method, scene, run, seconds=self.seconds)
+        if outcome.signal is not None:
+            say(f"Stopped and saved after step {outcome.state.step}; go on with: lumigraph resume {run.folder}")
+            return exit_code(outcome.signal)
+        result = evaluate_run(run, method, scene)
+        orbit = run.folder / "renders" / "orbit.mp4"
+        film(method, film_cameras(run, "orbit", self.frames, longest=480), orbit)
+        report = write_report(run)
+        show(
+            {
+                "held-out PSNR": f"[bold]{result['psnr']:.2f} dB[/bold] over {result['protocol']['views']} views",
+                "film": str(orbit),
+                "report": str(report),
+                "run": str(run.folder),
+            }
+        )
+        return 0

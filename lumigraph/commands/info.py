@@ -1,0 +1,34 @@
+"""`lumigraph info`: what a run or a folder of photographs is."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+from rich.console import Console
+from tyro.conf import Positional
+
+from .common import needed, open_with_warnings, option
+
+
+@dataclass(frozen=True)
+class Info:
+    """Say what a run or a scene holds."""
+
+    what: Annotated[Positional[str], needed("RUN_OR_SCENE")]
+    """Folder of a run, folder of photographs, or procedural:NAME."""
+    downscale: Annotated[int | None, option("N", "none, or what suits the photographs")] = None
+    """Shrink a scene's photographs by a whole number."""
+
+    def run(self) -> int:
+        from ..describe import run_tree, scene_tree
+
+        if (Path(self.what) / "config.json").exists():
+            from ..run import Run
+
+            tree = run_tree(Run(self.what))
+        else:
+            tree = scene_tree(open_with_warnings(self.what, downscale=self.downscale))
+        Console(highlight=False, soft_wrap=True).print(tree)
+        return 0

@@ -1,0 +1,17 @@
+"""`lumigraph methods`: what can be trained."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from .. import methods
+from .common import show
+
+
+@dataclass(frozen=True)
+class Methods:
+    """List the methods that are installed."""
+
+    def run(self) -> int:
+        show({f"[/dim][bold]{name}[/bold][dim]": methods.summary(name) for name in methods.available()})
+        return 0

@@ -1,0 +1,80 @@
+"""`lumigraph render`: films of a trained scene. No photographs are needed."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from tyro.conf import Positional
+
+from ..errors import LumigraphError
+from .common import choose_device, needed, option, show
+
+PathName = Literal["orbit", "spiral", "interpolate", "held-out"]
+
+
+@dataclass(frozen=True)
+class Render:
+    """Fly a camera through a run: colour and depth, as films and as pictures.
+
+    Paths keep to where the photographs were taken from. orbit goes round (or to and fro), spiral twice round while
+    rising, interpolate passes smoothly through photographs' places, held-out visits the test photographs' own cameras.
+    """
+
+    run_folder: Annotated[Positional[Path], needed("RUN")]
+    """Folder of the run."""
+    path: PathName = "orbit"
+    """Where the camera goes."""
+    frames: Annotated[int | None, option("N", "120; every held-out view")] = None
+    """Length in frames."""
+    fps: Annotated[float, option("N")] = 30.0
+    """Frames per second."""
+    size: Annotated[int, option("PIXELS")] = 480
+    """Longer side of the picture, at most that of the photographs."""
+    output: Annotated[Path | None, option("FILE.mp4", "RUN/renders/PATH.mp4")] = None
+    """The film. FILE-depth.mp4, FILE.json and the folder FILE of pictures go beside it."""
+    device: Annotated[str, option("NAME")] = "auto"
+    """auto, cpu, cuda, cuda:1."""
+
+    def run(self) -> int:
+        from ..export.film import film
+        from ..run import Run
+
+        run = Run(self.run_folder)
+        output = self.output or run.folder / "renders" / f"{self.path}.mp4"
+        if output.suffix != ".mp4":
+            raise LumigraphError(f"{output} should end in .mp4, the one kind of film there is; rename it")
+        cameras = film_cameras(run, self.path, self.frames, self.size)
+        method = run.method(choose_device(self.device))
+        about = film(method, cameras, output, self.fps)
+        width, height = about["size"]
+        show(
+            {
+                "film": str(output),
+                "depth": str(output.with_stem(f"{output.stem}-depth")),
+                "pictures": f"{output.with_suffix('')}/0000.png …",
+                "frames": f"{about['frames']} of {width}x{height}, {about['seconds_per_frame']:.3f} s each",
+            }
+        )
+        return 0
+
+
+def film_cameras(run: Any, path: str, frames: int | None, longest: int) -> Any:
+    """The cameras of a film of a Run, one for each frame."""
+    from ..paths import camera_path, film_size
+
+    if longest < 16:
+        raise LumigraphError(f"A film of {longest} pixels shows nothing; give --size at least 16")
+    cameras = run.cameras()
+    if path != "held-out":
+        train = cameras["train"]
+        return camera_path(path, train, run.frame, 120 if frames is None else frames, film_size(train, longest))
+    views = cameras.get("test")
+    if views is None or not len(views):
+        raise LumigraphError(f"{run.folder} has no held-out views; choose another --path")
+    if len(views.size.unique(dim=0)) > 1:
+        raise LumigraphError(
+            f"{run.folder} has held-out views of several sizes, which no film holds; choose another --path"
+        )
+    return views[: frames or len(views)].resized(min(1.0, longest / int(views.size.max())))

@@ -1,0 +1,57 @@
+"""`lumigraph resume`: training goes on where it stopped."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+from tyro.conf import Positional
+
+from ..errors import LumigraphError
+from .common import choose_device, exit_code, needed, option, tell_warnings
+
+
+@dataclass(frozen=True)
+class Resume:
+    """Go on with a run that was interrupted, exactly as if it had not been; or give it a larger budget."""
+
+    run_folder: Annotated[Positional[Path], needed("RUN")]
+    """Folder of the run."""
+    seconds: Annotated[float | None, option("S", "as begun")] = None
+    """New total of seconds, those already trained included."""
+    steps: Annotated[int | None, option("N", "as begun")] = None
+    """New total of steps, those already done included."""
+    scene: Annotated[str | None, option("SCENE", "where they were")] = None
+    """Where the photographs are now, if they have moved."""
+    device: Annotated[str, option("NAME", "the one it began on")] = "same"
+    """auto, cpu, cuda, cuda:1."""
+    pause_at: Annotated[int | None, option("STEP", "never")] = None
+    """Stop at this step as if interrupted."""
+
+    def run(self) -> int:
+        from ..run import Run
+        from ..train import Budget, fit
+        from .train import tell_outcome
+
+        if self.steps is not None and self.seconds is not None:
+            raise LumigraphError("--steps and --seconds are two ways to say how long; give one of them")
+        run = Run(self.run_folder)
+        budget = run.config["budget"]
+        if self.steps is not None:
+            budget = {"steps": self.steps}
+        elif self.seconds is not None:
+            budget = {"seconds": self.seconds}
+        state = run.state if run.has_state else None
+        if state and Budget(budget.get("steps"), budget.get("seconds")).progress(state.step, state.seconds) >= 1:
+            raise LumigraphError(
+                f"{run.folder} has spent its budget at step {state.step}, {state.seconds:.0f} s; "
+                f"give a larger total by --steps or --seconds"
+            )
+        device = choose_device(run.config["device"] if self.device == "same" else self.device)
+        method, scene = run.new_method(device), tell_warnings(run.scene(self.scene))
+        if budget != run.config["budget"]:
+            run.set_budget(**budget)
+        outcome = fit(method, scene, run, **budget, seed=run.config["seed"], pause_at=self.pause_at)
+        tell_outcome(run, outcome)
+        return exit_code(outcome.signal)

@@ -1,0 +1,103 @@
+"""`lumigraph train`: photographs become a trained method."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from tyro.conf import Fixed, OmitArgPrefixes, Positional, Suppress
+
+from .. import methods
+from ..errors import LumigraphError
+from .common import choose_device, exit_code, needed, next_free, open_with_warnings, option, say, scene_name, show
+
+DEFAULT_SECONDS = 60.0
+
+
+@dataclasses.dataclass(frozen=True)
+class Train:
+    """Learn a scene from its photographs.
+
+    The scene is a folder of posed photographs, or procedural:NAME. `lumigraph train METHOD --help` adds the method's
+    own options, `lumigraph methods` lists the methods. Ctrl-C saves; `lumigraph resume` goes on.
+    """
+
+    method: Annotated[Positional[str], needed("METHOD")]
+    """What to train, for example instant-ngp."""
+    scene: Annotated[Positional[str], needed("SCENE")]
+    """What to train it on."""
+    output: Annotated[Path | None, option("RUN", "runs/SCENE-METHOD-N")] = None
+    """New folder for the run."""
+    seconds: Annotated[float | None, option("S", f"{DEFAULT_SECONDS:.0f}")] = None
+    """Train for so long. Compiling kernels on first use comes before and is reported beside."""
+    steps: Annotated[int | None, option("N", "as long as --seconds")] = None
+    """Train for so many steps instead."""
+    downscale: Annotated[int | None, option("N", "none, or what suits the photographs")] = None
+    """Shrink photographs by a whole number."""
+    seed: Annotated[int, option("N")] = 0
+    """Of all random choices."""
+    device: Annotated[str, option("NAME")] = "auto"
+    """auto, cpu, cuda, cuda:1."""
+    preset: Literal["auto", "cpu", "gpu"] = "auto"
+    """Which machine the method's own defaults are for; auto is that of --device."""
+    pause_at: Annotated[int | None, option("STEP", "never")] = None
+    """Stop at this step as if interrupted. The schedule still follows the whole budget."""
+
+    def run(self) -> int:
+        from ..run import Run, build, check_new
+        from ..train import fit
+
+        if self.steps is not None and self.seconds is not None:
+            raise LumigraphError("--steps and --seconds are two ways to say how long; give one of them")
+        kind, device = methods.find(self.method), choose_device(self.device)
+        output = self.output or next_free(f"runs/{scene_name(self.scene)}-{methods.check(self.method)}")
+        check_new(output)
+        scene = open_with_warnings(self.scene, downscale=self.downscale)
+        config = self.method_config(kind)
+        seed = getattr(config, "seed", self.seed)
+        method = build(kind, scene.frame, config, device, seed)
+        budget = {"steps": self.steps} if self.steps is not None else {"seconds": self.seconds or DEFAULT_SECONDS}
+        run = Run.create(output, method, scene, seed=seed, options={"downscale": self.downscale}, budget=budget)
+        outcome = fit(method, scene, run, **budget, seed=seed, pause_at=self.pause_at)
+        tell_outcome(run, outcome)
+        return exit_code(outcome.signal)
+
+    def method_config(self, kind: Any) -> Any:
+        """The method's Config, which the command line adds as another field; see `with_options_of`."""
+        return getattr(self, option_group(self.method), None) or kind.preset(preset_device(self.device, self.preset))
+
+
+def option_group(name: str) -> str:
+    """The field that holds a method's own numbers; help shows its name above them."""
+    return methods.check(name).replace("-", "_")
+
+
+def with_options_of(name: str, device: str, preset: str) -> type[Train]:
+    """The command with a method's own numbers among its options."""
+    kind = methods.find(name)
+    default = kind.preset(preset_device(device, preset))
+    extra: list[Any] = [(option_group(name), Annotated[kind.Config, OmitArgPrefixes], dataclasses.field(default=default))]
+    for common in dataclasses.fields(Train):  # where a method has a number of that name, it is the one to ask for
+        if common.name in {field.name for field in dataclasses.fields(kind.Config)}:
+            extra.append((common.name, Annotated[Any, Fixed, Suppress], dataclasses.field(default=common.default)))
+    made = dataclasses.make_dataclass("Train", extra, bases=(Train,), frozen=True)
+    made.__doc__ = Train.__doc__
+    return made
+
+
+def preset_device(device: str, preset: str) -> Any:
+    """The kind of machine whose defaults are wanted; it need not be here."""
+    import torch
+
+    return choose_device(device) if preset == "auto" else torch.device("cuda" if preset == "gpu" else "cpu")
+
+
+def tell_outcome(run: Any, outcome: Any) -> None:
+    """Where a Run is after an Outcome, and how to go on."""
+    state = outcome.state
+    if not outcome.finished:
+        say(f"Stopped and saved after step {state.step}; go on with: lumigraph resume {run.folder}")
+    besides = f"{state.compile_seconds:.1f} s compiling, {outcome.saving_seconds:.1f} s saving"
+    rows = {"run": str(run.folder), "training": f"{state.step} steps in {state.seconds:.1f} s (besides: {besides})"}
+    show(rows | ({"next": f"lumigraph eval {run.folder}"} if outcome.finished else {}))

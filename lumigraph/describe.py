@@ -1,0 +1,76 @@
+"""What a run or a scene is, as a printed tree."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from rich.tree import Tree
+
+from .run import Run
+from .scene import Frame, Scene
+
+
+def run_tree(run: Run) -> Tree:
+    config = run.config
+    tree = Tree(f"[bold]{run.folder}[/bold]  a run of {run.method_name}")
+    branch(tree, "scene", {"source": config["scene"]["source"], **config["splits"], **config["scene"]["options"]})
+    branch(tree, "frame", frame_rows(run.frame))
+    branch(tree, "config", config["config"])
+    if run.has_state:
+        state = run.state
+        rows = {"step": state.step, "seconds": state.seconds, "compiling, beside": state.compile_seconds}
+        branch(tree, "trained", rows | {"budget": config["budget"], "seed": config["seed"], "on": config["device"]})
+    if evaluation := run.evaluation():
+        names = ("psnr", "ssim", "seconds_per_view")
+        branch(tree, "evaluated", {name: evaluation[name] for name in names} | evaluation["protocol"])
+    found = sorted(
+        path for path in run.folder.rglob("*") if path.is_file() and path.suffix in (".mp4", ".html", ".png")
+    )
+    pages = [path for path in found if path.parent in (run.folder, run.folder / "renders")]
+    if pages:
+        branch(tree, "files", {str(path.relative_to(run.folder)): size(path) for path in pages})
+    return tree
+
+
+def scene_tree(scene: Scene) -> Tree:
+    cameras = scene.cameras
+    tree = Tree(f"[bold]{scene.source}[/bold]  a scene of {len(scene)} photographs")
+    sizes, counts = cameras.size.unique(dim=0, return_counts=True)
+    shapes = (f"{count} of {w}x{h}" for (w, h), count in zip(sizes.tolist(), counts.tolist(), strict=True))
+    photographs = {name: f"{len(index)} views" for name, index in scene.splits.items()}
+    photographs |= {"sizes": ", ".join(shapes), "lens": type(cameras.lens).__name__}
+    branch(tree, "photographs", photographs)
+    branch(tree, "frame", frame_rows(scene.frame))
+    if scene.points is not None:
+        branch(tree, "points", {"count": len(scene.points)})
+    return tree
+
+
+def frame_rows(frame: Frame) -> dict[str, Any]:
+    low, high = frame.bounds
+    scale = sum(x * x for x in frame.source_from_scene[0][:3]) ** 0.5
+    return {
+        "bounds": f"{vector(low)} to {vector(high)}",
+        "reach": frame.reach,
+        "near": frame.near,
+        "background": vector(frame.background) + (" behind alpha" if frame.has_alpha else ""),
+        "one scene unit": f"{scale:.4g} of the source's",
+    }
+
+
+def branch(tree: Tree, title: str, rows: dict[str, Any]) -> None:
+    node = tree.add(f"[bold]{title}[/bold]")
+    width = max(map(len, rows))
+    for name, value in rows.items():
+        if value is not None:
+            node.add(f"[dim]{name:<{width}}[/dim]  {f'{value:.4g}' if isinstance(value, float) else value}")
+
+
+def vector(numbers: tuple[float, ...]) -> str:
+    return "(" + ", ".join(f"{x:.3g}" for x in numbers) + ")"
+
+
+def size(path: Path) -> str:
+    count = path.stat().st_size
+    return f"{count / 1e6:.1f} MB" if count >= 1e5 else f"{count / 1e3:.0f} kB"

@@ -1,0 +1,207 @@
+"""A run on one page: figures, film, curves, contact sheet and settings in one HTML file that needs nothing else."""
+
+from __future__ import annotations
+
+import base64
+import io
+import json
+from html import escape
+from pathlib import Path
+from typing import Any
+
+from PIL import Image
+
+from . import __version__
+from .charts import Series, bar_chart, line_chart
+from .display import clock, short
+from .files import write_bytes
+from .run import Run
+
+LARGEST_FILM = 12 << 20  # bytes; larger ones are named instead of embedded
+STYLE = (Path(__file__).parent / "report.css").read_text("utf-8")
+
+
+def write_report(run: Run) -> Path:
+    """Write RUN/report.html from what the run's folder holds: the more commands have run, the more it shows."""
+    evaluation = run.evaluation()
+    title = f"{scene_title(run)} · {run.method_name}"
+    sections = [
+        header(run, evaluation),
+        films(run),
+        previews(run),
+        curves(run),
+        views(run, evaluation),
+        contact_sheet(run),
+        settings(run, evaluation),
+    ]
+    page = (
+        f'<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
+        f'<meta name="viewport" content="width=device-width, initial-scale=1">\n<title>{escape(title)}</title>\n'
+        f"<style>\n{STYLE}</style>\n</head>\n<body>\n<main>\n{''.join(sections)}</main>\n"
+        f"<footer>Lumigraph {escape(__version__)} · {escape(str(run.folder))}</footer>\n</body>\n</html>\n"
+    )
+    path = run.folder / "report.html"
+    write_bytes(path, page.encode())
+    return path
+
+
+def scene_title(run: Run) -> str:
+    source = run.config["scene"]["source"]
+    return source.partition(":")[2] if source.startswith("procedural:") else Path(source).name
+
+
+def header(run: Run, evaluation: dict[str, Any] | None) -> str:
+    figures: list[tuple[str, str, str]] = []
+    if evaluation:
+        protocol = evaluation["protocol"]
+        held_out = "held-out views" if protocol["split"] == "test" else f"{protocol['split']} views"
+        figures.append((f"{evaluation['psnr']:.2f}", "dB", f"PSNR, {protocol['views']} {held_out}"))
+        figures.append((f"{evaluation['ssim']:.3f}", "", "SSIM"))
+    if run.has_state:
+        state = run.state
+        figures.append((f"{state.seconds:.0f}" if state.seconds < 1000 else clock(state.seconds), "s", "of training"))
+        figures.append((f"{state.step:,}".replace(",", "\u202f"), "", "steps"))
+    if evaluation:
+        figures.append((f"{evaluation['seconds_per_view']:.2f}", "s", "to render a view"))
+    cells = "".join(
+        f"<div><b>{escape(value)}<small>{escape(unit)}</small></b><span>{escape(label)}</span></div>"
+        for value, unit, label in figures
+    )
+    return (
+        f"<header><h1>{escape(scene_title(run))}</h1><p>{escape(run.method_name)}, trained on "
+        f"{run.config['splits'].get('train', 0)} photographs</p><div class='figures'>{cells}</div></header>\n"
+    )
+
+
+def films(run: Run) -> str:
+    """The first film there is, beside its depth."""
+    found = [path for path in sorted((run.folder / "renders").glob("*.mp4")) if not path.stem.endswith("-depth")]
+    found = sorted(found, key=lambda path: path.stem != "orbit")
+    if not found:
+        return ""
+    players = "".join(
+        f"<figure><video src='{data_uri(path, 'video/mp4')}' autoplay loop muted playsinline controls></video>"
+        f"<figcaption>{name}</figcaption></figure>"
+        for path, name in ((found[0], "colour"), (found[0].with_stem(f"{found[0].stem}-depth"), "depth"))
+        if path.exists() and path.stat().st_size < LARGEST_FILM
+    )
+    names = ", ".join(f"<code>{escape(str(path.relative_to(run.folder)))}</code>" for path in found)
+    return section(found[0].stem.capitalize(), f"<div class='row'>{players}</div>", f"Films in the run: {names}")
+
+
+def previews(run: Run) -> str:
+    seconds = {row["step"]: row["seconds"] for row in run.metrics()}
+    cells = []
+    for step, path in run.previews().items():
+        near = min(seconds, key=lambda at: abs(at - step), default=None)
+        when = f" · {seconds[near]:.0f} s" if near is not None and abs(near - step) <= 0.1 * step + 10 else ""
+        cells.append(f"<figure><img src='{jpeg(path)}' alt=''><figcaption>step {step}{when}</figcaption></figure>")
+    if len(cells) < 2:
+        return ""
+    return section("How the picture came to be", f"<div class='row strip'>{''.join(cells)}</div>")
+
+
+def curves(run: Run) -> str:
+    rows = run.metrics()
+    if len(rows) < 3:
+        return ""
+    seconds, steps = [row["seconds"] for row in rows], [row["step"] for row in rows]
+    psnr = [row["psnr"] for row in rows]
+    charts = [
+        line_chart([Series("PSNR", seconds, psnr)], "seconds of training", "PSNR of training batches, dB"),
+        line_chart([Series("PSNR", steps, psnr)], "step", "PSNR of training batches, dB"),
+    ]
+    losses = [Series(name, steps, [row["terms"][name] for row in rows]) for name in rows[-1]["terms"]]
+    charts.append(line_chart(losses, "step", "loss", log=True))
+    if all("samples" in row["statistics"] for row in rows):
+        speed = [
+            (b["step"] - a["step"]) * b["statistics"]["samples"] / max(b["seconds"] - a["seconds"], 1e-9)
+            for a, b in zip(rows, rows[1:], strict=False)
+        ]
+        charts.append(
+            line_chart([Series("samples/s", seconds[1:], speed)], "seconds of training", "samples per second")
+        )
+    return section("Curves", f"<div class='charts'>{''.join(f'<figure>{chart}</figure>' for chart in charts)}</div>")
+
+
+def views(run: Run, evaluation: dict[str, Any] | None) -> str:
+    if not evaluation or len(evaluation["views"]) < 2:
+        return ""
+    scores = evaluation["views"]
+    chart = bar_chart([view["name"] for view in scores], [view["psnr"] for view in scores], "PSNR, dB")
+    worst, best = (choose(scores, key=lambda view: view["psnr"]) for choose in (min, max))
+    note = (
+        f"From {worst['psnr']:.2f} dB ({escape(worst['name'])}) to {best['psnr']:.2f} dB ({escape(best['name'])}); "
+        f"the line is the mean. Single values are in <code>eval.json</code>."
+    )
+    return section("View by view", f"<figure>{chart}</figure>", note)
+
+
+def contact_sheet(run: Run) -> str:
+    path = run.folder / "eval.png"
+    return section("Contact sheet", f"<img class='sheet' src='{jpeg(path)}' alt=''>") if path.exists() else ""
+
+
+def settings(run: Run, evaluation: dict[str, Any] | None) -> str:
+    config = run.config
+    frame = config["frame"]
+    about = {
+        "scene": config["scene"]["source"],
+        "photographs": ", ".join(f"{count} {name}" for name, count in config["splits"].items()),
+        **{name: value for name, value in config["scene"]["options"].items() if value is not None},
+        "bounds": " to ".join("(" + ", ".join(f"{x:.3g}" for x in corner) + ")" for corner in frame["bounds"]),
+        "reach": f"{frame['reach']:g}",
+        "near": f"{frame['near']:.3g}",
+        "background": ", ".join(f"{x:g}" for x in frame["background"]),
+        "budget": ", ".join(f"{value:g} {name}" for name, value in config["budget"].items()),
+        "seed": config["seed"],
+    }
+    tables = [table("Scene", about), table(config["method"], config["config"])]
+    timings = {"trained on": f"{config['device']}, {config['processor']}"}
+    if run.has_state:
+        state = run.state
+        timings |= {"training": f"{state.seconds:.1f} s", "compiling, beside": f"{state.compile_seconds:.1f} s"}
+        timings["per step"] = f"{1000 * state.seconds / max(state.step, 1):.1f} ms"
+    rows = [row for row in run.metrics() if "samples" in row["statistics"]]
+    if rows:
+        timings["samples per step, at the end"] = short(rows[-1]["statistics"]["samples"])
+    if evaluation:
+        timings["rendering"] = f"{evaluation['seconds_per_view']:.3f} s per view, on {evaluation['evaluated_on']}"
+        tables.append(table("Protocol", evaluation["protocol"]))
+    tables += [table("Time", timings), table("Made with", config["versions"])]
+    return section("Settings", f"<div class='tables'>{''.join(tables)}</div>")
+
+
+def section(title: str, body: str, note: str = "") -> str:
+    return f"<section><h2>{escape(title)}</h2>{body}{f'<p class=note>{note}</p>' if note else ''}</section>\n"
+
+
+def table(title: str, rows: dict[str, Any]) -> str:
+    cells = "".join(
+        f"<tr><th>{escape(name.replace('_', ' '))}</th><td>{escape(plain(x))}</td></tr>" for name, x in rows.items()
+    )
+    return f"<table><caption>{escape(title)}</caption>{cells}</table>"
+
+
+def plain(value: Any) -> str:
+    match value:
+        case None:
+            return "none"
+        case bool():
+            return "yes" if value else "no"
+        case float():
+            return f"{value:g}"
+        case dict() | list():
+            return json.dumps(value)
+    return str(value)
+
+
+def jpeg(path: Path) -> str:
+    """A picture small enough to embed."""
+    file = io.BytesIO()
+    Image.open(path).convert("RGB").save(file, "JPEG", quality=90, optimize=True)
+    return f"data:image/jpeg;base64,{base64.b64encode(file.getvalue()).decode()}"
+
+
+def data_uri(path: Path, kind: str) -> str:
+    return f"data:{kind};base64,{base64.b64encode(path.read_bytes()).decode()}"
