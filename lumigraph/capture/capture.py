@@ -22,7 +22,8 @@ class Shot:
     pose:  camera-to-world, (3, 4), in the source's own frame and units; +x right, +y down, +z forward
     lens:  one lens, for a picture of `size`
     size:  (width, height) that the lens was calibrated for; None if the source does not say, then the picture's own
-    image: a file, the pixels themselves, or a function that makes them when asked
+    image: the pixels, or a function that makes them when asked (it needs `size`), or files: the same photograph reduced
+           1, 2, 4... times, {1: Path, ...}
     mask:  where the photograph is to be trusted: non-zero is good; a file or (height, width) numbers
     split: "train", "test" or "val" where the source publishes that. If no shot of a capture has one, every 8th by name
            is held out
@@ -34,7 +35,7 @@ class Shot:
     pose: Float[np.ndarray, "3 4"]
     lens: Lens
     size: tuple[int, int] | None
-    image: Path | Pixels | Callable[[], Pixels]
+    image: dict[int, Path] | Pixels | Callable[[], Pixels]
     mask: Path | np.ndarray | None = None
     split: str | None = None
     time: float | None = None
@@ -49,7 +50,7 @@ class Capture:
     shots:    at least two
     points:   sparse points in the source's frame, from structure from motion; sightings says how many photographs
               saw each
-    missing:  files that the source lists but that do not exist
+    missing:  what the source lists but does not hold; its user is told, and the rest is used
 
     Hints, for captures that know better than what can be found from cameras and points:
     bounds:   the box of interest ((x, y, z), (x, y, z)), source's frame and units

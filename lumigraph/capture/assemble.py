@@ -1,0 +1,245 @@
+"""A Capture becomes a Scene: faults told, poses checked, images read, the place found, some views held out."""
+
+from __future__ import annotations
+
+import time
+import warnings
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from torch import Tensor
+
+from ..camera import Camera
+from ..errors import LumigraphError, LumigraphWarning
+from ..images import ImageStore, Picture
+from ..lens import Equirectangular, Lens, Pinhole
+from ..scene import Frame, Scene
+from .capture import Capture, Shot
+from .normalise import Place, find_place
+from .pictures import Chosen, choose
+
+HOLD_OUT = 8  # every 8th photograph by name, starting with the first, where nothing is published
+RIGID = 0.01  # how far a pose's axes may be from unit length and right angles
+PATIENCE = 1.0  # seconds before a progress bar appears
+NAMED = 20  # missing files at most in a warning; further ones are counted
+
+
+def assemble(
+    capture: Capture, downscale: int | None = None, memory: int | None = None, cache: Path | None = None
+) -> Scene:
+    """The Scene that a capture holds.
+
+    Raises LumigraphError for fewer than two photographs, poses that are no poses, images that cannot be read or
+    contradict their lens, and published splits that hold nothing out. What is missing or unusual becomes a
+    LumigraphWarning, which is kept in `Scene.warnings` too.
+    """
+    if downscale is not None and downscale < 1:
+        raise LumigraphError(f"--downscale {downscale} cannot be; it is a whole number from 1 on")
+    told = [about_missing(capture)] if capture.missing else []
+    shots = sorted(capture.shots, key=lambda shot: shot.name)
+    if len(shots) < 2:
+        raise LumigraphError(
+            f"{capture.source} has {counted(len(shots), 'usable photograph')} with a pose, and two are the least; "
+            f"{'restore the missing files' if capture.missing else 'add more'}"
+        )
+    splits = split(capture.source, shots)
+    poses = np.stack([checked_pose(shot, capture.source) for shot in shots])
+    chosen = [choose(shot, downscale) for shot in shots]
+    told += about_small(capture.source, chosen) if downscale else []
+    for warning in told:
+        warnings.warn(warning, LumigraphWarning, stacklevel=3)
+    lenses = [fitted_lens(shot, c) for shot, c in zip(shots, chosen, strict=True)]
+    with progress(f"Reading {Path(capture.source).name}", len(shots)) as done:
+        images = ImageStore.load(masked_by_lens([c.picture for c in chosen], lenses), memory, cache, done)
+
+    # Single precision is for what is near the origin: maps may put a capture hundreds of kilometres away.
+    away = poses[:, :, 3].mean(0)
+    cameras = make_cameras(shots, moved(poses, translation(-away)), lenses, images.sizes)
+    place = find_place(shifted(capture, -away), cameras, images, splits["train"].tolist())
+    matrix = place.scene_from_source @ translation(-away)
+    cameras = make_cameras(shots, moved(poses, matrix), lenses, images.sizes)
+    points = None if capture.points is None else torch.from_numpy(capture.points @ matrix[:3, :3].T + matrix[:3, 3])
+    return Scene(
+        cameras,
+        images,
+        make_frame(place, matrix, images),
+        splits,
+        [shot.name for shot in shots],
+        capture.source,
+        None if points is None else points.float(),
+        None if capture.point_colours is None else torch.from_numpy(np.ascontiguousarray(capture.point_colours)),
+        told,
+    )
+
+
+def split(source: str, shots: list[Shot]) -> dict[str, Int[Tensor, " image"]]:
+    """Image numbers by purpose: as published, otherwise every 8th held out."""
+    if any(shot.split for shot in shots):
+        names = [shot.split for shot in shots]
+    else:
+        names = ["train" if i % HOLD_OUT else "test" for i in range(len(shots))]
+    found = {s: torch.tensor([i for i, name in enumerate(names) if name == s]) for s in ("train", "test", "val")}
+    for purpose, task in (("train", "learning"), ("test", "testing")):
+        if not len(found[purpose]):
+            raise LumigraphError(
+                f"{source} has no view for {task}: its own lists name none that exists; restore the photographs, "
+                f"or remove those lists so that every {HOLD_OUT}th is held out"
+            )
+    return {purpose: images for purpose, images in found.items() if len(images)}
+
+
+def checked_pose(shot: Shot, source: str) -> Float[np.ndarray, "3 4"]:
+    """The pose with an exact rotation. Raises LumigraphError for what is no rigid pose."""
+    axes = shot.pose[:, :3]
+    if not np.isfinite(shot.pose).all():
+        fault = "holds NaN or infinite numbers"
+    elif np.abs(axes.T @ axes - np.eye(3)).max() > RIGID:
+        fault = "is not rigid, for its axes are not of unit length and at right angles"
+    elif np.linalg.det(axes) < 0:
+        fault = "is mirrored"
+    else:
+        u, _, vt = np.linalg.svd(axes)
+        return np.concatenate([u @ vt, shot.pose[:, 3:]], -1)
+    raise LumigraphError(f"{source}: the pose of {shot.name} {fault}; correct it or remove that photograph")
+
+
+def fitted_lens(shot: Shot, chosen: Chosen) -> Lens:
+    """The shot's lens behind the picture as it will be used."""
+    scale = torch.tensor([chosen.picture.size], dtype=torch.float64) / torch.tensor([chosen.calibrated])
+    return shot.lens.resized(scale.float())
+
+
+def make_cameras(
+    shots: list[Shot], poses: Float[np.ndarray, "camera 3 4"], lenses: list[Lens], sizes: Int[Tensor, "camera 2"]
+) -> Camera:
+    times = [shot.time for shot in shots]
+    time = None if any(t is None for t in times) else torch.tensor(times, dtype=torch.float32)
+    return Camera(torch.from_numpy(poses).float(), Lens.cat(lenses), sizes, time, torch.arange(len(shots)))
+
+
+def make_frame(place: Place, scene_from_source: np.ndarray, images: ImageStore) -> Frame:
+    back = np.linalg.inv(scene_from_source)
+    return Frame(
+        bounds=place.bounds,
+        reach=place.reach,
+        near=place.near,
+        background=place.background,
+        has_alpha=images.has_alpha,
+        image_count=len(images),
+        source_from_scene=tuple((a, b, c, d) for a, b, c, d in back.tolist()),
+    )
+
+
+def moved(poses: Float[np.ndarray, "camera 3 4"], matrix: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "camera 3 4"]:
+    """Poses in the frame that a similarity leads to: positions scale, rotations stay rotations."""
+    rotation = matrix[:3, :3] / np.cbrt(np.linalg.det(matrix[:3, :3])) @ poses[:, :, :3]
+    position = poses[:, :, 3] @ matrix[:3, :3].T + matrix[:3, 3]
+    return np.concatenate([rotation, position[:, :, None]], -1)
+
+
+def translation(by: Float[np.ndarray, " 3"]) -> Float[np.ndarray, "4 4"]:
+    matrix = np.eye(4)
+    matrix[:3, 3] = by
+    return matrix
+
+
+def shifted(capture: Capture, by: Float[np.ndarray, " 3"]) -> Capture:
+    """The capture with its points and bounds moved; the poses are handed on separately."""
+    points = None if capture.points is None else capture.points + by
+    if capture.bounds is None:
+        return replace(capture, points=points)
+    low, high = (np.asarray(corner) + by for corner in capture.bounds)
+    return replace(capture, points=points, bounds=(tuple(low.tolist()), tuple(high.tolist())))
+
+
+def masked_by_lens(pictures: list[Picture], lenses: list[Lens]) -> list[Picture]:
+    """Pictures that also distrust what lies beyond their lens's reach, such as the black around a fisheye's circle."""
+    known: dict[tuple[str, tuple[int, int]], np.ndarray | None] = {}
+    masked = []
+    for picture, lens in zip(pictures, lenses, strict=True):
+        key = (str(lens.to_json()), picture.size)
+        if key not in known:
+            known[key] = within_reach(lens, picture.size)
+        masked.append(picture if known[key] is None else with_mask(picture, known[key], key[0]))
+    return masked
+
+
+def with_mask(picture: Picture, trusted: np.ndarray, why: str) -> Picture:
+    def read() -> tuple[np.ndarray, np.ndarray | None]:
+        image, mask = picture.read()
+        return image, trusted if mask is None else mask & trusted
+
+    return Picture(picture.size, read, None if picture.identity is None else f"{picture.identity} {why}")
+
+
+def within_reach(lens: Lens, size: tuple[int, int]) -> np.ndarray | None:
+    """Which pixels a lens maps to directions and back; None if all, which a look at the edges tells."""
+    if isinstance(lens, Pinhole | Equirectangular):
+        return None
+    width, height = size
+
+    def returns(x: Tensor, y: Tensor) -> Tensor:
+        pixels = torch.stack([x.reshape(-1), y.reshape(-1)], -1) + 0.5
+        back, valid = lens.project(lens.unproject(pixels))
+        return valid & ((back - pixels).norm(dim=-1) < 0.5)
+
+    x, y = torch.arange(width).float(), torch.arange(height).float()
+    left, top = torch.zeros(height), torch.zeros(width)
+    edges = ((x, top), (x, top + height - 1), (left, y), (left + width - 1, y))
+    if all(bool(returns(*edge).all()) for edge in edges):
+        return None
+    whole = returns(x.expand(height, width), y[:, None].expand(height, width))
+    return whole.view(height, width).numpy()
+
+
+def about_missing(capture: Capture) -> str:
+    """One sentence with the names of all missing files."""
+    names = sorted(capture.missing)
+    more = f" and {len(names) - NAMED} more" if len(names) > NAMED else ""
+    verb = "does" if len(names) == 1 else "do"
+    return (
+        f"{capture.source} lists {counted(len(names), 'file')} that {verb} not exist; using the other "
+        f"{len(capture.shots)} photographs without {', '.join(names[:NAMED])}{more}"
+    )
+
+
+def about_small(source: str, chosen: list[Chosen]) -> list[str]:
+    """Whether the photographs at hand are smaller than what was asked for."""
+    small = [c for c in chosen if max(c.picture.size) < 0.9 * max(c.wanted)]
+    if not small:
+        return []
+    (width, height), (wide, high) = small[0].picture.size, small[0].wanted
+    return [
+        f"{source} holds {counted(len(small), 'photograph')} smaller than asked for, such as {width}x{height} "
+        f"instead of {wide}x{high}; using them as they are"
+    ]
+
+
+def counted(number: int, noun: str) -> str:
+    return f"{'no' if number == 0 else number} {noun}{'' if number == 1 else 's'}"
+
+
+@contextmanager
+def progress(label: str, total: int) -> Iterator[Callable[[int], None]]:
+    """A bar on the terminal, once the work has taken a second."""
+    console = Console(stderr=True)
+    columns = (TextColumn(label), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    bar = Progress(*columns, console=console, transient=True)
+    task, begin = bar.add_task(label, total=total), time.monotonic()
+
+    def done(count: int) -> None:
+        if console.is_terminal and not bar.live.is_started and time.monotonic() - begin > PATIENCE:
+            bar.start()
+        bar.update(task, completed=count)
+
+    try:
+        yield done
+    finally:
+        bar.stop()

@@ -1,0 +1,32 @@
+"""Blender's synthetic scenes (Mildenhall et al. 2020): transforms_train.json and its sisters, images with alpha.
+
+Each file is a transforms.json; what differs is that there is one for each split. Validation views are read only where
+there are no test views, for nothing uses both.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from .capture import Capture, Shot
+from .transforms import read_frames_file, read_shots
+
+LOOKED_FOR = "transforms_train.json (Blender, one file per split)"
+
+
+def recognises(folder: Path) -> bool:
+    return (folder / "transforms_train.json").is_file()
+
+
+def read(folder: Path) -> Capture:
+    """Raises LumigraphError as `transforms.read` does."""
+    held_out = next((s for s in ("test", "val") if (folder / f"transforms_{s}.json").is_file()), None)
+    files = {"train": "train"} if held_out is None else {"train": "train", held_out: "test"}
+    shots: list[Shot] = []
+    missing: list[str] = []
+    for file, split in files.items():
+        path = folder / f"transforms_{file}.json"
+        found, absent = read_shots(path, read_frames_file(path), split if held_out else None)
+        shots += found
+        missing += absent
+    return Capture(str(folder), shots, missing=missing)

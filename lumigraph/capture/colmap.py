@@ -1,0 +1,123 @@
+"""COLMAP models, binary or text, in the places where programs leave them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+import torch
+
+from ..errors import LumigraphError
+from ..lens import Equirectangular, Fisheye, Lens, OpenCV, Pinhole
+from .capture import Capture, Shot
+from .pictures import reductions, versions
+from .points import Points
+
+PLACES = ("sparse/0", "sparse", "colmap/sparse/0", "colmap/sparse", "colmap", ".")
+LOOKED_FOR = "sparse/0 with cameras, images and points3D, .bin or .txt (COLMAP)"
+
+# How each model's parameters become (fx fy cx cy) and the distortion of our lenses: a place in COLMAP's list each.
+FOCAL = {1: (0, 0, 1, 2), 2: (0, 1, 2, 3)}
+PLANAR = {
+    "SIMPLE_PINHOLE": (1, ()),
+    "PINHOLE": (2, ()),
+    "SIMPLE_RADIAL": (1, (3,)),
+    "RADIAL": (1, (3, 4)),
+    "OPENCV": (2, (4, 5, 6, 7)),
+    "FULL_OPENCV": (2, (4, 5, 6, 7, 8, 9, 10, 11)),
+}
+FISHEYE = {
+    "SIMPLE_FISHEYE": (1, ()),
+    "FISHEYE": (2, ()),
+    "SIMPLE_RADIAL_FISHEYE": (1, (3,)),
+    "RADIAL_FISHEYE": (1, (3, 4)),
+    "OPENCV_FISHEYE": (2, (4, 5, 6, 7)),
+}
+
+
+def recognises(folder: Path) -> bool:
+    return model_folder(folder) is not None
+
+
+def model_folder(folder: Path) -> Path | None:
+    """The first place that holds a whole model."""
+    for place in PLACES:
+        for suffix in (".bin", ".txt"):
+            if all((folder / place / f"{part}{suffix}").is_file() for part in ("cameras", "images", "points3D")):
+                return folder / place
+    return None
+
+
+def read(folder: Path) -> Capture:
+    """Raises LumigraphError for a damaged model, a camera model our lenses cannot follow, and absent image folders."""
+    place = model_folder(folder)
+    assert place is not None
+    model = read_model(folder)
+    images = sorted((image for image in model.images.values() if image.has_pose), key=lambda image: image.name)
+    names = [image.name for image in images]
+    root = next((folder / n for n in ("images", "input") if reductions(folder / n)), folder)
+    shots, missing = [], []
+    lenses = {k: (read_lens(camera, place), (camera.width, camera.height)) for k, camera in model.cameras.items()}
+    for image, files in zip(images, versions(root, names), strict=True):
+        if not files:
+            missing.append(image.name)
+            continue
+        lens, size = lenses[image.camera_id]
+        pose = image.cam_from_world().inverse().matrix()
+        shots.append(Shot(image.name, pose, lens, size, files, find_mask(folder / "masks", image.name)))
+    if not shots and names:
+        raise LumigraphError(
+            f"{root} holds none of the {len(names)} photographs that {place} lists, such as {names[0]}"
+        )
+    cloud = points(model)
+    return Capture(str(folder), shots, cloud.positions, cloud.colours, cloud.sightings, missing)
+
+
+def read_model(folder: Path) -> pycolmap.Reconstruction:
+    place = model_folder(folder)
+    try:
+        return pycolmap.Reconstruction(place)
+    except Exception as fault:
+        reason = " ".join(str(fault).split()) or type(fault).__name__
+        raise LumigraphError(f"{place} holds no readable COLMAP model ({reason}); make or copy it again") from fault
+
+
+def positions(model: pycolmap.Reconstruction) -> dict[str, np.ndarray]:
+    """Where each photograph was taken."""
+    return {i.name: i.cam_from_world().inverse().translation for i in model.images.values() if i.has_pose}
+
+
+def points(model: pycolmap.Reconstruction) -> Points:
+    found = list(model.points3D.values())
+    return Points(
+        np.array([p.xyz for p in found], np.float64).reshape(-1, 3),
+        np.array([p.color for p in found], np.uint8).reshape(-1, 3),
+        np.array([p.track.length() for p in found], np.int64),
+    )
+
+
+def find_mask(folder: Path, name: str) -> Path | None:
+    """COLMAP's own masks are called image.jpg.png; image.png is common as well. Black is to be ignored."""
+    candidates = (folder / f"{name}.png", (folder / name).with_suffix(".png"))
+    return next((path for path in candidates if path.is_file()), None)
+
+
+def read_lens(camera: pycolmap.Camera, place: Path) -> Lens:
+    kind, p = camera.model.name, torch.tensor(camera.params, dtype=torch.float32)
+    if kind == "EQUIRECTANGULAR":
+        return Equirectangular(torch.tensor([[camera.width, camera.height]], dtype=torch.float32))
+    if kind not in PLANAR and kind not in FISHEYE:
+        raise LumigraphError(
+            f"{place}: camera {camera.camera_id} has model {kind}, which no lens here follows; "
+            f"run COLMAP's image_undistorter and use its folder"
+        )
+    focals, bends = (PLANAR | FISHEYE)[kind]
+    four = p[list(FOCAL[focals])]
+    distortion = torch.zeros(1, 8 if kind in PLANAR else 4)
+    distortion[0, : len(bends)] = p[list(bends)]
+    if kind in FISHEYE:
+        return Fisheye(four[None, :2], four[None, 2:], distortion)
+    if not distortion.any():
+        return Pinhole(four[None, :2], four[None, 2:])
+    return OpenCV(four[None, :2], four[None, 2:], distortion)

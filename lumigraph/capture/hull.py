@@ -1,0 +1,151 @@
+"""Where an object is, from its silhouettes: the box around a coarse visual hull (Laurentini 1994)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+from torch.nn import functional
+
+from ..camera import Camera
+from ..images import ImageStore
+from ..lens import OpenCV, Pinhole
+
+VIEWS = 24
+GRIDS = (32, 32, 64)  # cells along each side of the box that is searched; each round searches what the last one found
+DOUBLINGS = 2  # of the first box, while the hull touches its walls
+OPAQUE = 8  # of 255: what is more opaque, or differs more from the background, belongs to the object
+BORDER_SHARE = 0.97  # of the pixels at the pictures' edges have one colour, where there is a plain background
+SEEN = 0.5  # share of the views that must have a point inside their picture
+SLACKS = (0.0, 0.1)  # share of the views that may disagree: first none, then some, for masks are seldom perfect
+
+
+@dataclass(frozen=True)
+class Silhouette:
+    """Where one camera sees the object."""
+
+    camera: Camera
+    inside: Bool[Tensor, "height width"]
+
+
+def silhouettes(
+    cameras: Camera, images: ImageStore, views: list[int], centre: Float[np.ndarray, " 3"]
+) -> tuple[list[Silhouette], tuple[float, float, float]] | None:
+    """Outlines of an object that has alpha or stands before one plain colour, and that colour (white with alpha).
+
+    None where the photographs show neither. centre: what the cameras look at, roughly
+    """
+    position = cameras.position[views].double().numpy() - centre
+    chosen = [views[i] for i in farthest(position / np.linalg.norm(position, axis=-1, keepdims=True), VIEWS)]
+    if images.has_alpha:
+        return [Silhouette(cameras[i], images[i][..., 3] > OPAQUE) for i in chosen], (1.0, 1.0, 1.0)
+    if not isinstance(cameras.lens, Pinhole | OpenCV):
+        return None  # the black around a fisheye's circle is no background
+    pictures = [images[i].int() for i in chosen]
+    edges = torch.cat([border(picture) for picture in pictures])
+    colour = edges.median(0).values
+    if ((edges - colour).abs().amax(-1) <= OPAQUE).float().mean() < BORDER_SHARE:
+        return None
+    outlines = [filled((picture - colour).abs().amax(-1) > OPAQUE) for picture in pictures]
+    red, green, blue = (colour / 255).tolist()
+    return [Silhouette(cameras[i], outline) for i, outline in zip(chosen, outlines, strict=True)], (red, green, blue)
+
+
+def border(picture: Tensor) -> Tensor:
+    """The pixels along a picture's four edges."""
+    return torch.cat([picture[0], picture[-1], picture[:, 0], picture[:, -1]])
+
+
+def filled(inside: Bool[Tensor, "height width"]) -> Bool[Tensor, "height width"]:
+    """Also what lies between inside pixels of a row or a column: parts of the object may look like the background."""
+
+    def between(x: Tensor, axis: int) -> Tensor:
+        before, after = x.cummax(axis).values, x.flip(axis).cummax(axis).values.flip(axis)
+        return before & after
+
+    x = inside.int()
+    return (between(x, 0) | between(x, 1)).bool()
+
+
+def hull_box(
+    outlines: list[Silhouette], centre: Float[np.ndarray, " 3"], half: float
+) -> tuple[Float[np.ndarray, " 3"], Float[np.ndarray, " 3"]] | None:
+    """Two corners of the box around the object, which lies within about `half` of `centre`.
+
+    None where the silhouettes enclose nothing, or no end to it.
+    """
+    for slack in SLACKS:
+        low, high = centre - half, centre + half
+        for _ in range(DOUBLINGS + 1):
+            found = carve(outlines, low, high, GRIDS[0], slack)
+            if found is None or ends_inside(found, low, high):
+                break
+            low, high = centre + 2 * (low - centre), centre + 2 * (high - centre)
+        else:
+            return None
+        for grid in GRIDS[1:]:
+            if found is not None:
+                found = carve(outlines, found[0] - found[2], found[1] + found[2], grid, slack)
+        if found is not None:
+            return found[:2]
+    return None
+
+
+def ends_inside(found: tuple[np.ndarray, np.ndarray, np.ndarray], low: np.ndarray, high: np.ndarray) -> bool:
+    """Whether a found box keeps a cell's distance from the walls of the box that was searched."""
+    inner_low, inner_high, cell = found
+    return bool((inner_low > low + cell).all() and (inner_high < high - cell).all())
+
+
+def carve(
+    outlines: list[Silhouette], low: np.ndarray, high: np.ndarray, grid: int, slack: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
+    """The box around those cells of a grid that no view sees past, and a cell's size."""
+    cell = (high - low) / grid
+    axes = [torch.from_numpy(low[k] + cell[k] * (np.arange(grid) + 0.5)).float() for k in range(3)]
+    points = torch.stack(torch.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
+    radius = 0.5 * float(np.linalg.norm(cell))  # so that no part of a cell is overlooked
+    seen, missed = torch.zeros(len(points)), torch.zeros(len(points))
+    for outline in outlines:
+        pixels, valid = outline.camera.project(points)
+        size = outline.camera.size[0]
+        inside_picture = valid & (pixels >= 0).all(-1) & (pixels < size).all(-1)
+        pooled, times = widened(outline, points.mean(0), radius)
+        x, y = (pixels[inside_picture] / times).long().unbind(-1)
+        hit = pooled[y.clamp(max=pooled.shape[0] - 1), x.clamp(max=pooled.shape[1] - 1)]
+        seen += inside_picture
+        missed[inside_picture] += ~hit
+        keep = missed <= slack * len(outlines)
+        points, seen, missed = points[keep], seen[keep], missed[keep]
+        if not len(points):
+            return None
+    points = points[seen >= SEEN * len(outlines)]
+    if not len(points):
+        return None
+    lowest, highest = (x.double().numpy() for x in points.aminmax(dim=0))
+    return lowest - 0.5 * cell, highest + 0.5 * cell, cell
+
+
+def widened(outline: Silhouette, where: Tensor, radius: float) -> tuple[Tensor, int]:
+    """The silhouette grown by a cell's radius, on a coarser grid, and by how many times coarser."""
+    sideways = outline.camera.pose[0, :, 0]
+    ends, _ = outline.camera.project(torch.stack([where, where + radius * sideways]))
+    pixels = float((ends[1] - ends[0]).norm())
+    times = max(1, int(pixels / 2))
+    grow = int(np.ceil(pixels / times))
+    mask = outline.inside[None, None].float()
+    coarse = functional.max_pool2d(mask, times, ceil_mode=True)
+    return functional.max_pool2d(coarse, 2 * grow + 1, 1, grow)[0, 0] > 0, times
+
+
+def farthest(points: Float[np.ndarray, "point 3"], count: int) -> list[int]:
+    """Indices of points spread as far apart as they can be, one after another."""
+    chosen = [0]
+    away = np.linalg.norm(points - points[0], axis=-1)
+    while len(chosen) < min(count, len(points)):
+        chosen.append(int(away.argmax()))
+        away = np.minimum(away, np.linalg.norm(points - points[chosen[-1]], axis=-1))
+    return chosen

@@ -1,0 +1,56 @@
+"""LLFF captures (Mildenhall et al. 2019): poses_bounds.npy, one row of 17 numbers for each image in order of name.
+
+A row holds a 3x5 matrix and the nearest and farthest depth seen. The matrix's columns are the camera's down, right and
+backward axes, its position, and (height, width, focal length) in pixels.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from ..errors import LumigraphError
+from ..lens import Pinhole
+from .capture import Capture, Shot
+from .pictures import list_images, reductions, versions
+from .points import read_points3d
+
+LOOKED_FOR = "poses_bounds.npy (LLFF)"
+
+
+def recognises(folder: Path) -> bool:
+    return (folder / "poses_bounds.npy").is_file()
+
+
+def read(folder: Path) -> Capture:
+    """Raises LumigraphError where the array is no such table or its rows are not as many as there are images."""
+    path = folder / "poses_bounds.npy"
+    try:
+        table = np.load(path, allow_pickle=False)
+        assert table.ndim == 2 and table.shape[1] == 17 and table.dtype.kind == "f"
+    except (OSError, ValueError, EOFError, AssertionError) as fault:
+        raise LumigraphError(
+            f"{path} is not LLFF's table of 17 numbers for each image; make or copy it again"
+        ) from fault
+    listed = {place: list_images(place) for place in reductions(folder / "images").values()}
+    names = next((names for names in listed.values() if len(names) == len(table)), None)
+    if names is None:
+        found = ", ".join(f"{len(names)} in {place.name}" for place, names in listed.items()) or "no folder of images"
+        raise LumigraphError(f"{path} has poses of {len(table)} images, but there are {found}; restore the images")
+    shots = []
+    for name, files, line in zip(names, versions(folder / "images", names), table, strict=True):
+        matrix, depths = line[:15].reshape(3, 5), line[15:]
+        down, right, backward, position, (height, width, focal) = matrix.T
+        if not (np.isfinite(line).all() and min(height, width, focal) > 0):
+            raise LumigraphError(f"{path} has no usable numbers for image {name}; make or copy it again")
+        size = (round(width), round(height))
+        lens = Pinhole(torch.tensor([[focal, focal]]).float(), torch.tensor([[width / 2, height / 2]]).float())
+        pose = np.stack([right, down, -backward, position], -1)
+        shots.append(Shot(name, pose, lens, size, files, depths=(float(depths[0]), float(depths[1]))))
+    cloud = folder / "sparse/0/points3D.bin"
+    if not cloud.is_file():
+        return Capture(str(folder), shots)
+    points = read_points3d(cloud)
+    return Capture(str(folder), shots, points.positions, points.colours, points.sightings)

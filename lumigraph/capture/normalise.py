@@ -1,0 +1,258 @@
+"""Where a capture is: the similarity that brings what is worth seeing into [-1, 1]^3, and how far the rest reaches.
+
+Three kinds of knowledge, best first: what the source says itself, silhouettes of an object, and sparse points together
+with where the cameras look. Nothing here depends on which program found the poses, nor on a user's numbers.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float
+
+from ..camera import Camera
+from ..images import ImageStore
+from ..scene import Vector
+from .capture import Capture
+from .hull import hull_box, silhouettes
+
+MARGIN = 1.01  # around an object that is known exactly
+FARTHEST = 64  # half-size of the largest cube, in scene units
+UNKNOWN_REACH = 16.0  # of a capture without points
+HELD = 0.99  # share of sightings that the reach must hold
+CONVERGING = 0.02  # mean squared sine between optical axes from which on they tell where they meet: 8 degrees
+BOX_SHARE = 0.5  # of the distance from which things are looked at: half-size of the box of interest
+BEFORE_NEAREST = 0.4  # rays begin at this share of the distance to the nearest thing seen
+SMALLEST_NEAR = 1e-3
+SAMPLED_POINTS, SAMPLED_CAMERAS = 5000, 64
+UPRIGHT = math.cos(math.radians(15))  # a source axis nearer to up than this is up
+
+
+@dataclass(frozen=True)
+class Place:
+    """The frame of a scene: scene_from_source is the similarity x_scene = M x_source; the rest as in `Frame`."""
+
+    scene_from_source: Float[np.ndarray, "4 4"]
+    bounds: tuple[Vector, Vector]
+    reach: float
+    near: float
+    background: Vector
+
+
+CUBE: tuple[Vector, Vector] = ((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0))
+
+
+def find_place(capture: Capture, cameras: Camera, images: ImageStore, views: list[int]) -> Place:
+    """Where the capture is. cameras: in the source's frame; views: the images that may be looked at, not held out."""
+    if capture.bounds is not None:
+        return stated_place(capture, cameras)
+    upright = find_upright(cameras)
+    turned = cameras.transformed(torch.from_numpy(upright))
+    gaze = find_gaze(capture, turned, upright)
+    found = silhouettes(turned, images, views, gaze.centre) if gaze.converging else None
+    background = (0.0, 0.0, 0.0) if found is None else found[1]
+    if capture.background is not None:
+        background = capture.background
+    if found is not None:
+        box = hull_box(found[0], gaze.centre, gaze.distance)
+        if box is not None:
+            return object_place(upright, box, turned, background)
+    return open_place(capture, upright, gaze, background)
+
+
+def stated_place(capture: Capture, cameras: Camera) -> Place:
+    """What the source says: bounds, and where it says them, reach and near."""
+    assert capture.bounds is not None
+    low, high = np.array(capture.bounds, np.float64)
+    centre, half = 0.5 * (low + high), 0.5 * float((high - low).max())
+    bounds = box_in_scene(low, high, centre, half)
+    reach = 1.0 if capture.reach is None else power_of_two(capture.reach / half)
+    near = nearest_to_box(cameras, low, high) if capture.near is None else capture.near
+    return Place(
+        similarity(np.eye(4), centre, half),
+        bounds,
+        reach,
+        max(near / half, SMALLEST_NEAR),
+        capture.background or (0.0,) * 3,
+    )
+
+
+def object_place(upright: np.ndarray, box: tuple[np.ndarray, np.ndarray], cameras: Camera, background: Vector) -> Place:
+    """An object alone: its box fills the scene."""
+    low, high = box
+    centre, half = 0.5 * (low + high), 0.5 * MARGIN * float((high - low).max())
+    low, high = centre - 0.5 * MARGIN * (high - low), centre + 0.5 * MARGIN * (high - low)
+    near = max(nearest_to_box(cameras, low, high) / half, SMALLEST_NEAR)
+    return Place(similarity(upright, centre, half), box_in_scene(low, high, centre, half), 1.0, near, background)
+
+
+def nearest_to_box(cameras: Camera, low: np.ndarray, high: np.ndarray) -> float:
+    """Half the distance from the nearest camera to a box; for cameras inside it, a hundredth of its size."""
+    position = cameras.position.double().numpy()
+    away = np.linalg.norm(np.maximum(0, np.maximum(low - position, position - high)), axis=-1).min()
+    return max(0.5 * away, 0.01 * float((high - low).max()))
+
+
+@dataclass(frozen=True)
+class Gaze:
+    """What the cameras look at, in the turned frame.
+
+    centre:     the middle of it
+    distance:   typical, from the cameras
+    converging: whether their axes meet there; otherwise they look the same way, or around themselves
+    nearest:    distance of the nearest thing any of them sees
+    points, weights: sparse points and their sightings, if there are any
+    """
+
+    centre: Float[np.ndarray, " 3"]
+    distance: float
+    converging: bool
+    nearest: float
+    points: Float[np.ndarray, "point 3"] | None
+    weights: np.ndarray | None
+
+
+def find_gaze(capture: Capture, cameras: Camera, upright: np.ndarray) -> Gaze:
+    position, forward = cameras.position.double().numpy(), cameras.forward.double().numpy()
+    points, weights = reliable_points(capture, upright)
+    meeting, converging = where_axes_meet(position, forward)
+    if points is not None:
+        depths = visible_depths(cameras, points, weights)
+        middle, nearest = (np.nanmedian(depths[:, 1]), np.nanpercentile(depths[:, 0], 2))
+    elif all(shot.depths is not None for shot in capture.shots):
+        stated = np.array([shot.depths for shot in capture.shots])
+        middle, nearest = np.median(2 / (1 / stated).sum(-1)), stated[:, 0].min()
+    else:
+        away = np.linalg.norm(position - meeting, axis=-1) if converging else None
+        spread = np.linalg.norm(position - position.mean(0), axis=-1).mean()
+        middle = np.median(away) if away is not None else 3 * spread or 1.0
+        nearest = 0.25 * (away.min() if away is not None else middle)
+    if converging:
+        centre, distance = meeting, float(np.median(np.linalg.norm(position - meeting, axis=-1)))
+    else:
+        centre, distance = (position + middle * forward).mean(0), float(middle)
+    return Gaze(centre, distance, converging, float(nearest), points, weights)
+
+
+def open_place(capture: Capture, upright: np.ndarray, gaze: Gaze, background: Vector) -> Place:
+    """A room or the open: a box in the middle of what is looked at, and cubes around it as far as the points go."""
+    centre, half = gaze.centre, BOX_SHARE * gaze.distance
+    reach = UNKNOWN_REACH
+    if gaze.points is not None:
+        centre, half = settle(gaze.points, gaze.weights, centre, half)
+        radius = np.abs(gaze.points - centre).max(-1)
+        reach = power_of_two(quantile(radius, gaze.weights, HELD) / half)
+    elif all(shot.depths is not None for shot in capture.shots):
+        farthest = max(shot.depths[1] for shot in capture.shots if shot.depths is not None)
+        reach = power_of_two((farthest + gaze.distance) / half)
+    if capture.reach is not None:
+        reach = power_of_two(capture.reach / half)
+    near = BEFORE_NEAREST * gaze.nearest if capture.near is None else capture.near
+    return Place(similarity(upright, centre, half), CUBE, reach, max(near / half, SMALLEST_NEAR), background)
+
+
+def settle(points: np.ndarray, weights: np.ndarray, centre: np.ndarray, half: float) -> tuple[np.ndarray, float]:
+    """Move a box to the middle of the points inside it, and shrink it where they are fewer than it could hold."""
+    inside = np.abs(points - centre).max(-1) < half
+    for _ in range(5):
+        if weights[inside].sum() < 0.05 * weights.sum():
+            return centre, half  # the points say little about what is looked at
+        centre = np.array([quantile(points[inside, k], weights[inside], 0.5) for k in range(3)])
+        inside = np.abs(points - centre).max(-1) < half
+    filled = quantile(np.abs(points[inside] - centre).max(-1), weights[inside], 0.95)
+    return centre, min(half, 1.1 * filled)
+
+
+def reliable_points(capture: Capture, upright: np.ndarray) -> tuple[np.ndarray | None, np.ndarray | None]:
+    """The finite points that were seen at least twice, turned, and how often each was seen."""
+    if capture.points is None:
+        return None, None
+    sightings = np.full(len(capture.points), 2) if capture.sightings is None else capture.sightings
+    keep = np.isfinite(capture.points).all(-1) & (sightings >= 2)
+    if keep.sum() < 16:
+        return None, None
+    return capture.points[keep] @ upright[:3, :3].T, sightings[keep].astype(np.float64)
+
+
+def visible_depths(cameras: Camera, points: np.ndarray, weights: np.ndarray) -> Float[np.ndarray, "camera 2"]:
+    """Distance to the nearest (2nd percentile) and the middle of the points inside each picture; NaN where none are."""
+    chosen = np.linspace(0, len(points) - 1, min(SAMPLED_POINTS, len(points))).astype(int)
+    cloud, weight = torch.from_numpy(points[chosen]).float(), weights[chosen]
+    depths = []
+    for i in np.linspace(0, len(cameras) - 1, min(SAMPLED_CAMERAS, len(cameras))).round().astype(int).tolist():
+        camera = cameras[i]
+        pixels, valid = camera.project(cloud)
+        inside = (valid & (pixels >= 0).all(-1) & (pixels < camera.size[0]).all(-1)).numpy()
+        away = np.linalg.norm(points[chosen[inside]] - camera.position[0].numpy(), axis=-1)
+        depths.append([quantile(away, weight[inside], q) if inside.any() else math.nan for q in (0.02, 0.5)])
+    return np.array(depths) if not np.isnan(depths).all() else np.ones((1, 2))
+
+
+def where_axes_meet(position: np.ndarray, forward: np.ndarray) -> tuple[np.ndarray, bool]:
+    """The point nearest to all optical axes (least squares), and whether there is one: in front, at an angle."""
+    across = np.eye(3) - forward[:, :, None] * forward[:, None]
+    if np.linalg.eigvalsh(across.mean(0))[0] < CONVERGING:
+        return position.mean(0), False
+    meeting = np.linalg.solve(across.sum(0), (across @ position[:, :, None]).sum(0))[:, 0]
+    in_front = ((meeting - position) * forward).sum(-1) > 0
+    return meeting, bool(in_front.mean() > 0.8)
+
+
+def find_upright(cameras: Camera) -> Float[np.ndarray, "4 4"]:
+    """The rotation that brings the cameras' common up to +z; none if the source already has an axis there.
+
+    People hold cameras level rather than straight ahead: up is the direction most at right angles to all pictures'
+    rows. Where rows are all parallel, up is the mean of the pictures' own.
+    """
+    rows, own = cameras.pose[:, :, 0].double().numpy(), -cameras.pose[:, :, 1].double().numpy().mean(0)
+    values, vectors = np.linalg.eigh(rows.T @ rows / len(rows))
+    own /= max(np.linalg.norm(own), 1e-9)
+    level = vectors[:, 0] * np.sign(vectors[:, 0] @ own)
+    up = level if values[1] > 0.1 and level @ own > 0.7 else own
+    if not np.linalg.norm(up) > 0.5:
+        return np.eye(4)
+    nearest = np.zeros(3)
+    nearest[np.abs(up).argmax()] = np.sign(up[np.abs(up).argmax()])
+    if up @ nearest > UPRIGHT:
+        up = nearest
+    matrix = np.eye(4)
+    matrix[:3, :3] = turn_onto_z(up)
+    return matrix
+
+
+def turn_onto_z(up: Float[np.ndarray, " 3"]) -> Float[np.ndarray, "3 3"]:
+    """The smallest rotation that takes a unit vector to +z (Rodrigues)."""
+    x, y, z = up
+    if z < -1 + 1e-9:
+        return np.diag([1.0, -1.0, -1.0])
+    cross = np.array([[0, 0, -x], [0, 0, -y], [x, y, 0]])
+    return np.eye(3) + cross + cross @ cross / (1 + z)
+
+
+def similarity(upright: np.ndarray, centre: np.ndarray, half: float) -> Float[np.ndarray, "4 4"]:
+    """Turn, then bring a centre to the origin and a half-size to 1."""
+    matrix = np.eye(4)
+    matrix[:3, :3] = upright[:3, :3] / half
+    matrix[:3, 3] = -np.asarray(centre) / half
+    return matrix
+
+
+def box_in_scene(low: np.ndarray, high: np.ndarray, centre: np.ndarray, half: float) -> tuple[Vector, Vector]:
+    corners = np.clip((np.stack([low, high]) - centre) / half, -1, 1)
+    return tuple(corners[0].tolist()), tuple(corners[1].tolist())
+
+
+def power_of_two(value: float) -> float:
+    """The smallest power of two that is at least `value`, from 1 to 64."""
+    return float(min(2 ** max(0, math.ceil(math.log2(max(value, 1e-9)) - 1e-6)), FARTHEST))
+
+
+def quantile(values: np.ndarray, weights: np.ndarray, share: float) -> float:
+    """The value below which a share of the weight lies."""
+    order = np.argsort(values)
+    return float(
+        values[order][np.searchsorted(np.cumsum(weights[order]), share * weights.sum()).clip(max=len(values) - 1)]
+    )

@@ -1,0 +1,240 @@
+"""Photographs as files: found, measured, turned upright, reduced, and read as bytes."""
+
+from __future__ import annotations
+
+import math
+import re
+import zlib
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from PIL import Image, ImageOps
+
+from ..errors import LumigraphError
+from ..images import Picture
+from .capture import Shot
+
+LONGEST_SIDE = 1100  # pixels that a photograph is reduced to, where the user asks for nothing
+SUFFIXES = (".png", ".jpg", ".jpeg", ".JPG", ".JPEG", ".PNG", ".webp", ".tif", ".tiff", ".bmp")
+EXIF_ORIENTATION = 0x0112
+EXIF_UPRIGHT = (None, 0, 1)
+EXIF_SIDEWAYS = (5, 6, 7, 8)
+
+Size = tuple[int, int]
+
+
+def find_file(path: Path) -> Path:
+    """The file itself, or where it was named without a suffix, the image of that name. May not exist."""
+    if path.is_file():
+        return path
+    return next((p for s in SUFFIXES if (p := path.with_name(path.name + s)).is_file()), path)
+
+
+def list_images(folder: Path) -> list[str]:
+    """Names of the images below a folder, sorted, with / between folders."""
+    if not folder.is_dir():
+        return []
+    files = (p for p in folder.rglob("*") if p.suffix.lower() in {s.lower() for s in SUFFIXES} and p.is_file())
+    return sorted(p.relative_to(folder).as_posix() for p in files if not p.name.startswith("."))
+
+
+def reductions(folder: Path) -> dict[int, Path]:
+    """Folders of the same photographs, reduced: images, images_2, images_4..., by how many times."""
+    found = {1: folder} if folder.is_dir() else {}
+    for beside in folder.parent.glob(f"{folder.name}_*"):
+        if (match := re.fullmatch(r".*_(\d+)", beside.name)) and beside.is_dir() and int(match[1]) > 1:
+            found[int(match[1])] = beside
+    return dict(sorted(found.items()))
+
+
+def versions(folder: Path, names: list[str]) -> list[dict[int, Path]]:
+    """For each named photograph its files in `folder` and in the reduced folders beside it.
+
+    A file may have another suffix than the name says. In a reduced folder where no name fits but the number of files
+    does, the order of names decides.
+    """
+    found: list[dict[int, Path]] = [{} for _ in names]
+    for times, place in reductions(folder).items():
+        files = [place / name for name in names]
+        if not all(file.is_file() for file in files):
+            listed = list_images(place)
+            by_stem = {stem(name): place / name for name in listed}
+            if times > 1 and len(listed) == len(names) and by_stem.keys().isdisjoint(map(stem, names)):
+                renamed = dict(zip(sorted(names), listed, strict=True))
+                files = [place / renamed[name] for name in names]
+            else:
+                files = [place / name if (place / name).is_file() else by_stem.get(stem(name)) for name in names]
+        for file, known in zip(files, found, strict=True):
+            if file is not None:
+                known[times] = file
+    return found
+
+
+def stem(name: str) -> str:
+    return name.rsplit(".", 1)[0]
+
+
+@dataclass(frozen=True)
+class Chosen:
+    """A photograph as it will be used: its pixels, the size its lens was calibrated for, and the size wanted."""
+
+    picture: Picture
+    calibrated: Size
+    wanted: Size
+
+
+def choose(shot: Shot, downscale: int | None) -> Chosen:
+    """Which file of a shot to read and how far to reduce it: `downscale` times what the lens was calibrated for.
+
+    Raises LumigraphError for a file that is no image or whose shape contradicts the lens.
+    """
+    if isinstance(shot.image, dict):
+        return choose_file(shot, shot.image, downscale)
+    pixels = shot.image
+    if isinstance(pixels, np.ndarray):
+        own: Size = (pixels.shape[1], pixels.shape[0])
+    else:
+        assert shot.size is not None, f"{shot.name} is made when asked, so its size must be said"
+        own = shot.size
+    calibrated = shot.size or own
+    wanted = reduced(calibrated, downscale)
+    size = smaller(own, wanted)
+
+    def make() -> np.ndarray:
+        made = pixels if isinstance(pixels, np.ndarray) else pixels()
+        return made if size == own else np.asarray(Image.fromarray(made).resize(size, Image.Resampling.BOX))
+
+    return Chosen(Picture(size, with_mask(make, shot.mask, size, False)), calibrated, wanted)
+
+
+def choose_file(shot: Shot, files: dict[int, Path], downscale: int | None) -> Chosen:
+    if shot.size is None:
+        path = files[min(files)]
+        stored, orientation = measure(path)
+        stored = (stored[0] * min(files), stored[1] * min(files))
+        calibrated = stored[::-1] if orientation in EXIF_SIDEWAYS else stored
+    else:
+        calibrated = shot.size
+    wanted = reduced(calibrated, downscale)
+    times = max(1, round(max(calibrated) / max(wanted)))
+    fitting = [k for k in files if times % k == 0]
+    path = files[max(fitting) if fitting else min(files, key=lambda k: (k > times, abs(k - times)))]
+    stored, orientation = measure(path)
+    turned = stored[::-1] if orientation in EXIF_SIDEWAYS else stored
+    # Most programs that find poses read pixels as they are stored; some turn them upright first.
+    if shot.size is not None and same_shape(stored, calibrated):
+        turn, own = False, stored
+    elif same_shape(turned, calibrated):
+        turn, own = orientation not in EXIF_UPRIGHT, turned
+    else:
+        raise LumigraphError(
+            f"{path} is {stored[0]}x{stored[1]} pixels, but its camera was calibrated for "
+            f"{calibrated[0]}x{calibrated[1]}, which is another shape; "
+            f"correct the camera's width and height or restore the image"
+        )
+    size = smaller(own, wanted)
+    identity = f"{path.resolve()} {stat(path)} {turn}"
+    if isinstance(shot.mask, Path):
+        identity += f" {shot.mask.resolve()} {stat(shot.mask)}"
+    elif shot.mask is not None:
+        identity += f" {zlib.crc32(shot.mask.tobytes())}"
+    return Chosen(
+        Picture(size, with_mask(lambda: read_image(path, turn, size), shot.mask, size, turn), identity),
+        calibrated,
+        wanted,
+    )
+
+
+def reduced(size: Size, downscale: int | None) -> Size:
+    times = math.ceil(max(size) / LONGEST_SIDE) if downscale is None else downscale
+    return max(round(size[0] / times), 1), max(round(size[1] / times), 1)
+
+
+def smaller(own: Size, wanted: Size) -> Size:
+    """Pictures are never enlarged, nor resampled for the one pixel by which somebody else rounded differently."""
+    return own if max(own) <= max(wanted) + 1 else wanted
+
+
+def same_shape(a: Size, b: Size) -> bool:
+    """Whether two sizes have the same ratio of sides, up to 1% and one pixel of rounding."""
+    return abs(math.log(a[0] * b[1] / (a[1] * b[0]))) < 0.01 + 1 / min(*a, *b)
+
+
+def stat(path: Path) -> str:
+    found = path.stat()
+    return f"{found.st_mtime_ns} {found.st_size}"
+
+
+def measure(path: Path) -> tuple[Size, int | None]:
+    """Width and height as stored, and how EXIF says to turn it."""
+    with readable(path), Image.open(path) as image:
+        return image.size, image.getexif().get(EXIF_ORIENTATION)
+
+
+def read_image(path: Path, turn: bool, size: Size) -> np.ndarray:
+    """Pixels as uint8 (height, width, 3 or 4), upright if asked, area-averaged down to a size."""
+    with readable(path), Image.open(path) as image:
+        if turn:
+            image = ImageOps.exif_transpose(image)
+        return np.asarray(resize(eight_bits(image), size))
+
+
+def eight_bits(image: Image.Image) -> Image.Image:
+    """Any kind of image as RGB or RGBA."""
+    if image.mode.startswith("I"):  # 16 bits of grey
+        image = Image.fromarray((np.asarray(image).astype(np.uint32) // 257).clip(0, 255).astype(np.uint8))
+    elif image.mode == "F":
+        raise ValueError("it holds floating-point numbers; convert it to 8 bits")
+    see_through = image.mode in ("RGBA", "LA", "PA", "La", "RGBa") or "transparency" in image.info
+    return image.convert("RGBA" if see_through else "RGB")
+
+
+def resize(image: Image.Image, size: Size) -> Image.Image:
+    """Averages areas; where there is alpha, each colour counts as much as it is opaque."""
+    return image if image.size == size else image.resize(size, Image.Resampling.BOX)
+
+
+def with_mask(
+    make: Callable[[], np.ndarray], mask: Path | np.ndarray | None, size: Size, turn: bool
+) -> Callable[[], tuple[np.ndarray, np.ndarray | None]]:
+    return lambda: (make(), None if mask is None else read_mask(mask, size, turn))
+
+
+def read_mask(mask: Path | np.ndarray, size: Size, turn: bool) -> np.ndarray:
+    """Which pixels to trust: those whose whole area the mask calls good (brighter than half)."""
+    if isinstance(mask, np.ndarray):
+        grey = Image.fromarray(mask.astype(bool))
+    else:
+        with readable(mask), Image.open(mask) as image:
+            upright = ImageOps.exif_transpose(image) if turn else image
+            channels = np.asarray(eight_bits(upright))
+            grey = Image.fromarray(channels[..., :3].max(-1) > 127)
+            if not same_shape(grey.size, size):
+                raise ValueError(f"its shape {grey.size[0]}x{grey.size[1]} is not the image's {size[0]}x{size[1]}")
+    if grey.size == size:
+        return np.asarray(grey)
+    return np.asarray(grey.convert("L").resize(size, Image.Resampling.BOX)) > 254
+
+
+class readable:  # noqa: N801
+    """Inside this block, whatever a damaged file makes an image library raise becomes one sentence."""
+
+    def __init__(self, path: Path):
+        self.path = path
+
+    def __enter__(self) -> None:
+        return None
+
+    def __exit__(self, kind, fault, trace) -> None:
+        if isinstance(fault, Exception) and not isinstance(fault, LumigraphError):
+            raise LumigraphError(
+                f"{self.path} cannot be read as an image ({describe(fault)}); "
+                f"restore it, or delete it so that it is skipped"
+            ) from fault
+
+
+def describe(fault: Exception) -> str:
+    text = " ".join(str(fault).split()).rstrip(".")
+    return "unknown format" if "cannot identify" in text else text or type(fault).__name__
