@@ -75,11 +75,13 @@ def cases(generator: torch.Generator):
 
 
 def benchmark_case(generator: torch.Generator, size: int = 2**18):
-    """Samples along rays, 64 to a ray, as a training step has them; points ask for no gradient there."""
+    """Samples along rays as a training step has them: runs of 32 through the unit cube, each two of the steps that
+    Instant-NGP takes (sqrt(3) / 1024) from the next. Points ask for no gradient there.
+    """
     levels = HashLevels(levels=16, features=2, log2_entries=17)
-    ends = torch.rand(size // 64, 2, 1, 3, generator=generator)
-    along = (torch.arange(64) + 0.5)[:, None] / 64
-    points = torch.lerp(ends[:, 0], ends[:, 1], along).reshape(-1, 3)
+    start = 0.2 + 0.6 * torch.rand(size // 32, 1, 3, generator=generator)
+    direction = torch.nn.functional.normalize(torch.randn(size // 32, 1, 3, generator=generator), dim=-1)
+    points = (start + direction * torch.arange(32)[:, None] * 3**0.5 / 512).reshape(-1, 3)
     table = 1e-4 * (2 * torch.rand(levels.offsets[-1], levels.features, generator=generator) - 1)
     return points, table.requires_grad_(), levels
 
