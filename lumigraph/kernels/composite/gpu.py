@@ -116,10 +116,9 @@ class _Composite(torch.autograd.Function):
         tau, values, ray_starts, *outputs = ctx.saved_tensors
         d_tau, d_values = (empty(*x.shape, device=x.device) for x in (tau, values))
         if len(ray_starts) > 1:
-            grads = [g.contiguous() for g in grads]
-            results = d_tau, d_values, ctx.stop
+            given = *(g.contiguous() for g in grads), tau, values, ray_starts, *outputs
             grid = (len(ray_starts) - 1,)
-            _backward[grid](*grads, tau, values, ray_starts, *outputs, *results, **ctx.sizes, num_warps=1)
+            _backward[grid](*given, d_tau, d_values, ctx.stop, **ctx.sizes, num_warps=1)
         return d_tau, d_values, None, None
 
 

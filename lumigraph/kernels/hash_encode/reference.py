@@ -19,9 +19,9 @@ def _level(points: Tensor, n: int, entries: Tensor, log2_entries: int) -> Tensor
     """Trilinear interpolation on a grid of n^3 cells."""
     cell = (points.detach() * n).long().clamp(max=n - 1)
     fraction = points * n - cell
-    total = 0
-    for corner in itertools.product((0, 1), repeat=3):
-        corner = torch.tensor(corner, device=points.device)
+    total = entries.new_zeros(len(points), entries.shape[1])
+    for place in itertools.product((0, 1), repeat=3):
+        corner = torch.tensor(place, device=points.device)
         weight = torch.where(corner == 1, fraction, 1 - fraction).prod(-1)
         total = total + weight[:, None] * entries[_index(cell + corner, n, log2_entries)]
     return total

@@ -45,7 +45,7 @@ def locate(x: Tensor, shape: tuple[int, ...]) -> tuple[tuple[Tensor, ...], Tenso
     """Index [cascade, x, y, z] of the cell that each point is in, and whether any cascade holds it."""
     cascades, n = shape[:2]
     distance = x.abs().amax(-1)
-    cascade = sum((distance >= 2.0**c).long() for c in range(cascades))
+    cascade = (distance[..., None] >= 2.0 ** torch.arange(cascades, device=x.device)).sum(-1)
     held = cascade < cascades
     cascade = cascade.clamp(max=cascades - 1)
     cell = ((x / 2.0 ** cascade[..., None] + 1) / 2 * n).long().clamp(0, n - 1)
