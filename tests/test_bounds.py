@@ -8,32 +8,7 @@ from __future__ import annotations
 
 import numba
 import pytest
-from agreement import OPERATIONS, assert_agrees, cases, edit_engine
-
-# What replaces the hash encoding's vector operations, which are below the level at which Numba could check.
-PLAIN_LANES = """
-from .lanes import BLOCK
-
-
-@njit
-def blend(table, base, entries, weights, i, lanes, out, first, stride):
-    for f in range(len(lanes)):
-        total = ZERO
-        for corner in range(8):
-            total += weights[corner * BLOCK + i] * table[base + entries[corner * BLOCK + i], f]
-        out[first + f * stride] = total
-
-
-@njit
-def spread(grad, first, stride, base, entries, weights, i, lanes, table):
-    for f in range(len(lanes)):
-        for corner in range(8):
-            table[base + entries[corner * BLOCK + i], f] += weights[corner * BLOCK + i] * grad[first + f * stride]
-"""
-
-
-def plain_lanes(source: str) -> str:
-    return source.replace("from .lanes import BLOCK, blend, spread\n", PLAIN_LANES)
+from agreement import OPERATIONS, assert_agrees, cases, edit_engine, plain_lanes
 
 
 @pytest.fixture(autouse=True)

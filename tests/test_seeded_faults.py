@@ -7,7 +7,9 @@ from typing import NamedTuple
 
 import numba
 import pytest
-from agreement import assert_agrees, cases, edit_engine
+from agreement import assert_agrees, cases, edit_engine, plain_lanes
+
+pytestmark = pytest.mark.filterwarnings("ignore:overflow encountered")  # hashes wrap around, in Python aloud
 
 
 class Fault(NamedTuple):
@@ -32,6 +34,8 @@ FAULTS = {
     "weight forgotten": Fault("hash_encode", "gpu", "_backward_table", "weight[:, None] * g", "g"),
     "slope's sign": Fault("hash_encode", "gpu", "_backward_points", "(corner % 2 * 2 - 1)", "(1 - corner % 2 * 2)"),
     "clamped, yet with gradient": Fault("hash_encode", "gpu", "_backward_points", "where(inside_y", "where(here"),
+    "gradient of another sample": Fault("hash_encode", "cpu", "_table_gradient", "plane + first + i", "plane + first"),
+    "slope's sign on the cpu": Fault("hash_encode", "cpu", "_point_gradient", "(2 * by - 1)", "(1 - 2 * by)"),
     # spherical harmonics
     "sign in band 3": Fault("spherical_harmonics", "gpu", "_backward", "- sectoral * g15", "+ sectoral * g15"),
     "never written": Fault(
@@ -51,7 +55,7 @@ def seed(fault: Fault, folder: Path, monkeypatch) -> None:
     def edit(source: str) -> str:
         before, function = source.split(f"def {fault.function}(", 1)
         assert fault.old in function, f"{fault.operation}/{fault.engine}.py no longer says {fault.old!r}"
-        return f"{before}def {fault.function}({function.replace(fault.old, fault.new, 1)}"
+        return plain_lanes(f"{before}def {fault.function}({function.replace(fault.old, fault.new, 1)}")
 
     monkeypatch.setattr(numba.config, "DISABLE_JIT", True)  # as plain Python, which spares compiling each copy
     edit_engine(fault.operation, fault.engine, edit, folder, monkeypatch)
