@@ -109,4 +109,6 @@ def spread(grad, first, stride, base, entries, weights, i, lanes, table):
 
 
 def plain_lanes(source: str) -> str:
-    return source.replace("from .lanes import BLOCK, blend, spread\n", PLAIN_LANES)
+    line = "from .lanes import BLOCK, blend, spread\n"
+    assert line in source or "lanes import" not in source
+    return source.replace(line, PLAIN_LANES)
