@@ -1,0 +1,83 @@
+"""Procedural scenes: worlds made of formulas, photographed by our own ray tracer, with everything about them known.
+
+    stage = scenes.stage("still-life")                    a world and its cameras
+    render(stage.world, stage.cameras["test"][0])         picture, exact depth, normals, masks, albedo
+    signed_distance(stage.world, points)                  exact geometry
+    open_scene("procedural:still-life,size=400")          the same as any other capture
+    write_blender(stage, folder)                          the same for other tools
+
+A new scene is a new file in `scenes/`; nothing is compiled for it.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+
+import numpy as np
+
+from ...camera import Camera
+from ...errors import LumigraphError
+from ..capture import Capture, Shot
+from . import scenes as scenes
+from .blender_folder import write_blender as write_blender
+from .rendering import eight_bits, photograph
+from .rendering import render as render
+from .rendering import signed_distance as signed_distance
+from .rendering import trace as trace
+from .stage import Stage as Stage
+from .world import Lamp as Lamp
+from .world import Material as Material
+from .world import Object as Object
+from .world import Pose as Pose
+from .world import Sky as Sky
+from .world import Sun as Sun
+from .world import World as World
+
+OPTIONS = ("size", "views", "seed")
+
+
+def read(request: str) -> Capture:
+    """The capture that a name stands for, with options after commas: "still-life", "still-life,size=400,seed=1".
+
+    size:  of the square pictures, pixels; default 200
+    views: number of photographs to learn from; default 100
+    seed:  where the cameras stand; default 0
+    Pictures are traced when somebody reads them. Raises LumigraphError for a name or an option that does not exist.
+    """
+    name, *rest = request.split(",")
+    options = dict(parse(request, text) for text in rest)
+    return capture(scenes.stage(name, **options), f"procedural:{request}")
+
+
+def parse(request: str, text: str) -> tuple[str, int]:
+    """One option, "size=400"."""
+    name, _, value = text.strip().partition("=")
+    if name not in OPTIONS:
+        raise LumigraphError(f"procedural:{request}: there is no option {name!r}; there are {', '.join(OPTIONS)}")
+    if not value.isdecimal() or (name != "seed" and not int(value)):
+        raise LumigraphError(f"procedural:{request}: {name} must be a whole number, as in {name}=20; got {value!r}")
+    return name, int(value)
+
+
+def capture(stage: Stage, source: str) -> Capture:
+    """A stage as photographs with known poses."""
+    visible = stage.world.sky.visible
+    shots = [
+        Shot(
+            name=f"{split}_{i:04d}",
+            pose=cameras.pose[i].double().numpy(),
+            lens=cameras.lens[i],
+            size=(int(cameras.size[i, 0]), int(cameras.size[i, 1])),
+            image=partial(picture, stage, cameras[i]),
+            split=split,
+        )
+        for split, cameras in stage.cameras.items()
+        for i in range(len(cameras))
+    ]
+    background = (0.0, 0.0, 0.0) if visible else (1.0, 1.0, 1.0)
+    return Capture(source, shots, bounds=stage.bounds, reach=stage.reach, near=stage.near, background=background)
+
+
+def picture(stage: Stage, camera: Camera) -> np.ndarray:
+    """Bytes (height, width, 3), or (height, width, 4) with straight alpha where the background is transparent."""
+    return eight_bits(*photograph(stage.world, camera), alpha=not stage.world.sky.visible)

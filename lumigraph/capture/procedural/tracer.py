@@ -1,0 +1,242 @@
+"""The ray tracer: what each ray through a world sees. Compiled once; scenes are data.
+
+Light: chalky (Lambert) and glossy (GGX, Walter 2007; Fresnel after Schlick 1994) reflection of area lights, each ray
+asking for one point of each light whether it is in shadow, light from the sky darkened in corners, and one mirrored bounce on whatever is glossy.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from pathlib import Path
+
+import numpy as np
+from numba import njit
+
+from .shapes import INFINITY, distance, gradient, hollow, intersect, inverse, slab
+from .textures import clouds, pattern
+from .vector import FAST, INNER, along, clamp, cross, dot, mix, mul, rotate, rotate_back, scale, smooth, unit, vec
+
+LIFT = 2e-4  # shadow and mirrored rays begin this far above the surface, scene units
+MIRRORED = 0.02, 0.06  # a weaker reflection shows the sky alone; a stronger one what is there
+SHOULDER = 0.75  # radiance above this is compressed as by film, so that highlights keep their shape
+
+
+def spread(count: int) -> np.ndarray:
+    """Points in the unit disc of which any few successive ones are evenly spread (Roberts' R2 sequence)."""
+    k = np.arange(count)
+    radius, turn = np.sqrt((0.5 + k * 0.7548776662466927) % 1), 2 * np.pi * (k * 0.5698402909980532 % 1)
+    return np.stack([radius * np.cos(turn), radius * np.sin(turn)], -1)
+
+
+DISC = spread(256)  # successive rays, hence the samples of a pixel, aim at different points of a light
+
+
+@njit(**INNER)
+def meet(objects, nodes, o, d, limit, enough, leaving):
+    """(distance, object) of the first surface along a ray, or (infinity, -1) if none is nearer than limit.
+
+    enough:  the search ends early with any surface nearer than this: 0 finds the first, infinity whether there is one
+    leaving: the object on whose surface the ray begins, or -1: where that is convex, the ray cannot meet it again
+    """
+    best, found, i = limit, -1, 0
+    over = inverse(d)
+    while i < len(nodes):
+        node = nodes[i]
+        enter, leave = slab(o, over, vec(node.low), vec(node.high))
+        if enter > leave or enter >= best:
+            i = node.skip
+            continue
+        if node.object >= 0 and (node.object != leaving or hollow(objects[leaving].kind)):
+            thing = objects[node.object]
+            turn = thing.rotation
+            begin = rotate_back(turn, along(o, -1.0, vec(thing.position)))
+            t = intersect(thing.kind, thing.size, vec(thing.half), begin, rotate_back(turn, d), best)
+            if t < best:
+                best, found = t, node.object
+                if t < enough:
+                    break
+        i += 1
+    return (best if found >= 0 else INFINITY), found
+
+
+@njit(**INNER)
+def clearance(objects, nodes, p, limit):
+    """Signed distance from a point to the nearest surface, at most limit."""
+    best, i = limit, 0
+    while i < len(nodes):
+        node = nodes[i]
+        low, high = vec(node.low), vec(node.high)
+        x = max(0.0, max(low[0] - p[0], p[0] - high[0]))
+        y = max(0.0, max(low[1] - p[1], p[1] - high[1]))
+        z = max(0.0, max(low[2] - p[2], p[2] - high[2]))
+        square = x * x + y * y + z * z
+        if square > 0.0 and square >= best * abs(best):
+            i = node.skip
+            continue
+        if node.object >= 0:
+            thing = objects[node.object]
+            own = rotate_back(thing.rotation, along(p, -1.0, vec(thing.position)))
+            best = min(best, distance(thing.kind, thing.size, own))
+        i += 1
+    return best
+
+
+@njit(**INNER)
+def surroundings(sky, d, cover):
+    """Radiance from the sky in a direction; of which clouds cover a share."""
+    if d[2] < 0.0:
+        return mix(vec(sky.horizon), vec(sky.ground), smooth(-d[2], 0.0, 0.25))
+    colour = mix(vec(sky.horizon), vec(sky.zenith), 1.0 - (1.0 - min(d[2], 1.0)) ** 3)
+    if cover > 0.0:
+        up = 1.0 / (d[2] + 0.12)
+        thick = 0.5 + clouds((d[0] * up, d[1] * up, 0.0), 1.6, 0.2, 0.02 * up * up)
+        white = smooth(thick, 1.0 - cover, 1.45 - cover) * smooth(d[2], 0.0, 0.15)
+        colour = mix(colour, (1.0, 0.985, 0.96), 0.85 * white)
+    return colour
+
+
+@njit(**INNER)
+def ambient(objects, nodes, sky, p, n):
+    """Light from all of the sky onto a surface, less what its neighbourhood hides (Evans 2006): balls that touch the
+    surface from outside, each half as large as the last, and how much room there is around their centres."""
+    hidden, weight, h = 0.0, 0.25, sky.reach
+    for _ in range(4):
+        room = clearance(objects, nodes, along(p, h, n), h)
+        if room > 0.999 * h:
+            break  # the smaller balls lie within this one
+        hidden += weight * (1.0 - max(room, 0.0) / h)
+        h *= 0.5
+    light = mix(vec(sky.ground), mix(vec(sky.horizon), vec(sky.zenith), 0.6), 0.5 + 0.5 * n[2])
+    return scale(light, 1.0 - 0.75 * hidden)
+
+
+@njit(**INNER)
+def towards(toward, width, ray):
+    """Direction to one of the points of a round light; successive rays choose different ones.
+
+    toward: direction to its centre; width: tangent of half its apparent size
+    """
+    side = unit((-toward[1], toward[0], 0.0) if abs(toward[2]) < 0.9 else (0.0, -toward[2], toward[1]))
+    point = DISC[ray % len(DISC)]
+    return unit(along(along(toward, width * point[0], side), width * point[1], cross(toward, side)))
+
+
+@njit(**INNER)
+def reflect(objects, nodes, lights, sky, found, p, n, d, albedo, material, ray):
+    """Radiance that a surface sends back along a ray d, all but its mirrored surroundings."""
+    base = scale(albedo, 1.0 - material.metal)
+    coat = 0.04 * material.gloss
+    mirror = mix((coat, coat, coat), albedo, material.metal)
+    colour = mul(base, ambient(objects, nodes, sky, p, n))
+    start = along(p, LIFT, n)
+    for i in range(len(lights)):
+        light = lights[i]
+        toward, away, power, width = vec(light.position), INFINITY, vec(light.colour), light.radius
+        if light.distant == 0:
+            toward = along(toward, -1.0, p)
+            away = math.sqrt(dot(toward, toward))
+            toward, power, width = scale(toward, 1.0 / away), scale(power, 1.0 / (away * away)), width / away
+        facing = dot(n, toward)
+        if facing <= 0.0:
+            continue
+        if meet(objects, nodes, start, towards(toward, width, ray), away, INFINITY, found)[1] >= 0:
+            continue
+        send = base
+        if coat > 0.0 or material.metal > 0.0:
+            half = unit(along(toward, -1.0, d))
+            nh, nv, vh = dot(n, half), max(-dot(n, d), 1e-3), -dot(half, d)
+            wide = min(material.roughness**2 + 0.5 * width, 1.0)  # a large light makes a large highlight (Karis 2013)
+            ggx = wide * wide / (nh * nh * (wide * wide - 1.0) + 1.0) ** 2
+            k = 0.5 * wide
+            shape = 0.25 * ggx / ((facing * (1.0 - k) + k) * (nv * (1.0 - k) + k))
+            fresnel = (1.0 - vh) ** 5 * max(material.gloss, material.metal)
+            send = along(send, shape, mix(mirror, (1.0, 1.0, 1.0), fresnel))
+        colour = along(colour, facing, mul(send, power))
+    return colour
+
+
+@njit(**INNER)
+def film(x):
+    """Linear up to the shoulder, then ever slower towards one."""
+    return x if x < SHOULDER else 1.0 - (1.0 - SHOULDER) * math.exp((SHOULDER - x) / (1.0 - SHOULDER))
+
+
+@njit(**INNER)
+def look(objects, materials, lights, sky, nodes, o, d, radius, shaded, ray):
+    """(radiance, distance, normal, thing, reflectance) for one ray; see `trace`."""
+    t, found = meet(objects, nodes, o, d, INFINITY, 0.0, -1)
+    black = (0.0, 0.0, 0.0)
+    depth, facing, identity, own = t, black, -1, black
+    total, weight, travelled = black, (1.0, 1.0, 1.0), 0.0
+    for bounce in range(2):
+        if found < 0:
+            if bounce > 0 or sky.visible:
+                total = along(total, 1.0, mul(weight, surroundings(sky, d, sky.clouds if bounce == 0 else 0.0)))
+            break
+        thing = objects[found]
+        material = materials[thing.material]
+        p = along(o, t, d)
+        local = rotate_back(thing.rotation, along(p, -1.0, vec(thing.position)))
+        shape_normal = gradient(thing.kind, thing.size, local)
+        n = rotate(thing.rotation, shape_normal)
+        travelled += t
+        slant = max(-dot(n, d), 0.05)
+        blend, shade = pattern(material.texture, material.numbers, local, shape_normal, radius * travelled / slant)
+        albedo = scale(mix(vec(material.a), vec(material.b), blend), shade)
+        if bounce == 0:
+            facing, identity, own = n, thing.identity, albedo
+            if not shaded:
+                break
+        colour = reflect(objects, nodes, lights, sky, found, p, n, d, albedo, material, ray)
+        thick = 1.0 - math.exp(-sky.haze * travelled) if bounce == 0 else 0.0
+        colour = mix(colour, surroundings(sky, (d[0], d[1], max(d[2], 0.0)), 0.0), thick)
+        total = along(total, 1.0, mul(weight, colour))
+        coat = 0.04 * material.gloss
+        fresnel = (1.0 - clamp(-dot(n, d), 0.0, 1.0)) ** 5 * max(material.gloss, material.metal)
+        weight = mix(mix((coat, coat, coat), albedo, material.metal), (1.0, 1.0, 1.0), fresnel)
+        weight = scale(
+            weight, (1.0 - material.roughness) ** 2 * (1.0 - thick)
+        )  # a rough coat mirrors little that is sharp
+        o, d = along(p, LIFT, n), along(d, -2.0 * dot(d, n), n)
+        strong = smooth(max(weight[0], max(weight[1], weight[2])), MIRRORED[0], MIRRORED[1])
+        total = along(total, 1.0 - strong, mul(weight, surroundings(sky, d, 0.0)))
+        if strong <= 0.0:
+            break
+        weight = scale(weight, strong)
+        t, found = meet(objects, nodes, o, d, INFINITY, 0.0, found)
+    return total, depth, facing, identity, own
+
+
+def _build(sources: int):
+    """The entry points. Numba's cache on disk looks at this file only; `sources`, being part of the compiled functions,
+    renews it when any file of the tracer changes."""
+
+    @njit(cache=True, **FAST)
+    def trace(arrays, origins, directions, radius, first, shaded, radiance, depth, normal, identity, reflectance):
+        objects, materials, lights, sky, nodes = arrays
+        for i in range(len(origins)):
+            ray = first + i + 0 * sources
+            c, t, n, k, own = look(
+                objects, materials, lights, sky[0], nodes, vec(origins[i]), vec(directions[i]), radius[i], shaded, ray
+            )
+            depth[i], identity[i] = t, k
+            for axis in range(3):
+                radiance[i, axis] = film(sky[0].exposure * c[axis])
+                normal[i, axis], reflectance[i, axis] = n[axis], own[axis]
+
+    @njit(cache=True, **FAST)
+    def signed_distance(arrays, points, out):
+        for i in range(len(points)):
+            out[i] = clearance(arrays.objects, arrays.nodes, vec(points[i]), INFINITY) + 0 * sources
+
+    return trace, signed_distance
+
+
+def _digest() -> int:
+    folder = Path(__file__).parent
+    text = b"".join((folder / f"{name}.py").read_bytes() for name in ("vector", "shapes", "textures", "tracer"))
+    return int.from_bytes(hashlib.sha256(text).digest()[:6], "big")
+
+
+trace, signed_distance = _build(_digest())
