@@ -5,10 +5,11 @@ LUMIGRAPH_DEBUG=1 shows where in the code a fault was noticed.
 
 from __future__ import annotations
 
+import contextlib
 import os
 import sys
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -25,7 +26,7 @@ from .commands.render import Render
 from .commands.report import Report
 from .commands.resume import Resume
 from .commands.train import Train, with_options_of
-from .errors import LumigraphError
+from .errors import LumigraphError, LumigraphWarning
 from .files import refusal
 
 COMMANDS: dict[str, type] = {
@@ -52,9 +53,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if arguments in (["--version"], ["-V"]):
         print(f"lumigraph {__version__}")
         return 0
-    warnings.showwarning = lambda message, *_, **__: say(f"warning: {message}")
     try:
-        return parse(arguments).run()
+        with told_warnings():
+            return parse(arguments).run()
     except LumigraphError as error:
         return refuse(str(error))
     except KeyboardInterrupt:
@@ -68,6 +69,18 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if type(error).__name__ != "OutOfMemoryError":
             raise
         return refuse("The device's memory is full; use a larger --downscale, or --device cpu")
+
+
+@contextlib.contextmanager
+def told_warnings() -> Iterator[None]:
+    """Say our own warnings in a line each; those of libraries are for developers."""
+    debugging = bool(os.environ.get("LUMIGRAPH_DEBUG"))
+    with warnings.catch_warnings():
+        if not debugging:
+            warnings.simplefilter("ignore")
+            warnings.simplefilter("always", LumigraphWarning)
+            warnings.showwarning = lambda message, *_, **__: say(f"warning: {message}")
+        yield
 
 
 def refuse(sentence: str, code: int = 2) -> int:

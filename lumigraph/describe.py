@@ -22,8 +22,10 @@ def run_tree(run: Run) -> Tree:
         rows = {"step": state.step, "seconds": state.seconds, "compiling, beside": state.compile_seconds}
         branch(tree, "trained", rows | {"budget": config["budget"], "seed": config["seed"], "on": config["device"]})
     if evaluation := run.evaluation():
-        names = ("psnr", "ssim", "seconds_per_view")
-        branch(tree, "evaluated", {name: evaluation[name] for name in names} | evaluation["protocol"])
+        rows = {name: evaluation[name] for name in ("psnr", "ssim", "seconds_per_view")}
+        branch(
+            tree, "evaluated", rows | {name: evaluation["protocol"][name] for name in ("split", "views", "resolution")}
+        )
     found = sorted(
         path for path in run.folder.rglob("*") if path.is_file() and path.suffix in (".mp4", ".html", ".png")
     )

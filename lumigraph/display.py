@@ -32,7 +32,7 @@ class TrainingDisplay:
             SpinnerColumn(), TextColumn("[bold]{task.description}"), BarColumn(24),
             TextColumn("{task.percentage:>3.0f} %"), TextColumn("{task.fields[figures]}"),
         )  # fmt: skip
-        self.bar = Progress(*columns, console=self.console, refresh_per_second=1 / REFRESH, disable=not self._live)
+        self.bar = Progress(*columns, console=self.console, refresh_per_second=1 / REFRESH)
         self.task = self.bar.add_task("Starting", total=1.0, figures="")
         self.error: float | None = None  # smoothed squared error
         self._seen: tuple[int, float] | None = None  # step and seconds at the last look
@@ -44,11 +44,13 @@ class TrainingDisplay:
         return self.show and self.terminal
 
     def __enter__(self) -> TrainingDisplay:
-        self.bar.start()
+        if self._live:
+            self.bar.start()
         return self
 
     def __exit__(self, *fault: object) -> None:
-        self.bar.stop()
+        if self._live:
+            self.bar.stop()
 
     def say(self, text: str) -> None:
         """What is going on, ahead of the first step."""
@@ -119,8 +121,10 @@ def track(items: Iterable[T], description: str, total: int) -> Iterator[T]:
     console = Console(stderr=True)
     if not console.is_terminal:
         print(f"{description} ({total})", file=sys.stderr, flush=True)
+        yield from items
+        return
     columns = (TextColumn("[bold]{task.description}"), BarColumn(24), MofNCompleteColumn(), TimeRemainingColumn(True))
-    with Progress(*columns, console=console, disable=not console.is_terminal, transient=True) as bar:
+    with Progress(*columns, console=console, transient=True) as bar:
         yield from bar.track(items, total=total, description=description)
 
 

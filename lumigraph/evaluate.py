@@ -77,7 +77,7 @@ class Evaluation:
             depth = colour_depth(seen.depth, seen.opacity, depth_range(seen.depth, seen.opacity))
             pictures = [photograph, seen.rgb, colour_error(photograph, seen.rgb), depth]
             rows.append(Row(f"worst: {label}" if name == worst and len(self.views) > 1 else label, pictures))
-        return contact_sheet(title, ["photograph", "rendering", f"error × {ERROR_GAIN}", "depth"], rows)
+        return contact_sheet(title, ["photograph", "rendering", f"{ERROR_GAIN}x error", "depth"], rows)
 
 
 def evaluate(

@@ -24,8 +24,10 @@ from .scene import Frame
 Poses = Float[Tensor, "frame 3 4"]
 
 FULL_CIRCLE = math.radians(260)  # of azimuth that must be covered for a path to go all the way round
-SHARPNESS = 6.0  # of the weights with which nearby cameras set a path's height and distance (von Mises)
-FRAMES_PER_KEY = 12  # interpolated frames between two photographs, at least
+UP = torch.tensor([0.0, 0.0, 1.0], dtype=torch.double)  # scenes stand upright
+SHARPNESS = 4.0  # of the weights with which nearby cameras set a path's height and distance (von Mises)
+OUTLYING = 4.0  # median deviations of log distance beyond which a camera does not count
+FRAMES_PER_KEY = 6  # interpolated frames between two photographs, at least
 WIDEST, NARROWEST = 75.0, 20.0  # degrees, of a film's smaller angle of view
 
 
@@ -87,22 +89,12 @@ class Surroundings:
         return torch.linalg.solve(across.mean(0) + loose, target)
 
     @cached_property
-    def up(self) -> Float[Tensor, " 3"]:
-        """Square to the cameras' right, as far as that tells; otherwise the cameras' mean upward direction."""
-        right, up = self.cameras.pose[:, :, 0].double().cpu(), -self.cameras.pose[:, :, 1].double().cpu()
-        level = right.T @ right / len(right) + 0.01 * torch.eye(3, dtype=torch.double)
-        above = unit(self.position.mean(0) - self.focus)  # decides where all look straight down
-        return unit(torch.linalg.solve(level, up.mean(0) + 0.05 * above))
-
-    @cached_property
     def axes(self) -> Float[Tensor, "3 3"]:
         """Rows: towards azimuth 0, towards azimuth 90 degrees, up. Azimuth 0 is where the cameras are, on average."""
         towards = (self.position - self.focus if self.inward else self.forward).mean(0)
-        towards = towards - (towards @ self.up) * self.up
-        if towards.norm() < 1e-6:
-            towards = torch.linalg.cross(self.up, torch.eye(3, dtype=torch.double)[self.up.abs().argmin()])
-        first = unit(towards)
-        return torch.stack([first, torch.linalg.cross(self.up, first), self.up])
+        level = torch.stack([towards[0], towards[1], torch.zeros((), dtype=torch.double)])
+        first = unit(level) if level.norm() > 1e-6 else torch.tensor([1.0, 0.0, 0.0], dtype=torch.double)
+        return torch.stack([first, torch.linalg.cross(UP, first), UP])
 
     @cached_property
     def inward(self) -> bool:
@@ -131,7 +123,9 @@ class Surroundings:
 
     def typical(self, azimuth: Float[Tensor, " frame"]) -> tuple[Tensor, Tensor]:
         """Elevation and log distance of the cameras near each azimuth."""
-        near = torch.exp(SHARPNESS * (torch.cos(azimuth[:, None] - self.polar[:, 0]) - 1)) + 1e-6
+        away = (self.polar[:, 2] - self.polar[:, 2].median()).abs()
+        ordinary = away <= OUTLYING * away.median() + 0.1
+        near = ordinary * torch.exp(SHARPNESS * (torch.cos(azimuth[:, None] - self.polar[:, 0]) - 1)) + 1e-9
         near = near / near.sum(-1, keepdim=True)
         return near @ self.polar[:, 1], near @ self.polar[:, 2]
 
@@ -146,8 +140,8 @@ class Surroundings:
         level = elevation.cos()
         outward = torch.stack([level * azimuth.cos(), level * azimuth.sin(), elevation.sin()], -1) @ self.axes
         if self.inward:
-            return look_at(self.focus + log_distance.exp()[:, None] * outward, -outward, self.up)
-        return look_at(self.position.median(0).values.expand(len(outward), 3), outward, self.up)
+            return look_at(self.focus + log_distance.exp()[:, None] * outward, -outward, UP)
+        return look_at(self.position.median(0).values.expand(len(outward), 3), outward, UP)
 
 
 def orbit(around: Surroundings, frames: int) -> Poses:

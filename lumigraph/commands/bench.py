@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Annotated, Literal
 
 from tyro.conf import Positional
 
-from .common import needed
+from .common import choose_device, needed, option
 
 
 @dataclass(frozen=True)
@@ -17,8 +18,13 @@ class Bench:
     what: Annotated[Positional[Literal["kernels"]], needed("kernels")] = "kernels"
     """What to measure."""
 
+    output: Annotated[Path | None, option("FILE.json", "the table alone")] = None
+    """Also write the figures there."""
+    device: Annotated[str, option("NAME")] = "auto"
+    """auto, cpu, cuda, cuda:1."""
+
     def run(self) -> int:
         from ..kernels.bench import bench_kernels
 
-        bench_kernels()
+        bench_kernels(device=choose_device(self.device), output=self.output)
         return 0

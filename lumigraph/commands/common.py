@@ -7,13 +7,14 @@ import re
 import sys
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import tyro
 from rich.console import Console
-from rich.table import Table
 
 from ..errors import LumigraphError
+
+Reader = Literal["transforms", "blender", "colmap", "llff"]
 
 
 def option(metavar: str, default: str | None = None) -> Any:
@@ -41,19 +42,6 @@ def choose_device(name: str) -> Any:
     return device
 
 
-def open_with_warnings(source: str, **options: Any) -> Any:
-    """A Scene, with what should be known about it on stderr."""
-    from ..capture import open_scene
-
-    return tell_warnings(open_scene(source, **options))
-
-
-def tell_warnings(scene: Any) -> Any:
-    for warning in scene.warnings:
-        say(f"warning: {warning}")
-    return scene
-
-
 def say(text: str) -> None:
     """To stderr, where it does not mix with results."""
     print(text, file=sys.stderr, flush=True)
@@ -61,11 +49,9 @@ def say(text: str) -> None:
 
 def show(rows: Mapping[str, str]) -> None:
     """Results, one to a line, names aligned."""
-    console = Console(highlight=False, soft_wrap=True)
-    table = Table.grid(padding=(0, 2))
+    console, width = Console(highlight=False, soft_wrap=True), max(map(len, rows))
     for name, value in rows.items():
-        table.add_row(f"[dim]{name}[/dim]", value)
-    console.print(table)
+        console.print(f"[dim]{name:<{width}}[/dim]  {value}")
 
 
 def scene_name(source: str) -> str:

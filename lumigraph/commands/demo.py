@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Annotated
 
 from ..errors import LumigraphError
-from .common import choose_device, exit_code, next_free, open_with_warnings, option, say, show
+from .common import choose_device, exit_code, next_free, option, say, show
 
 FRAMES = 90
 
@@ -34,6 +34,7 @@ class Demo:
 
     def run(self) -> int:
         from .. import methods
+        from ..capture import open_scene
         from ..export.film import film
         from ..report import write_report
         from ..run import Run, build, check_new
@@ -48,7 +49,7 @@ class Demo:
         check_new(output)
 
         say(f"Photographing {self.scene}")
-        scene = open_with_warnings(self.scene)
+        scene = open_scene(self.scene)
         method = build(kind, scene.frame, kind.preset(device), device, seed=0)
         run = Run.create(output, method, scene, budget={"seconds": self.seconds})
         outcome = fit(method, scene, run, seconds=self.seconds)

@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 
 from tyro.conf import Positional
 
-from .common import choose_device, needed, option, scene_name, show, tell_warnings
+from .common import choose_device, needed, option, scene_name, show
 
 
 @dataclass(frozen=True)
@@ -35,7 +35,7 @@ class Eval:
 
         run = Run(self.run_folder)
         method = run.method(choose_device(self.device))
-        result = evaluate_run(run, method, tell_warnings(run.scene(self.scene)), self.split, self.save_images)
+        result = evaluate_run(run, method, run.scene(self.scene), self.split, self.save_images)
         protocol = result["protocol"]
         show(
             {

@@ -9,7 +9,7 @@ from typing import Annotated
 from rich.console import Console
 from tyro.conf import Positional
 
-from .common import needed, open_with_warnings, option
+from .common import Reader, needed, option
 
 
 @dataclass(frozen=True)
@@ -20,8 +20,11 @@ class Info:
     """Folder of a run, folder of photographs, or procedural:NAME."""
     downscale: Annotated[int | None, option("N", "none, or what suits the photographs")] = None
     """Shrink a scene's photographs by a whole number."""
+    reader: Annotated[Reader | None, option("NAME", "found by looking into the folder")] = None
+    """Layout of a scene's folder: transforms, blender, colmap or llff."""
 
     def run(self) -> int:
+        from ..capture import open_scene
         from ..describe import run_tree, scene_tree
 
         if (Path(self.what) / "config.json").exists():
@@ -29,6 +32,6 @@ class Info:
 
             tree = run_tree(Run(self.what))
         else:
-            tree = scene_tree(open_with_warnings(self.what, downscale=self.downscale))
+            tree = scene_tree(open_scene(self.what, downscale=self.downscale, reader=self.reader))
         Console(highlight=False, soft_wrap=True).print(tree)
         return 0

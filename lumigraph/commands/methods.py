@@ -13,5 +13,5 @@ class Methods:
     """List the methods that are installed."""
 
     def run(self) -> int:
-        show({f"[/dim][bold]{name}[/bold][dim]": methods.summary(name) for name in methods.available()})
+        show({name: methods.summary(name) for name in methods.available()})
         return 0

@@ -9,7 +9,7 @@ from typing import Annotated
 from tyro.conf import Positional
 
 from ..errors import LumigraphError
-from .common import choose_device, exit_code, needed, option, tell_warnings
+from .common import choose_device, exit_code, needed, option
 
 
 @dataclass(frozen=True)
@@ -49,7 +49,7 @@ class Resume:
                 f"give a larger total by --steps or --seconds"
             )
         device = choose_device(run.config["device"] if self.device == "same" else self.device)
-        method, scene = run.new_method(device), tell_warnings(run.scene(self.scene))
+        method, scene = run.new_method(device), run.scene(self.scene)
         if budget != run.config["budget"]:
             run.set_budget(**budget)
         outcome = fit(method, scene, run, **budget, seed=run.config["seed"], pause_at=self.pause_at)

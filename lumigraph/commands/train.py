@@ -10,7 +10,17 @@ from tyro.conf import Fixed, OmitArgPrefixes, Positional, Suppress
 
 from .. import methods
 from ..errors import LumigraphError
-from .common import choose_device, exit_code, needed, next_free, open_with_warnings, option, say, scene_name, show
+from .common import (
+    Reader,
+    choose_device,
+    exit_code,
+    needed,
+    next_free,
+    option,
+    say,
+    scene_name,
+    show,
+)
 
 DEFAULT_SECONDS = 60.0
 
@@ -35,6 +45,8 @@ class Train:
     """Train for so many steps instead."""
     downscale: Annotated[int | None, option("N", "none, or what suits the photographs")] = None
     """Shrink photographs by a whole number."""
+    reader: Annotated[Reader | None, option("NAME", "found by looking into the folder")] = None
+    """Layout of the folder: transforms, blender, colmap or llff."""
     seed: Annotated[int, option("N")] = 0
     """Of all random choices."""
     device: Annotated[str, option("NAME")] = "auto"
@@ -45,6 +57,7 @@ class Train:
     """Stop at this step as if interrupted. The schedule still follows the whole budget."""
 
     def run(self) -> int:
+        from ..capture import open_scene
         from ..run import Run, build, check_new
         from ..train import fit
 
@@ -53,12 +66,13 @@ class Train:
         kind, device = methods.find(self.method), choose_device(self.device)
         output = self.output or next_free(f"runs/{scene_name(self.scene)}-{methods.check(self.method)}")
         check_new(output)
-        scene = open_with_warnings(self.scene, downscale=self.downscale)
+        options = {"downscale": self.downscale, "reader": self.reader}
+        scene = open_scene(self.scene, **options)
         config = self.method_config(kind)
         seed = getattr(config, "seed", self.seed)
         method = build(kind, scene.frame, config, device, seed)
         budget = {"steps": self.steps} if self.steps is not None else {"seconds": self.seconds or DEFAULT_SECONDS}
-        run = Run.create(output, method, scene, seed=seed, options={"downscale": self.downscale}, budget=budget)
+        run = Run.create(output, method, scene, seed=seed, options=options, budget=budget)
         outcome = fit(method, scene, run, **budget, seed=seed, pause_at=self.pause_at)
         tell_outcome(run, outcome)
         return exit_code(outcome.signal)
@@ -77,7 +91,9 @@ def with_options_of(name: str, device: str, preset: str) -> type[Train]:
     """The command with a method's own numbers among its options."""
     kind = methods.find(name)
     default = kind.preset(preset_device(device, preset))
-    extra: list[Any] = [(option_group(name), Annotated[kind.Config, OmitArgPrefixes], dataclasses.field(default=default))]
+    extra: list[Any] = [
+        (option_group(name), Annotated[kind.Config, OmitArgPrefixes], dataclasses.field(default=default))
+    ]
     for common in dataclasses.fields(Train):  # where a method has a number of that name, it is the one to ask for
         if common.name in {field.name for field in dataclasses.fields(kind.Config)}:
             extra.append((common.name, Annotated[Any, Fixed, Suppress], dataclasses.field(default=common.default)))
