@@ -79,5 +79,5 @@ def alike(a: Any, b: Any, tolerance: float = 1e-4) -> bool:
         case ((list() | tuple()), (list() | tuple())):
             return len(a) == len(b) and all(alike(x, y, tolerance) for x, y in zip(a, b, strict=True))
         case ((int() | float()), (int() | float())):
-            return abs(a - b) <= tolerance * max(1.0, abs(a))
-    return a == b
+            return bool(abs(a - b) <= tolerance * max(1.0, abs(a)))
+    return bool(a == b)

@@ -42,6 +42,28 @@ def choose_device(name: str) -> Any:
     return device
 
 
+def budget_of(steps: int | None, seconds: float | None) -> dict[str, Any]:
+    """What --steps and --seconds say, as fit() takes it; empty if they say nothing."""
+    from ..train import Budget
+
+    if steps is not None and seconds is not None:
+        raise LumigraphError("--steps and --seconds are two ways to say how long; give one of them")
+    told = {name: value for name, value in (("steps", steps), ("seconds", seconds)) if value is not None}
+    if told:
+        Budget(steps, seconds)  # refuses what makes no sense, before anything is opened
+    return told
+
+
+def check_film(frames: int | None, fps: float, longest: int) -> None:
+    """Refuse films that cannot be, before anything is rendered."""
+    if frames is not None and frames < 1:
+        raise LumigraphError(f"A film cannot have {frames} frames; give --frames a number above 0")
+    if not 0 < fps <= 1000:
+        raise LumigraphError(f"A film cannot show {fps:g} frames per second; give --fps a number from 1 to 1000")
+    if longest < 16:
+        raise LumigraphError(f"A film of {longest} pixels shows nothing; give --size at least 16")
+
+
 def say(text: str) -> None:
     """To stderr, where it does not mix with results."""
     print(text, file=sys.stderr, flush=True)

@@ -6,8 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
-from ..errors import LumigraphError
-from .common import choose_device, exit_code, next_free, option, say, show
+from .common import budget_of, check_film, choose_device, exit_code, next_free, option, say, show
 
 FRAMES = 90
 
@@ -42,8 +41,8 @@ class Demo:
         from .eval import evaluate_run
         from .render import film_cameras
 
-        if self.frames < 1:
-            raise LumigraphError(f"A film cannot have {self.frames} frames; give --frames a number above 0")
+        budget = budget_of(None, self.seconds)
+        check_film(self.frames, fps=30, longest=480)
         kind, device = methods.find(self.method), choose_device(self.device)
         output = self.output or next_free("demo/run")
         check_new(output)
@@ -51,8 +50,8 @@ class Demo:
         say(f"Photographing {self.scene}")
         scene = open_scene(self.scene)
         method = build(kind, scene.frame, kind.preset(device), device, seed=0)
-        run = Run.create(output, method, scene, budget={"seconds": self.seconds})
-        outcome = fit(method, scene, run, seconds=self.seconds)
+        run = Run.create(output, method, scene, budget=budget)
+        outcome = fit(method, scene, run, **budget)
         if outcome.signal is not None:
             say(f"Stopped and saved after step {outcome.state.step}; go on with: lumigraph resume {run.folder}")
             return exit_code(outcome.signal)

@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal
 from tyro.conf import Positional
 
 from ..errors import LumigraphError
-from .common import choose_device, needed, option, show
+from .common import check_film, choose_device, needed, option, show
 
 PathName = Literal["orbit", "spiral", "interpolate", "held-out"]
 
@@ -41,6 +41,7 @@ class Render:
         from ..export.film import film
         from ..run import Run
 
+        check_film(self.frames, self.fps, self.size)
         run = Run(self.run_folder)
         output = self.output or run.folder / "renders" / f"{self.path}.mp4"
         if output.suffix != ".mp4":
@@ -64,8 +65,6 @@ def film_cameras(run: Any, path: str, frames: int | None, longest: int) -> Any:
     """The cameras of a film of a Run, one for each frame."""
     from ..paths import camera_path, film_size
 
-    if longest < 16:
-        raise LumigraphError(f"A film of {longest} pixels shows nothing; give --size at least 16")
     cameras = run.cameras()
     if path != "held-out":
         train = cameras["train"]

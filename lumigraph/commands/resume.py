@@ -9,7 +9,7 @@ from typing import Annotated
 from tyro.conf import Positional
 
 from ..errors import LumigraphError
-from .common import choose_device, exit_code, needed, option
+from .common import budget_of, choose_device, exit_code, needed, option
 
 
 @dataclass(frozen=True)
@@ -34,14 +34,8 @@ class Resume:
         from ..train import Budget, fit
         from .train import tell_outcome
 
-        if self.steps is not None and self.seconds is not None:
-            raise LumigraphError("--steps and --seconds are two ways to say how long; give one of them")
         run = Run(self.run_folder)
-        budget = run.config["budget"]
-        if self.steps is not None:
-            budget = {"steps": self.steps}
-        elif self.seconds is not None:
-            budget = {"seconds": self.seconds}
+        budget = budget_of(self.steps, self.seconds) or run.config["budget"]
         state = run.state if run.has_state else None
         if state and Budget(budget.get("steps"), budget.get("seconds")).progress(state.step, state.seconds) >= 1:
             raise LumigraphError(

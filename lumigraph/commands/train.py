@@ -9,9 +9,9 @@ from typing import Annotated, Any, Literal
 from tyro.conf import Fixed, OmitArgPrefixes, Positional, Suppress
 
 from .. import methods
-from ..errors import LumigraphError
 from .common import (
     Reader,
+    budget_of,
     choose_device,
     exit_code,
     needed,
@@ -61,17 +61,15 @@ class Train:
         from ..run import Run, build, check_new
         from ..train import fit
 
-        if self.steps is not None and self.seconds is not None:
-            raise LumigraphError("--steps and --seconds are two ways to say how long; give one of them")
+        budget = budget_of(self.steps, self.seconds) or {"seconds": DEFAULT_SECONDS}
         kind, device = methods.find(self.method), choose_device(self.device)
         output = self.output or next_free(f"runs/{scene_name(self.scene)}-{methods.check(self.method)}")
         check_new(output)
-        options = {"downscale": self.downscale, "reader": self.reader}
+        options: dict[str, Any] = {"downscale": self.downscale, "reader": self.reader}
         scene = open_scene(self.scene, **options)
         config = self.method_config(kind)
         seed = getattr(config, "seed", self.seed)
         method = build(kind, scene.frame, config, device, seed)
-        budget = {"steps": self.steps} if self.steps is not None else {"seconds": self.seconds or DEFAULT_SECONDS}
         run = Run.create(output, method, scene, seed=seed, options=options, budget=budget)
         outcome = fit(method, scene, run, **budget, seed=seed, pause_at=self.pause_at)
         tell_outcome(run, outcome)
