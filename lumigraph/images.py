@@ -12,7 +12,8 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -41,6 +42,10 @@ class Picture:
     size: tuple[int, int]
     read: Callable[[], tuple[np.ndarray, np.ndarray | None]]
     identity: str | None = None
+
+
+def pair(image: np.ndarray, mask: np.ndarray | None) -> tuple[np.ndarray, np.ndarray | None]:
+    return image, mask
 
 
 @dataclass(frozen=True)
@@ -113,7 +118,7 @@ class ImageStore:
     def from_arrays(cls, images: Sequence[np.ndarray], masks: Sequence[np.ndarray | None] | None = None) -> ImageStore:
         """Pictures that are already here: uint8 (height, width, 3 or 4), and optionally which pixels to trust."""
         pairs = zip(images, masks or [None] * len(images), strict=True)
-        return cls.load([Picture(i.shape[1::-1], lambda i=i, m=m: (i, m)) for i, m in pairs], memory=sys.maxsize)
+        return cls.load([Picture((i.shape[1], i.shape[0]), partial(pair, i, m)) for i, m in pairs], memory=sys.maxsize)
 
     def __len__(self) -> int:
         return len(self.sizes)
@@ -136,18 +141,22 @@ class ImageStore:
         width, height = self.sizes[index].tolist()
         return self._trusted.mask(index, width * height).view(height, width)
 
+    @property
+    def trusted_pixels(self) -> Int[Tensor, " image"]:
+        """How many pixels of each image may be learnt from."""
+        return self._count
+
     def draw(self, count: int, images: Int[Tensor, " choice"], generator: torch.Generator) -> Drawn:
         """Random pixels: each of the given images as likely as the next, each trusted pixel of it as well."""
         piece = min(max(count // PIECES, SHORTEST_PIECE), LONGEST_PIECE) if self.shuffled else 1
         chance = torch.rand(-(-count // piece), dtype=torch.float64, generator=generator)
-        drawn = Drawn(
-            torch.empty(count, dtype=torch.int64), torch.empty(count, 2), torch.empty(count, dtype=torch.int32)
-        )
+        image, xy = torch.empty(count, dtype=torch.int64), torch.empty(count, 2)
+        rgba = torch.empty(count, 4, dtype=torch.uint8)
         nothing = torch.empty(0, dtype=torch.int64)
         runs = (nothing,) * 4 if self._trusted is None else self._trusted.columns()
         inputs = (chance, images, self._first, self._count, self._stride, self._width, *runs, self._rgba)
-        look_up(piece, *(x.numpy() for x in (*inputs, drawn.image, drawn.xy, drawn.rgba)))
-        return replace(drawn, rgba=drawn.rgba[:, None].view(torch.uint8))
+        look_up(piece, *(x.numpy() for x in (*inputs, image, xy, rgba.view(torch.int32)[:, 0])))
+        return Drawn(image, xy, rgba)
 
 
 @dataclass(frozen=True)
@@ -159,7 +168,7 @@ class Runs:
     before: Int[Tensor, " run"]
     count: Int[Tensor, " image"]
 
-    def columns(self) -> tuple[Tensor, Tensor, Tensor]:
+    def columns(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """start, before, the trusted pixels ahead of each image, and each image's first run, one longer than images."""
         ahead = self.count.cumsum(0) - self.count
         first_run = torch.searchsorted(self.before, torch.cat([ahead, self.count.sum()[None]]))
@@ -249,8 +258,8 @@ def write_store(folder: Path, total: int, pictures: Sequence[Picture], progress:
             has_alpha, trusted = fill(rgba, pictures, progress, shuffled=True)
             rgba.flush()
             if trusted is not None:
-                runs = {"start": trusted.start, "before": trusted.before, "count": trusted.count}
-                np.savez(part / "trusted.npz", **{k: v.numpy() for k, v in runs.items()})
+                start, before, count = (x.numpy() for x in (trusted.start, trusted.before, trusted.count))
+                np.savez(part / "trusted.npz", start=start, before=before, count=count)
             about = {"has_alpha": has_alpha, "trusted": trusted is not None}
             (part / "store.json").write_text(json.dumps(about))
             if not (folder / "store.json").exists():  # else another process was quicker
@@ -276,7 +285,7 @@ def full_disk_told(path: Path, size: int) -> Iterator[None]:
     except OSError as fault:
         raise LumigraphError(
             f"{path.parent}: cannot keep {size / 1e9:.1f} GB of decoded images here ({fault.strerror or fault}); "
-            f"free some space, set LUMIGRAPH_CACHE to a folder on another disk, or use a larger --downscale."
+            f"free some space, set LUMIGRAPH_CACHE to a folder on another disk, or use a larger --downscale"
         ) from fault
 
 

@@ -58,6 +58,11 @@ def assemble(
     lenses = [fitted_lens(shot, c) for shot, c in zip(shots, chosen, strict=True)]
     with progress(f"Reading {Path(capture.source).name}", len(shots)) as done:
         images = ImageStore.load(masked_by_lens([c.picture for c in chosen], lenses), memory, cache, done)
+    for shot, pixels in zip(shots, images.trusted_pixels.tolist(), strict=True):
+        if not pixels:
+            raise LumigraphError(
+                f"{capture.source}: the mask of {shot.name} trusts no pixel; correct it or remove the photograph"
+            )
 
     # Single precision is for what is near the origin: maps may put a capture hundreds of kilometres away.
     away = poses[:, :, 3].mean(0)
@@ -167,7 +172,8 @@ def masked_by_lens(pictures: list[Picture], lenses: list[Lens]) -> list[Picture]
         key = (str(lens.to_json()), picture.size)
         if key not in known:
             known[key] = within_reach(lens, picture.size)
-        masked.append(picture if known[key] is None else with_mask(picture, known[key], key[0]))
+        trusted = known[key]
+        masked.append(picture if trusted is None else with_mask(picture, trusted, key[0]))
     return masked
 
 
@@ -242,4 +248,5 @@ def progress(label: str, total: int) -> Iterator[Callable[[int], None]]:
     try:
         yield done
     finally:
-        bar.stop()
+        if bar.live.is_started:  # otherwise stop() would print an empty line
+            bar.stop()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 from pathlib import Path
 
 import numpy as np
@@ -12,13 +13,14 @@ from ..errors import LumigraphError
 from ..lens import Equirectangular, Fisheye, Lens, OpenCV, Pinhole
 from .capture import Capture, Shot
 from .pictures import reductions, versions
-from .points import Points
+from .points import Points, read_points3d
 
 PLACES = ("sparse/0", "sparse", "colmap/sparse/0", "colmap/sparse", "colmap", ".")
 LOOKED_FOR = "sparse/0 with cameras, images and points3D, .bin or .txt (COLMAP)"
 
-# How each model's parameters become (fx fy cx cy) and the distortion of our lenses: a place in COLMAP's list each.
-FOCAL = {1: (0, 0, 1, 2), 2: (0, 1, 2, 3)}
+# COLMAP's list of parameters begins with one focal length or two and the centre. For each model, which it is, and where
+# the rest of the list has what our lenses call their distortion.
+FOCAL_AND_CENTRE = {1: (0, 0, 1, 2), 2: (0, 1, 2, 3)}
 PLANAR = {
     "SIMPLE_PINHOLE": (1, ()),
     "PINHOLE": (2, ()),
@@ -53,7 +55,7 @@ def read(folder: Path) -> Capture:
     """Raises LumigraphError for a damaged model, a camera model our lenses cannot follow, and absent image folders."""
     place = model_folder(folder)
     assert place is not None
-    model = read_model(folder)
+    model = read_model(place)
     images = sorted((image for image in model.images.values() if image.has_pose), key=lambda image: image.name)
     names = [image.name for image in images]
     root = next((folder / n for n in ("images", "input") if reductions(folder / n)), folder)
@@ -70,17 +72,45 @@ def read(folder: Path) -> Capture:
         raise LumigraphError(
             f"{root} holds none of the {len(names)} photographs that {place} lists, such as {names[0]}"
         )
-    cloud = points(model)
+    cloud = read_points(place, model)
     return Capture(str(folder), shots, cloud.positions, cloud.colours, cloud.sightings, missing)
 
 
-def read_model(folder: Path) -> pycolmap.Reconstruction:
-    place = model_folder(folder)
+def read_model(place: Path) -> pycolmap.Reconstruction:
+    """Raises LumigraphError for what is no whole model."""
     try:
-        return pycolmap.Reconstruction(place)
+        if (place / "images.bin").is_file():
+            check_whole(place / "images.bin")
+            read_points3d(place / "points3D.bin")
+        model = pycolmap.Reconstruction(place)
+        if (place / "cameras.bin").is_file():
+            wanted = 8 + sum(24 + 8 * len(camera.params) for camera in model.cameras.values())
+            if (place / "cameras.bin").stat().st_size < wanted:
+                raise ValueError("cameras.bin ends early")
+        return model
+    except LumigraphError:
+        raise
     except Exception as fault:
         reason = " ".join(str(fault).split()) or type(fault).__name__
         raise LumigraphError(f"{place} holds no readable COLMAP model ({reason}); make or copy it again") from fault
+
+
+def check_whole(path: Path) -> None:
+    """Walk through images.bin: pycolmap would ask for all the memory there is to read a file that ends early.
+
+    Per image an id, a pose of seven numbers, a camera, a name that ends in zero, and a list of (x, y, point).
+    """
+    data = path.read_bytes()
+    try:
+        (count,), offset = struct.unpack_from("<Q", data), 8
+        for _ in range(count):
+            name_ends = data.index(b"\0", offset + 64)
+            (features,) = struct.unpack_from("<Q", data, name_ends + 1)
+            offset = name_ends + 9 + 24 * features
+        if offset > len(data):
+            raise ValueError("it ends early")
+    except (struct.error, ValueError) as fault:
+        raise LumigraphError(f"{path} is truncated; make or copy the model again") from fault
 
 
 def positions(model: pycolmap.Reconstruction) -> dict[str, np.ndarray]:
@@ -88,7 +118,9 @@ def positions(model: pycolmap.Reconstruction) -> dict[str, np.ndarray]:
     return {i.name: i.cam_from_world().inverse().translation for i in model.images.values() if i.has_pose}
 
 
-def points(model: pycolmap.Reconstruction) -> Points:
+def read_points(place: Path, model: pycolmap.Reconstruction) -> Points:
+    if (place / "images.bin").is_file():
+        return read_points3d(place / "points3D.bin")  # much quicker than asking the model for each
     found = list(model.points3D.values())
     return Points(
         np.array([p.xyz for p in found], np.float64).reshape(-1, 3),
@@ -113,7 +145,9 @@ def read_lens(camera: pycolmap.Camera, place: Path) -> Lens:
             f"run COLMAP's image_undistorter and use its folder"
         )
     focals, bends = (PLANAR | FISHEYE)[kind]
-    four = p[list(FOCAL[focals])]
+    four = p[list(FOCAL_AND_CENTRE[focals])]
+    if not (p.isfinite().all() and (four[:2] > 0).all()):
+        raise LumigraphError(f"{place}: camera {camera.camera_id} has unusable parameters {camera.params_to_string()}")
     distortion = torch.zeros(1, 8 if kind in PLANAR else 4)
     distortion[0, : len(bends)] = p[list(bends)]
     if kind in FISHEYE:

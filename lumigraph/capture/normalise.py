@@ -25,6 +25,7 @@ UNKNOWN_REACH = 16.0  # of a capture without points
 HELD = 0.99  # share of sightings that the reach must hold
 CONVERGING = 0.02  # mean squared sine between optical axes from which on they tell where they meet: 8 degrees
 BOX_SHARE = 0.5  # of the distance from which things are looked at: half-size of the box of interest
+SAME_WAY = 0.5  # length of the mean viewing direction, below which cameras look around themselves rather than one way
 BEFORE_NEAREST = 0.4  # rays begin at this share of the distance to the nearest thing seen
 SMALLEST_NEAR = 1e-3
 SAMPLED_POINTS, SAMPLED_CAMERAS = 5000, 64
@@ -97,30 +98,39 @@ def nearest_to_box(cameras: Camera, low: np.ndarray, high: np.ndarray) -> float:
 
 
 @dataclass(frozen=True)
+class Cloud:
+    """Sparse points in the turned frame, and how often each was seen."""
+
+    points: Float[np.ndarray, "point 3"]
+    weights: Float[np.ndarray, " point"]
+
+
+@dataclass(frozen=True)
 class Gaze:
     """What the cameras look at, in the turned frame.
 
     centre:     the middle of it
     distance:   typical, from the cameras
-    converging: whether their axes meet there; otherwise they look the same way, or around themselves
+    converging: whether their axes meet there
+    half:       half-size of a box that holds what matters most
     nearest:    distance of the nearest thing any of them sees
-    points, weights: sparse points and their sightings, if there are any
+    cloud:      sparse points, if there are any
     """
 
     centre: Float[np.ndarray, " 3"]
     distance: float
     converging: bool
+    half: float
     nearest: float
-    points: Float[np.ndarray, "point 3"] | None
-    weights: np.ndarray | None
+    cloud: Cloud | None
 
 
 def find_gaze(capture: Capture, cameras: Camera, upright: np.ndarray) -> Gaze:
     position, forward = cameras.position.double().numpy(), cameras.forward.double().numpy()
-    points, weights = reliable_points(capture, upright)
+    cloud = reliable_points(capture, upright)
     meeting, converging = where_axes_meet(position, forward)
-    if points is not None:
-        depths = visible_depths(cameras, points, weights)
+    depths = None if cloud is None else visible_depths(cameras, cloud)
+    if depths is not None:
         middle, nearest = (np.nanmedian(depths[:, 1]), np.nanpercentile(depths[:, 0], 2))
     elif all(shot.depths is not None for shot in capture.shots):
         stated = np.array([shot.depths for shot in capture.shots])
@@ -134,17 +144,19 @@ def find_gaze(capture: Capture, cameras: Camera, upright: np.ndarray) -> Gaze:
         centre, distance = meeting, float(np.median(np.linalg.norm(position - meeting, axis=-1)))
     else:
         centre, distance = (position + middle * forward).mean(0), float(middle)
-    return Gaze(centre, distance, converging, float(nearest), points, weights)
+    around = not converging and np.linalg.norm(forward.mean(0)) < SAME_WAY
+    half = distance if around else BOX_SHARE * distance  # from inside, all that is seen lies at that distance
+    return Gaze(centre, distance, converging, half, float(nearest), cloud)
 
 
 def open_place(capture: Capture, upright: np.ndarray, gaze: Gaze, background: Vector) -> Place:
     """A room or the open: a box in the middle of what is looked at, and cubes around it as far as the points go."""
-    centre, half = gaze.centre, BOX_SHARE * gaze.distance
+    centre, half = gaze.centre, gaze.half
     reach = UNKNOWN_REACH
-    if gaze.points is not None:
-        centre, half = settle(gaze.points, gaze.weights, centre, half)
-        radius = np.abs(gaze.points - centre).max(-1)
-        reach = power_of_two(quantile(radius, gaze.weights, HELD) / half)
+    if gaze.cloud is not None:
+        centre, half = settle(gaze.cloud, centre, half)
+        radius = np.abs(gaze.cloud.points - centre).max(-1)
+        reach = power_of_two(quantile(radius, gaze.cloud.weights, HELD) / half)
     elif all(shot.depths is not None for shot in capture.shots):
         farthest = max(shot.depths[1] for shot in capture.shots if shot.depths is not None)
         reach = power_of_two((farthest + gaze.distance) / half)
@@ -154,8 +166,9 @@ def open_place(capture: Capture, upright: np.ndarray, gaze: Gaze, background: Ve
     return Place(similarity(upright, centre, half), CUBE, reach, max(near / half, SMALLEST_NEAR), background)
 
 
-def settle(points: np.ndarray, weights: np.ndarray, centre: np.ndarray, half: float) -> tuple[np.ndarray, float]:
+def settle(cloud: Cloud, centre: np.ndarray, half: float) -> tuple[np.ndarray, float]:
     """Move a box to the middle of the points inside it, and shrink it where they are fewer than it could hold."""
+    points, weights = cloud.points, cloud.weights
     inside = np.abs(points - centre).max(-1) < half
     for _ in range(5):
         if weights[inside].sum() < 0.05 * weights.sum():
@@ -166,29 +179,33 @@ def settle(points: np.ndarray, weights: np.ndarray, centre: np.ndarray, half: fl
     return centre, min(half, 1.1 * filled)
 
 
-def reliable_points(capture: Capture, upright: np.ndarray) -> tuple[np.ndarray | None, np.ndarray | None]:
-    """The finite points that were seen at least twice, turned, and how often each was seen."""
+def reliable_points(capture: Capture, upright: np.ndarray) -> Cloud | None:
+    """The finite points that were seen at least twice, if there are enough to speak of."""
     if capture.points is None:
-        return None, None
+        return None
     sightings = np.full(len(capture.points), 2) if capture.sightings is None else capture.sightings
     keep = np.isfinite(capture.points).all(-1) & (sightings >= 2)
     if keep.sum() < 16:
-        return None, None
-    return capture.points[keep] @ upright[:3, :3].T, sightings[keep].astype(np.float64)
+        return None
+    return Cloud(capture.points[keep] @ upright[:3, :3].T, sightings[keep].astype(np.float64))
 
 
-def visible_depths(cameras: Camera, points: np.ndarray, weights: np.ndarray) -> Float[np.ndarray, "camera 2"]:
-    """Distance to the nearest (2nd percentile) and the middle of the points inside each picture; NaN where none are."""
-    chosen = np.linspace(0, len(points) - 1, min(SAMPLED_POINTS, len(points))).astype(int)
-    cloud, weight = torch.from_numpy(points[chosen]).float(), weights[chosen]
+def visible_depths(cameras: Camera, cloud: Cloud) -> Float[np.ndarray, "camera 2"] | None:
+    """Distance to the nearest (2nd percentile) and the middle of the points inside each picture.
+
+    NaN for a picture that none are in, None if that is so for all.
+    """
+    chosen = np.linspace(0, len(cloud.points) - 1, min(SAMPLED_POINTS, len(cloud.points))).astype(int)
+    points, weights = cloud.points[chosen], cloud.weights[chosen]
+    sampled = torch.from_numpy(points).float()
     depths = []
     for i in np.linspace(0, len(cameras) - 1, min(SAMPLED_CAMERAS, len(cameras))).round().astype(int).tolist():
         camera = cameras[i]
-        pixels, valid = camera.project(cloud)
+        pixels, valid = camera.project(sampled)
         inside = (valid & (pixels >= 0).all(-1) & (pixels < camera.size[0]).all(-1)).numpy()
-        away = np.linalg.norm(points[chosen[inside]] - camera.position[0].numpy(), axis=-1)
-        depths.append([quantile(away, weight[inside], q) if inside.any() else math.nan for q in (0.02, 0.5)])
-    return np.array(depths) if not np.isnan(depths).all() else np.ones((1, 2))
+        away = np.linalg.norm(points[inside] - camera.position[0].numpy(), axis=-1)
+        depths.append([quantile(away, weights[inside], q) if inside.any() else math.nan for q in (0.02, 0.5)])
+    return None if np.isnan(depths).all() else np.array(depths)
 
 
 def where_axes_meet(position: np.ndarray, forward: np.ndarray) -> tuple[np.ndarray, bool]:

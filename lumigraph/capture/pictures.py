@@ -57,8 +57,8 @@ def versions(folder: Path, names: list[str]) -> list[dict[int, Path]]:
     """
     found: list[dict[int, Path]] = [{} for _ in names]
     for times, place in reductions(folder).items():
-        files = [place / name for name in names]
-        if not all(file.is_file() for file in files):
+        files: list[Path | None] = [place / name for name in names]
+        if not all((place / name).is_file() for name in names):
             listed = list_images(place)
             by_stem = {stem(name): place / name for name in listed}
             if times > 1 and len(listed) == len(names) and by_stem.keys().isdisjoint(map(stem, names)):
@@ -163,7 +163,8 @@ def same_shape(a: Size, b: Size) -> bool:
 
 
 def stat(path: Path) -> str:
-    found = path.stat()
+    with readable(path):
+        found = path.stat()
     return f"{found.st_mtime_ns} {found.st_size}"
 
 
@@ -176,9 +177,8 @@ def measure(path: Path) -> tuple[Size, int | None]:
 def read_image(path: Path, turn: bool, size: Size) -> np.ndarray:
     """Pixels as uint8 (height, width, 3 or 4), upright if asked, area-averaged down to a size."""
     with readable(path), Image.open(path) as image:
-        if turn:
-            image = ImageOps.exif_transpose(image)
-        return np.asarray(resize(eight_bits(image), size))
+        upright = ImageOps.exif_transpose(image) if turn else image
+        return np.asarray(resize(eight_bits(upright), size))
 
 
 def eight_bits(image: Image.Image) -> Image.Image:
@@ -236,5 +236,7 @@ class readable:  # noqa: N801
 
 
 def describe(fault: Exception) -> str:
+    if isinstance(fault, OSError) and fault.strerror:
+        return fault.strerror.lower()
     text = " ".join(str(fault).split()).rstrip(".")
     return "unknown format" if "cannot identify" in text else text or type(fault).__name__

@@ -198,14 +198,15 @@ def find_points(folder: Path, whole: Json, shots: list[Shot], missing: list[str]
         if (folder / name).is_file():
             return read_ply(folder / name)
         missing.append(name)
-    if not colmap.recognises(folder):
+    place = colmap.model_folder(folder)
+    if place is None:
         return None
     positions = {Path(s.name).stem: s.pose[:, 3] for s in shots}
-    model = colmap.read_model(folder)
+    model = colmap.read_model(place)
     found = {Path(name).stem: position for name, position in colmap.positions(model).items()}
     both = sorted(positions.keys() & found.keys())
     matrix = similarity(np.array([found[k] for k in both]), np.array([positions[k] for k in both]))
     if matrix is None:
         return None
-    points = colmap.points(model)
+    points = colmap.read_points(place, model)
     return Points(points.positions @ matrix[:3, :3].T + matrix[:3, 3], points.colours, points.sightings)
