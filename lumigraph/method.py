@@ -50,6 +50,9 @@ class Method(nn.Module, ABC):
     def render(self, camera: Camera) -> Rendering:
         """What one camera sees, (height, width, ...), without gradients, in eval mode."""
 
+    def begin(self, scene: Scene) -> None:
+        """Called once, ahead of the first step of a new run: what the photographs tell without any learning."""
+
     def before_step(self, step: int, progress: float) -> None:
         """Called ahead of each step. progress is the share of the budget (steps or seconds) spent, in [0, 1]."""
 

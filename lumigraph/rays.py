@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 
@@ -75,6 +75,11 @@ class Samples:
         counts = self.ray_starts.diff()
         rays = torch.arange(len(counts), device=counts.device)
         return torch.repeat_interleave(rays, counts, output_size=len(self))
+
+    def keep(self, mask: Bool[Tensor, " sample"]) -> Samples:
+        """The samples that a mask picks, still packed by ray."""
+        before = torch.nn.functional.pad(mask.cumsum(0), (1, 0))
+        return Samples(self.t_start[mask], self.t_end[mask], before[self.ray_starts])
 
     def along(self, rays: Rays) -> tuple[Float[Tensor, "sample 3"], Float[Tensor, "sample 3"]]:
         """Midpoints as positions, and the direction each is seen along."""

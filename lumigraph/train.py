@@ -77,6 +77,8 @@ def fit(
             run.forget_after(state.step)
         method.train()
         clock, step = Clock(state.seconds), state.step
+        if step == 0:
+            method.begin(scene)
         next_save = clock.seconds + min(FIRST_SAVE, save_every)
         previews = Previews(run, method, scene, budget.progress(step, clock.seconds))
 

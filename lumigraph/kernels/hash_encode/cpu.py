@@ -14,7 +14,7 @@ from .lanes import BLOCK, blend, spread
 
 P1, P2 = np.uint32(PRIMES[1]), np.uint32(PRIMES[2])
 ZERO, ONE = np.float32(0), np.float32(1)
-CHUNK = 1 << 16  # points a thread takes at a time: large, so that a level's table is fetched once
+CHUNK = 1 << 16  # points a thread takes at most at a time: many, so that a level's table is fetched once
 
 
 @njit(inline="always")
@@ -63,14 +63,14 @@ def _place(points, first, count, resolution, mask, entries, weights):
 
 
 @njit(parallel=True, fastmath=True, cache=True)
-def _look_up(points, table, resolutions, offsets, masks, lanes, out):
+def _look_up(points, table, resolutions, offsets, masks, lanes, out, share):
     n, features = points.shape[1], len(lanes)
-    for chunk in prange((n + CHUNK - 1) // CHUNK):
+    for chunk in prange((n + share - 1) // share):
         entries, weights = np.empty(8 * BLOCK, np.uint32), np.empty(8 * BLOCK, np.float32)
-        last = min(n, (chunk + 1) * CHUNK)
+        last = min(n, (chunk + 1) * share)
         for level in range(len(resolutions)):
             base, plane = offsets[level], level * features * n
-            for first in range(chunk * CHUNK, last, BLOCK):
+            for first in range(chunk * share, last, BLOCK):
                 count = min(BLOCK, last - first)
                 _place(points, first, count, resolutions[level], masks[level], entries, weights)
                 for i in range(count):
@@ -134,13 +134,16 @@ def _grid(levels):
 
 class _Encode(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, points, table, levels):
+    def forward(ctx, points, table, levels, known):
         planes = points.detach().t().contiguous()
         ctx.levels = levels
         ctx.save_for_backward(planes, table)
+        if known is not None:
+            return known.detach().clone()
         out = empty(levels.levels * levels.features, len(points))
         *grid, lanes = _grid(levels)
-        _look_up(planes.numpy(), table.detach().numpy(), *grid, lanes, out.numpy().reshape(-1))
+        share = max(BLOCK, min(CHUNK, -(-len(points) // get_num_threads())))
+        _look_up(planes.numpy(), table.detach().numpy(), *grid, lanes, out.numpy().reshape(-1), share)
         return out.t()
 
     @staticmethod
@@ -160,7 +163,7 @@ class _Encode(torch.autograd.Function):
             _table_gradient(
                 grad.reshape(-1), points.numpy(), resolutions, offsets, masks, order, lanes, to_table.numpy()
             )
-        return to_points, to_table, None
+        return to_points, to_table, None, None
 
 
 @cache
@@ -169,5 +172,5 @@ def _shared_out(levels, threads):
     return np.concatenate([np.arange(t, levels, threads) for t in range(threads)])
 
 
-def run(points, table, levels):
-    return _Encode.apply(points, table.contiguous(), levels)
+def run(points, table, levels, known=None):
+    return _Encode.apply(points, table.contiguous(), levels, known)

@@ -153,12 +153,12 @@ def _pyramid(levels: HashLevels, device: torch.device) -> Tensor:
 
 class _HashEncode(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, points, table, levels):
+    def forward(ctx, points, table, levels, known):
         L, F = levels.levels, levels.features
-        out = empty(len(points), L * F, device=points.device)
+        out = empty(len(points), L * F, device=points.device) if known is None else known.detach().clone()
         ctx.sizes = {"S": len(points), "L": L, "F": F, "FEATURES": triton.next_power_of_2(F), "BLOCK": BLOCK}
         ctx.pyramid = _pyramid(levels, points.device)
-        if len(points):
+        if len(points) and known is None:
             _forward[(triton.cdiv(len(points), BLOCK), L)](points, table, ctx.pyramid, out, **ctx.sizes)
         ctx.save_for_backward(points, table)
         return out
@@ -177,8 +177,8 @@ class _HashEncode(torch.autograd.Function):
             d_table = torch.zeros_like(table)
             if blocks:
                 _backward_table[(blocks, ctx.sizes["L"])](grad, points, ctx.pyramid, d_table, **ctx.sizes)
-        return d_points, d_table, None
+        return d_points, d_table, None, None
 
 
-def run(points: Tensor, table: Tensor, levels: HashLevels) -> Tensor:
-    return _HashEncode.apply(points.contiguous(), table.contiguous(), levels)
+def run(points: Tensor, table: Tensor, levels: HashLevels, known: Tensor | None = None) -> Tensor:
+    return _HashEncode.apply(points.contiguous(), table.contiguous(), levels, known)

@@ -1,8 +1,9 @@
 """Two small machine operations for the Numba engine: all features of an entry as one vector register.
 
 Numba has no vector type, and its loops touch the features of an entry one by one; written in LLVM's terms, the eight
-corners cost eight loads and eight fused multiply-adds however many features there are (measured with two features:
-2.0 times the backward pass, 1.4 times the forward). A tuple argument `lanes` carries the number of features in its type.
+corners cost eight loads and eight multiply-adds however many features there are (measured with two features:
+2.0 times the backward pass, 1.4 times the forward).
+A tuple argument `lanes` carries the number of features in its type.
 """
 
 from llvmlite import ir

@@ -1,0 +1,1 @@
+"""What two or more methods share: occupancy, perceptrons, optimizers, corrections of exposure and pose."""

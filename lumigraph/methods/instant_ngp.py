@@ -1,0 +1,229 @@
+"""Instant-NGP: a scene in a multiresolution hash table and two tiny networks (Müller et al. 2022, arXiv 2201.05989)."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from .. import kernels
+from ..components.activations import truncated_exp
+from ..components.carving import visual_hull
+from ..components.corrections import Exposure, PoseRefinement
+from ..components.lazy_adam import LazyAdam
+from ..components.occupancy import OccupancyGrid
+from ..components.perceptron import Perceptron
+from ..method import RayMethod
+from ..rays import Rays, Rendering
+from ..scene import Batch, Frame, Scene
+from ..volume import composite
+
+
+@dataclass(frozen=True)
+class Config:
+    """The paper's numbers, with where it gives them; `InstantNGP.preset` says what a plain CPU does otherwise."""
+
+    levels: int = 16  # L, table 1
+    features: int = 2  # F, table 1
+    log2_entries: int = 19  # log2 T, table 1: 14 to 24
+    coarsest: int = 16  # N_min, table 1
+    finest: int = 2048  # N_max for a scene of reach 1; grows with the reach (section 5.4)
+    width: int = 64  # neurons per hidden layer, section 5.4
+    density_layers: int = 1  # hidden layers, section 5.4
+    colour_layers: int = 2  # hidden layers, section 5.4
+    geometry_features: int = 16  # from the density network to the colour network, section 5.4
+    direction_bands: int = 4  # of spherical harmonics, section 5.4
+    samples_per_step: int = 1 << 18  # section 5.4: batches are sized by samples, not by rays
+    lattice: int = 1024  # steps across the diagonal of the unit cascade, appendix E.1
+    growth: float = 1 / 256  # of a step with distance in unbounded scenes, appendix E.1
+    stop: float = 1e-4  # transmittance at which a ray is spent, appendix E.1
+    occupancy: int = 128  # cells per axis and cascade, appendix E.2
+    cell_thickness: float = 0.05  # optical thickness across a cell below which it is empty; E.2's threshold at n = 128
+    grid_every: int = 16  # steps between looks at the occupancy grid, appendix E.2
+    grid_decay: float = 0.95  # of what it remembers, appendix E.2
+    learning_rate: float = 1e-2  # section 4
+    last_learning_rate: float = 1e-3  # at the end of the budget
+    hold: float = 0.3  # share of the budget before the learning rate begins to fall
+    huber: float = 0.1  # residual at which the loss turns from square to linear
+    exposure: bool = False  # learn a gain per photograph
+    refine_cameras: bool = False  # learn a correction of each photograph's pose
+    seed: int = 0
+
+
+# Coarse to fine: share of the budget from which on, and which part of the Config's occupancy and lattice.
+STAGES = ((0.0, 1 / 4, 1 / 4), (0.04, 1 / 2, 1 / 2), (0.12, 1, 1 / 2), (0.5, 1, 1))
+PROBES = 0.02  # share of all cells looked at again at random, in case something has grown there
+BATCH_GROWTH = 1.5  # rays per step at most, from one step to the next
+
+
+class Field(nn.Module):
+    """Density from position, colour from position and direction (figure 3 and section 5.4)."""
+
+    def __init__(self, config: Config, reach: float):
+        super().__init__()
+        self.reach, self.bands = reach, config.direction_bands
+        finest = int(config.finest * reach)
+        self.levels = kernels.HashLevels(config.levels, config.features, config.log2_entries, config.coarsest, finest)
+        self.table = nn.Parameter(torch.empty(self.levels.offsets[-1], config.features).uniform_(-1e-4, 1e-4))
+        hidden = [config.width] * config.density_layers
+        self.density_network = Perceptron(config.levels * config.features, *hidden, config.geometry_features)
+        hidden = [config.width] * config.colour_layers
+        self.colour_network = Perceptron(config.geometry_features + self.bands**2, *hidden, 3)
+
+    def encode(self, points: Float[Tensor, "sample 3"], known: Tensor | None = None) -> Float[Tensor, "sample width"]:
+        return kernels.hash_encode(points * (0.5 / self.reach) + 0.5, self.table, self.levels, known)
+
+    def density(
+        self, encoded: Float[Tensor, "sample width"]
+    ) -> tuple[Float[Tensor, " sample"], Float[Tensor, "sample geometry"]]:
+        """Density per scene unit, and what the colour network wants to know of each place."""
+        geometry = self.density_network(encoded)
+        return truncated_exp(geometry[:, 0]), geometry
+
+    def colour(
+        self, geometry: Float[Tensor, "sample geometry"], harmonics: Float[Tensor, "sample coefficient"]
+    ) -> Float[Tensor, "sample 3"]:
+        """sRGB-encoded colour, seen along directions given by their spherical harmonics."""
+        return torch.sigmoid(self.colour_network(torch.cat([geometry, harmonics], -1)))
+
+
+class InstantNGP(RayMethod):
+    """The occupancy grid says where to look, a first look says what is hidden, the second learns from the rest."""
+
+    Config = Config
+    rays_per_step: Tensor
+
+    def __init__(self, frame: Frame, config: Any = None):
+        config = config or Config()
+        super().__init__(frame, config)
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(config.seed)
+            self.field = Field(config, frame.reach)
+        self.exposure = Exposure(frame.image_count) if config.exposure else None
+        self.poses = PoseRefinement(frame.image_count) if config.refine_cameras else None
+        self.occupancy = OccupancyGrid(frame.reach, max(4, int(config.occupancy * STAGES[0][1])))
+        self.growth = config.growth if frame.reach > 1 else 0.0
+        self.lattice = config.lattice
+        self.register_buffer("rays_per_step", torch.tensor(256))
+        self._optimizers: list[torch.optim.Optimizer] = []
+        self._figures: dict[str, float] = {}
+
+    @classmethod
+    def preset(cls, device: torch.device) -> Config:
+        """On a GPU the paper's numbers. On a CPU, what learns most in a minute: half as many levels with twice the
+        features, smaller tables and networks, a wider step and a smaller batch."""
+        if device.type == "cuda":
+            return Config()
+        return Config(
+            levels=8,
+            features=4,
+            log2_entries=16,
+            finest=512,
+            width=32,
+            samples_per_step=1 << 14,
+            lattice=512,
+            stop=1e-3,
+        )
+
+    def begin(self, scene: Scene) -> None:
+        if scene.images.has_alpha and self.frame.reach == 1:
+            self.occupancy.rule_out(visual_hull(scene, self.config.occupancy)[None])
+
+    def batch(self, scene: Scene, generator: torch.Generator) -> Batch:
+        return scene.sample_rays(int(self.rays_per_step), generator).to(self.device)
+
+    def render_rays(
+        self, rays: Rays, background: Float[Tensor, "#ray 3"], jitter: Float[Tensor, " ray"] | None = None
+    ) -> Rendering:
+        step = 2 * math.sqrt(3) / self.lattice
+        found = self.occupancy.sample(rays, self.frame.near, step, self.growth, jitter=jitter)
+        points, _ = found.along(rays)
+        with torch.no_grad():  # a first look: most samples lie behind what their ray sees
+            encoded = self.field.encode(points)
+            density, geometry = self.field.density(encoded)
+            thickness = density * found.length
+            *_, weights = kernels.composite(thickness, found.t[:, None], found.ray_starts, self.config.stop)
+            visible = weights > 0
+        samples = found.keep(visible)
+        if torch.is_grad_enabled():
+            encoded = self.field.encode(points[visible], known=columns(encoded, visible))
+            density, geometry = self.field.density(encoded)
+        else:
+            density, geometry = density[visible], columns(geometry, visible)
+        harmonics = columns(kernels.spherical_harmonics(rays.directions, self.field.bands), samples.ray_index)
+        rgb = self.field.colour(geometry, harmonics)
+        self._figures = {"rays": len(rays), "samples": len(found), "visible_samples": len(samples)}
+        return composite(samples, density, rgb, background)
+
+    def loss(self, batch: Batch, step: int) -> dict[str, Tensor]:
+        generator = self._random(step)
+        jitter = torch.rand(len(batch), generator=generator).to(self.device)
+        rays, target = batch.rays, batch.rgb
+        background = torch.tensor([self.frame.background], device=self.device)
+        if batch.alpha is not None:  # a random colour behind each ray, so that only opacity can imitate opacity
+            background = torch.rand(len(batch), 3, generator=generator).to(self.device)
+            target = background + batch.alpha[:, None] * (target - background)
+        if self.poses:
+            rays = self.poses(rays)
+        rgb = self.render_rays(rays, background, jitter).rgb
+        if self.exposure and rays.image_index is not None:
+            rgb = self.exposure(rgb, rays.image_index)
+        self._figures["mse"] = float((rgb.detach() - target).square().mean())
+        # Divided by delta, so that the linear part has slope 1.
+        return {"huber": nn.functional.huber_loss(rgb, target, delta=self.config.huber) / self.config.huber}
+
+    def optimizers(self) -> list[torch.optim.Optimizer]:
+        networks = [*self.field.density_network.parameters(), *self.field.colour_network.parameters()]
+        groups: list[dict[str, Any]] = [{"params": networks, "scale": 1.0}]
+        groups += [{"params": [*x.parameters()], "scale": 0.05} for x in (self.exposure, self.poses) if x]
+        common = {"lr": self.config.learning_rate, "betas": (0.9, 0.99), "eps": 1e-15}
+        self._optimizers = [LazyAdam([self.field.table], **common), torch.optim.Adam(groups, foreach=True, **common)]
+        return self._optimizers
+
+    def before_step(self, step: int, progress: float) -> None:
+        self._set_learning_rate(step, progress)
+        _, cells, lattice = max(stage for stage in STAGES if stage[0] <= progress)
+        self.lattice = int(self.config.lattice * lattice)
+        finer = False
+        while self.occupancy.resolution < self.config.occupancy * cells:
+            self.occupancy.refine()
+            finer = True
+        if finer or step % (4 if step < 32 else self.config.grid_every) == 0:
+            threshold = self.config.cell_thickness * self.occupancy.resolution / 2
+            share = 1.0 if finer or step < 32 else PROBES
+            self.occupancy.update(self.density, threshold, self._random(~step), self.config.grid_decay, share)
+
+    def after_step(self, step: int) -> None:
+        """So many rays next time as should give the wanted number of samples."""
+        rays = int(self.rays_per_step)
+        wanted = rays * self.config.samples_per_step / max(self._figures["samples"], 1)
+        self.rays_per_step.fill_(int(min(max(wanted, 64), BATCH_GROWTH * rays, self.config.samples_per_step)))
+
+    def density(self, points: Float[Tensor, "sample 3"]) -> Float[Tensor, " sample"]:
+        """Density per scene unit."""
+        return self.field.density(self.field.encode(points))[0]
+
+    def statistics(self) -> dict[str, float]:
+        return self._figures
+
+    def _set_learning_rate(self, step: int, progress: float) -> None:
+        """Twenty steps of warm-up, then constant, then an exponential fall (section 4 decays likewise)."""
+        c = self.config
+        fall = max(0.0, progress - c.hold) / (1 - c.hold)
+        rate = c.learning_rate * (c.last_learning_rate / c.learning_rate) ** fall * min(1.0, (step + 1) / 20)
+        for optimizer in self._optimizers:
+            for group in optimizer.param_groups:
+                group["lr"] = rate * group.get("scale", 1.0)
+
+    def _random(self, number: int) -> torch.Generator:
+        """Random numbers that depend on the seed and the step alone, so that a resumed run draws the same."""
+        return torch.Generator().manual_seed((self.config.seed << 40) + (number % (1 << 40)))
+
+
+def columns(x: Float[Tensor, "row feature"], chosen: Tensor) -> Float[Tensor, "chosen feature"]:
+    """Rows of a tensor that lies in memory feature by feature, as they are left by the kernels, kept that way."""
+    return x.t()[:, chosen].t()
