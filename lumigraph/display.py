@@ -97,7 +97,7 @@ class TrainingDisplay:
             if "samples" in statistics:
                 parts.append(f"{short(statistics['samples'] * (step - self._seen[0]) * rate)} samples/s")
             parts.append(f"{short(self._rays * rate)} rays/s")
-        if progress > 0:
+        if progress > 0.02:  # before that nobody can tell
             parts.append(f"{clock(seconds * (1 - progress) / progress)} left")
         self._seen, self._rays = (step, seconds), 0
         figures = " · ".join(parts)

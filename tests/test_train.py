@@ -12,7 +12,7 @@ import torch
 from lumigraph.errors import LumigraphError
 from lumigraph.evaluate import evaluate
 from lumigraph.run import Run
-from lumigraph.train import Budget, Clock, fit, rehearse
+from lumigraph.train import Budget, Clock, finite, fit, rehearse
 
 
 def final_state(run: Run) -> tuple[dict[str, torch.Tensor], str]:
@@ -203,3 +203,18 @@ def test_progress_is_the_share_of_the_budget():
     assert Budget(200, None).progress(50, 1e9) == 0.25
     assert Budget(None, 60.0).progress(10**9, 15.0) == 0.25
     assert Budget(None, 60.0).progress(0, 75.0) == 1.0
+
+
+@pytest.mark.parametrize(
+    ("values", "expected"),
+    [
+        ([1.0, -2.0], True),
+        ([], True),
+        ([0.0, float("nan")], False),
+        ([float("inf"), float("-inf")], False),
+        ([1.0, float("-inf"), 3.0], False),
+    ],
+)
+def test_finite_notices_every_fault(values, expected):
+    assert finite([torch.ones(3), torch.tensor(values), torch.arange(3)]) is expected
+    assert finite([torch.full((8,), 60_000.0, dtype=torch.float16)])  # whose sum float16 cannot hold
