@@ -49,6 +49,10 @@ def check(folder: Path) -> int:
     return step
 
 
+def newest(folder: Path) -> int:
+    return max(int(path.name) for path in (folder / "checkpoints").iterdir() if path.name.isdecimal())
+
+
 def main(folder: Path) -> None:
     torch.set_num_threads(1)  # a forked process has no other threads
     chance, before, halfway = random.Random(5), 0, 0
@@ -59,7 +63,8 @@ def main(folder: Path) -> None:
         child = os.fork()
         if child == 0:
             save_forever(folder)
-        while run.state.step == before:
+        while newest(folder) == before:  # reading more would race with the child, who deletes what is old
+            assert os.waitpid(child, os.WNOHANG) == (0, 0), "the saving process ended by itself"
             time.sleep(0.001)
         time.sleep(chance.random() * 0.05)
         os.kill(child, signal.SIGKILL)
