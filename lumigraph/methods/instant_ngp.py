@@ -55,7 +55,7 @@ class Config:
 
 
 # Coarse to fine: share of the budget from which on, and which part of the Config's occupancy and lattice.
-STAGES = ((0.0, 1 / 4, 1 / 4), (0.04, 1 / 2, 1 / 2), (0.12, 1, 1 / 2), (0.5, 1, 1))
+STAGES = ((0.0, 1 / 4, 1 / 4), (0.04, 1 / 2, 1 / 2), (0.12, 1, 2 / 3), (0.75, 1, 1))
 PROBES = 0.02  # share of all cells looked at again at random, in case something has grown there
 BATCH_GROWTH = 1.5  # rays per step at most, from one step to the next
 
@@ -125,8 +125,10 @@ class InstantNGP(RayMethod):
             finest=512,
             width=32,
             samples_per_step=1 << 14,
-            lattice=512,
+            lattice=384,
             stop=1e-3,
+            cell_thickness=0.3,
+            learning_rate=2e-2,
         )
 
     def begin(self, scene: Scene) -> None:
