@@ -20,14 +20,14 @@ from lumigraph.run import Run, State
 KILLS = 20
 
 
-def save_forever(folder: Path) -> None:
+def save_forever(folder: Path, parent: int) -> None:
     run, generator = Run(folder), torch.Generator()
     method = run.new_method()
     (optimizer,) = method.optimizers()
     sum(p.sum() for p in method.parameters()).backward()
     optimizer.step()
     step = run.state.step
-    while True:
+    while os.getppid() == parent:  # not beyond the test, if that is killed itself
         step += 1
         for parameter in method.parameters():
             parameter.data.fill_(step)
@@ -60,9 +60,10 @@ def main(folder: Path) -> None:
     method = run.new_method()
     run.save(State(), method, method.optimizers(), torch.Generator())
     for _ in range(KILLS):
-        child = os.fork()
+        parent, child = os.getpid(), os.fork()
         if child == 0:
-            save_forever(folder)
+            save_forever(folder, parent)
+            os._exit(1)
         while newest(folder) == before:  # reading more would race with the child, who deletes what is old
             assert os.waitpid(child, os.WNOHANG) == (0, 0), "the saving process ended by itself"
             time.sleep(0.001)
