@@ -11,7 +11,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -112,6 +112,8 @@ class ImageStore:
         trusted = Runs(*map(torch.from_numpy, np.load(folder / "trusted.npz").values())) if about["trusted"] else None
         # Copy on write: PyTorch wants a writable array, and the file must stay as it is.
         rgba = np.memmap(folder / "pixels", np.int32, "c")
+        if any(p.identity is None for p in pictures):
+            shutil.rmtree(folder, ignore_errors=True)  # nobody can ask for it again; what is mapped stays
         return cls(torch.from_numpy(rgba), sizes, about["has_alpha"], trusted, shuffled=True)
 
     @classmethod
@@ -315,8 +317,7 @@ def default_memory() -> int:
         total = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
     except (AttributeError, ValueError, OSError):
         total = 8 << 30
-    try:
-        total = min(total, int(Path("/sys/fs/cgroup/memory.max").read_text()))
-    except (OSError, ValueError):
-        pass  # no container, or no limit
+    for limit in ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory/memory.limit_in_bytes"):
+        with suppress(OSError, ValueError):  # no container, or no limit
+            total = min(total, int(Path(limit).read_text()))
     return int(MEMORY_SHARE * total)

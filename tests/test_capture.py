@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import warnings
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -262,6 +263,19 @@ def test_reduced_folders_are_used_where_they_fit(tiny, tmp_path):
         assert camera.size[0, 0] == width
         assert red is None or (image[..., 0] * 255).round().unique().tolist() == [red]
         assert red is not None or len(image[..., 0].unique()) == width
+
+
+def test_a_neighbouring_capture_is_no_reduced_folder(tiny, tmp_path):
+    """room and room_2 are two captures, even where photographs lie beside their model."""
+    for name in ("room", "room_2"):
+        write_colmap(tmp_path / name, tiny, place=".")
+        for picture in (tmp_path / name / "images").iterdir():
+            picture.rename(tmp_path / name / picture.name)
+        (tmp_path / name / "images").rmdir()
+    for picture in (tmp_path / "room_2").glob("*.png"):
+        Image.new("RGB", (24, 18), (255, 0, 0)).save(picture)
+    scene = open_scene(tmp_path / "room", downscale=2)
+    assert (scene.view(3)[1][..., 2] * 255).round().unique().tolist() == [30]
 
 
 def test_asking_for_more_pixels_than_there_are_is_said(tiny, tmp_path):
@@ -539,6 +553,33 @@ def test_the_cameras_up_becomes_z():
         scene = assemble(cloud_capture(orbit(), outdoors(), matrix))
         up = -scene.cameras.pose[:, :, 1].mean(0)
         torch.testing.assert_close(up / up.norm(), torch.tensor([0.0, 0.0, 1.0]), rtol=0, atol=1e-3)
+
+
+def test_cameras_that_all_look_down_are_above():
+    random = np.random.default_rng(0)
+    spots = np.stack([*random.uniform(-5, 5, (2, 20)), np.full(20, -8.0)], -1)
+    ups = [np.array([math.cos(a), math.sin(a), 0]) for a in random.uniform(0, 6.3, 20)]
+    poses = [look_at(spot, spot + [0, 0, 1], up) for spot, up in zip(spots, ups, strict=True)]
+    points = random.uniform([-6, -6, -0.2], [6, 6, 0.2], (2000, 3))
+    scene = assemble(cloud_capture(poses, points))
+    assert scene.points is not None and scene.cameras.position[:, 2].min() > scene.points[:, 2].max()
+
+
+def test_alpha_without_an_end_is_no_object():
+    """Cameras that look one way cannot tell how deep something is; the capture is open, before white."""
+    capture = ball_capture(True, np.zeros(3), np.ones(3))
+    poses = [np.concatenate([np.eye(3), [[0.02 * i], [0], [-5]]], -1) for i in range(len(capture.shots))]
+    shots = [replace(shot, pose=pose) for shot, pose in zip(capture.shots, poses, strict=True)]
+    frame = assemble(Capture("x", shots)).frame
+    assert frame.background == (1.0, 1.0, 1.0) and frame.has_alpha and frame.reach > 1
+
+
+def test_llff_depths_bound_a_capture_without_points(tiny, tmp_path):
+    frame = open_scene(write_llff(tmp_path, tiny)).frame
+    half = np.linalg.norm(np.array(frame.source_from_scene)[:3, 0])
+    assert frame.near * half == pytest.approx(0.4 * 2.0)
+    distance = np.median([np.linalg.norm(pose[:3, 3]) for pose in tiny.poses])
+    assert frame.reach == power_of_two((6.0 + distance) / half)
 
 
 def test_what_a_source_knows_of_itself_is_kept():

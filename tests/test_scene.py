@@ -146,6 +146,7 @@ def test_a_file_is_used_again_until_a_picture_changes(images, tmp_path):
     for _ in range(2):
         ImageStore.load(nameless, memory=0, cache=tmp_path)
     assert len(reads) == 16
+    assert len(list(tmp_path.iterdir())) == 2  # nobody can ask for the nameless again
 
 
 def test_training_never_writes_to_the_file(images, tmp_path):

@@ -58,10 +58,10 @@ def read(folder: Path) -> Capture:
     model = read_model(place)
     images = sorted((image for image in model.images.values() if image.has_pose), key=lambda image: image.name)
     names = [image.name for image in images]
-    root = next((folder / n for n in ("images", "input") if reductions(folder / n)), folder)
+    folders = reductions(folder / "images") or reductions(folder / "input") or {1: folder}
     shots, missing = [], []
     lenses = {k: (read_lens(camera, place), (camera.width, camera.height)) for k, camera in model.cameras.items()}
-    for image, files in zip(images, versions(root, names), strict=True):
+    for image, files in zip(images, versions(folders, names), strict=True):
         if not files:
             missing.append(image.name)
             continue
@@ -70,7 +70,8 @@ def read(folder: Path) -> Capture:
         shots.append(Shot(image.name, pose, lens, size, files, find_mask(folder / "masks", image.name)))
     if not shots and names:
         raise LumigraphError(
-            f"{root} holds none of the {len(names)} photographs that {place} lists, such as {names[0]}"
+            f"{folders[min(folders)]} holds none of the {len(names)} photographs that {place} lists, "
+            f"such as {names[0]}; put them into {folder / 'images'}"
         )
     cloud = read_points(place, model)
     return Capture(str(folder), shots, cloud.positions, cloud.colours, cloud.sightings, missing)

@@ -13,6 +13,7 @@ from torch.nn import functional
 from ..camera import Camera
 from ..images import ImageStore
 from ..lens import OpenCV, Pinhole
+from ..scene import Vector
 
 VIEWS = 24
 GRIDS = (32, 32, 64)  # cells along each side of the box that is searched; each round searches what the last one found
@@ -31,27 +32,38 @@ class Silhouette:
     inside: Bool[Tensor, "height width"]
 
 
+@dataclass(frozen=True)
+class Silhouettes:
+    """Outlines of an object, and the colour it stands before: the photographs' own, or white where they have alpha."""
+
+    outlines: list[Silhouette]
+    background: Vector
+
+
 def silhouettes(
     cameras: Camera, images: ImageStore, views: list[int], centre: Float[np.ndarray, " 3"]
-) -> tuple[list[Silhouette], tuple[float, float, float]] | None:
-    """Outlines of an object that has alpha or stands before one plain colour, and that colour (white with alpha).
+) -> Silhouettes | None:
+    """Outlines of an object that has alpha or stands before one plain colour.
 
     None where the photographs show neither. centre: what the cameras look at, roughly
     """
     position = cameras.position[views].double().numpy() - centre
-    chosen = [views[i] for i in farthest(position / np.linalg.norm(position, axis=-1, keepdims=True), VIEWS)]
+    position /= np.linalg.norm(position, axis=-1, keepdims=True).clip(min=1e-9)
+    chosen = [views[i] for i in farthest(position, VIEWS)]
     if images.has_alpha:
-        return [Silhouette(cameras[i], images[i][..., 3] > OPAQUE) for i in chosen], (1.0, 1.0, 1.0)
+        return Silhouettes([Silhouette(cameras[i], images[i][..., 3] > OPAQUE) for i in chosen], (1.0, 1.0, 1.0))
     if not isinstance(cameras.lens, Pinhole | OpenCV):
         return None  # the black around a fisheye's circle is no background
-    pictures = [images[i].int() for i in chosen]
-    edges = torch.cat([border(picture) for picture in pictures])
+    edges = torch.cat([border(images[i]) for i in chosen]).int()
     colour = edges.median(0).values
-    if ((edges - colour).abs().amax(-1) <= OPAQUE).float().mean() < BORDER_SHARE:
+    if not differs(edges, colour).float().mean() <= 1 - BORDER_SHARE:
         return None
-    outlines = [filled((picture - colour).abs().amax(-1) > OPAQUE) for picture in pictures]
     red, green, blue = (colour / 255).tolist()
-    return [Silhouette(cameras[i], outline) for i, outline in zip(chosen, outlines, strict=True)], (red, green, blue)
+    return Silhouettes([Silhouette(cameras[i], filled(differs(images[i], colour))) for i in chosen], (red, green, blue))
+
+
+def differs(pixels: Tensor, colour: Tensor) -> Tensor:
+    return (pixels.int() - colour).abs().amax(-1) > OPAQUE
 
 
 def border(picture: Tensor) -> Tensor:

@@ -34,13 +34,14 @@ def read(folder: Path) -> Capture:
         raise LumigraphError(
             f"{path} is not LLFF's table of 17 numbers for each image; make or copy it again"
         ) from fault
-    listed = {place: list_images(place) for place in reductions(folder / "images").values()}
+    folders = reductions(folder / "images")
+    listed = {place: list_images(place) for place in folders.values()}
     names = next((names for names in listed.values() if len(names) == len(table)), None)
     if names is None:
         found = ", ".join(f"{len(names)} in {place.name}" for place, names in listed.items()) or "no folder of images"
         raise LumigraphError(f"{path} has poses of {len(table)} images, but there are {found}; restore the images")
     shots = []
-    for name, files, line in zip(names, versions(folder / "images", names), table, strict=True):
+    for name, files, line in zip(names, versions(folders, names), table, strict=True):
         matrix, depths = line[:15].reshape(3, 5), line[15:]
         down, right, backward, position, (height, width, focal) = matrix.T
         if not (np.isfinite(line).all() and min(height, width, focal) > 0):

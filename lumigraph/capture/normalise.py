@@ -44,27 +44,26 @@ class Place:
 
 
 CUBE: tuple[Vector, Vector] = ((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0))
+BLACK: Vector = (0.0, 0.0, 0.0)
+WHITE: Vector = (1.0, 1.0, 1.0)
 
 
 def find_place(capture: Capture, cameras: Camera, images: ImageStore, views: list[int]) -> Place:
     """Where the capture is. cameras: in the source's frame; views: the images that may be looked at, not held out."""
+    background = capture.background or (WHITE if images.has_alpha else BLACK)
     if capture.bounds is not None:
-        return stated_place(capture, cameras)
+        return stated_place(capture, cameras, background)
     upright = find_upright(cameras)
     turned = cameras.transformed(torch.from_numpy(upright))
     gaze = find_gaze(capture, turned, upright)
-    found = silhouettes(turned, images, views, gaze.centre) if gaze.converging else None
-    background = (0.0, 0.0, 0.0) if found is None else found[1]
-    if capture.background is not None:
-        background = capture.background
-    if found is not None:
-        box = hull_box(found[0], gaze.centre, gaze.distance)
-        if box is not None:
-            return object_place(upright, box, turned, background)
-    return open_place(capture, upright, gaze, background)
+    found = silhouettes(turned, images, views, gaze.centre)
+    box = None if found is None else hull_box(found.outlines, gaze.centre, gaze.distance)
+    if found is None or box is None:
+        return open_place(capture, upright, gaze, background)
+    return object_place(upright, box, turned, capture.background or found.background)
 
 
-def stated_place(capture: Capture, cameras: Camera) -> Place:
+def stated_place(capture: Capture, cameras: Camera, background: Vector) -> Place:
     """What the source says: bounds, and where it says them, reach and near."""
     assert capture.bounds is not None
     low, high = np.array(capture.bounds, np.float64)
@@ -72,13 +71,7 @@ def stated_place(capture: Capture, cameras: Camera) -> Place:
     bounds = box_in_scene(low, high, centre, half)
     reach = 1.0 if capture.reach is None else power_of_two(capture.reach / half)
     near = nearest_to_box(cameras, low, high) if capture.near is None else capture.near
-    return Place(
-        similarity(np.eye(4), centre, half),
-        bounds,
-        reach,
-        max(near / half, SMALLEST_NEAR),
-        capture.background or (0.0,) * 3,
-    )
+    return Place(similarity(np.eye(4), centre, half), bounds, reach, max(near / half, SMALLEST_NEAR), background)
 
 
 def object_place(upright: np.ndarray, box: tuple[np.ndarray, np.ndarray], cameras: Camera, background: Vector) -> Place:
@@ -222,14 +215,20 @@ def find_upright(cameras: Camera) -> Float[np.ndarray, "4 4"]:
     """The rotation that brings the cameras' common up to +z; none if the source already has an axis there.
 
     People hold cameras level rather than straight ahead: up is the direction most at right angles to all pictures'
-    rows. Where rows are all parallel, up is the mean of the pictures' own.
+    rows, on the side of the pictures' own up, or where all look straight down, on the side that they look from. Where
+    rows are all parallel, up is the mean of the pictures' own.
     """
-    rows, own = cameras.pose[:, :, 0].double().numpy(), -cameras.pose[:, :, 1].double().numpy().mean(0)
+    rows, downs, forwards = (cameras.pose[:, :, k].double().numpy() for k in range(3))
+    own, length = -downs.mean(0), np.linalg.norm(downs.mean(0))
     values, vectors = np.linalg.eigh(rows.T @ rows / len(rows))
-    own /= max(np.linalg.norm(own), 1e-9)
-    level = vectors[:, 0] * np.sign(vectors[:, 0] @ own)
-    up = level if values[1] > 0.1 and level @ own > 0.7 else own
-    if not np.linalg.norm(up) > 0.5:
+    level = vectors[:, 0]
+    if length > 0.2:
+        own /= length
+        level = level * np.sign(level @ own)
+        up = level if values[1] > 0.1 and level @ own > 0.7 else own
+    elif values[1] > 0.1:
+        up = level * np.sign(-level @ forwards.mean(0))
+    else:
         return np.eye(4)
     nearest = np.zeros(3)
     nearest[np.abs(up).argmax()] = np.sign(up[np.abs(up).argmax()])

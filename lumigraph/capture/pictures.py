@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import re
 import zlib
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -44,19 +43,20 @@ def reductions(folder: Path) -> dict[int, Path]:
     """Folders of the same photographs, reduced: images, images_2, images_4..., by how many times."""
     found = {1: folder} if folder.is_dir() else {}
     for beside in folder.parent.glob(f"{folder.name}_*"):
-        if (match := re.fullmatch(r".*_(\d+)", beside.name)) and beside.is_dir() and int(match[1]) > 1:
-            found[int(match[1])] = beside
+        times = beside.name.removeprefix(f"{folder.name}_")
+        if times.isascii() and times.isdigit() and int(times) > 1 and beside.is_dir():
+            found[int(times)] = beside
     return dict(sorted(found.items()))
 
 
-def versions(folder: Path, names: list[str]) -> list[dict[int, Path]]:
-    """For each named photograph its files in `folder` and in the reduced folders beside it.
+def versions(folders: dict[int, Path], names: list[str]) -> list[dict[int, Path]]:
+    """For each named photograph its files in folders of photographs reduced so many times.
 
     A file may have another suffix than the name says. In a reduced folder where no name fits but the number of files
     does, the order of names decides.
     """
     found: list[dict[int, Path]] = [{} for _ in names]
-    for times, place in reductions(folder).items():
+    for times, place in folders.items():
         files: list[Path | None] = [place / name for name in names]
         if not all((place / name).is_file() for name in names):
             listed = list_images(place)

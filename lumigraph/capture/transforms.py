@@ -19,7 +19,7 @@ from ..files import read_json
 from ..lens import Equirectangular, Fisheye, Lens, OpenCV, Pinhole
 from . import colmap
 from .capture import Capture, Shot
-from .pictures import EXIF_SIDEWAYS, find_file, measure, versions
+from .pictures import EXIF_SIDEWAYS, find_file, measure, reductions, versions
 from .points import Points, read_ply, similarity
 
 LOOKED_FOR = "transforms.json (instant-ngp, nerfstudio)"
@@ -97,7 +97,7 @@ def find_versions(folder: Path, names: list[str]) -> list[dict[int, Path]]:
     files = [find_file(folder / name) for name in names]
     found = [{1: path} if path.is_file() else {} for path in files]
     inside = [i for i, path in enumerate(files) if path.parent == folder / "images"]
-    for i, more in zip(inside, versions(folder / "images", [files[i].name for i in inside]), strict=True):
+    for i, more in zip(inside, versions(reductions(folder / "images"), [files[i].name for i in inside]), strict=True):
         found[i] |= more
     return found
 
