@@ -19,7 +19,7 @@ class LazyAdam(torch.optim.Optimizer):
         super().__init__(params, {"lr": lr, "betas": betas, "eps": eps})
 
     @torch.no_grad()
-    def step(self, closure=None) -> None:
+    def step(self, closure=None) -> None:  # type: ignore[override]  # nobody asks for a closure
         """One step of all parameters that have a gradient."""
         for group in self.param_groups:
             for p in group["params"]:

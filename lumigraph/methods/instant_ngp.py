@@ -113,7 +113,7 @@ class InstantNGP(RayMethod):
         self._figures: dict[str, float] = {}
 
     @classmethod
-    def preset(cls, device: torch.device) -> Config:
+    def preset(cls, device: torch.device) -> Any:
         """On a GPU the paper's numbers. On a CPU, what learns most in a minute: half as many levels with twice the
         features, smaller tables and networks, a wider step and a smaller batch."""
         if device.type == "cuda":
