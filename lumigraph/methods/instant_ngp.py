@@ -171,9 +171,11 @@ class InstantNGP(RayMethod):
             target = background + batch.alpha[:, None] * (target - background)
         if self.poses:
             rays = self.poses(rays)
-        rgb = self.render_rays(rays, background, jitter).rgb
-        if self.exposure and rays.image_index is not None:
-            rgb = self.exposure(rgb, rays.image_index)
+        rendering = self.render_rays(rays, background, jitter)
+        rgb = rendering.rgb
+        if self.exposure and rays.image_index is not None:  # the gain is the scene's, not the background's
+            behind = (1 - rendering.opacity)[:, None] * background
+            rgb = self.exposure(rgb - behind, rays.image_index) + behind
         self._figures["mse"] = float((rgb.detach() - target).square().mean())
         # Divided by delta, so that the linear part has slope 1.
         return {"huber": nn.functional.huber_loss(rgb, target, delta=self.config.huber) / self.config.huber}
