@@ -47,9 +47,9 @@ def camera_path(kind: str, cameras: Camera, frame: Frame, frames: int, size: tup
 
 
 def film_size(camera: Camera, longest: int) -> tuple[int, int]:
-    """Even (width, height) in the shape of the first camera's picture, no larger than it, nor than `longest`."""
+    """Even (width, height) in the shape of the first camera's picture, the longer side as given."""
     width, height = camera.size[0].tolist()
-    scale = min(1.0, longest / max(width, height))
+    scale = longest / max(width, height)
     return max(2, round(width * scale / 2) * 2), max(2, round(height * scale / 2) * 2)
 
 

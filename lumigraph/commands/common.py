@@ -54,14 +54,14 @@ def budget_of(steps: int | None, seconds: float | None) -> dict[str, Any]:
     return told
 
 
-def check_film(frames: int | None, fps: float, longest: int) -> None:
+def check_film(frames: int | None, fps: float, size: int | None) -> None:
     """Refuse films that cannot be, before anything is rendered."""
     if frames is not None and frames < 1:
         raise LumigraphError(f"A film cannot have {frames} frames; give --frames a number above 0")
     if not 0 < fps <= 1000:
         raise LumigraphError(f"A film cannot show {fps:g} frames per second; give --fps a number from 1 to 1000")
-    if longest < 16:
-        raise LumigraphError(f"A film of {longest} pixels shows nothing; give --size at least 16")
+    if size is not None and not 16 <= size <= 8192:
+        raise LumigraphError(f"A film cannot be {size} pixels large; give --size a number from 16 to 8192")
 
 
 def say(text: str) -> None:

@@ -42,7 +42,7 @@ class Demo:
         from .render import film_cameras
 
         budget = budget_of(None, self.seconds)
-        check_film(self.frames, fps=30, longest=480)
+        check_film(self.frames, fps=30, size=None)
         kind, device = methods.find(self.method), choose_device(self.device)
         output = self.output or next_free("demo/run")
         check_new(output)
@@ -57,7 +57,7 @@ class Demo:
             return exit_code(outcome.signal)
         result = evaluate_run(run, method, scene)
         orbit = run.folder / "renders" / "orbit.mp4"
-        film(method, film_cameras(run, "orbit", self.frames, longest=480), orbit)
+        film(method, film_cameras(run, "orbit", self.frames, size=None), orbit)
         report = write_report(run)
         show(
             {

@@ -11,6 +11,7 @@ from tyro.conf import Positional
 from ..errors import LumigraphError
 from .common import check_film, choose_device, needed, option, show
 
+LONGEST = 480  # pixels of a film, if nobody asks for more
 PathName = Literal["orbit", "spiral", "interpolate", "held-out"]
 
 
@@ -30,8 +31,8 @@ class Render:
     """Length in frames."""
     fps: Annotated[float, option("N")] = 30.0
     """Frames per second."""
-    size: Annotated[int, option("PIXELS")] = 480
-    """Longer side of the picture, at most that of the photographs."""
+    size: Annotated[int | None, option("PIXELS", f"that of the photographs, at most {LONGEST}")] = None
+    """Longer side of the picture."""
     output: Annotated[Path | None, option("FILE.mp4", "RUN/renders/PATH.mp4")] = None
     """The film. FILE-depth.mp4, FILE.json and the folder FILE of pictures go beside it."""
     device: Annotated[str, option("NAME")] = "auto"
@@ -61,13 +62,14 @@ class Render:
         return 0
 
 
-def film_cameras(run: Any, path: str, frames: int | None, longest: int) -> Any:
-    """The cameras of a film of a Run, one for each frame."""
+def film_cameras(run: Any, path: str, frames: int | None, size: int | None) -> Any:
+    """The cameras of a film of a Run, one for each frame. size: longer side; None as the photographs, up to a limit."""
     from ..paths import camera_path, film_size
 
     cameras = run.cameras()
     if path != "held-out":
         train = cameras["train"]
+        longest = size or min(LONGEST, int(train.size[0].max()))
         return camera_path(path, train, run.frame, 120 if frames is None else frames, film_size(train, longest))
     views = cameras.get("test")
     if views is None or not len(views):
@@ -76,4 +78,5 @@ def film_cameras(run: Any, path: str, frames: int | None, longest: int) -> Any:
         raise LumigraphError(
             f"{run.folder} has held-out views of several sizes, which no film holds; choose another --path"
         )
-    return views[: frames or len(views)].resized(min(1.0, longest / int(views.size.max())))
+    longest = size or min(LONGEST, int(views.size.max()))
+    return views[: frames or len(views)].resized(longest / int(views.size.max()))
