@@ -38,10 +38,9 @@ def write_blender(stage: Stage, folder: Path, truth: bool = True) -> None:
             pixels = eight_bits(seen.rgb.numpy(), seen.opacity.numpy(), alpha=not stage.world.sky.visible)
             Image.fromarray(pixels).save(folder / f"{path}.png")
             if truth:
-                known = {k: v.numpy() for k, v in seen.extra.items()}
-                np.savez_compressed(
-                    folder / f"{path}_truth.npz", depth=seen.depth.numpy(), names=np.array(stage.world.names), **known
-                )
+                known = {k: v.numpy() for k, v in (("depth", seen.depth), *seen.extra.items())}
+                known["names"] = np.array(stage.world.names)
+                np.savez_compressed(folder / f"{path}_truth.npz", allow_pickle=False, **known)
             pose = np.vstack([cameras.pose[i].double().numpy(), [0, 0, 0, 1]]) @ OPENGL
             frames.append({"file_path": f"./{path}", "transform_matrix": pose.tolist()})
         listed = {"camera_angle_x": angle_across(cameras), "frames": frames}
@@ -53,11 +52,7 @@ def angle_across(cameras: Camera) -> float:
     lens = cameras.lens
     if not isinstance(lens, Pinhole):
         raise ValueError(f"Blender's format knows pinhole cameras only, not {type(lens).__name__}")
-    focal, centre = lens.focal, lens.centre
-    if not (
-        (focal == focal[0, 0]).all() and (cameras.size == cameras.size[0]).all() and (2 * centre == cameras.size).all()
-    ):
-        raise ValueError(
-            "Blender's format wants one focal length and size for all cameras, and the centre in the middle"
-        )
+    focal, centre, size = lens.focal, lens.centre, cameras.size
+    if not ((focal == focal[0, 0]).all() and (size == size[0]).all() and (2 * centre == size).all()):
+        raise ValueError("Blender's format wants all cameras alike, with square pixels and the centre in the middle")
     return 2 * math.atan(float(cameras.size[0, 0]) / (2 * float(focal[0, 0])))

@@ -1,6 +1,7 @@
 """A tree of boxes around objects, so that a ray asks only those it might meet.
 
-Stored in depth-first order: where a box is missed, the walk jumps to `skip`, past everything inside it. No stack is needed.
+Stored in depth-first order: where a box is missed, the walk jumps to `skip`, past everything inside it. There is no
+stack.
 """
 
 from __future__ import annotations
@@ -12,8 +13,11 @@ FAR = 1e30  # infinity times zero is no number; this is far enough
 
 
 def hierarchy(boxes: list[tuple[np.ndarray, np.ndarray]]) -> np.ndarray:
-    """The tree over boxes (low, high), as an array of NODE: unbounded ones first, the others split again and again where
-    a ray has least to ask (surface area heuristic, Goldsmith and Salmon 1987)."""
+    """The tree over boxes (low, high), as an array of NODE.
+
+    Unbounded ones come first; the others are split again and again where a ray then has least to ask (surface area
+    heuristic, Goldsmith and Salmon 1987).
+    """
     low, high = (np.clip(np.array(x).reshape(-1, 3), -FAR, FAR) for x in zip(*boxes, strict=True))
     bounded = high[:, 0] < FAR
     nodes: list[tuple] = []

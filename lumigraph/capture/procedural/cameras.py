@@ -51,12 +51,31 @@ def dome(count: int, radius: float, random: np.random.Generator, lowest: float =
 
 def spiral(count: int, radius: float, random: np.random.Generator, lowest: float = 12.0, highest: float = 60.0):
     """Poses on a path that climbs around the origin in two turns."""
-    start = random.uniform(0, 2 * math.pi)
-    share = (np.arange(count) + 0.5) / count
-    elevation = np.radians(lowest + (highest - lowest) * share)
-    return np.stack(
-        [
-            look_at(sphere_point(start + 4 * math.pi * s, e, radius), np.zeros(3))
-            for s, e in zip(share, elevation, strict=True)
-        ]
-    )
+    start, poses = random.uniform(0, 2 * math.pi), []
+    for share in (np.arange(count) + 0.5) / count:
+        elevation = math.radians(lowest + (highest - lowest) * share)
+        poses.append(look_at(sphere_point(start + 4 * math.pi * share, elevation, radius), np.zeros(3)))
+    return np.stack(poses)
+
+
+def walk(count: int, inner: float, outer: float, random: np.random.Generator):
+    """Poses on a ring around the origin at eye height, by turns looking across the middle and away from it."""
+    start, poses = random.uniform(0, 2 * math.pi), []
+    for k in range(count):
+        azimuth = start + GOLDEN_ANGLE * k + random.normal(0, 0.05)
+        eye = sphere_point(azimuth, 0.0, random.uniform(inner, outer)) + (0, 0, random.uniform(-0.12, 0.16))
+        inward = math.pi if k % 2 == 0 else 0.0
+        gaze = sphere_point(azimuth + inward + random.uniform(-0.7, 0.7), math.radians(random.uniform(-14, 10)))
+        poses.append(look_at(eye, eye + gaze))
+    return np.stack(poses)
+
+
+def stroll(count: int, radius: float, random: np.random.Generator):
+    """Poses once around the origin, the gaze sweeping twice over everything."""
+    start, poses = random.uniform(0, 2 * math.pi), []
+    for share in (np.arange(count) + 0.5) / count:
+        azimuth = start + 2 * math.pi * share
+        eye = sphere_point(azimuth, 0.0, radius) + (0, 0, 0.08 * math.sin(6 * math.pi * share))
+        gaze = sphere_point(azimuth + math.pi + 1.2 * math.sin(8 * math.pi * share), math.radians(-3.0))
+        poses.append(look_at(eye, eye + (gaze if share < 0.5 else gaze * (-1, -1, 1))))
+    return np.stack(poses)

@@ -18,7 +18,7 @@ from . import tracer
 from .world import World, srgb_from_linear
 
 RAYS_PER_TASK = 4096
-CONTRAST = 0.08  # samples of a pixel that differ by more, in encoded colour, are not enough
+CONTRAST = 0.08  # samples of a pixel that differ by more than this are not enough (0 is black, 1 white, as it looks)
 
 
 class Seen(NamedTuple):
@@ -57,15 +57,15 @@ def render(world: World, camera: Camera, samples: int = 4, more: int = 8) -> Ren
 def photograph(world: World, camera: Camera, samples: int = 4, more: int = 8) -> tuple[np.ndarray, np.ndarray]:
     """The picture alone, float32: straight sRGB colours (height, width, 3) and coverage (height, width) in [0, 1]."""
     width, height = camera.size[0].tolist()
-    pixels = camera.pixels()
-    picture, spread = _sample(world, camera, pixels, samples)
+    places = camera.pixels()
+    pixels = _gather(world, camera, places, samples, aims=1)
     count = np.full((len(pixels), 1), samples)
-    again = np.flatnonzero(_uneven((picture / samples).reshape(height, width, 4), spread.reshape(height, width)))
+    again = np.flatnonzero(_uneven((pixels / samples).reshape(height, width, 5), pixels[:, 4].reshape(height, width)))
     if more and len(again):
-        picture[again] += _sample(world, camera, pixels[again], more)[0]
+        pixels[again] += _gather(world, camera, places[again], more, aims=3)
         count[again] += more
-    rgb = srgb_from_linear(picture[:, :3] / np.maximum(picture[:, 3:], 1)).astype(np.float32)
-    opacity = (picture[:, 3:] / count).astype(np.float32)
+    rgb = srgb_from_linear(pixels[:, :3] / np.maximum(pixels[:, 3:4], 1)).astype(np.float32)
+    opacity = (pixels[:, 3:4] / count).astype(np.float32)
     return rgb.reshape(height, width, 3), opacity.reshape(height, width)
 
 
@@ -78,14 +78,13 @@ def eight_bits(rgb: np.ndarray, opacity: np.ndarray, alpha: bool) -> np.ndarray:
 def trace(world: World, rays: Rays, shaded: bool = True) -> Seen:
     """What each ray meets. `radiance` is linear light after the film's response, in [0, 1]; black unless shaded."""
     n = len(rays)
-    origins, directions = (x.detach().double().contiguous().numpy() for x in (rays.origins, rays.directions))
-    radius = rays.radius.detach().double().contiguous().numpy()
-    seen = Seen(*(np.empty(shape) for shape in ((n, 3), (n,), (n, 3))), np.empty(n, np.int64), np.empty((n, 3)))
+    origins, directions, radius = _arrays(rays)
+    seen = Seen(np.empty((n, 3)), np.empty(n), np.empty((n, 3)), np.empty(n, np.int64), np.empty((n, 3)))
 
     def work(first: int) -> None:
         part = slice(first, first + RAYS_PER_TASK)
         out = (x[part] for x in seen)
-        tracer.trace(world.arrays, origins[part], directions[part], radius[part], first, shaded, *out)
+        tracer.trace(world.arrays, origins[part], directions[part], radius[part], first, int(shaded), *out)
 
     list(_workers().map(work, range(0, n, RAYS_PER_TASK)))
     return seen
@@ -107,27 +106,40 @@ def signed_distance(world: World, points: Float[Tensor, "point 3"]) -> Float[Ten
     return torch.from_numpy(out).to(points.dtype)
 
 
-def _sample(world: World, camera: Camera, pixels: Tensor, samples: int) -> tuple[np.ndarray, np.ndarray]:
-    """Over `samples` rays through each pixel: the sums of linear colour and of hits (pixel, 4), and the range of the
-    encoded colours (pixel,)."""
-    offsets = torch.from_numpy(hammersley(samples)).to(pixels) - 0.5
-    rays = camera.rays((pixels[:, None] + offsets).reshape(-1, 2))
-    seen = trace(world, Rays(rays.origins, rays.directions, rays.radius / samples**0.5))
-    radiance = seen.radiance.reshape(-1, samples, 3)
-    hits = np.full(len(pixels), samples) if world.sky.visible else (seen.identity >= 0).reshape(-1, samples).sum(1)
-    spread = srgb_from_linear(radiance.max(1)) - srgb_from_linear(radiance.min(1))
-    return np.concatenate([radiance.sum(1), hits[:, None]], 1), spread.max(-1)
+def _gather(world: World, camera: Camera, places: Tensor, samples: int, aims: int) -> np.ndarray:
+    """Sums over `samples` rays around each place on the picture, and how they differ: see `tracer.gather`.
+
+    aims: shadow rays that each of them sends to each light
+    """
+    offsets = torch.from_numpy(hammersley(samples)).to(places) - 0.5
+    rays = camera.rays((places[:, None] + offsets).reshape(-1, 2))
+    origins, directions, radius = _arrays(rays)
+    pixels = np.empty((len(places), 5))
+    step = -(-RAYS_PER_TASK // samples)
+
+    def work(first: int) -> None:
+        part, some = slice(first, first + step), slice(first * samples, (first + step) * samples)
+        width = radius[some] / samples**0.5
+        tracer.gather(world.arrays, origins[some], directions[some], width, first, aims, samples, pixels[part])
+
+    list(_workers().map(work, range(0, len(places), step)))
+    return pixels
 
 
-def _uneven(picture: np.ndarray, spread: np.ndarray) -> np.ndarray:
+def _uneven(pixels: np.ndarray, spread: np.ndarray) -> np.ndarray:
     """Pixels whose few samples may have missed something: they differ among themselves, or from their neighbours."""
     uneven = spread > CONTRAST
-    encoded = np.concatenate([srgb_from_linear(picture[..., :3]), picture[..., 3:]], -1)
+    seen = np.sqrt(pixels[..., :4])
     for axis in (0, 1):
-        jump = np.abs(np.diff(encoded, axis=axis)).max(-1) > 4 * CONTRAST
+        jump = np.abs(np.diff(seen, axis=axis)).max(-1) > 4 * CONTRAST
         uneven[(slice(1, None), slice(None))[:: 1 - 2 * axis]] |= jump
         uneven[(slice(None, -1), slice(None))[:: 1 - 2 * axis]] |= jump
     return uneven
+
+
+def _arrays(rays: Rays) -> tuple[np.ndarray, ...]:
+    """Origins, directions and radius as the tracer reads them."""
+    return tuple(x.detach().double().contiguous().numpy() for x in (rays.origins, rays.directions, rays.radius))
 
 
 def hammersley(count: int) -> np.ndarray:

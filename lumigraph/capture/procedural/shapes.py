@@ -18,7 +18,7 @@ SPHERE, BOX, CYLINDER, CONE, TORUS, ARCH, PLANE = range(7)
 INFINITY = math.inf
 TINY = 1e-12  # a direction's component below this counts as this: no division by zero
 ON_SURFACE = 1e-7  # where a march along the ray ends, scene units
-NEAR_SURFACE = 2e-3  # within this distance the march may use the secant
+NEAR_SURFACE = 5e-3  # within this distance the march around a shape that is not convex may use the secant
 MAX_STEPS = 400
 
 
@@ -254,17 +254,22 @@ def intersect(kind, size, half, o, d, limit):
             return t if outside < 0.0 and t > 0.0 else INFINITY
         near = max(near, ((-half[2] if d[2] > 0.0 else half[2]) - o[2]) * inverse(d)[2])
         return near if near > 0.0 and near < min(far, leave) else INFINITY
-    # Sphere tracing (Hart 1996): the distance is a step that cannot pass the surface. Close to it, where the distance falls
-    # steadily, the secant through the last two points saves most of the steps.
-    step, before = INFINITY, INFINITY
+    # Sphere tracing (Hart 1996): a step as long as the distance cannot pass the surface. Along a ray, the distance to a
+    # convex body is a convex function: the secant through the last two points cannot pass the surface either, and once
+    # the distance grows it grows for ever. Other shapes take the secant only close to the surface.
+    convex = not hollow(kind)
+    before = distance(kind, size, along(o, t, d))
+    step = before
     for _ in range(MAX_STEPS):
-        now = distance(kind, size, along(o, t, d))
-        if abs(now) < ON_SURFACE:
-            return t + now
-        fall = (before - now) / step
-        step = now / fall if now < NEAR_SURFACE and fall > 0.2 else now
-        before = now
+        if abs(before) < ON_SURFACE:
+            return t + before
         t += step
         if t > leave:
             return INFINITY
+        now = distance(kind, size, along(o, t, d))
+        fall = (before - now) / step
+        if convex and fall <= 0.0:
+            return INFINITY
+        step = now / fall if convex or (now < NEAR_SURFACE and fall > 0.3) else now
+        before = now
     return INFINITY

@@ -1,7 +1,7 @@
 """Textures: colours that fill space, so that every shape can be cut out of them.
 
-A texture blends two colours by a pattern in the object's own frame. All patterns are band-limited: an edge is as wide as
-the pixel's footprint, and noise finer than that fades to its mean, so that far pavements grow grey instead of flickering.
+A texture blends two colours by a pattern in the object's own frame. All patterns are band-limited: an edge is as wide
+as the pixel's footprint, and noise finer than that fades to its mean, so that far pavements grow grey, not noisy.
 Colours are written as they look on screen (sRGB) and computed with as reflectances (linear).
 """
 
@@ -11,11 +11,16 @@ import math
 from dataclasses import astuple, dataclass
 from typing import ClassVar
 
+import numpy as np
 from numba import njit
 
 from .vector import INNER, clamp, smooth
 
 PLAIN, CHECKER, STRIPES, SECTORS, RINGS, WOOD, MARBLE, BRICKS, MOTTLE = range(9)
+PRIMES = (73856093, 19349663, 83492791)
+GRADIENTS = np.array([(a, b, 0) for a in (1, -1) for b in (1, -1)], float)  # towards the edges of a cube, four twice
+GRADIENTS = np.concatenate([np.roll(GRADIENTS, k, 1) for k in (0, 1, 2, 0)])
+
 Colour = tuple[float, float, float]
 
 
@@ -40,7 +45,7 @@ class Plain(Texture):
 
 @dataclass(frozen=True)
 class Checker(Texture):
-    """Squares with side `size` on whatever faces x, y or z, cubes in between; `shift` is the middle of one of colour b."""
+    """Squares of side `size` on whatever faces x, y or z, cubes in between; a square's middle lies at `shift`."""
 
     kind = CHECKER
     size: float = 0.1
@@ -78,7 +83,7 @@ class Rings(Texture):
 
 @dataclass(frozen=True)
 class Wood(Texture):
-    """Year rings around a trunk along x that passes at (`seed`, 1.7 `ring` ...) off the centre, wavy and with fibres."""
+    """Wavy year rings around a trunk along x, somewhat below the object, with fibres."""
 
     kind = WOOD
     ring: float = 0.06
@@ -98,8 +103,8 @@ class Marble(Texture):
 
 @dataclass(frozen=True)
 class Bricks(Texture):
-    """A running bond of colour a with joints of colour b on the sides facing x and y, and square slabs with side `length`
-    on those facing z. Every brick has its own shade, darker or lighter by up to `variation`."""
+    """A running bond of colour a with joints of colour b on what faces x and y, square slabs of side `length` on what
+    faces z. Every brick has its own shade, darker or lighter by up to `variation`."""
 
     kind = BRICKS
     length: float = 0.24
@@ -120,36 +125,39 @@ class Mottle(Texture):
 
 @njit(**INNER)
 def scramble(x, y, z):
-    """A lattice point's own 16 bits."""
-    h = ((x * 73856093) ^ (y * 19349663) ^ (z * 83492791)) & 0xFFFFFFFF
-    h = ((h ^ (h >> 15)) * 0x2C1B3C6D) & 0xFFFFFFFF
-    return h >> 16
+    """Sixteen bits of a lattice point's own, from its coordinates times three large primes (Teschner 2003)."""
+    h = (x ^ y ^ z) & 0xFFFFFFFF
+    return (((h ^ (h >> 15)) * 0x2C1B3C6D) & 0xFFFFFFFF) >> 16
 
 
 @njit(**INNER)
 def slope(bits, x, y, z):
-    """One of twelve gradients times an offset (Perlin 2002)."""
-    h = bits & 15
-    u = x if h < 8 else y
-    v = y if h < 4 else (x if h == 12 or h == 14 else z)
-    return (u if h & 1 == 0 else -u) + (v if h & 2 == 0 else -v)
+    """A lattice point's gradient, times an offset from it."""
+    k = bits & 15
+    return GRADIENTS[k, 0] * x + GRADIENTS[k, 1] * y + GRADIENTS[k, 2] * z
+
+
+@njit(**INNER)
+def fade(t):
+    return t * t * t * (t * (6.0 * t - 15.0) + 10.0)
 
 
 @njit(**INNER)
 def noise(x, y, z):
-    """Gradient noise in about [-1, 1] with features of size one."""
+    """Gradient noise in about [-1, 1] with features of size one (Perlin 2002)."""
     i, j, k = math.floor(x), math.floor(y), math.floor(z)
     x, y, z = x - i, y - j, z - k
-    i, j, k = int(i), int(j), int(k)
-    u = x * x * x * (x * (6.0 * x - 15.0) + 10.0)
-    v = y * y * y * (y * (6.0 * y - 15.0) + 10.0)
-    w = z * z * z * (z * (6.0 * z - 15.0) + 10.0)
-    total = 0.0
-    for c in range(8):
-        a, b, d = c & 1, (c >> 1) & 1, c >> 2
-        weight = (u if a else 1.0 - u) * (v if b else 1.0 - v) * (w if d else 1.0 - w)
-        total += weight * slope(scramble(i + a, j + b, k + d), x - a, y - b, z - d)
-    return total
+    i, j, k = int(i) * PRIMES[0], int(j) * PRIMES[1], int(k) * PRIMES[2]
+    p, q, r = i + PRIMES[0], j + PRIMES[1], k + PRIMES[2]
+    u, v, w = fade(x), fade(y), fade(z)
+    a, b = slope(scramble(i, j, k), x, y, z), slope(scramble(p, j, k), x - 1.0, y, z)
+    c, d = slope(scramble(i, q, k), x, y - 1.0, z), slope(scramble(p, q, k), x - 1.0, y - 1.0, z)
+    low = a + u * (b - a) + v * (c + u * (d - c) - a - u * (b - a))
+    z -= 1.0
+    a, b = slope(scramble(i, j, r), x, y, z), slope(scramble(p, j, r), x - 1.0, y, z)
+    c, d = slope(scramble(i, q, r), x, y - 1.0, z), slope(scramble(p, q, r), x - 1.0, y - 1.0, z)
+    high = a + u * (b - a) + v * (c + u * (d - c) - a - u * (b - a))
+    return low + w * (high - low)
 
 
 @njit(**INNER)
@@ -176,7 +184,7 @@ def band(x, period, share, footprint):
 
 @njit(**INNER)
 def pattern(kind, n, p, normal, footprint):
-    """(blend, shade) at a point p of a surface with some normal, in the object's frame: colour = shade mix(a, b, blend).
+    """(blend, shade) at a point p of a surface, so that colour = shade mix(a, b, blend). All in the object's frame.
 
     n: the texture's own numbers; footprint: the pixel's width on the surface, scene units
     """
@@ -226,12 +234,11 @@ def pattern(kind, n, p, normal, footprint):
             u += 0.5 * length * (row - 2.0 * math.floor(0.5 * row))
         column = math.floor(u / length)
         gap = max(band(u, length, joint / length, footprint), band(v, height, joint / height, footprint))
-        own = scramble(int(column), int(row), int(column + row)) / 65535.0 - 0.5
+        own = scramble(int(column) * PRIMES[0], int(row) * PRIMES[1], PRIMES[2]) / 65535.0 - 0.5
         fade = 1.0 - smooth(footprint / height, 0.3, 1.0)
         return gap, 1.0 + 2.0 * strength * fade * own * (1.0 - gap)
     if kind == MOTTLE:
         s = n[2]
-        return clamp(
-            0.5 + 1.4 * n[1] * clouds((x + 7.1 * s, y - 2.9 * s, z + s), n[0], n[0] / 8.0, footprint), 0.0, 1.0
-        ), 1.0
+        cloud = clouds((x + 7.1 * s, y - 2.9 * s, z + s), n[0], n[0] / 8.0, footprint)
+        return clamp(0.5 + 1.4 * n[1] * cloud, 0.0, 1.0), 1.0
     return 0.0, 1.0

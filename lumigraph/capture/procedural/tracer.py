@@ -1,7 +1,8 @@
 """The ray tracer: what each ray through a world sees. Compiled once; scenes are data.
 
-Light: chalky (Lambert) and glossy (GGX, Walter 2007; Fresnel after Schlick 1994) reflection of area lights, each ray
-asking for one point of each light whether it is in shadow, light from the sky darkened in corners, and one mirrored bounce on whatever is glossy.
+Light: what lamps and sun send straight to a surface, reflected by chalk (Lambert) and gloss (GGX, Walter 2007; Fresnel
+after Schlick 1994), each ray asking for one point of each light whether it is in shadow; light from the whole sky, less
+in corners; and one mirrored bounce on whatever is glossy.
 """
 
 from __future__ import annotations
@@ -14,11 +15,11 @@ import numpy as np
 from numba import njit
 
 from .shapes import INFINITY, distance, gradient, hollow, intersect, inverse, slab
-from .textures import clouds, pattern
+from .textures import PRIMES, clouds, pattern, scramble
 from .vector import FAST, INNER, along, clamp, cross, dot, mix, mul, rotate, rotate_back, scale, smooth, unit, vec
 
 LIFT = 2e-4  # shadow and mirrored rays begin this far above the surface, scene units
-MIRRORED = 0.02, 0.06  # a weaker reflection shows the sky alone; a stronger one what is there
+MIRRORED = 0.04, 0.10  # a weaker reflection shows the sky alone; a stronger one what is there
 SHOULDER = 0.75  # radiance above this is compressed as by film, so that highlights keep their shape
 
 
@@ -61,16 +62,21 @@ def meet(objects, nodes, o, d, limit, enough, leaving):
 
 
 @njit(**INNER)
-def clearance(objects, nodes, p, limit):
-    """Signed distance from a point to the nearest surface, at most limit."""
-    best, i = limit, 0
+def gap(p, low, high):
+    """Squared distance from a point to a box, 0 inside."""
+    x = max(0.0, max(low[0] - p[0], p[0] - high[0]))
+    y = max(0.0, max(low[1] - p[1], p[1] - high[1]))
+    z = max(0.0, max(low[2] - p[2], p[2] - high[2]))
+    return x * x + y * y + z * z
+
+
+@njit(**INNER)
+def clearance(objects, nodes, p):
+    """Signed distance from a point to the nearest surface."""
+    best, i = INFINITY, 0
     while i < len(nodes):
         node = nodes[i]
-        low, high = vec(node.low), vec(node.high)
-        x = max(0.0, max(low[0] - p[0], p[0] - high[0]))
-        y = max(0.0, max(low[1] - p[1], p[1] - high[1]))
-        z = max(0.0, max(low[2] - p[2], p[2] - high[2]))
-        square = x * x + y * y + z * z
+        square = gap(p, vec(node.low), vec(node.high))
         if square > 0.0 and square >= best * abs(best):
             i = node.skip
             continue
@@ -90,25 +96,37 @@ def surroundings(sky, d, cover):
     colour = mix(vec(sky.horizon), vec(sky.zenith), 1.0 - (1.0 - min(d[2], 1.0)) ** 3)
     if cover > 0.0:
         up = 1.0 / (d[2] + 0.12)
-        thick = 0.5 + clouds((d[0] * up, d[1] * up, 0.0), 1.6, 0.2, 0.02 * up * up)
+        thick = 0.5 + clouds((d[0] * up, d[1] * up, 0.0), 1.6, 0.1, 0.02 * up * up)
         white = smooth(thick, 1.0 - cover, 1.45 - cover) * smooth(d[2], 0.0, 0.15)
         colour = mix(colour, (1.0, 0.985, 0.96), 0.85 * white)
     return colour
 
 
 @njit(**INNER)
-def ambient(objects, nodes, sky, p, n):
+def ambient(objects, nodes, sky, found, p, n):
     """Light from all of the sky onto a surface, less what its neighbourhood hides (Evans 2006): balls that touch the
-    surface from outside, each half as large as the last, and how much room there is around their centres."""
-    hidden, weight, h = 0.0, 0.25, sky.reach
-    for _ in range(4):
-        room = clearance(objects, nodes, along(p, h, n), h)
-        if room > 0.999 * h:
-            break  # the smaller balls lie within this one
-        hidden += weight * (1.0 - max(room, 0.0) / h)
-        h *= 0.5
+    surface from outside, each within the last, and how much room other things leave around their centres."""
+    h = sky.reach
+    large, middle, small = 1.0, 1.0, 1.0
+    centre = along(p, h, n)
+    i = 0
+    while i < len(nodes):
+        node = nodes[i]
+        if gap(centre, vec(node.low), vec(node.high)) > h * h:
+            i = node.skip
+            continue
+        if node.object >= 0 and (node.object != found or hollow(objects[found].kind)):
+            thing = objects[node.object]
+            own = rotate_back(thing.rotation, along(p, -1.0, vec(thing.position)))
+            up = rotate_back(thing.rotation, n)
+            large = min(large, distance(thing.kind, thing.size, along(own, h, up)) / h)
+            middle = min(middle, distance(thing.kind, thing.size, along(own, 0.4 * h, up)) / (0.4 * h))
+            small = min(small, distance(thing.kind, thing.size, along(own, 0.16 * h, up)) / (0.16 * h))
+        i += 1
+    # Squares, so that no line shows where something comes within reach.
+    hidden = (1.0 - max(large, 0.0)) ** 2 + (1.0 - max(middle, 0.0)) ** 2 + (1.0 - max(small, 0.0)) ** 2
     light = mix(vec(sky.ground), mix(vec(sky.horizon), vec(sky.zenith), 0.6), 0.5 + 0.5 * n[2])
-    return scale(light, 1.0 - 0.75 * hidden)
+    return scale(light, 1.0 - 0.29 * hidden)
 
 
 @njit(**INNER)
@@ -123,12 +141,12 @@ def towards(toward, width, ray):
 
 
 @njit(**INNER)
-def reflect(objects, nodes, lights, sky, found, p, n, d, albedo, material, ray):
+def reflect(objects, nodes, lights, sky, found, p, n, d, albedo, material, ray, aims):
     """Radiance that a surface sends back along a ray d, all but its mirrored surroundings."""
     base = scale(albedo, 1.0 - material.metal)
     coat = 0.04 * material.gloss
     mirror = mix((coat, coat, coat), albedo, material.metal)
-    colour = mul(base, ambient(objects, nodes, sky, p, n))
+    colour = mul(base, ambient(objects, nodes, sky, found, p, n))
     start = along(p, LIFT, n)
     for i in range(len(lights)):
         light = lights[i]
@@ -140,7 +158,12 @@ def reflect(objects, nodes, lights, sky, found, p, n, d, albedo, material, ray):
         facing = dot(n, toward)
         if facing <= 0.0:
             continue
-        if meet(objects, nodes, start, towards(toward, width, ray), away, INFINITY, found)[1] >= 0:
+        seen = 0
+        for k in range(aims):
+            aim = towards(toward, width, aims * ray + k)
+            if meet(objects, nodes, start, aim, away, INFINITY, found)[1] < 0:
+                seen += 1
+        if seen == 0:
             continue
         send = base
         if coat > 0.0 or material.metal > 0.0:
@@ -152,7 +175,7 @@ def reflect(objects, nodes, lights, sky, found, p, n, d, albedo, material, ray):
             shape = 0.25 * ggx / ((facing * (1.0 - k) + k) * (nv * (1.0 - k) + k))
             fresnel = (1.0 - vh) ** 5 * max(material.gloss, material.metal)
             send = along(send, shape, mix(mirror, (1.0, 1.0, 1.0), fresnel))
-        colour = along(colour, facing, mul(send, power))
+        colour = along(colour, facing * seen / aims, mul(send, power))
     return colour
 
 
@@ -163,7 +186,7 @@ def film(x):
 
 
 @njit(**INNER)
-def look(objects, materials, lights, sky, nodes, o, d, radius, shaded, ray):
+def look(objects, materials, lights, sky, nodes, o, d, radius, ray, aims):
     """(radiance, distance, normal, thing, reflectance) for one ray; see `trace`."""
     t, found = meet(objects, nodes, o, d, INFINITY, 0.0, -1)
     black = (0.0, 0.0, 0.0)
@@ -186,18 +209,18 @@ def look(objects, materials, lights, sky, nodes, o, d, radius, shaded, ray):
         albedo = scale(mix(vec(material.a), vec(material.b), blend), shade)
         if bounce == 0:
             facing, identity, own = n, thing.identity, albedo
-            if not shaded:
+            if aims == 0:
                 break
-        colour = reflect(objects, nodes, lights, sky, found, p, n, d, albedo, material, ray)
+        colour = reflect(objects, nodes, lights, sky, found, p, n, d, albedo, material, ray, aims)
         thick = 1.0 - math.exp(-sky.haze * travelled) if bounce == 0 else 0.0
         colour = mix(colour, surroundings(sky, (d[0], d[1], max(d[2], 0.0)), 0.0), thick)
         total = along(total, 1.0, mul(weight, colour))
+        if bounce > 0:
+            break
         coat = 0.04 * material.gloss
         fresnel = (1.0 - clamp(-dot(n, d), 0.0, 1.0)) ** 5 * max(material.gloss, material.metal)
         weight = mix(mix((coat, coat, coat), albedo, material.metal), (1.0, 1.0, 1.0), fresnel)
-        weight = scale(
-            weight, (1.0 - material.roughness) ** 2 * (1.0 - thick)
-        )  # a rough coat mirrors little that is sharp
+        weight = scale(weight, (1.0 - material.roughness) ** 2 * (1.0 - thick))  # roughness blurs it away
         o, d = along(p, LIFT, n), along(d, -2.0 * dot(d, n), n)
         strong = smooth(max(weight[0], max(weight[1], weight[2])), MIRRORED[0], MIRRORED[1])
         total = along(total, 1.0 - strong, mul(weight, surroundings(sky, d, 0.0)))
@@ -213,24 +236,47 @@ def _build(sources: int):
     renews it when any file of the tracer changes."""
 
     @njit(cache=True, **FAST)
-    def trace(arrays, origins, directions, radius, first, shaded, radiance, depth, normal, identity, reflectance):
+    def trace(arrays, origins, directions, radius, first, aims, radiance, depth, normal, identity, reflectance):
+        """Everything about each ray. first: number of the first; aims: shadow rays to each light, 0 for no shading."""
         objects, materials, lights, sky, nodes = arrays
         for i in range(len(origins)):
-            ray = first + i + 0 * sources
-            c, t, n, k, own = look(
-                objects, materials, lights, sky[0], nodes, vec(origins[i]), vec(directions[i]), radius[i], shaded, ray
-            )
+            o, d, ray = vec(origins[i]), vec(directions[i]), first + i + 0 * sources
+            c, t, n, k, own = look(objects, materials, lights, sky[0], nodes, o, d, radius[i], ray, aims)
             depth[i], identity[i] = t, k
             for axis in range(3):
                 radiance[i, axis] = film(sky[0].exposure * c[axis])
                 normal[i, axis], reflectance[i, axis] = n[axis], own[axis]
 
     @njit(cache=True, **FAST)
+    def gather(arrays, origins, directions, radius, first, aims, samples, pixels):
+        """Rays pixel by pixel, `samples` to each: sums of radiance where something was seen, how often that was, and
+        the largest difference between two samples, in radiance's square root, which is about as unequal as it looks."""
+        objects, materials, lights, sky, nodes = arrays
+        for pixel in range(len(pixels)):
+            begin = scramble((first + pixel) * PRIMES[0], PRIMES[1], 0 * sources)  # pixels should form no pattern
+            low, high, total, hits = (1.0, 1.0, 1.0), (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), 0
+            for s in range(samples):
+                i = samples * pixel + s
+                o, d = vec(origins[i]), vec(directions[i])
+                c, _, _, k, _ = look(objects, materials, lights, sky[0], nodes, o, d, radius[i], begin + s, aims)
+                c = scale(c, sky[0].exposure)
+                c = (film(c[0]), film(c[1]), film(c[2]))
+                low = (min(low[0], c[0]), min(low[1], c[1]), min(low[2], c[2]))
+                high = (max(high[0], c[0]), max(high[1], c[1]), max(high[2], c[2]))
+                total = along(total, 1.0, c)
+                hits += 1 if k >= 0 or sky[0].visible else 0
+            spread = 0.0
+            for axis in range(3):
+                pixels[pixel, axis] = total[axis]
+                spread = max(spread, math.sqrt(high[axis]) - math.sqrt(low[axis]))
+            pixels[pixel, 3], pixels[pixel, 4] = hits, spread
+
+    @njit(cache=True, **FAST)
     def signed_distance(arrays, points, out):
         for i in range(len(points)):
-            out[i] = clearance(arrays.objects, arrays.nodes, vec(points[i]), INFINITY) + 0 * sources
+            out[i] = clearance(arrays.objects, arrays.nodes, vec(points[i])) + 0 * sources
 
-    return trace, signed_distance
+    return trace, gather, signed_distance
 
 
 def _digest() -> int:
@@ -239,4 +285,4 @@ def _digest() -> int:
     return int.from_bytes(hashlib.sha256(text).digest()[:6], "big")
 
 
-trace, signed_distance = _build(_digest())
+trace, gather, signed_distance = _build(_digest())

@@ -6,7 +6,7 @@ import math
 
 from numba import njit
 
-# How every function of the tracer is compiled. Infinity stands for "nothing is hit", so fast-math may not assume it away.
+# How every function of the tracer is compiled. Infinity means "nothing is hit", so fast-math may not assume it away.
 FAST = {"nogil": True, "_nrt": False, "error_model": "numpy", "fastmath": {"reassoc", "nsz", "arcp", "contract"}}
 INNER = {**FAST, "no_cpython_wrapper": True}  # called by compiled code only: quicker to compile
 

@@ -1,7 +1,7 @@
 """What a procedural scene is made of: objects with a shape, a material and a rigid pose; lights; a sky.
 
-Everything is a frozen value, so a moved, relit or repainted scene is `dataclasses.replace` away and the first stays as it
-was. `World.arrays` flattens it for the tracer, which is compiled once and never again for a new scene.
+Everything is a frozen value, so a moved, relit or repainted scene is `dataclasses.replace` away and the first stays as
+it was. `World.arrays` flattens it for the tracer, which is compiled once and never again for a new scene.
 """
 
 from __future__ import annotations

@@ -19,7 +19,5 @@ def stage(name: str, size: int = 200, views: int = 100, seed: int = 0) -> Stage:
     Raises LumigraphError for a name that nothing here has.
     """
     if name not in available():
-        raise LumigraphError(
-            f"procedural:{name}: there is no such procedural scene; choose one of {', '.join(available())}"
-        )
+        raise LumigraphError(f"procedural:{name} does not exist; choose one of {', '.join(available())}")
     return importlib.import_module(f".{name.replace('-', '_')}", __name__).stage(size, views, seed)

@@ -28,7 +28,7 @@ def paint(colour) -> Material:
 
 
 def turntable():
-    marble = Material(Marble((0.93, 0.91, 0.88), (0.52, 0.50, 0.50), vein=0.55, seed=3.0), gloss=0.7, roughness=0.3)
+    marble = Material(Marble((0.87, 0.84, 0.80), (0.42, 0.40, 0.41), vein=0.5, seed=3.0), gloss=0.7, roughness=0.3)
     yield Object(Cylinder(0.98, 0.055, rounding=0.02), WALNUT, Pose.at(0, 0, -0.067, turn=30), "turntable")
     yield Object(Cylinder(0.88, 0.02), marble, Pose.at(0, 0, -0.02), "turntable")
     yield Object(Torus(0.885, 0.012), BRASS, Pose.at(0, 0, -0.01), "turntable")
@@ -80,8 +80,11 @@ def abacus(place: Pose):
     yield Object(Box((0.31, 0.075, 0.018), 0.008), WALNUT, place @ Pose.at(0, 0, 0.018), "abacus")
     yield Object(Box((0.29, 0.035, 0.018), 0.008), WALNUT, place @ Pose.at(0, 0, 0.42), "abacus")
     lying = Pose.about((0, 1, 0), 90)
-    rows = ((TERRACOTTA, (-0.20, -0.13, -0.06, 0.13, 0.20)), (MUSTARD, (-0.20, -0.13, 0.06, 0.13, 0.20)))
-    rows += ((TEAL, (-0.20, 0.0, 0.07, 0.14, 0.21)),)
+    rows = (
+        (TERRACOTTA, (-0.20, -0.13, -0.06, 0.13, 0.20)),
+        (MUSTARD, (-0.20, -0.13, 0.06, 0.13, 0.20)),
+        (TEAL, (-0.20, 0.0, 0.07, 0.14, 0.21)),
+    )
     for row, (colour, beads) in enumerate(rows):
         rod = place @ Pose.at(0, 0, 0.12 + 0.105 * row)
         yield Object(Cylinder(0.007, 0.25), BRASS, rod @ lying, "abacus")
@@ -90,9 +93,9 @@ def abacus(place: Pose):
 
 
 def marbles():
-    places = ((-0.10, -0.24, 0.06, TEAL), (-0.26, -0.42, 0.048, TERRACOTTA), (0.62, -0.40, 0.062, NAVY))
+    places = ((-0.10, -0.24, 0.062, TEAL), (-0.28, -0.44, 0.05, TERRACOTTA), (0.60, -0.42, 0.064, NAVY))
     for i, (x, y, radius, colour) in enumerate(places):
-        glass = Material(Marble(CREAM, colour, vein=0.09, turbulence=1.4, seed=4.0 + i), gloss=1.0, roughness=0.2)
+        glass = Material(Marble(colour, CREAM, vein=0.11, turbulence=1.2, seed=4.0 + i), gloss=1.0, roughness=0.2)
         yield Object(Sphere(radius), glass, Pose.at(x, y, radius), "marbles")
 
 
@@ -108,9 +111,9 @@ def world() -> World:
         *abacus(Pose.at(0.20, 0.66, 0, turn=-14)),
         *marbles(),
     )
-    key = Lamp((-2.4, -2.2, 3.4), radius=0.5, power=19.0, colour=(1.0, 0.96, 0.90))
+    key = Lamp((-2.8, -1.5, 3.2), radius=0.42, power=18.0, colour=(1.0, 0.95, 0.87))
     fill = Lamp((3.0, 0.6, 2.2), radius=0.8, power=3.6, colour=(0.86, 0.93, 1.0))
-    sky = Sky((0.86, 0.92, 1.0), (0.97, 0.95, 0.92), (0.66, 0.60, 0.54), light=0.40)
+    sky = Sky((0.84, 0.91, 1.0), (0.95, 0.94, 0.92), (0.70, 0.62, 0.54), light=0.38)
     upright = World(objects, (key, fill), sky)
     low, high = upright.bounds()
     return upright.transformed(Pose((0.0, 0.0, -0.5 * float(low[2] + high[2]))))
