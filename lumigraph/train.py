@@ -83,6 +83,8 @@ def fit(
         previews = Previews(run, method, scene, budget.progress(step, clock.seconds))
 
         def save() -> State:
+            if not finite(method.parameters()):
+                raise LumigraphError(stop("a parameter is not finite", step, run, method, save))
             now = State(step, clock.seconds, compile_seconds)
             with clock.paused():
                 previews.take(step, budget.progress(step, now.seconds))
@@ -108,16 +110,12 @@ def fit(
             if run and logged:
                 run.log(row | {"learning_rate": [g["lr"] for o in optimizers for g in o.param_groups if "lr" in g]})
             if clock.seconds >= next_save:
-                if not finite(method.parameters()):
-                    raise LumigraphError(stop("a parameter is not finite", step, run, method, save))
                 save()
                 next_save = clock.seconds + save_every
             elif previews.due(progress):
                 with clock.paused():
                     previews.take(step, progress)
 
-        if step > state.step and not finite(method.parameters()):
-            raise LumigraphError(stop("a parameter is not finite", step, run, method, save))
         final = save()
         display.done(step, final.seconds, budget.progress(step, final.seconds))
     method.eval()
