@@ -3,12 +3,7 @@
 from __future__ import annotations
 
 import importlib
-import os
 from typing import TYPE_CHECKING, Any
-
-# OpenMP's threads would otherwise spin after each operation, on cores that Numba's threads are waiting for.
-# It is read when PyTorch is loaded, so it is set before anything here loads it.
-os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 if TYPE_CHECKING:
     from .camera import Camera as Camera

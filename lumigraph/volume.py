@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from . import kernels
@@ -33,3 +35,35 @@ def composite(
     hit = opacity > 1e-3
     depth = torch.where(hit, distance[:, 0] / opacity.clamp_min(1e-3), torch.inf)
     return Rendering(colour, depth, opacity, dict(zip(values, rest, strict=True)))
+
+
+STRETCH = 4  # samples of a ray that are asked about at first; each time after that, twice as many
+
+
+@torch.no_grad()
+def visible(
+    samples: Samples, thickness_of: Callable[[Int[Tensor, " asked"]], Float[Tensor, " asked"]], stop: float
+) -> Bool[Tensor, " sample"]:
+    """Which samples light reaches, asking about few others: front to back, a stretch of each ray at a time.
+
+    thickness_of: optical thickness of the samples of these numbers
+    stop:         transmittance below which a ray is spent, as in `composite`
+    """
+    begin, end = samples.ray_starts[:-1], samples.ray_starts[1:]
+    light, tau = torch.ones(len(begin), device=begin.device), torch.zeros_like(samples.t_start)
+    stretch = STRETCH
+    while len(going := ((begin < end) & (light >= stop)).nonzero()[:, 0]):
+        begin, end, light = begin[going], end[going], light[going]
+        starts = packed((end - begin).clamp(max=stretch))
+        asked = torch.arange(int(starts[-1]), device=begin.device)
+        asked += torch.repeat_interleave(begin - starts[:-1], starts.diff(), output_size=len(asked))
+        thickness = thickness_of(asked)
+        tau[asked] = thickness
+        light = light * (1 - kernels.composite(thickness, thickness[:, None], starts)[1])
+        begin, stretch = begin + stretch, 2 * stretch
+    return kernels.composite(tau, tau[:, None], samples.ray_starts, stop)[2] > 0
+
+
+def packed(counts: Int[Tensor, " ray"]) -> Int[Tensor, " ray_plus_one"]:
+    """Where each ray's samples begin, when they lie end to end."""
+    return torch.nn.functional.pad(counts.cumsum(0), (1, 0))

@@ -28,6 +28,9 @@ class Perceptron(nn.Module):
             nn.init.kaiming_uniform_(weight, nonlinearity="relu")
 
     def forward(self, x: Float[Tensor, "sample feature"]) -> Float[Tensor, "sample output"]:
+        if not x.is_cuda:
+            from ..kernels.perceptron import cpu
+            return cpu.run(x, list(self.weights))
         return _Layers.apply(x.t().contiguous(), product_dtype(x.device), *self.weights).t()
 
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from .. import kernels
@@ -18,9 +18,9 @@ from ..components.lazy_adam import LazyAdam
 from ..components.occupancy import OccupancyGrid
 from ..components.perceptron import Perceptron
 from ..method import RayMethod
-from ..rays import Rays, Rendering
+from ..rays import Rays, Rendering, Samples
 from ..scene import Batch, Frame, Scene
-from ..volume import composite
+from ..volume import composite, visible
 
 
 @dataclass(frozen=True)
@@ -74,8 +74,8 @@ class Field(nn.Module):
         hidden = [config.width] * config.colour_layers
         self.colour_network = Perceptron(config.geometry_features + self.bands**2, *hidden, 3)
 
-    def encode(self, points: Float[Tensor, "sample 3"], known: Tensor | None = None) -> Float[Tensor, "sample width"]:
-        return kernels.hash_encode(points * (0.5 / self.reach) + 0.5, self.table, self.levels, known)
+    def encode(self, points: Float[Tensor, "sample 3"]) -> Float[Tensor, "sample width"]:
+        return kernels.hash_encode(points * (0.5 / self.reach) + 0.5, self.table, self.levels)
 
     def density(
         self, encoded: Float[Tensor, "sample width"]
@@ -85,10 +85,11 @@ class Field(nn.Module):
         return truncated_exp(geometry[:, 0]), geometry
 
     def colour(
-        self, geometry: Float[Tensor, "sample geometry"], harmonics: Float[Tensor, "sample coefficient"]
+        self, geometry: Float[Tensor, "sample geometry"], directions: Float[Tensor, "sample 3"]
     ) -> Float[Tensor, "sample 3"]:
-        """sRGB-encoded colour, seen along directions given by their spherical harmonics."""
-        return torch.sigmoid(self.colour_network(torch.cat([geometry, harmonics], -1)))
+        """sRGB-encoded colour."""
+        harmonics = kernels.spherical_harmonics(directions, self.bands)
+        return torch.sigmoid(self.colour_network(torch.cat([geometry.t(), harmonics.t()]).t()))
 
 
 class InstantNGP(RayMethod):
@@ -143,23 +144,28 @@ class InstantNGP(RayMethod):
     ) -> Rendering:
         step = 2 * math.sqrt(3) / self.lattice
         found = self.occupancy.sample(rays, self.frame.near, step, self.growth, jitter=jitter)
-        points, _ = found.along(rays)
-        with torch.no_grad():  # a first look: most samples lie behind what their ray sees
-            encoded = self.field.encode(points)
-            density, geometry = self.field.density(encoded)
-            thickness = density * found.length
-            *_, weights = kernels.composite(thickness, found.t[:, None], found.ray_starts, self.config.stop)
-            visible = weights > 0
-        samples = found.keep(visible)
-        if torch.is_grad_enabled():
-            encoded = self.field.encode(points[visible], known=columns(encoded, visible))
-            density, geometry = self.field.density(encoded)
-        else:
-            density, geometry = density[visible], columns(geometry, visible)
-        harmonics = columns(kernels.spherical_harmonics(rays.directions, self.field.bands), samples.ray_index)
-        rgb = self.field.colour(geometry, harmonics)
-        self._figures = {"rays": len(rays), "samples": len(found), "visible_samples": len(samples)}
+        samples = found.keep(self._visible(rays, found))
+        points, directions = samples.along(rays)
+        density, geometry = self.field.density(self.field.encode(points))
+        rgb = self.field.colour(geometry, directions)
+        self._figures |= {"rays": len(rays), "visible_samples": len(samples)}
         return composite(samples, density, rgb, background)
+
+    @torch.no_grad()
+    def _visible(self, rays: Rays, found: Samples) -> Bool[Tensor, " sample"]:
+        """A first look, for most samples lie behind what their ray sees."""
+        ray, t, length = found.ray_index, found.t, found.length
+        asked_in_all = 0
+
+        def thickness_of(asked: Tensor) -> Tensor:
+            nonlocal asked_in_all
+            asked_in_all += len(asked)
+            on = ray[asked]
+            return self.density(rays.origins[on] + t[asked][:, None] * rays.directions[on]) * length[asked]
+
+        seen = visible(found, thickness_of, self.config.stop)
+        self._figures["samples"] = asked_in_all
+        return seen
 
     def loss(self, batch: Batch, step: int) -> dict[str, Tensor]:
         generator = self._random(step)
@@ -226,8 +232,3 @@ class InstantNGP(RayMethod):
     def _random(self, number: int) -> torch.Generator:
         """Random numbers that depend on the seed and the step alone, so that a resumed run draws the same."""
         return torch.Generator().manual_seed((self.config.seed << 40) + (number % (1 << 40)))
-
-
-def columns(x: Float[Tensor, "row feature"], chosen: Tensor) -> Float[Tensor, "chosen feature"]:
-    """Rows of a tensor that lies in memory feature by feature, as they are left by the kernels, kept that way."""
-    return x.t()[:, chosen].t()

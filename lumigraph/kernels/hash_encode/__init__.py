@@ -46,10 +46,7 @@ class HashLevels:
 
 
 def hash_encode(
-    points: Float[Tensor, "sample 3"],
-    table: Float[Tensor, "entry feature"],
-    levels: HashLevels,
-    known: Float[Tensor, "sample width"] | None = None,
+    points: Float[Tensor, "sample 3"], table: Float[Tensor, "entry feature"], levels: HashLevels
 ) -> Float[Tensor, "sample width"]:
     """Trilinear interpolation of each level's features around each point (Müller 2022, section 3).
 
@@ -59,12 +56,10 @@ def hash_encode(
 
     points: in the unit cube; those outside are clamped to it. The point 1.0 belongs to the last cell.
     table:  (levels.offsets[-1], levels.features), all levels end to end
-    known:  the result, where it was already looked up without gradients: it is taken as it is, and only gradients
-            are worked out
     Returns (S, levels * features), level by level; differentiable in the table and in the points (a clamped
     coordinate gets no gradient).
     """
-    return implementation("hash_encode", points)(points, table, levels, known)
+    return implementation("hash_encode", points)(points, table, levels)
 
 
 def cases(generator: torch.Generator):

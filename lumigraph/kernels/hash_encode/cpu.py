@@ -10,7 +10,8 @@ from numba import get_num_threads, njit, prange
 
 from .._dispatch import empty
 from . import PRIMES
-from .lanes import BLOCK, blend, spread
+from .._vectors import LANES
+from .lanes import BLOCK, blend, place_dense, place_hashed, spread
 
 P1, P2 = np.uint32(PRIMES[1]), np.uint32(PRIMES[2])
 ZERO, ONE = np.float32(0), np.float32(1)
@@ -25,46 +26,21 @@ def _cell(x, resolution):
     return cell, s - np.float32(cell)
 
 
-@njit(fastmath=True, cache=True)
-def _place(points, first, count, resolution, mask, entries, weights):
-    """The eight corners around each of `count` points: entries in the level's table, and trilinear weights.
-
-    One buffer with constant strides for each, because only then does the compiler vectorise the loop.
-    """
+@njit(inline="always")
+def _place(points, axes, first, count, resolution, mask, base, lanes, entries, weights):
+    """The eight corners around each of `count` points: where their features lie, and trilinear weights."""
     row = np.uint32(resolution + 1)
-    step_y = P1 if mask else row
-    step_z = P2 if mask else np.uint32(row * row)
-    for i in range(count):
-        cx, fx = _cell(points[0, first + i], resolution)
-        cy, fy = _cell(points[1, first + i], resolution)
-        cz, fz = _cell(points[2, first + i], resolution)
-        gx, gy, gz = ONE - fx, ONE - fy, ONE - fz
-        a, b, c, d = gy * gz, fy * gz, gy * fz, fy * fz
-        weights[i], weights[BLOCK + i] = gx * a, fx * a
-        weights[2 * BLOCK + i], weights[3 * BLOCK + i] = gx * b, fx * b
-        weights[4 * BLOCK + i], weights[5 * BLOCK + i] = gx * c, fx * c
-        weights[6 * BLOCK + i], weights[7 * BLOCK + i] = gx * d, fx * d
-        x0 = np.uint32(cx)
-        x1 = np.uint32(x0 + np.uint32(1))
-        y0 = np.uint32(np.uint32(cy) * step_y)
-        y1 = np.uint32(y0 + step_y)
-        z0 = np.uint32(np.uint32(cz) * step_z)
-        z1 = np.uint32(z0 + step_z)
+    for i in range(0, count, LANES):
         if mask:
-            entries[i], entries[BLOCK + i] = (x0 ^ y0 ^ z0) & mask, (x1 ^ y0 ^ z0) & mask
-            entries[2 * BLOCK + i], entries[3 * BLOCK + i] = (x0 ^ y1 ^ z0) & mask, (x1 ^ y1 ^ z0) & mask
-            entries[4 * BLOCK + i], entries[5 * BLOCK + i] = (x0 ^ y0 ^ z1) & mask, (x1 ^ y0 ^ z1) & mask
-            entries[6 * BLOCK + i], entries[7 * BLOCK + i] = (x0 ^ y1 ^ z1) & mask, (x1 ^ y1 ^ z1) & mask
+            place_hashed(points, first + i, axes, resolution, P1, P2, mask, base, lanes, entries, weights, i)
         else:
-            entries[i], entries[BLOCK + i] = x0 + y0 + z0, x1 + y0 + z0
-            entries[2 * BLOCK + i], entries[3 * BLOCK + i] = x0 + y1 + z0, x1 + y1 + z0
-            entries[4 * BLOCK + i], entries[5 * BLOCK + i] = x0 + y0 + z1, x1 + y0 + z1
-            entries[6 * BLOCK + i], entries[7 * BLOCK + i] = x0 + y1 + z1, x1 + y1 + z1
+            place_dense(points, first + i, axes, resolution, row, row * row, mask, base, lanes, entries, weights, i)
 
 
 @njit(parallel=True, fastmath=True, cache=True)
 def _look_up(points, table, resolutions, offsets, masks, lanes, out, share):
     n, features = points.shape[1], len(lanes)
+    axes = points.strides[0] // 4
     for chunk in prange((n + share - 1) // share):
         entries, weights = np.empty(8 * BLOCK, np.uint32), np.empty(8 * BLOCK, np.float32)
         last = min(n, (chunk + 1) * share)
@@ -72,14 +48,15 @@ def _look_up(points, table, resolutions, offsets, masks, lanes, out, share):
             base, plane = offsets[level], level * features * n
             for first in range(chunk * share, last, BLOCK):
                 count = min(BLOCK, last - first)
-                _place(points, first, count, resolutions[level], masks[level], entries, weights)
+                _place(points, axes, first, count, resolutions[level], masks[level], base, lanes, entries, weights)
                 for i in range(count):
-                    blend(table, base, entries, weights, i, lanes, out, plane + first + i, n)
+                    blend(table, entries, weights, i, lanes, out, plane + first + i, n)
 
 
 @njit(parallel=True, fastmath=True, cache=True)
 def _table_gradient(grad, points, resolutions, offsets, masks, order, lanes, out):
     n, features = points.shape[1], len(lanes)
+    axes = points.strides[0] // 4
     for slot in prange(len(order)):
         level = order[slot]
         entries, weights = np.empty(8 * BLOCK, np.uint32), np.empty(8 * BLOCK, np.float32)
@@ -87,9 +64,9 @@ def _table_gradient(grad, points, resolutions, offsets, masks, order, lanes, out
         out[base : offsets[level + 1]] = 0
         for first in range(0, n, BLOCK):
             count = min(BLOCK, n - first)
-            _place(points, first, count, resolutions[level], masks[level], entries, weights)
+            _place(points, axes, first, count, resolutions[level], masks[level], base, lanes, entries, weights)
             for i in range(count):
-                spread(grad, plane + first + i, n, base, entries, weights, i, lanes, out)
+                spread(grad, plane + first + i, n, entries, weights, i, lanes, out)
 
 
 @njit(parallel=True, fastmath=True, cache=True)
@@ -134,12 +111,10 @@ def _grid(levels):
 
 class _Encode(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, points, table, levels, known):
-        planes = points.detach().t().contiguous()
+    def forward(ctx, points, table, levels):
+        planes = _planes(points.detach())
         ctx.levels = levels
         ctx.save_for_backward(planes, table)
-        if known is not None:
-            return known.detach().clone()
         out = empty(levels.levels * levels.features, len(points))
         *grid, lanes = _grid(levels)
         share = max(BLOCK, min(CHUNK, -(-len(points) // get_num_threads())))
@@ -163,7 +138,14 @@ class _Encode(torch.autograd.Function):
             _table_gradient(
                 grad.reshape(-1), points.numpy(), resolutions, offsets, masks, order, lanes, to_table.numpy()
             )
-        return to_points, to_table, None, None
+        return to_points, to_table, None
+
+
+def _planes(points):
+    """One axis after another, and as much memory after the last as a vector may reach over the end."""
+    n = len(points)
+    planes = empty(3 * n + LANES)[: 3 * n].view(3, n)
+    return planes.copy_(points.t())
 
 
 @cache
@@ -172,5 +154,5 @@ def _shared_out(levels, threads):
     return np.concatenate([np.arange(t, levels, threads) for t in range(threads)])
 
 
-def run(points, table, levels, known=None):
-    return _Encode.apply(points, table.contiguous(), levels, known)
+def run(points, table, levels):
+    return _Encode.apply(points, table.contiguous(), levels)

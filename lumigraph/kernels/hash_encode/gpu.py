@@ -153,12 +153,12 @@ def _pyramid(levels: HashLevels, device: torch.device) -> Tensor:
 
 class _HashEncode(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, points, table, levels, known):
+    def forward(ctx, points, table, levels):
         L, F = levels.levels, levels.features
-        out = empty(len(points), L * F, device=points.device) if known is None else known.detach().clone()
+        out = empty(len(points), L * F, device=points.device)
         ctx.sizes = {"S": len(points), "L": L, "F": F, "FEATURES": triton.next_power_of_2(F), "BLOCK": BLOCK}
         ctx.pyramid = _pyramid(levels, points.device)
-        if len(points) and known is None:
+        if len(points):
             _forward[(triton.cdiv(len(points), BLOCK), L)](points, table, ctx.pyramid, out, **ctx.sizes)
         ctx.save_for_backward(points, table)
         return out
@@ -177,8 +177,8 @@ class _HashEncode(torch.autograd.Function):
             d_table = torch.zeros_like(table)
             if blocks:
                 _backward_table[(blocks, ctx.sizes["L"])](grad, points, ctx.pyramid, d_table, **ctx.sizes)
-        return d_points, d_table, None, None
+        return d_points, d_table, None
 
 
-def run(points: Tensor, table: Tensor, levels: HashLevels, known: Tensor | None = None) -> Tensor:
-    return _HashEncode.apply(points.contiguous(), table.contiguous(), levels, known)
+def run(points: Tensor, table: Tensor, levels: HashLevels) -> Tensor:
+    return _HashEncode.apply(points.contiguous(), table.contiguous(), levels)

@@ -10,7 +10,7 @@ from torch import Tensor
 from . import PRIMES, HashLevels
 
 
-def run(points: Tensor, table: Tensor, levels: HashLevels, known: Tensor | None = None) -> Tensor:  # looks up again
+def run(points: Tensor, table: Tensor, levels: HashLevels) -> Tensor:
     pyramid = zip(levels.resolutions, table.split(levels.sizes), strict=True)
     return torch.cat([_level(points.clamp(0, 1), n, entries, levels.log2_entries) for n, entries in pyramid], -1)
 

@@ -10,7 +10,7 @@ from torch.utils.weak import WeakTensorKeyDictionary
 from .._dispatch import empty
 
 ZERO, HALF, ONE, TWO = (np.float32(x) for x in (0, 0.5, 1, 2))
-BLOCK = 4  # cells per axis of the blocks that empty space is skipped by
+BLOCK_BITS = 2  # log2 of the cells per axis of the blocks that empty space is skipped by
 FAST = {"cache": True, "error_model": "numpy"}
 
 
@@ -40,21 +40,24 @@ def _index_of(t, near, step, growth, linear, bend):
 
 
 @njit(inline="always")
-def _exit(cell, per_unit, half, origin, direction, inverse):
-    """Distance at which a ray leaves a cell through the side it heads for along one axis."""
+def _exit(cell, clear, per_unit, half, origin, direction, inverse):
+    """Distance at which a ray leaves a cell, and all that is clear around it, through the side it heads for."""
     if direction == ZERO:
         return np.float32(np.inf)
-    side = np.float32(cell + 1) if direction > ZERO else np.float32(cell)
+    side = np.float32(cell + clear) if direction > ZERO else np.float32(cell + 1 - clear)
     return (side / per_unit - half - origin) * inverse
 
 
 @njit(**FAST)
-def _walk(o, d, near, far, occupied, blocks, density, step, growth, depth_limit, kept):
-    """Note the lattice intervals of one ray that are kept; returns how many."""
-    cascades, n, block = occupied.shape[0], occupied.shape[1], occupied.shape[1] // blocks.shape[1]
+def _walk(ox, oy, oz, dx, dy, dz, near, far, occupied, clearance, density, step, growth, depth_limit, kept, first):
+    """Note the lattice intervals of one ray that are kept, from kept[first] on; returns how many.
+
+    Takes numbers rather than rows: a row would be counted in and out, for which threads wait on each other.
+    """
+    cascades, n = occupied.shape[:2]
+    shift, block = (0, ONE) if clearance.shape[1] == n else (BLOCK_BITS, np.float32(1 << BLOCK_BITS))
     outermost = np.float32(1 << (cascades - 1))
     linear, bend = _bend(near, step, growth)
-    ox, oy, oz, dx, dy, dz = o[0], o[1], o[2], d[0], d[1], d[2]
     ix, iy, iz = ONE / dx, ONE / dy, ONE / dz
     k, count, thickness, t0 = np.int64(0), 0, ZERO, near
     while True:
@@ -79,27 +82,31 @@ def _walk(o, d, near, far, occupied, blocks, density, step, growth, depth_limit,
                 min(max(np.int64((y + half) * per_unit), 0), n - 1),
                 min(max(np.int64((z + half) * per_unit), 0), n - 1),
             )
-            bx, by, bz = cx // block, cy // block, cz // block
-            if not blocks[cascade, bx, by, bz]:
-                cx, cy, cz, per_unit = bx, by, bz, per_unit / np.float32(block)
+            bx, by, bz = cx >> shift, cy >> shift, cz >> shift
+            clear = np.int64(clearance[cascade, bx, by, bz])
+            if clear:
+                cx, cy, cz, per_unit = bx, by, bz, per_unit / block
             elif occupied[cascade, cx, cy, cz]:
-                kept[count] = k
+                kept[first + count] = k
                 count += 1
-                thickness += density[cascade, cx, cy, cz] * (t1 - t0)
-                if thickness > depth_limit:
-                    return count
+                if depth_limit < np.float32(np.inf):
+                    thickness += density[cascade, cx, cy, cz] * (t1 - t0)
+                    if thickness > depth_limit:
+                        return count
                 k += 1
                 t0 = t1
                 continue
-            if cascades > 1 and n % 4:  # this cell may reach into the finer cascade: a step, no leap
+            # A step where a leap would hardly be longer, or where this cell may reach into the finer cascade.
+            if (clear == 0 and (t1 - t0) * per_unit > HALF) or (cascades > 1 and n % 4):
                 k += 1
                 t0 = t1
                 continue
-            # Empty: on to the first midpoint that may lie outside this cell, or block of cells.
+            # Empty: on to the first midpoint that may lie outside this cell, or outside all the clear blocks around it.
+            clear = max(clear, 1)
             leave = min(
-                _exit(cx, per_unit, half, ox, dx, ix),
-                _exit(cy, per_unit, half, oy, dy, iy),
-                _exit(cz, per_unit, half, oz, dz, iz),
+                _exit(cx, clear, per_unit, half, ox, dx, ix),
+                _exit(cy, clear, per_unit, half, oy, dy, iy),
+                _exit(cz, clear, per_unit, half, oz, dz, iz),
                 far,
             )
             beyond = _index_of(leave, near, step, growth, linear, bend) - np.float32(0.51)
@@ -108,19 +115,23 @@ def _walk(o, d, near, far, occupied, blocks, density, step, growth, depth_limit,
 
 
 @njit(parallel=True, **FAST)
-def _room(near, far, step, growth, room):
-    """At most how many samples each ray can have."""
+def _room(o, near, far, outermost, step, growth, end, room):
+    """Where each ray ends, beyond every cascade at the latest, and at most how many samples it can have."""
     for r in prange(len(near)):
+        away = np.sqrt(o[r, 0] * o[r, 0] + o[r, 1] * o[r, 1] + o[r, 2] * o[r, 2])
+        end[r] = min(far[r], away + TWO * outermost)
         linear, bend = _bend(near[r], step, growth)
-        last = _index_of(far[r], near[r], step, growth, linear, bend) if far[r] > near[r] else ZERO
+        last = _index_of(end[r], near[r], step, growth, linear, bend) if end[r] > near[r] else ZERO
         room[r] = np.int64(last) + 2
 
 
 @njit(parallel=True, **FAST)
-def _walk_all(o, d, near, far, occupied, blocks, density, step, growth, depth_limit, begin, kept, counts):
+def _walk_all(o, d, near, far, occupied, clearance, density, step, growth, depth_limit, begin, kept, counts):
     for r in prange(len(o)):
-        room = kept[begin[r] : begin[r + 1]]
-        counts[r] = _walk(o[r], d[r], near[r], far[r], occupied, blocks, density, step, growth, depth_limit, room)
+        counts[r] = _walk(
+            o[r, 0], o[r, 1], o[r, 2], d[r, 0], d[r, 1], d[r, 2], near[r], far[r],
+            occupied, clearance, density, step, growth, depth_limit, kept, begin[r],
+        )  # fmt: skip
 
 
 @njit(parallel=True, **FAST)
@@ -133,32 +144,63 @@ def _write(near, step, growth, begin, kept, starts, t_start, t_end):
             t_end[starts[r] + i] = _lattice(k + 1, near[r], step, growth, linear, bend)
 
 
+@njit(cache=True)
+def _measure(clear):
+    """Turn 0 where a block holds something, else 1, into how many blocks away the nearest such block or wall is.
+
+    The chessboard distance, in two sweeps (Rosenfeld and Pfaltz 1968). At k, the (2k - 1)^3 blocks around are clear.
+    """
+    cascades, n = clear.shape[:2]
+    for cascade in range(cascades):
+        for sweep in (1, -1):
+            for i in range(n * n * n):
+                j = i if sweep > 0 else n * n * n - 1 - i
+                x, y, z = j // (n * n), j // n % n, j % n
+                if not clear[cascade, x, y, z]:
+                    continue
+                nearest = min(x, y, z, n - 1 - x, n - 1 - y, n - 1 - z, 254)
+                if nearest:
+                    if sweep < 0:
+                        nearest = min(nearest, clear[cascade, x, y, z] - 1)
+                    for before in range(13):  # the neighbours that this sweep has passed
+                        a, b, c = before // 9 - 1, before // 3 % 3 - 1, before % 3 - 1
+                        a, b, c = sweep * a, sweep * b, sweep * c
+                        nearest = min(nearest, np.int64(clear[cascade, x + a, y + b, z + c]))
+                clear[cascade, x, y, z] = nearest + 1
+
+
 _known: WeakTensorKeyDictionary = WeakTensorKeyDictionary()
 
 
-def _blocks(occupied):
-    """Which blocks of cells hold an occupied one; worked out once for each state of a grid."""
-    version, blocks = _known.get(occupied, (None, None))
+def _clearance(occupied):
+    """(cascade, x, y, z): of how many blocks of cells around each one nothing is known but that they are empty, so
+    that a ray may leap; 0 in blocks that hold an occupied cell. Worked out once for each state of a grid.
+    """
+    version, clear = _known.get(occupied, (None, None))
     if version != occupied._version:
         cascades, n = occupied.shape[:2]
-        m = n // BLOCK if n % (4 * BLOCK) == 0 else n
-        blocks = occupied.view(cascades, m, n // m, m, n // m, m, n // m).any(6).any(4).any(2).numpy()
-        _known[occupied] = occupied._version, blocks
-    return blocks
+        m = n >> BLOCK_BITS if n % (4 << BLOCK_BITS) == 0 else n
+        holds = occupied.view(cascades, m, n // m, m, n // m, m, n // m).any(6).any(4).any(2)
+        inner = slice(m // 4, m - m // 4)
+        holds[1:, inner, inner, inner] = True  # there a finer cascade knows better
+        clear = (~holds).to(torch.uint8).numpy()
+        _measure(clear)
+        _known[occupied] = occupied._version, clear
+    return clear
 
 
 def run(origins, directions, t_near, t_far, occupied, density, step, growth, stop):
-    t_far = torch.minimum(t_far, origins.norm(dim=-1) + 2.0 * 2.0 ** (len(occupied) - 1))  # beyond every cascade
     tensors = (origins, directions, t_near, t_far, occupied, density)
     o, d, near, far, occupied, density = (x.detach().contiguous().numpy() for x in tensors)
-    blocks = _blocks(tensors[4])
+    clearance = _clearance(tensors[4])
     step, growth = np.float32(step), np.float32(growth)
     depth_limit = np.float32(-math.log(stop) if stop > 0 else math.inf)
     begin, starts = (np.zeros(len(o) + 1, np.int64) for _ in range(2))
-    _room(near, far, step, growth, begin[1:])
+    end = np.empty_like(far)
+    _room(o, near, far, np.float32(2.0 ** (len(occupied) - 1)), step, growth, end, begin[1:])
     np.cumsum(begin, out=begin)
     kept = np.empty(begin[-1], np.int32)  # mostly untouched
-    _walk_all(o, d, near, far, occupied, blocks, density, step, growth, depth_limit, begin, kept, starts[1:])
+    _walk_all(o, d, near, end, occupied, clearance, density, step, growth, depth_limit, begin, kept, starts[1:])
     np.cumsum(starts, out=starts)
     t_start, t_end = empty(int(starts[-1])), empty(int(starts[-1]))
     _write(near, step, growth, begin, kept, starts, t_start.numpy(), t_end.numpy())

@@ -1,4 +1,4 @@
-"""Numba: threads share the directions."""
+"""Numba: threads share the directions. One coefficient of all directions after another, as networks like them."""
 
 from __future__ import annotations
 
@@ -14,25 +14,25 @@ from . import K00, K1, K20, K21, K22, K30, K31, K32, K33
 def _forward(directions, bands, out):
     for r in prange(len(directions)):
         x, y, z = directions[r, 0], directions[r, 1], directions[r, 2]
-        out[r, 0] = K00
+        out[0, r] = K00
         if bands > 1:
-            out[r, 1] = -K1 * y
-            out[r, 2] = K1 * z
-            out[r, 3] = -K1 * x
+            out[1, r] = -K1 * y
+            out[2, r] = K1 * z
+            out[3, r] = -K1 * x
         if bands > 2:
-            out[r, 4] = K21 * x * y
-            out[r, 5] = -K21 * y * z
-            out[r, 6] = K20 * (3 * z * z - 1)
-            out[r, 7] = -K21 * x * z
-            out[r, 8] = K22 * (x * x - y * y)
+            out[4, r] = K21 * x * y
+            out[5, r] = -K21 * y * z
+            out[6, r] = K20 * (3 * z * z - 1)
+            out[7, r] = -K21 * x * z
+            out[8, r] = K22 * (x * x - y * y)
         if bands > 3:
-            out[r, 9] = -K33 * y * (3 * x * x - y * y)
-            out[r, 10] = 2 * K32 * x * y * z
-            out[r, 11] = -K31 * y * (5 * z * z - 1)
-            out[r, 12] = K30 * z * (5 * z * z - 3)
-            out[r, 13] = -K31 * x * (5 * z * z - 1)
-            out[r, 14] = K32 * z * (x * x - y * y)
-            out[r, 15] = -K33 * x * (x * x - 3 * y * y)
+            out[9, r] = -K33 * y * (3 * x * x - y * y)
+            out[10, r] = 2 * K32 * x * y * z
+            out[11, r] = -K31 * y * (5 * z * z - 1)
+            out[12, r] = K30 * z * (5 * z * z - 3)
+            out[13, r] = -K31 * x * (5 * z * z - 1)
+            out[14, r] = K32 * z * (x * x - y * y)
+            out[15, r] = -K33 * x * (x * x - 3 * y * y)
 
 
 @njit(parallel=True, fastmath=True, cache=True)
@@ -65,9 +65,9 @@ class _SphericalHarmonics(torch.autograd.Function):
     def forward(ctx, directions, bands):
         ctx.save_for_backward(directions)
         ctx.bands = bands
-        out = empty(len(directions), bands**2)
+        out = empty(bands**2, len(directions))
         _forward(directions.numpy(), bands, out.numpy())
-        return out
+        return out.t()
 
     @staticmethod
     @torch.autograd.function.once_differentiable
