@@ -15,7 +15,7 @@ from torch import Tensor
 from lumigraph import kernels
 from lumigraph.rays import Samples
 
-OPERATIONS = ["spherical_harmonics", "composite", "hash_encode", "march"]
+OPERATIONS = ["spherical_harmonics", "composite", "hash_encode", "march", "perceptron"]
 ENGINES = ["cpu", "gpu"]
 DEVICES = {"reference": "cpu", "cpu": "cpu", "gpu": "cuda" if torch.cuda.is_available() else "cpu"}
 
@@ -86,29 +86,111 @@ def edit_engine(name: str, engine: str, edit: Callable[[str], str], folder: Path
     monkeypatch.setattr(original, "run", copy.run)
 
 
-# What replaces the hash encoding's vector operations, which are below the level at which Numba could check.
-PLAIN_LANES = """
+# What replaces the engines' vector operations, which are below the level at which Numba could check.
+PLAIN_LANES = {
+    "from .lanes import BLOCK, blend, place_dense, place_hashed, spread\n": """
 from .lanes import BLOCK
 
 
 @njit
-def blend(table, base, entries, weights, i, lanes, out, first, stride):
+def _corners(points, at, axes, resolution, strides, mask, base, features, entries, weights, i):
+    flat = points.reshape(-1)
+    for j in range(min(LANES, points.shape[1] - at)):
+        cx, fx = _cell(flat[at + j], resolution)
+        cy, fy = _cell(flat[at + j + axes], resolution)
+        cz, fz = _cell(flat[at + j + 2 * axes], resolution)
+        for corner in range(8):
+            bx, by, bz = corner & 1, corner >> 1 & 1, corner >> 2
+            x, y, z = np.int64(cx) + bx, (np.int64(cy) + by) * strides[0], (np.int64(cz) + bz) * strides[1]
+            x, y, z = x & 0xFFFFFFFF, y & 0xFFFFFFFF, z & 0xFFFFFFFF
+            entry = (x ^ y ^ z) & mask if mask else x + y + z
+            entries[corner * BLOCK + i + j] = (entry + base) * features
+            weight = (fx if bx else 1 - fx) * (fy if by else 1 - fy) * (fz if bz else 1 - fz)
+            weights[corner * BLOCK + i + j] = weight
+
+
+@njit
+def place_dense(points, at, axes, resolution, stride_y, stride_z, mask, base, lanes, entries, weights, i):
+    strides = np.int64(stride_y), np.int64(stride_z)
+    _corners(points, at, axes, resolution, strides, np.int64(mask), base, len(lanes), entries, weights, i)
+
+
+place_hashed = place_dense
+
+
+@njit
+def blend(table, entries, weights, i, lanes, out, first, stride):
     for f in range(len(lanes)):
         total = ZERO
         for corner in range(8):
-            total += weights[corner * BLOCK + i] * table[base + entries[corner * BLOCK + i], f]
+            total += weights[corner * BLOCK + i] * table.reshape(-1)[np.int64(entries[corner * BLOCK + i]) + f]
         out[first + f * stride] = total
 
 
 @njit
-def spread(grad, first, stride, base, entries, weights, i, lanes, table):
+def spread(grad, first, stride, entries, weights, i, lanes, table):
+    flat = table.reshape(-1)
     for f in range(len(lanes)):
         for corner in range(8):
-            table[base + entries[corner * BLOCK + i], f] += weights[corner * BLOCK + i] * grad[first + f * stride]
-"""
+            at = np.int64(entries[corner * BLOCK + i]) + f
+            flat[at] += weights[corner * BLOCK + i] * grad[first + f * stride]
+""",
+    "from .lanes import BLOCK, TILE, added, gated, move, product, rectified, transpose\n": """
+from .lanes import BLOCK, TILE
+
+
+@njit
+def move(source, start, target, to):
+    a, b = source.reshape(-1), target.reshape(-1)
+    for i in range(BLOCK):
+        b[to + i] = a[start + i]
+
+
+@njit
+def transpose(buffer, source, target):
+    for i in range(BLOCK):
+        for j in range(BLOCK):
+            buffer[(target + i) * BLOCK + j] = buffer[(source + j) * BLOCK + i]
+
+
+@njit
+def _tile(inputs, first_input, depth, weights, first_weight, down, across, outputs, y, first_gate, lanes, kind):
+    for o in range(len(lanes)):
+        for s in range(BLOCK):
+            total = np.float32(0)
+            for i in range(depth):
+                total += weights[first_weight + down * i + across * o] * inputs[(first_input + i) * BLOCK + s]
+            gate = outputs[(first_gate + o) * BLOCK + s]
+            if (kind == 1 and total < 0) or (kind == 2 and not gate > 0):
+                total = np.float32(0)
+            outputs[(y + o) * BLOCK + s] = total + gate if kind == 3 else total
+
+
+@njit
+def product(x, i, d, w, f, down, across, y, o, g, lanes):
+    _tile(x, i, d, w, f, down, across, y, o, g, lanes, 0)
+
+
+@njit
+def rectified(x, i, d, w, f, down, across, y, o, g, lanes):
+    _tile(x, i, d, w, f, down, across, y, o, g, lanes, 1)
+
+
+@njit
+def gated(x, i, d, w, f, down, across, y, o, g, lanes):
+    _tile(x, i, d, w, f, down, across, y, o, g, lanes, 2)
+
+
+@njit
+def added(x, i, d, w, f, down, across, y, o, g, lanes):
+    _tile(x, i, d, w, f, down, across, y, o, g, lanes, 3)
+""",
+}
 
 
 def plain_lanes(source: str) -> str:
-    line = "from .lanes import BLOCK, blend, spread\n"
-    assert line in source or "lanes import" not in source
-    return source.replace(line, PLAIN_LANES)
+    """An engine's source with its vector operations written out in numbers."""
+    assert "lanes import" not in source or any(line in source for line in PLAIN_LANES)
+    for line, plain in PLAIN_LANES.items():
+        source = source.replace(line, plain)
+    return source

@@ -33,8 +33,9 @@ def test_no_index_leaves_its_array(name, tmp_path, monkeypatch):
     [
         ("composite", "weights[i] = w", "weights[i + 1] = w"),
         ("hash_encode", "np.int32(resolution - 1))\n", "np.int32(resolution))\n"),  # the point 1.0, a cell too far
+        ("perceptron", "whole = across - across % TILE\n", "whole = across\n"),
     ],
-    ids=["composite", "hash_encode"],
+    ids=["composite", "hash_encode", "perceptron"],
 )
 def test_an_index_astray_is_noticed(name, sound, astray, tmp_path, monkeypatch):
     def edit(source: str) -> str:

@@ -9,8 +9,8 @@ from agreement import ENGINES, OPERATIONS, assert_agrees, cases, module, outputs
 
 from lumigraph import kernels
 
-DIFFERENTIABLE = {"spherical_harmonics": [0], "composite": [0, 1], "hash_encode": [0, 1]}
-TYPICAL = {"spherical_harmonics": 4, "composite": 13, "hash_encode": 2, "march": 2}  # a case of each
+DIFFERENTIABLE = {"spherical_harmonics": [0], "composite": [0, 1], "hash_encode": [0, 1], "perceptron": [0, 1, 2]}
+TYPICAL = {"spherical_harmonics": 4, "composite": 13, "hash_encode": 2, "march": 2, "perceptron": 4}  # a case of each
 
 
 @pytest.mark.parametrize("engine", ENGINES)

@@ -42,6 +42,12 @@ FAULTS = {
         "spherical_harmonics", "gpu", "_backward", "d_directions + 3 * r + 2", "d_directions + 3 * r"
     ),
     "term forgotten": Fault("spherical_harmonics", "cpu", "_backward", " - zonal * g[13]", ""),
+    # perceptrons
+    "a layer that no gate closes": Fault("perceptron", "cpu", "_backward", "layer == 0)", "True)"),
+    "the wrong gate": Fault("perceptron", "cpu", "_downwards", "gate + i", "target + i"),
+    "the last block's rest counted twice": Fault(
+        "perceptron", "cpu", "_fetch", "block[(row + f) * BLOCK : (row + f + 1) * BLOCK] = 0", "pass"
+    ),
     # marching has no backward pass
     "empty cells counted": Fault("march", "gpu", "_march", "count += kept", "count += held"),
     "a cell too far": Fault("march", "gpu", "_first_at", "- 0.02)", "+ 1.0)"),

@@ -6,4 +6,5 @@ from .composite import composite as composite
 from .hash_encode import HashLevels as HashLevels
 from .hash_encode import hash_encode as hash_encode
 from .march import march as march
+from .perceptron import perceptron as perceptron
 from .spherical_harmonics import spherical_harmonics as spherical_harmonics

@@ -20,7 +20,13 @@ from ..files import write_json
 from ..rays import Samples
 from ._dispatch import Engine, using
 
-UNITS = {"hash_encode": "samples", "composite": "samples", "march": "rays", "spherical_harmonics": "directions"}
+UNITS = {
+    "hash_encode": "samples",
+    "composite": "samples",
+    "march": "rays",
+    "spherical_harmonics": "directions",
+    "perceptron": "samples",
+}
 PATIENCE = 5.0  # seconds: what takes longer is repeated less often, but three times at least
 
 

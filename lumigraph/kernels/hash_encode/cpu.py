@@ -9,8 +9,8 @@ import torch
 from numba import get_num_threads, njit, prange
 
 from .._dispatch import empty
-from . import PRIMES
 from .._vectors import LANES
+from . import PRIMES
 from .lanes import BLOCK, blend, place_dense, place_hashed, spread
 
 P1, P2 = np.uint32(PRIMES[1]), np.uint32(PRIMES[2])
