@@ -179,6 +179,27 @@ def test_looking_at_a_share_of_cells_still_sees_what_appears(generator):
     assert max(looked_at) < 16**3 / 2
 
 
+def test_a_budget_of_looks_is_kept_and_everything_gets_its_turn(generator):
+    grid, looked_at = ball_grid(generator, radius=0.3), []
+
+    def larger(points):
+        looked_at.append(len(points))
+        return ball(0.6)(points)
+
+    for _ in range(600):
+        grid.update(larger, 1.0, generator, share=0.5, budget=100)
+    _, farthest = nearest_and_farthest(16)
+    assert max(looked_at) <= 100 and grid.occupied[0][farthest < 0.6].float().mean() > 0.97
+
+
+def test_a_larger_cell_is_occupied_by_thinner_matter(generator):
+    """The same thickness across a cell: half the density where cells are twice as large."""
+    grid = OccupancyGrid(2.0, 8)
+    grid.update(lambda points: torch.where(points[:, 0] < 0, 3.0, 50.0), 1.0, generator)
+    assert not grid.occupied[0, :4].any() and grid.occupied[0, 4:].all()
+    assert grid.occupied[1].all()
+
+
 def test_refining_keeps_what_was_known(generator):
     grid = ball_grid(generator)
     coarse = [getattr(grid, name).clone() for name in grid.GRIDS]

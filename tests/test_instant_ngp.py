@@ -10,7 +10,7 @@ import torch
 
 from lumigraph.evaluate import evaluate
 from lumigraph.images import ImageStore
-from lumigraph.methods.instant_ngp import Config, InstantNGP, columns
+from lumigraph.methods.instant_ngp import Config, InstantNGP
 from lumigraph.rays import Rays
 from lumigraph.run import Run, build
 from lumigraph.scene import Scene
@@ -186,9 +186,3 @@ def test_the_preset_of_a_cpu_is_smaller_than_the_papers():
     cpu, gpu = (InstantNGP.preset(torch.device(name)) for name in ("cpu", "cuda"))
     assert gpu == Config() and (gpu.levels, gpu.features, gpu.log2_entries) == (16, 2, 19)
     assert cpu.samples_per_step < gpu.samples_per_step and cpu.finest < gpu.finest
-
-
-def test_columns_keep_their_memory_in_planes():
-    x = torch.arange(12.0).view(2, 6).t()
-    mask = torch.tensor([True, False, True, True, False, False])
-    assert torch.equal(columns(x, mask), x[mask]) and columns(x, mask).t().is_contiguous()

@@ -85,32 +85,42 @@ class OccupancyGrid(nn.Module):
     def update(
         self,
         density_at: Callable[[Float[Tensor, "sample 3"]], Float[Tensor, " sample"]],
-        threshold: float,
+        thickness: float,
         generator: torch.Generator,
         decay: float = 0.95,
         share: float = 1.0,
+        budget: int | None = None,
     ) -> None:
         """Look at one random point in each of some cells, and decide anew which are occupied.
 
-        threshold: density that makes a cell occupied, or the mean over all cells where that is less
+        thickness: optical thickness across a cell from which on it is occupied; or the density's mean over all cells,
+                   where that is less
         share:     below 1, only the occupied cells and that share of all cells, drawn at random, are looked at
+        budget:    looks at most, half of them at occupied cells; cells then take turns
         """
         flat = self.density.view(-1)
-        cells = self._choose(share, generator)
+        cells = self._choose(share, budget, generator)
         flat[cells] *= decay
         for part in cells.split(1 << 18):
             seen = density_at(self._point_in(part, generator))
             flat[part] = torch.maximum(flat[part], seen)
-        self.occupied = self.possible & (self.density > min(threshold, float(self.density.mean())))
+        sizes = 2.0 ** torch.arange(len(self.density), device=flat.device) * 2 / self.resolution
+        enough = (thickness / sizes).clamp(max=float(self.density.mean()))
+        self.occupied = self.possible & (self.density > enough[:, None, None, None])
         self.box.copy_(self._box())
 
-    def _choose(self, share: float, generator: torch.Generator) -> Int[Tensor, " cell"]:
+    def _choose(self, share: float, budget: int | None, generator: torch.Generator) -> Int[Tensor, " cell"]:
+        possible, occupied = self.possible.view(-1), self.occupied.view(-1)
         if share >= 1:
-            return self.possible.view(-1).nonzero()[:, 0]
-        drawn = torch.randint(self.density.numel(), (int(share * self.density.numel()),), generator=generator)
-        chosen = self.occupied.view(-1).clone()
-        chosen[drawn.to(chosen.device)] = True
-        return (chosen & self.possible.view(-1)).nonzero()[:, 0]
+            return possible.nonzero()[:, 0]
+        probes = min(int(share * len(possible)), budget // 2 if budget else len(possible))
+        drawn = torch.randint(len(possible), (probes,), generator=generator).to(possible.device)
+        known = occupied.nonzero()[:, 0]
+        if budget and len(known) > budget // 2:
+            known = known[torch.randint(len(known), (budget // 2,), generator=generator).to(known.device)]
+        chosen = torch.zeros_like(occupied)
+        chosen[drawn] = chosen[known] = True
+        return (chosen & possible).nonzero()[:, 0]
 
     def _point_in(self, cells: Int[Tensor, " cell"], generator: torch.Generator) -> Float[Tensor, "cell 3"]:
         n = self.resolution

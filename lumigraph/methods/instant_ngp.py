@@ -56,6 +56,7 @@ class Config:
 
 # Coarse to fine: share of the budget from which on, and which part of the Config's occupancy and lattice.
 STAGES = ((0.0, 1 / 4, 1 / 4), (0.04, 1 / 2, 1 / 2), (0.12, 1, 2 / 3), (0.75, 1, 1))
+LOOKS = 4  # at the grid at most, for each sample of a step
 PROBES = 0.02  # share of all cells looked at again at random, in case something has grown there
 BATCH_GROWTH = 1.5  # rays per step at most, from one step to the next
 
@@ -125,10 +126,10 @@ class InstantNGP(RayMethod):
             log2_entries=16,
             finest=512,
             width=32,
-            samples_per_step=1 << 14,
+            samples_per_step=1 << 15,
             lattice=384,
             stop=1e-3,
-            cell_thickness=0.3,
+            cell_thickness=0.15,
             learning_rate=2e-2,
         )
 
@@ -203,9 +204,10 @@ class InstantNGP(RayMethod):
             self.occupancy.refine()
             finer = True
         if finer or step % (4 if step < 32 else self.config.grid_every) == 0:
-            threshold = self.config.cell_thickness * self.occupancy.resolution / 2
-            share = 1.0 if finer or step < 32 else PROBES
-            self.occupancy.update(self.density, threshold, self._random(~step), self.config.grid_decay, share)
+            share, budget = (1.0, None) if finer or step < 32 else (PROBES, self.config.samples_per_step * LOOKS)
+            chance = self._random(~step)
+            c = self.config
+            self.occupancy.update(self.density, c.cell_thickness, chance, c.grid_decay, share, budget)
 
     def after_step(self, step: int) -> None:
         """So many rays next time as should give the wanted number of samples."""
