@@ -6,7 +6,7 @@
         000800/     weights.safetensors · optimizer.safetensors · state.json
     metrics.jsonl   one line every few steps
     previews/       one view as it came to be
-    eval.json, evaluation.png, renders/, report.html: what the commands made of it
+    eval.json, eval.png, renders/, report.html: what the commands made of it
 
 Nothing in it runs code when opened. A checkpoint is written beside the old one and renamed once it is whole, so the
 folder holds a complete state whenever it held one before, however the writer ended.

@@ -68,8 +68,8 @@ class _Composite(torch.autograd.Function):
     def backward(ctx, *grads):
         saved = [x.detach().numpy() for x in ctx.saved_tensors]
         to_tau, to_values = (empty(*x.shape) for x in ctx.saved_tensors[:2])
-        grads = (g.contiguous().numpy() for g in grads)
-        _backward(*grads, *saved, np.float32(ctx.stop), to_tau.numpy(), to_values.numpy())
+        arrays = (g.contiguous().numpy() for g in grads)
+        _backward(*arrays, *saved, np.float32(ctx.stop), to_tau.numpy(), to_values.numpy())
         return to_tau, to_values, None, None
 
 

@@ -102,7 +102,7 @@ def _walk(ox, oy, oz, dx, dy, dz, near, far, occupied, clearance, density, step,
                 t0 = t1
                 continue
             # Empty: on to the first midpoint that may lie outside this cell, or outside all the clear blocks around it.
-            clear = max(clear, 1)
+            clear = max(clear, np.int64(1))
             leave = min(
                 _exit(cx, clear, per_unit, half, ox, dx, ix),
                 _exit(cy, clear, per_unit, half, oy, dy, iy),
