@@ -205,9 +205,8 @@ class InstantNGP(RayMethod):
             finer = True
         if finer or step % (4 if step < 32 else self.config.grid_every) == 0:
             share, budget = (1.0, None) if finer or step < 32 else (PROBES, self.config.samples_per_step * LOOKS)
-            chance = self._random(~step)
-            c = self.config
-            self.occupancy.update(self.density, c.cell_thickness, chance, c.grid_decay, share, budget)
+            thickness, decay = self.config.cell_thickness, self.config.grid_decay
+            self.occupancy.update(self.density, thickness, self._random(~step), decay, share, budget)
 
     def after_step(self, step: int) -> None:
         """So many rays next time as should give the wanted number of samples."""
