@@ -75,12 +75,13 @@ def descend(optimizer, p, slopes):
         optimizer.step()
 
 
-def test_lazy_adam_is_adam_where_every_gradient_counts(generator):
+@pytest.mark.parametrize("decay", [0.0, 0.5])
+def test_lazy_adam_is_adam_where_every_gradient_counts(decay, generator):
     begin, slopes = torch.randn(50, 2, generator=generator), gradients(20, generator)
     results = []
-    for kind in (LazyAdam, torch.optim.Adam):
+    for kind in (LazyAdam, torch.optim.AdamW):
         p = torch.nn.Parameter(begin.clone())
-        descend(kind([p], lr=0.02, betas=(0.9, 0.99), eps=1e-15), p, slopes)
+        descend(kind([p], lr=0.02, betas=(0.9, 0.99), eps=1e-15, weight_decay=decay), p, slopes)
         results.append(p.detach())
     assert (results[0] - begin).abs().mean() > 0.02
     torch.testing.assert_close(results[0], results[1], rtol=1e-5, atol=1e-6)
@@ -88,7 +89,7 @@ def test_lazy_adam_is_adam_where_every_gradient_counts(generator):
 
 def test_lazy_adam_leaves_alone_what_has_no_gradient(generator):
     p = torch.nn.Parameter(torch.randn(50, 2, generator=generator))
-    optimizer = LazyAdam([p])
+    optimizer = LazyAdam([p], weight_decay=0.5)
     descend(optimizer, p, gradients(3, generator))
     held = [x.detach().clone() for x in (p, optimizer.state[p]["mean"], optimizer.state[p]["square"])]
     slopes = gradients(4, generator)

@@ -66,6 +66,22 @@ def test_gradients_reach_everything_that_learns():
     assert 0.01 < touched <= 1
 
 
+def test_each_ray_stands_before_a_colour_and_its_opposite(monkeypatch):
+    scene, losses = tiny.scene(), []
+    made = method(scene)
+    made.before_step(0, 0.0)
+    batch = made.batch(scene, torch.Generator().manual_seed(0))
+    for level in (0.2, 0.8, 0.5):  # of the background; rays are not jittered
+
+        def drawn(*shape, generator, level=level):
+            return torch.full(shape, level if len(shape) > 1 else 0.0)
+
+        monkeypatch.setattr(torch, "rand", drawn)
+        losses.append(made.loss(batch, 0)["huber"].item())
+    assert losses[0] == pytest.approx(losses[1], rel=1e-5)
+    assert abs(losses[0] - losses[2]) > 1e-3 * losses[2]
+
+
 @pytest.mark.parametrize("scene", [tiny.scene, black_room], ids=["alpha", "no alpha"])
 def test_the_same_seed_gives_the_same_losses(scene, tmp_path):
     losses = []

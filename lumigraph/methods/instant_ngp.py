@@ -48,6 +48,7 @@ class Config:
     learning_rate: float = 1e-2  # section 4
     last_learning_rate: float = 1e-3  # at the end of the budget
     hold: float = 0.3  # share of the budget before the learning rate begins to fall
+    table_decay: float = 0.0  # decoupled weight decay of the table; of objects only, for it pulls density towards 1
     huber: float = 0.1  # residual at which the loss turns from square to linear
     exposure: bool = False  # learn a gain per photograph
     refine_cameras: bool = False  # learn a correction of each photograph's pose
@@ -108,8 +109,7 @@ class InstantNGP(RayMethod):
         self.exposure = Exposure(frame.image_count) if config.exposure else None
         self.poses = PoseRefinement(frame.image_count) if config.refine_cameras else None
         self.occupancy = OccupancyGrid(frame.reach, max(4, int(config.occupancy * STAGES[0][1])))
-        self.growth = config.growth if frame.reach > 1 else 0.0
-        self.lattice = config.lattice
+        self._set_lattice(1.0)
         self.register_buffer("rays_per_step", torch.tensor(256))
         self._optimizers: list[torch.optim.Optimizer] = []
         self._figures: dict[str, float] = {}
@@ -129,8 +129,11 @@ class InstantNGP(RayMethod):
             samples_per_step=1 << 15,
             lattice=384,
             stop=1e-3,
+            growth=1 / 96,
             cell_thickness=0.15,
             learning_rate=2e-2,
+            table_decay=0.3,
+            huber=0.3,
         )
 
     def begin(self, scene: Scene) -> None:
@@ -183,22 +186,29 @@ class InstantNGP(RayMethod):
         if self.exposure and rays.image_index is not None:  # the gain is the scene's, not the background's
             behind = (1 - rendering.opacity)[:, None] * background
             rgb = self.exposure(rgb - behind, rays.image_index) + behind
-        self._figures["mse"] = float((rgb.detach() - target).square().mean())
+        residual = rgb - target
+        self._figures["mse"] = float(residual.detach().square().mean())
+        if batch.alpha is not None:  # and before the opposite colour, where only what opacity lacks looks different
+            lacking = (batch.alpha - rendering.opacity)[:, None]
+            residual = torch.cat([residual, residual + lacking * (1 - 2 * background)])
         # Divided by delta, so that the linear part has slope 1.
-        return {"huber": nn.functional.huber_loss(rgb, target, delta=self.config.huber) / self.config.huber}
+        delta = self.config.huber
+        return {"huber": nn.functional.huber_loss(residual, torch.zeros_like(residual), delta=delta) / delta}
 
     def optimizers(self) -> list[torch.optim.Optimizer]:
         networks = [*self.field.density_network.parameters(), *self.field.colour_network.parameters()]
         groups: list[dict[str, Any]] = [{"params": networks, "scale": 1.0}]
         groups += [{"params": [*x.parameters()], "scale": 0.05} for x in (self.exposure, self.poses) if x]
         common = {"lr": self.config.learning_rate, "betas": (0.9, 0.99), "eps": 1e-15}
-        self._optimizers = [LazyAdam([self.field.table], **common), torch.optim.Adam(groups, foreach=True, **common)]
+        decay = self.config.table_decay if self.frame.reach == 1 else 0.0
+        table = LazyAdam([self.field.table], weight_decay=decay, **common)
+        self._optimizers = [table, torch.optim.Adam(groups, foreach=True, **common)]
         return self._optimizers
 
     def before_step(self, step: int, progress: float) -> None:
         self._set_learning_rate(step, progress)
         _, cells, lattice = max(stage for stage in STAGES if stage[0] <= progress)
-        self.lattice = int(self.config.lattice * lattice)
+        self._set_lattice(lattice)
         finer = False
         while self.occupancy.resolution < self.config.occupancy * cells:
             self.occupancy.refine()
@@ -220,6 +230,11 @@ class InstantNGP(RayMethod):
 
     def statistics(self) -> dict[str, float]:
         return self._figures
+
+    def _set_lattice(self, share: float) -> None:
+        """Coarser, in both its steps and their growth with distance, where the share is below 1."""
+        self.lattice = int(self.config.lattice * share)
+        self.growth = self.config.growth / share if self.frame.reach > 1 else 0.0
 
     def _set_learning_rate(self, step: int, progress: float) -> None:
         """Twenty steps of warm-up, then constant, then an exponential fall (section 4 decays likewise)."""
