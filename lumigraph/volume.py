@@ -37,7 +37,7 @@ def composite(
     return Rendering(colour, depth, opacity, dict(zip(values, rest, strict=True)))
 
 
-STRETCH = 4  # samples of a ray that are asked about at first; each time after that, twice as many
+STRETCH = 8  # samples of a ray that are asked about at first; each time after that, twice as many
 
 
 @torch.no_grad()

@@ -123,7 +123,7 @@ class InstantNGP(RayMethod):
         return Config(
             levels=8,
             features=4,
-            log2_entries=16,
+            log2_entries=17,
             finest=512,
             width=32,
             samples_per_step=1 << 15,
