@@ -122,8 +122,12 @@ def test_a_second_interrupt_breaks_off(tmp_path, monkeypatch):
 
     monkeypatch.setattr(type(method), "before_step", insist)
     monkeypatch.setattr("lumigraph.train.rehearse", lambda *_: 0.0)
-    with pytest.raises(KeyboardInterrupt):
-        fit(method, scene, steps=50, show=False)
+    inherited = signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background jobs ignore it
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            fit(method, scene, steps=50, show=False)
+    finally:
+        signal.signal(signal.SIGINT, inherited)
 
 
 def finite_weights(run: Run) -> bool:
