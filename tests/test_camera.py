@@ -121,8 +121,9 @@ def test_one_camera_needs_no_index(kind, generator):
     ):
         torch.testing.assert_close(one, other, atol=1e-6, rtol=1e-5)
     points = among.at(torch.ones(len(pixels)))
-    # Beside a panorama's poles a rounding error of a direction is thousandths of a pixel.
-    torch.testing.assert_close(cameras[5].project(points), cameras.project(points, index), atol=1e-2, rtol=0)
+    # Beside a panorama's poles the last bit of a direction is thousandths of a pixel.
+    atol = 5e-3 if kind == "equirectangular" else 2e-3
+    torch.testing.assert_close(cameras[5].project(points), cameras.project(points, index), atol=atol, rtol=0)
 
 
 def test_each_ray_knows_its_photograph_and_moment(generator):
