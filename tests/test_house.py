@@ -17,7 +17,7 @@ FLOORS: list[set[str]] = [
     {"errors", "loops"},
     {"files", "plain", "lens", "rays"},
     {"camera", "images", "kernels", "charts", "figures", "metrics"},
-    {"volume", "scene"},
+    {"volume", "gaussians", "scene"},
     {"components", "capture", "method", "paths"},
     {"display"},
     {"methods", "export", "viewer"},
