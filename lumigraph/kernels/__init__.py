@@ -7,4 +7,9 @@ from .hash_encode import HashLevels as HashLevels
 from .hash_encode import hash_encode as hash_encode
 from .march import march as march
 from .perceptron import perceptron as perceptron
+from .project import View as View
+from .project import project as project
+from .rasterize import rasterize as rasterize
 from .spherical_harmonics import spherical_harmonics as spherical_harmonics
+from .tile import Tiles as Tiles
+from .tile import tile as tile

@@ -1,0 +1,85 @@
+"""Rasterising: footprints become a picture, front to back."""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from .._dispatch import implementation
+from ..project import FAINTEST
+from ..tile import SIDE, Tiles, footprints, tile
+
+OPAQUEST = 0.99  # no Gaussian hides more than this of what is behind it (Kerbl 2023, appendix C)
+
+
+def rasterize(
+    centres: Float[Tensor, "gaussian 2"],
+    conics: Float[Tensor, "gaussian 3"],
+    opacities: Float[Tensor, " gaussian"],
+    colours: Float[Tensor, "gaussian 3"],
+    depths: Float[Tensor, " gaussian"],
+    tiles: Tiles,
+    stop: float = 1e-4,
+) -> tuple[Float[Tensor, "height width 3"], Float[Tensor, "height width"], Float[Tensor, "height width"]]:
+    """Composite each pixel's Gaussians in the order of its tile's list (Kerbl 2023, eq. 3 and appendix C).
+
+        a_i = min(0.99, opacity_i exp(-d^T conic_i d / 2))      d from the centre to the pixel's centre; 0 if below 1/255
+        T_i = prod_{j<i} (1 - a_j)      light that comes through to i
+        w_i = a_i T_i                   0 once T_i < stop
+
+    Returns sum_i w_i colour_i (H, W, 3), sum_i w_i depth_i (H, W) and sum_i w_i (H, W). All are differentiable in the
+    five tensors; where 0.99 cuts a_i off, nothing flows back through it.
+    """
+    return implementation("rasterize", centres)(centres, conics, opacities, colours, depths, tiles, stop)
+
+
+def cases(generator: torch.Generator):
+    """Pictures that every engine must agree on, without pixels at which 1/255, 0.99 or `stop` hang on rounding."""
+    for count, size, side, stop in [
+        (0, (9, 5), 16, 1e-4),
+        (1, (1, 1), 32, 1e-4),
+        (30, (40, 33), 16, 1e-4),
+        (30, (40, 33), 32, 1e-4),
+        (60, (35, 21), 8, 1e-2),
+    ]:
+        yield _steady(*footprints(count, size, generator), size, side, stop, generator)
+    centres, conics, opacities, depths = footprints(150, (37, 50), generator)
+    yield _steady(centres, conics, 0.5 + opacities / 2, depths, (37, 50), 32, 1e-4, generator)  # walls
+    depths = (4 * depths).round()  # coincident
+    conics[:10] = torch.tensor([1e-6, 0.0, 1e-6])  # a haze everywhere
+    conics[10:20] = torch.tensor([0.5, 0.49999, 0.5])  # needles
+    conics[20:30], centres[30:40] = torch.tensor([3.3, 0.0, 3.3]), -500.0
+    opacities[40:60] = 0.0
+    yield _steady(centres, conics, opacities, depths, (37, 50), 16, 1e-4, generator)
+    yield _steady(centres[:60], conics[:60], opacities[:60] / 4, depths[:60], (37, 50), 32, 0.0, generator)
+
+
+def benchmark_case(generator: torch.Generator, size: int = 2**18):
+    """A square picture of `size` pixels, one Gaussian of a few pixels for every 8 of them."""
+    width = round(size**0.5)
+    centres, conics, opacities, depths = footprints(size // 8, (width, width), generator)
+    colours, tiles = (
+        torch.rand(len(centres), 3, generator=generator),
+        tile(centres, conics, opacities, depths, (width,) * 2),
+    )
+    return *(x.requires_grad_() for x in (centres, conics, opacities, colours, depths)), tiles, 1e-4
+
+
+def _steady(centres, conics, opacities, depths, size, side, stop, generator):
+    """Only the Gaussians that no pixel sees at a threshold; what remains is looked at again, for T changes with it."""
+    from ..tile.reference import run as tile_
+    from .reference import light
+
+    colours = torch.rand(len(centres), 3, generator=generator)
+    while True:
+        tiles = Tiles(*tile_(centres, conics, opacities, depths, size, side), size, side)
+        bad = torch.zeros(len(centres), dtype=torch.bool)
+        for numbers, _, raw, before in light(centres.double(), conics.double(), opacities.double(), tiles, stop):
+            near = torch.zeros_like(raw, dtype=torch.bool)
+            for value, threshold in ((raw, FAINTEST), (raw, OPAQUEST), (before, stop)):
+                near |= (value / max(threshold, 1e-12) - 1).abs() < 1e-3
+            bad[numbers] |= near.any(0)
+        if not bad.any():
+            return centres, conics, opacities, colours, depths, tiles, stop
+        centres, conics, opacities, depths, colours = (x[~bad] for x in (centres, conics, opacities, depths, colours))

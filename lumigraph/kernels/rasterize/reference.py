@@ -1,0 +1,46 @@
+"""The definition: every pixel of a tile against every Gaussian of its list, (P, M)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import torch
+from torch import Tensor
+
+from ..project import FAINTEST
+from ..tile import Tiles
+from . import OPAQUEST
+
+
+def run(
+    centres: Tensor, conics: Tensor, opacities: Tensor, colours: Tensor, depths: Tensor, tiles: Tiles, stop: float
+) -> tuple[Tensor, Tensor, Tensor]:
+    width, height = tiles.size
+    values = torch.cat([colours, depths[:, None], torch.ones_like(depths)[:, None]], -1)
+    parts, places = [centres.new_zeros(0, 5)], [torch.zeros(0, dtype=torch.int64, device=centres.device)]
+    for numbers, pixels, raw, before in light(centres, conics, opacities, tiles, stop):
+        alpha = torch.where(raw < FAINTEST, 0, raw.clamp(max=OPAQUEST))
+        weights = torch.where(before < stop, 0, alpha * before)
+        parts.append(weights @ values[numbers])
+        places.append(pixels[:, 1] * width + pixels[:, 0])
+    seen = centres.new_zeros(height * width, 5).index_copy(0, torch.cat(places), torch.cat(parts))
+    return seen[:, :3].view(height, width, 3), seen[:, 3].view(height, width), seen[:, 4].view(height, width)
+
+
+def light(
+    centres: Tensor, conics: Tensor, opacities: Tensor, tiles: Tiles, stop: float
+) -> Iterator[tuple[Tensor, Tensor, Tensor, Tensor]]:
+    """For each tile: numbers of its Gaussians (M,), its pixels' columns and rows (P, 2), opacity exp(-q / 2) before any
+    threshold (P, M), and the light T that comes through to each (P, M)."""
+    width, height = tiles.size
+    for k in range(tiles.across * tiles.down):
+        numbers = tiles.order[tiles.starts[k] : tiles.starts[k + 1]].long()
+        x = torch.arange(tiles.side, device=centres.device) + k % tiles.across * tiles.side
+        y = torch.arange(tiles.side, device=centres.device) + k // tiles.across * tiles.side
+        pixels = torch.cartesian_prod(y[y < height], x[x < width]).flip(-1)
+        d = pixels[:, None] + 0.5 - centres[numbers]
+        (dx, dy), (a, b, c) = d.unbind(-1), conics[numbers].unbind(-1)
+        raw = opacities[numbers] * torch.exp(-0.5 * (a * dx * dx + c * dy * dy) - b * dx * dy)
+        alpha = torch.where(raw < FAINTEST, 0, raw.clamp(max=OPAQUEST))
+        before = torch.nn.functional.pad(1 - alpha, (1, 0), value=1.0).cumprod(1)[:, :-1]
+        yield numbers, pixels, raw, before

@@ -1,0 +1,107 @@
+"""Tiling: which Gaussians each square of the picture must look at, nearest first."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from .._dispatch import implementation
+from ..project import FAINTEST
+
+SIDE = 32  # pixels along a tile
+
+
+@dataclass(frozen=True)
+class Tiles:
+    """Tile k, row by row, must look at Gaussians order[starts[k] : starts[k + 1]], front to back.
+
+    size: (width, height) of the picture; side: pixels along a tile. The last tile of a row or column may stick out.
+    """
+
+    order: Int[Tensor, " pair"]
+    starts: Int[Tensor, " tile_plus_one"]
+    size: tuple[int, int]
+    side: int
+
+    @property
+    def across(self) -> int:
+        """Tiles in a row."""
+        return -(-self.size[0] // self.side)
+
+    @property
+    def down(self) -> int:
+        """Rows of tiles."""
+        return -(-self.size[1] // self.side)
+
+
+def tile(
+    centres: Float[Tensor, "gaussian 2"],
+    conics: Float[Tensor, "gaussian 3"],
+    opacities: Float[Tensor, " gaussian"],
+    depths: Float[Tensor, " gaussian"],
+    size: tuple[int, int],
+    side: int = SIDE,
+) -> Tiles:
+    """Lists of the Gaussians that reach 1/255 somewhere between the outermost pixel centres of each tile.
+
+    A footprint is the ellipse d^T conic d <= 2 ln(255 opacity), as large as its opacity asks for and no larger
+    (a fixed 3 sigma is both too much and too little). Equal depths keep the order of their numbers.
+
+    size: (width, height) of the picture in pixels
+    side: of a tile, in pixels: 4, 8, 16 or 32
+    Not differentiable. order is int32, starts int64.
+    """
+    if side not in (4, 8, 16, 32):
+        raise ValueError(f"a tile of side {side} cannot be; it is 4, 8, 16 or 32 pixels")
+    run = implementation("tile", centres)
+    return Tiles(*run(*(x.detach() for x in (centres, conics, opacities, depths)), size, side), size, side)
+
+
+def cases(generator: torch.Generator):
+    """Inputs that every engine must agree on, without ellipses that end upon a tile's border."""
+    for count, size, side in [
+        (0, (70, 45), 16), (1, (5, 3), 32), (60, (70, 45), 16), (60, (70, 45), 32), (50, (33, 65), 8), (200, (40, 40), 4),
+    ]:  # fmt: skip
+        yield _steady(*footprints(count, size, generator), size, side)
+    centres, conics, opacities, depths = footprints(60, (70, 45), generator)
+    depths[10:50] = 2.0  # coincident
+    opacities[20:24], opacities[30:33] = 0.0, FAINTEST / 2
+    conics[:4] = torch.tensor([1e-6, 0.0, 1e-6])  # everywhere
+    conics[4:8] = torch.tensor([0.5, 0.49999, 0.5])  # needles across the picture
+    conics[8:10], centres[10:14] = torch.tensor([3.3, 0.0, 3.3]), -500.0
+    yield _steady(centres, conics, opacities, depths, (70, 45), 16)
+
+
+def benchmark_case(generator: torch.Generator, size: int = 2**18):
+    """Footprints of a few pixels each, on a square picture of `size` pixels with one Gaussian for every 8 of them."""
+    width = round(size**0.5)
+    return *footprints(size // 8, (width, width), generator), (width, width), SIDE
+
+
+def footprints(count: int, size: tuple[int, int], generator: torch.Generator):
+    """Centres, conics, opacities and depths of ellipses on and around a picture, a few pixels in size."""
+
+    def uniform(*shape):
+        return torch.rand(shape, generator=generator)
+
+    centres = (1.4 * uniform(count, 2) - 0.2) * torch.tensor(size)
+    angle, sigma = 3.2 * uniform(count), torch.exp(1.5 * uniform(count, 2))
+    c, s, (p, q) = angle.cos(), angle.sin(), sigma.pow(-2).T
+    conics = torch.stack([c * c * p + s * s * q, c * s * (p - q), s * s * p + c * c * q], -1)
+    return centres, conics, uniform(count), 1 + uniform(count)
+
+
+def _steady(centres, conics, opacities, depths, size, side):
+    """Only the Gaussians whose tiles stay the same when their opacity changes by more than float32 rounds."""
+    from .reference import touches
+
+    keep = torch.ones(len(centres), dtype=torch.bool)
+    for nudge in (1 - 1e-3, 1 + 1e-3):
+        keep &= (
+            touches(*(x.double() for x in (centres, conics, opacities)), size, side)
+            == touches(*(x.double() for x in (centres, conics, opacities * nudge)), size, side)
+        ).all(-1)
+    return *(x[keep] for x in (centres, conics, opacities, depths)), size, side
