@@ -47,7 +47,7 @@ def cases(generator: torch.Generator):
     centres, conics, opacities, depths = footprints(150, (37, 50), generator)
     yield _steady(centres, conics, 0.5 + opacities / 2, depths, (37, 50), 32, 1e-4, generator)  # walls
     depths = (4 * depths).round()  # coincident
-    conics[:10] = torch.tensor([1e-6, 0.0, 1e-6])  # a haze everywhere
+    conics[:10], opacities[:10] = torch.tensor([1e-6, 0.0, 1e-6]), opacities[:10] / 2  # a haze everywhere
     conics[10:20] = torch.tensor([0.5, 0.49999, 0.5])  # needles
     conics[20:30], centres[30:40] = torch.tensor([3.3, 0.0, 3.3]), -500.0
     opacities[40:60] = 0.0

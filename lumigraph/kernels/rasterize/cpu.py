@@ -1,0 +1,258 @@
+"""Numba: a thread takes a run of tiles; blocks of 4 x 4 pixels are sixteen lanes; each Gaussian visits the blocks that
+its ellipse touches and that still want light.
+
+Gradients of one Gaussian from one tile are summed in registers and kept by themselves; a second pass adds them up in the
+order of tiles, so that no two threads add to one place and the result is the same each time.
+"""
+
+import math
+
+import numpy as np
+import torch
+from numba import get_num_threads, njit, prange
+
+from .._dispatch import empty
+from .._lanes import bytes_between, exp2, fetch, first_bit, highest, lowest, put, root, some, totals, where
+from ..project import FAINTEST as FAINTEST_
+from . import OPAQUEST as OPAQUEST_
+
+FAST = {"cache": True, "fastmath": {"contract", "nsz", "arcp"}, "error_model": "numpy"}  # without "reassoc": see `exp2`
+LANES, BLOCKS = 16, 64  # pixels of a block; blocks of the largest tile, in eight rows of eight
+FAINTEST, OPAQUEST = np.float32(FAINTEST_), np.float32(OPAQUEST_)
+ZERO, ONE, HALF = np.float32(0), np.float32(1), np.float32(0.5)
+LOG2_E, LOG2_255 = math.log2(math.e), math.log2(255)
+
+# Rows of a table of constants: a block's columns and rows; a tile's rows of blocks, and right (+) and left (-) edges.
+TABLE = np.zeros(4 * LANES, np.float32)
+TABLE[:16], TABLE[16:32] = np.tile(np.arange(4), 4), np.repeat(np.arange(4), 4)
+TABLE[32:48], TABLE[48:64] = np.tile(4 * np.arange(8), 2), np.repeat([1, -1], 8)
+
+# Columns of a Gaussian's row: exponent of 2 at (dx, dy) is BRIGHT - (ALONG (dx + SKEW dy))^2 - (DOWN dy)^2.
+X, Y, ALONG, SKEW, DOWN, BRIGHT, RED, GREEN, BLUE, DEPTH, WIDEST, LIMIT = range(12)
+
+
+@njit(parallel=True, **FAST)
+def _pack(centres, conics, opacities, colours, depths, rows):
+    """What the loops want of each Gaussian, in a row of sixteen numbers."""
+    for i in prange(len(centres)):
+        row = rows[i * LANES : (i + 1) * LANES]
+        a, b, c = np.float64(conics[i, 0]), np.float64(conics[i, 1]), np.float64(conics[i, 2])
+        if opacities[i] > 0 and a > 0:
+            upright = c - b * b / a  # in double precision, for needles leave little of it
+            row[X], row[Y] = centres[i, 0], centres[i, 1]
+            row[ALONG], row[SKEW] = math.sqrt(0.5 * LOG2_E * a), b / a
+            row[DOWN] = math.sqrt(0.5 * LOG2_E * max(upright, 0.0))
+            row[BRIGHT] = math.log2(opacities[i])
+            row[LIMIT] = row[BRIGHT] + LOG2_255
+            # How far below the centre the ellipse reaches furthest to the right.
+            row[WIDEST] = -b / c * math.sqrt(max(row[LIMIT], ZERO) / (0.5 * LOG2_E * max(upright, 1e-30)) * c / a)
+            for k in range(3):
+                row[RED + k] = colours[i, k]
+            row[DEPTH] = depths[i]
+
+
+@njit(inline="always")
+def _blocks(rows, i, left, top, table):
+    """Which blocks of a tile hold a pixel that the ellipse may touch: bit 8 r + c for column c of row r."""
+    above = top + HALF - rows[i + Y]
+    sign = fetch(table, 48)
+    upper = fetch(table, 32) + above
+    y = lowest(highest(sign * rows[i + WIDEST], upper), upper + np.float32(3))
+    v = y * rows[i + DOWN]
+    room = rows[i + LIMIT] - v * v
+    edge = sign * root(highest(room, room * ZERO)) * (ONE / rows[i + ALONG]) - y * rows[i + SKEW]
+    # Columns of a block are 0.5 to 3.5 from its left; where nothing is left of the ellipse, right is left of left.
+    edge = (edge + (rows[i + X] - left - np.float32(2)) + sign * np.float32(1.5)) * np.float32(0.25)
+    return bytes_between(where(room >= ZERO, edge, sign * np.float32(-100)))
+
+
+@njit(inline="always")
+def _span(n, side, first):
+    """How many rows or columns of blocks of a tile lie on the picture."""
+    return (min(side, n - first) + 3) // 4
+
+
+@njit(inline="always")
+def _all_blocks(columns, rows):
+    found = np.uint64(0)
+    for r in range(rows):
+        found |= ((np.uint64(1) << np.uint64(columns)) - np.uint64(1)) << np.uint64(8 * r)
+    return found
+
+
+@njit(parallel=True, **FAST)
+def _forward(rows, order, starts, shares, size, side, stop, table, rgb, depth, opacity, masks):
+    width, height = size
+    across = (width + side - 1) // side
+    for share in prange(len(shares) - 1):
+        state = np.empty(BLOCKS * 5 * LANES, np.float32)
+        columns, lines = fetch(table, 0), fetch(table, 16)
+        for k in range(shares[share], shares[share + 1]):
+            left, top = k % across * side, k // across * side
+            wide, high = _span(width, side, left), _span(height, side, top)
+            alive = _all_blocks(wide, high)
+            state[:] = 0
+            for y in range(min(side, height - top)):
+                for x in range(min(side, width - left)):
+                    state[((y // 4 * 8 + x // 4) * 5) * LANES + y % 4 * 4 + x % 4] = 1
+            for p in range(starts[k], starts[k + 1]):
+                i = np.int64(order[p]) * LANES
+                todo = alive & _blocks(rows, i, np.float32(left), np.float32(top), table) if alive else alive
+                masks[p] = todo
+                if not todo:
+                    continue
+                along, down = rows[i + ALONG], rows[i + DOWN]
+                slant = along * rows[i + SKEW]
+                u, v = columns * along + lines * slant, lines * down
+                x0, y0 = np.float32(left) + HALF - rows[i + X], np.float32(top) + HALF - rows[i + Y]
+                while todo:
+                    block = first_bit(todo)
+                    todo &= todo - np.uint64(1)
+                    x, y = x0 + np.float32(4 * (block & 7)), y0 + np.float32(4 * (block >> 3))
+                    at = block * (5 * LANES)
+                    ub, vb = u + (along * x + slant * y), v + down * y
+                    raw = exp2(rows[i + BRIGHT] - ub * ub - vb * vb)
+                    light = fetch(state, at)
+                    nothing = light * ZERO
+                    alpha = where((raw >= FAINTEST) & (light >= stop), lowest(raw, nothing + OPAQUEST), nothing)
+                    weight = alpha * light
+                    light = light - weight
+                    put(state, at, light)
+                    for c in range(4):
+                        to = at + (c + 1) * LANES
+                        put(state, to, fetch(state, to) + weight * rows[i + RED + c])
+                    if not some(light >= stop):
+                        alive &= ~(np.uint64(1) << np.uint64(block))
+            for y in range(min(side, height - top)):
+                for x in range(min(side, width - left)):
+                    at = ((y // 4 * 8 + x // 4) * 5) * LANES + y % 4 * 4 + x % 4
+                    opacity[top + y, left + x] = ONE - state[at]
+                    for c in range(3):
+                        rgb[top + y, left + x, c] = state[at + (c + 1) * LANES]
+                    depth[top + y, left + x] = state[at + 4 * LANES]
+
+
+@njit(parallel=True, **FAST)
+def _backward(to_rgb, to_depth, to_opacity, rgb, depth, opacity, rows, order, starts, shares, size, side, stop, table, masks, sums):
+    """With c_i what one unit of weight is worth to the loss, and a_i = opacity exp(-q / 2) where that counts,
+
+        dL / d ln a_i = w_i c_i - a_i / (1 - a_i) sum_{j>i} w_j c_j
+
+    which is then weighted by 1, dx, dy, dx^2, dx dy, dy^2 and summed over pixels; beside them sum w_i dL/drgb, dL/ddepth.
+    """  # fmt: skip
+    width, height = size
+    across = (width + side - 1) // side
+    for share in prange(len(shares) - 1):
+        state = np.empty(BLOCKS * 7 * LANES, np.float32)
+        columns, lines = fetch(table, 0), fetch(table, 16)
+        for k in range(shares[share], shares[share + 1]):
+            left, top = k % across * side, k // across * side
+            state[:] = 0
+            for y in range(min(side, height - top)):
+                for x in range(min(side, width - left)):
+                    at = ((y // 4 * 8 + x // 4) * 7) * LANES + y % 4 * 4 + x % 4
+                    py, px = top + y, left + x
+                    behind = to_depth[py, px] * depth[py, px] + to_opacity[py, px] * opacity[py, px]
+                    for c in range(3):
+                        behind += to_rgb[py, px, c] * rgb[py, px, c]
+                        state[at + (c + 2) * LANES] = to_rgb[py, px, c]
+                    state[at], state[at + LANES] = 1, behind
+                    state[at + 5 * LANES], state[at + 6 * LANES] = to_depth[py, px], to_opacity[py, px]
+            for p in range(starts[k], starts[k + 1]):
+                todo = masks[p]
+                if not todo:
+                    continue
+                i = np.int64(order[p]) * LANES
+                along, down = rows[i + ALONG], rows[i + DOWN]
+                slant = along * rows[i + SKEW]
+                u, v = columns * along + lines * slant, lines * down
+                x0, y0 = np.float32(left) + HALF - rows[i + X], np.float32(top) + HALF - rows[i + Y]
+                nothing = columns * ZERO
+                s = sx = sy = sxx = sxy = syy = red = green = blue = far = nothing
+                while todo:
+                    block = first_bit(todo)
+                    todo &= todo - np.uint64(1)
+                    x, y = x0 + np.float32(4 * (block & 7)), y0 + np.float32(4 * (block >> 3))
+                    at = block * (7 * LANES)
+                    ub, vb = u + (along * x + slant * y), v + down * y
+                    raw = exp2(rows[i + BRIGHT] - ub * ub - vb * vb)
+                    light = fetch(state, at)
+                    alpha = where((raw >= FAINTEST) & (light >= stop), lowest(raw, nothing + OPAQUEST), nothing)
+                    weight = alpha * light
+                    put(state, at, light - weight)
+                    r, g, b, d = (fetch(state, at + 2 * LANES), fetch(state, at + 3 * LANES), fetch(state, at + 4 * LANES), fetch(state, at + 5 * LANES))  # fmt: skip
+                    worth = fetch(state, at + 6 * LANES) + r * rows[i + RED] + g * rows[i + GREEN]
+                    worth = (worth + b * rows[i + BLUE] + d * rows[i + DEPTH]) * weight
+                    behind = fetch(state, at + LANES) - worth
+                    put(state, at + LANES, behind)
+                    slope = worth - alpha * behind / (ONE - alpha)
+                    slope = where(raw < OPAQUEST, slope, nothing)
+                    dx, dy = columns + x, lines + y
+                    gx, gy = slope * dx, slope * dy
+                    s, sx, sy = s + slope, sx + gx, sy + gy
+                    sxx, sxy, syy = sxx + gx * dx, sxy + gx * dy, syy + gy * dy
+                    red, green, blue, far = red + weight * r, green + weight * g, blue + weight * b, far + weight * d
+                put(sums, p * LANES, totals((s, sx, sy, sxx, sxy, syy, red, green, blue, far)))
+
+
+@njit(parallel=True, **FAST)
+def _gather(sums, masks, order, rows, conics, opacities, parts, to_centres, to_conics, to_opacities, to_colours, to_depths):
+    """Each thread adds up its own Gaussians' sums, in the order of tiles, and makes gradients of them."""  # fmt: skip
+    n = len(to_depths)
+    for part in prange(parts):
+        begin, end = n * part // parts, n * (part + 1) // parts
+        total = np.zeros((end - begin) * LANES, np.float32)
+        for p in range(len(order)):
+            i = order[p]
+            if begin <= i < end and masks[p]:
+                at = (i - begin) * LANES
+                put(total, at, fetch(total, at) + fetch(sums, p * LANES))
+        for i in range(begin, end):
+            s = total[(i - begin) * LANES : (i - begin + 1) * LANES]
+            a, b, c = conics[i, 0], conics[i, 1], conics[i, 2]
+            to_centres[i, 0], to_centres[i, 1] = a * s[1] + b * s[2], b * s[1] + c * s[2]
+            to_conics[i, 0], to_conics[i, 1], to_conics[i, 2] = -HALF * s[3], -s[4], -HALF * s[5]
+            to_opacities[i] = s[0] / opacities[i] if opacities[i] > 0 else ZERO
+            for k in range(3):
+                to_colours[i, k] = s[6 + k]
+            to_depths[i] = s[9]
+
+
+def _shares(starts):
+    """Runs of tiles, one for each thread, with about as many pairs."""
+    threads = get_num_threads()
+    work = starts + 8 * np.arange(len(starts))
+    cuts = np.searchsorted(work, work[-1] * np.arange(1, threads) / threads)
+    return np.concatenate([[0], cuts, [len(starts) - 1]])
+
+
+class _Rasterize(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, centres, conics, opacities, colours, depths, tiles, stop):
+        width, height = tiles.size
+        order, starts = tiles.order.numpy(), tiles.starts.numpy()
+        rows = np.zeros(len(centres) * LANES, np.float32)
+        _pack(*(x.detach().numpy() for x in (centres, conics, opacities, colours, depths)), rows)
+        rgb, depth, opacity = empty(height, width, 3), empty(height, width), empty(height, width)
+        masks = np.empty(len(order), np.uint64)
+        ctx.numbers = _shares(starts), tiles.size, tiles.side, np.float32(stop), TABLE
+        _forward(rows, order, starts, *ctx.numbers, *(x.numpy() for x in (rgb, depth, opacity)), masks)
+        ctx.kept = rows, order, starts, masks
+        ctx.save_for_backward(rgb, depth, opacity, conics, opacities)
+        return rgb, depth, opacity
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx, *grads):
+        (rows, order, starts, masks), saved = ctx.kept, [x.detach().numpy() for x in ctx.saved_tensors]
+        n, sums = len(saved[3]), np.empty(len(order) * LANES, np.float32)
+        grads = (x.contiguous().numpy() for x in grads)
+        _backward(*grads, *saved[:3], rows, order, starts, *ctx.numbers, masks, sums)
+        results = empty(n, 2), empty(n, 3), empty(n), empty(n, 3), empty(n)
+        _gather(sums, masks, order, rows, *saved[3:], get_num_threads(), *(x.numpy() for x in results))
+        return *results, None, None
+
+
+def run(centres, conics, opacities, colours, depths, tiles, stop):
+    tensors = (x.contiguous() for x in (centres, conics, opacities, colours, depths))
+    return _Rasterize.apply(*tensors, tiles, stop)
