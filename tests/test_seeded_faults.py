@@ -41,7 +41,7 @@ FAULTS = {
     "never written": Fault(
         "spherical_harmonics", "gpu", "_backward", "d_directions + 3 * r + 2", "d_directions + 3 * r"
     ),
-    "term forgotten": Fault("spherical_harmonics", "cpu", "_backward", " - zonal * g[13]", ""),
+    "term forgotten": Fault("spherical_harmonics", "cpu", "slope", " - zonal * g[13]", ""),
     # perceptrons
     "a layer that no gate closes": Fault("perceptron", "cpu", "_backward", "layer == 0)", "True)"),
     "the wrong gate": Fault("perceptron", "cpu", "_downwards", "gate + i", "target + i"),

@@ -1,0 +1,507 @@
+"""Triton: one lane takes one Gaussian.
+
+Backward, from the picture to the world. A bar marks the loss's derivative, (k_xx, k_xy, k_yy) is the conic, L = Q diag(scale),
+T = N L with N = J R, and C = T T^T + blur I = (a b; b c). Rows of matrices are written T_0, T_1.
+
+    conic   det = |n|^2 + blur (a + c - blur), n = T_0 x T_1
+            det_ = -(k_xx k_xx_ + k_xy k_xy_ + k_yy k_yy_) / det
+            a_ = k_yy_ / det + blur det_      b_ = -k_xy_ / det      c_ = k_xx_ / det + blur det_
+    opacity share = |n|^2 / det; where it is above 1e-8:  share_ = o o'_ / (2 sqrt(share)),
+            |n|^2_ = det_ + share_ / det      det_ -= share_ share / det      (before a_ and c_ take theirs)
+    T       n_ = 2 |n|^2_ n      T_0_ = 2 a_ T_0 + b_ T_1 + T_1 x n_      T_1_ = 2 c_ T_1 + b_ T_0 + n_ x T_0
+    world   L_ = N^T T_      Q_ = L_ diag(scale)      scale_j_ = sum_i Q_ij L_ij_      J_ = T_ L^T R^T
+    J       = S O, S = diag(focal) B(x, y) and O = (1 0 -x; 0 1 -y) / z, with (x, y) = (X, Y) held within the limits
+            S_ = J_ O^T + u_ (X - x, Y - y)^T      z_ = -<J_, J> / z      (x, y)_ = -S^T J_{.2} / z + B_ : dB
+    lens    u = focal bent(x, y) + S (X - x, Y - y) + centre. What u owes to (x, y) through bent and through X - x cancels:
+            (X, Y)_ = S^T u_ + (x, y)_ where not held
+    B       is a gradient's slope, so its derivatives are symmetric, and four numbers tell them all
+    p       p_x_ = X_ / z      p_y_ = Y_ / z      p_z_ = z_ - (X X_ + Y Y_) / z      mean_ = R^T p_ + by way of d
+"""
+
+from __future__ import annotations
+
+import torch
+import triton
+import triton.language as tl
+from torch import Tensor
+
+from .._dispatch import empty
+from ..spherical_harmonics import K00 as _K00
+from ..spherical_harmonics import K1 as _K1
+from ..spherical_harmonics import K20 as _K20
+from ..spherical_harmonics import K21 as _K21
+from ..spherical_harmonics import K22 as _K22
+from ..spherical_harmonics import K30 as _K30
+from ..spherical_harmonics import K31 as _K31
+from ..spherical_harmonics import K32 as _K32
+from ..spherical_harmonics import K33 as _K33
+from . import FAINTEST as _FAINTEST
+from . import View
+
+K00, K1 = tl.constexpr(_K00), tl.constexpr(_K1)
+K20, K21, K22 = tl.constexpr(_K20), tl.constexpr(_K21), tl.constexpr(_K22)
+K30, K31, K32, K33 = tl.constexpr(_K30), tl.constexpr(_K31), tl.constexpr(_K32), tl.constexpr(_K33)
+FAINTEST, LEAST_SHARE = tl.constexpr(_FAINTEST), tl.constexpr(1e-8)
+# Where the parts of a view begin in View.numbers()
+EYE, FOCAL, CENTRE, DISTORTION = tl.constexpr(9), tl.constexpr(12), tl.constexpr(14), tl.constexpr(16)
+LIMITS, SIZE, NEAR = tl.constexpr(24), tl.constexpr(28), tl.constexpr(30)
+BLOCK = 128
+
+# Vectors are tuples of three, matrices tuples of rows.
+
+
+@triton.jit
+def _load(pointer, i, here):
+    x = tl.load(pointer + 3 * i, mask=here, other=0.0)
+    y = tl.load(pointer + 3 * i + 1, mask=here, other=0.0)
+    z = tl.load(pointer + 3 * i + 2, mask=here, other=0.0)
+    return x, y, z
+
+
+@triton.jit
+def _store(pointer, i, v, seen, here):
+    """A row of three, zero where not seen."""
+    tl.store(pointer + 3 * i, tl.where(seen, v[0], 0.0), mask=here)
+    tl.store(pointer + 3 * i + 1, tl.where(seen, v[1], 0.0), mask=here)
+    tl.store(pointer + 3 * i + 2, tl.where(seen, v[2], 0.0), mask=here)
+
+
+@triton.jit
+def _dot(a, b):
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+@triton.jit
+def _cross(a, b):
+    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
+
+
+@triton.jit
+def _mix(s, a, t, b):
+    """s a + t b"""
+    return s * a[0] + t * b[0], s * a[1] + t * b[1], s * a[2] + t * b[2]
+
+
+@triton.jit
+def _apply(M, v):
+    """M v"""
+    return _dot(M[0], v), _dot(M[1], v), _dot(M[2], v)
+
+
+@triton.jit
+def _across(v, M):
+    """v^T M"""
+    x = v[0] * M[0][0] + v[1] * M[1][0] + v[2] * M[2][0]
+    y = v[0] * M[0][1] + v[1] * M[1][1] + v[2] * M[2][1]
+    z = v[0] * M[0][2] + v[1] * M[1][2] + v[2] * M[2][2]
+    return x, y, z
+
+
+@triton.jit
+def _rotation(view):
+    return _load(view, 0, True), _load(view, 1, True), _load(view, 2, True)
+
+
+@triton.jit
+def _unit(quaternions, i, here):
+    """A unit quaternion (w, x, y, z), and 1 over the length that it had."""
+    w = tl.load(quaternions + 4 * i, mask=here, other=1.0)
+    x, y, z = _load(quaternions + i + 1, i, here)
+    inverse = 1 / tl.maximum(tl.sqrt(w * w + x * x + y * y + z * z), 1e-12)
+    return (w * inverse, x * inverse, y * inverse, z * inverse), inverse
+
+
+@triton.jit
+def _matrix(q):
+    w, x, y, z = q
+    row0 = 1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)
+    row1 = 2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)
+    row2 = 2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)
+    return row0, row1, row2
+
+
+@triton.jit
+def _matrix_backward(q, inverse, D):
+    """From a matrix's gradient to that of the quaternion before it was given unit length."""
+    w, x, y, z = q
+    dw = 2 * (x * (D[2][1] - D[1][2]) + y * (D[0][2] - D[2][0]) + z * (D[1][0] - D[0][1]))
+    dx = 2 * (y * (D[0][1] + D[1][0]) + z * (D[0][2] + D[2][0]) + w * (D[2][1] - D[1][2])) - 4 * x * (D[1][1] + D[2][2])
+    dy = 2 * (x * (D[0][1] + D[1][0]) + z * (D[1][2] + D[2][1]) + w * (D[0][2] - D[2][0])) - 4 * y * (D[0][0] + D[2][2])
+    dz = 2 * (x * (D[0][2] + D[2][0]) + y * (D[1][2] + D[2][1]) + w * (D[1][0] - D[0][1])) - 4 * z * (D[0][0] + D[1][1])
+    along = w * dw + x * dx + y * dy + z * dz
+    return (dw - along * w) * inverse, (dx - along * x) * inverse, (dy - along * y) * inverse, (dz - along * z) * inverse
+
+
+@triton.jit
+def _stretched(Q, s):
+    """Q diag(s)"""
+    row0 = Q[0][0] * s[0], Q[0][1] * s[1], Q[0][2] * s[2]
+    row1 = Q[1][0] * s[0], Q[1][1] * s[1], Q[1][2] * s[2]
+    row2 = Q[2][0] * s[0], Q[2][1] * s[1], Q[2][2] * s[2]
+    return row0, row1, row2
+
+
+@triton.jit
+def _radial(s, view):
+    """The lens's q(s), 2 q'(s) and 4 q''(s), of P / B:  B q = P,  B q' = P' - q B',  B q'' = P'' - 2 q' B' - q B''."""
+    k1, k2 = tl.load(view + DISTORTION), tl.load(view + DISTORTION + 1)
+    k3, k4 = tl.load(view + DISTORTION + 4), tl.load(view + DISTORTION + 5)
+    k5, k6 = tl.load(view + DISTORTION + 6), tl.load(view + DISTORTION + 7)
+    inverse = 1 / (1 + s * (k4 + s * (k5 + s * k6)))
+    below = k4 + s * (2 * k5 + s * (3 * k6))
+    q = (1 + s * (k1 + s * (k2 + s * k3))) * inverse
+    slope = 2 * (k1 + s * (2 * k2 + s * (3 * k3)) - q * below) * inverse
+    curve = 4 * (2 * k2 + 6 * k3 * s - slope * below - q * (2 * k5 + 6 * k6 * s)) * inverse
+    return q, slope, curve
+
+
+@triton.jit
+def _bend(x, y, view):
+    """The lens's distortion of (x, y, 1), and its slope (xx, xy, yy), as `lens.bend`."""
+    p1, p2 = tl.load(view + DISTORTION + 2), tl.load(view + DISTORTION + 3)
+    s = x * x + y * y
+    q, slope, _ = _radial(s, view)
+    across, down = p1 * y + p2 * x, p1 * x + p2 * y
+    bent_x, bent_y = x * (q + 2 * across) + p2 * s, y * (q + 2 * across) + p1 * s
+    xx = q + x * x * slope + 2 * across + 4 * p2 * x
+    yy = q + y * y * slope + 2 * across + 4 * p1 * y
+    return bent_x, bent_y, xx, x * y * slope + 2 * down, yy
+
+
+@triton.jit
+def _bend_backward(x, y, d_xx, d_xy, d_yy, view):
+    """The gradient in (x, y) by way of the slope. That is symmetric in all three derivatives: xx_y = xy_x, yy_x = xy_y."""
+    p1, p2 = tl.load(view + DISTORTION + 2), tl.load(view + DISTORTION + 3)
+    _, slope, curve = _radial(x * x + y * y, view)
+    xxx, yyy = x * (3 * slope + x * x * curve) + 6 * p2, y * (3 * slope + y * y * curve) + 6 * p1
+    xxy, xyy = y * (slope + x * x * curve) + 2 * p1, x * (slope + y * y * curve) + 2 * p2
+    return xxx * d_xx + xxy * d_xy + xyy * d_yy, xxy * d_xx + xyy * d_xy + yyy * d_yy
+
+
+@triton.jit
+def _held(X, low):
+    """A coordinate of the plane z = 1 within its limits."""
+    return tl.minimum(tl.maximum(X, tl.load(low)), tl.load(low + 1))
+
+
+@triton.jit
+def _lens(X, Y, z, view):
+    """u, the lens's slope S in pixels by rows, and J = S O."""
+    fx, fy = tl.load(view + FOCAL), tl.load(view + FOCAL + 1)
+    x, y = _held(X, view + LIMITS), _held(Y, view + LIMITS + 2)
+    bent_x, bent_y, xx, xy, yy = _bend(x, y, view)
+    ux = fx * (bent_x + xx * (X - x) + xy * (Y - y)) + tl.load(view + CENTRE)
+    uy = fy * (bent_y + xy * (X - x) + yy * (Y - y)) + tl.load(view + CENTRE + 1)
+    S = (fx * xx, fx * xy), (fy * xy, fy * yy)
+    J0 = S[0][0] / z, S[0][1] / z, -(S[0][0] * x + S[0][1] * y) / z
+    J1 = S[1][0] / z, S[1][1] / z, -(S[1][0] * x + S[1][1] * y) / z
+    return (ux, uy), S, (J0, J1)
+
+
+@triton.jit
+def _lens_backward(X, Y, z, S, J, d_u, d_J, view):
+    """The gradient in p = z (X, Y, 1)."""
+    fx, fy = tl.load(view + FOCAL), tl.load(view + FOCAL + 1)
+    x, y = _held(X, view + LIMITS), _held(Y, view + LIMITS + 2)
+    d_S00, d_S01 = (d_J[0][0] - x * d_J[0][2]) / z + d_u[0] * (X - x), (d_J[0][1] - y * d_J[0][2]) / z + d_u[0] * (Y - y)
+    d_S10, d_S11 = (d_J[1][0] - x * d_J[1][2]) / z + d_u[1] * (X - x), (d_J[1][1] - y * d_J[1][2]) / z + d_u[1] * (Y - y)
+    d_x, d_y = _bend_backward(x, y, fx * d_S00, fx * d_S01 + fy * d_S10, fy * d_S11, view)
+    d_x -= (S[0][0] * d_J[0][2] + S[1][0] * d_J[1][2]) / z
+    d_y -= (S[0][1] * d_J[0][2] + S[1][1] * d_J[1][2]) / z
+    d_X = S[0][0] * d_u[0] + S[1][0] * d_u[1] + tl.where(x == X, d_x, 0.0)
+    d_Y = S[0][1] * d_u[0] + S[1][1] * d_u[1] + tl.where(y == Y, d_y, 0.0)
+    return d_X / z, d_Y / z, -(_dot(d_J[0], J[0]) + _dot(d_J[1], J[1]) + X * d_X + Y * d_Y) / z
+
+
+@triton.jit
+def _covariance(T, blur):
+    """a, b, c and det of T T^T + blur I, and n = T_0 x T_1, whose square is det T T^T without cancellation."""
+    n = _cross(T[0], T[1])
+    a, b, c = _dot(T[0], T[0]) + blur, _dot(T[0], T[1]), _dot(T[1], T[1]) + blur
+    return a, b, c, _dot(n, n) + blur * (a + c - blur), n
+
+
+@triton.jit
+def _covariance_backward(T, d_conic, d_share, blur):
+    """The gradient in T, of the conic and of what share of det is left without the blur."""
+    a, b, c, det, n = _covariance(T, blur)
+    share = _dot(n, n) / det
+    d_det = -(d_conic[0] * c - d_conic[1] * b + d_conic[2] * a) / (det * det) - d_share * share / det
+    d_a, d_b, d_c = d_conic[2] / det + blur * d_det, -d_conic[1] / det, d_conic[0] / det + blur * d_det
+    twice = 2 * (d_det + d_share / det)
+    d_n = twice * n[0], twice * n[1], twice * n[2]
+    d_T0 = _mix(1.0, _mix(2 * d_a, T[0], d_b, T[1]), 1.0, _cross(T[1], d_n))
+    d_T1 = _mix(1.0, _mix(2 * d_c, T[1], d_b, T[0]), 1.0, _cross(d_n, T[0]))
+    return d_T0, d_T1
+
+
+@triton.jit
+def _harmonic(k: tl.constexpr, x, y, z):
+    """Y_k, as `spherical_harmonics`."""
+    if k == 0:
+        Y = K00 + 0 * x
+    elif k == 1:
+        Y = y * -K1
+    elif k == 2:
+        Y = z * K1
+    elif k == 3:
+        Y = x * -K1
+    elif k == 4:
+        Y = x * y * K21
+    elif k == 5:
+        Y = y * z * -K21
+    elif k == 6:
+        Y = (3 * z * z - 1) * K20
+    elif k == 7:
+        Y = x * z * -K21
+    elif k == 8:
+        Y = (x * x - y * y) * K22
+    elif k == 9:
+        Y = y * (3 * x * x - y * y) * -K33
+    elif k == 10:
+        Y = x * y * z * (2 * K32)
+    elif k == 11:
+        Y = y * (5 * z * z - 1) * -K31
+    elif k == 12:
+        Y = z * (5 * z * z - 3) * K30
+    elif k == 13:
+        Y = x * (5 * z * z - 1) * -K31
+    elif k == 14:
+        Y = z * (x * x - y * y) * K32
+    else:
+        Y = x * (x * x - 3 * y * y) * -K33
+    return Y
+
+
+@triton.jit
+def _slope(k: tl.constexpr, x, y, z):
+    """The gradient of Y_k in x, y and z."""
+    zero = 0 * x
+    if k == 0:
+        slope = zero, zero, zero
+    elif k == 1:
+        slope = zero, zero - K1, zero
+    elif k == 2:
+        slope = zero, zero, zero + K1
+    elif k == 3:
+        slope = zero - K1, zero, zero
+    elif k == 4:
+        slope = y * K21, x * K21, zero
+    elif k == 5:
+        slope = zero, z * -K21, y * -K21
+    elif k == 6:
+        slope = zero, zero, z * (6 * K20)
+    elif k == 7:
+        slope = z * -K21, zero, x * -K21
+    elif k == 8:
+        slope = x * (2 * K22), y * (-2 * K22), zero
+    elif k == 9:
+        slope = x * y * (-6 * K33), (x * x - y * y) * (-3 * K33), zero
+    elif k == 10:
+        slope = y * z * (2 * K32), x * z * (2 * K32), x * y * (2 * K32)
+    elif k == 11:
+        slope = zero, (5 * z * z - 1) * -K31, y * z * (-10 * K31)
+    elif k == 12:
+        slope = zero, zero, (5 * z * z - 1) * (3 * K30)
+    elif k == 13:
+        slope = (5 * z * z - 1) * -K31, zero, x * z * (-10 * K31)
+    elif k == 14:
+        slope = x * z * (2 * K32), y * z * (-2 * K32), (x * x - y * y) * K32
+    else:
+        slope = (x * x - y * y) * (-3 * K33), x * y * (6 * K33), zero
+    return slope
+
+
+@triton.jit
+def _colour(harmonics, i, d, seen, K: tl.constexpr, BANDS: tl.constexpr):
+    """1/2 + sum_k Y_k(d) h_k, before what is negative is cut off."""
+    half = 0.5 + 0 * d[0]
+    colour = half, half, half
+    for k in tl.static_range(BANDS * BANDS):
+        colour = _mix(1.0, colour, _harmonic(k, d[0], d[1], d[2]), _load(harmonics, K * i + k, seen))
+    return colour
+
+
+@triton.jit
+def _direction(v):
+    inverse = 1 / tl.maximum(tl.sqrt(_dot(v, v)), 1e-12)
+    return (v[0] * inverse, v[1] * inverse, v[2] * inverse), inverse
+
+
+@triton.jit
+def _reaches(u, extent, size):
+    """Whether along one axis a footprint comes to the picture's pixel centres."""
+    return (u + extent >= 0.5) & (u - extent <= size - 0.5)
+
+
+@triton.jit(do_not_specialize=["N"])
+def _forward(
+    means,
+    quaternions,
+    scales,
+    opacities,
+    harmonics,
+    view,
+    centres,
+    conics,
+    depths,
+    colours,
+    shown,
+    N,
+    blur,
+    K: tl.constexpr,
+    BANDS: tl.constexpr,
+    COMPENSATE: tl.constexpr,
+    BLOCK: tl.constexpr,
+):
+    i = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
+    here = i < N
+    R = _rotation(view)
+    v = _mix(1.0, _load(means, i, here), -1.0, _load(view + EYE, 0, True))
+    p = _apply(R, v)
+    seen = here & (p[2] > tl.load(view + NEAR))
+    z = tl.where(seen, p[2], 1.0)
+    u, _, J = _lens(p[0] / z, p[1] / z, z, view)
+    q, _ = _unit(quaternions, i, here)
+    L = _stretched(_matrix(q), _load(scales, i, here))
+    T = _across(_across(J[0], R), L), _across(_across(J[1], R), L)
+    a, b, c, det, n = _covariance(T, blur)
+    opacity = tl.load(opacities + i, mask=here, other=0.0)
+    if COMPENSATE:
+        opacity *= tl.sqrt(tl.maximum(_dot(n, n) / det, LEAST_SHARE))
+    reach = 2 * tl.log(tl.maximum(opacity / FAINTEST, 1.0))
+    wide, high = tl.sqrt(tl.maximum(reach * a, 1e-12)), tl.sqrt(tl.maximum(reach * c, 1e-12))
+    seen &= _reaches(u[0], wide, tl.load(view + SIZE)) & _reaches(u[1], high, tl.load(view + SIZE + 1))
+    seen &= opacity > FAINTEST
+    d, _ = _direction(v)
+    colour = _colour(harmonics, i, d, seen, K, BANDS)
+    colour = tl.maximum(colour[0], 0.0), tl.maximum(colour[1], 0.0), tl.maximum(colour[2], 0.0)
+    tl.store(centres + 2 * i, tl.where(seen, u[0], 0.0), mask=here)
+    tl.store(centres + 2 * i + 1, tl.where(seen, u[1], 0.0), mask=here)
+    _store(conics, i, (c / det, -b / det, a / det), seen, here)
+    tl.store(depths + i, tl.where(seen, z, 0.0), mask=here)
+    _store(colours, i, colour, seen, here)
+    tl.store(shown + i, tl.where(seen, opacity, 0.0), mask=here)
+
+
+@triton.jit(do_not_specialize=["N"])
+def _backward(
+    d_centres,
+    d_conics,
+    d_depths,
+    d_colours,
+    d_shown,
+    means,
+    quaternions,
+    scales,
+    opacities,
+    harmonics,
+    view,
+    depths,
+    d_means,
+    d_quaternions,
+    d_scales,
+    d_opacities,
+    d_harmonics,
+    N,
+    blur,
+    K: tl.constexpr,
+    BANDS: tl.constexpr,
+    COMPENSATE: tl.constexpr,
+    BLOCK: tl.constexpr,
+):
+    i = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
+    here = i < N
+    seen = tl.load(depths + i, mask=here, other=0.0) > 0  # what is not seen has depth zero, and all gradients zero
+    R = _rotation(view)
+    v = _mix(1.0, _load(means, i, seen), -1.0, _load(view + EYE, 0, True))
+    p = _apply(R, v)
+    z = tl.where(seen, p[2], 1.0)
+    X, Y = p[0] / z, p[1] / z
+    _, S, J = _lens(X, Y, z, view)
+    q, inverse = _unit(quaternions, i, seen)
+    Q, s = _matrix(q), _load(scales, i, seen)
+    L = _stretched(Q, s)
+    N0, N1 = _across(J[0], R), _across(J[1], R)
+    T = _across(N0, L), _across(N1, L)
+
+    d_opacity = tl.load(d_shown + i, mask=seen, other=0.0)
+    d_share = 0 * z
+    if COMPENSATE:
+        _, _, _, det, n = _covariance(T, blur)
+        share = _dot(n, n) / det
+        root = tl.sqrt(tl.maximum(share, LEAST_SHARE))
+        opacity = tl.load(opacities + i, mask=seen, other=0.0)
+        d_share = tl.where(share > LEAST_SHARE, 0.5 * d_opacity * opacity / root, 0.0)
+        d_opacity *= root
+    d_T = _covariance_backward(T, _load(d_conics, i, seen), d_share, blur)
+    d_L0 = _mix(N0[0], d_T[0], N1[0], d_T[1])
+    d_L1 = _mix(N0[1], d_T[0], N1[1], d_T[1])
+    d_L2 = _mix(N0[2], d_T[0], N1[2], d_T[1])
+    d_L = d_L0, d_L1, d_L2
+    d_J = _apply(R, _apply(L, d_T[0])), _apply(R, _apply(L, d_T[1]))
+    d_u = tl.load(d_centres + 2 * i, mask=seen, other=0.0), tl.load(d_centres + 2 * i + 1, mask=seen, other=0.0)
+    d_p = _lens_backward(X, Y, z, S, J, d_u, d_J, view)
+    d_v = _across((d_p[0], d_p[1], d_p[2] + tl.load(d_depths + i, mask=seen, other=0.0)), R)
+
+    d, shrink = _direction(v)
+    colour, g = _colour(harmonics, i, d, seen, K, BANDS), _load(d_colours, i, seen)
+    g = tl.where(colour[0] >= 0, g[0], 0.0), tl.where(colour[1] >= 0, g[1], 0.0), tl.where(colour[2] >= 0, g[2], 0.0)
+    d_d = 0 * z, 0 * z, 0 * z
+    for k in tl.static_range(K):
+        if k < BANDS * BANDS:
+            worth = _dot(g, _load(harmonics, K * i + k, seen))
+            d_d = _mix(1.0, d_d, worth, _slope(k, d[0], d[1], d[2]))
+            Y_k = _harmonic(k, d[0], d[1], d[2])
+            _store(d_harmonics, K * i + k, (Y_k * g[0], Y_k * g[1], Y_k * g[2]), seen, here)
+        else:
+            _store(d_harmonics, K * i + k, g, False, here)
+    d_v = _mix(1.0, d_v, shrink, _mix(1.0, d_d, -_dot(d, d_d), d))
+
+    d_q = _matrix_backward(q, inverse, _stretched(d_L, s))
+    d_s0 = Q[0][0] * d_L0[0] + Q[1][0] * d_L1[0] + Q[2][0] * d_L2[0]
+    d_s1 = Q[0][1] * d_L0[1] + Q[1][1] * d_L1[1] + Q[2][1] * d_L2[1]
+    d_s2 = Q[0][2] * d_L0[2] + Q[1][2] * d_L1[2] + Q[2][2] * d_L2[2]
+    _store(d_means, i, d_v, seen, here)
+    tl.store(d_quaternions + 4 * i, tl.where(seen, d_q[0], 0.0), mask=here)
+    _store(d_quaternions + i + 1, i, (d_q[1], d_q[2], d_q[3]), seen, here)
+    _store(d_scales, i, (d_s0, d_s1, d_s2), seen, here)
+    tl.store(d_opacities + i, tl.where(seen, d_opacity, 0.0), mask=here)
+
+
+class _Project(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, means, quaternions, scales, opacities, harmonics, camera, bands, blur, compensate):
+        inputs = means, quaternions, scales, opacities, harmonics, camera
+        count, device = len(means), means.device
+        outputs = [empty(*shape, device=device) for shape in ((count, 2), (count, 3), (count,), (count, 3), (count,))]
+        options = {"K": harmonics.shape[1], "BANDS": bands, "COMPENSATE": compensate, "BLOCK": BLOCK}
+        ctx.grid, ctx.rest, ctx.options = (triton.cdiv(count, BLOCK),), (count, float(blur)), options
+        if count:
+            _forward[ctx.grid](*inputs, *outputs, *ctx.rest, **options)
+        ctx.save_for_backward(*inputs, outputs[2])
+        return tuple(outputs)
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx, *grads):
+        saved = ctx.saved_tensors
+        found = [empty(*x.shape, device=x.device) for x in saved[:5]]
+        if len(saved[0]):
+            _backward[ctx.grid](*(g.contiguous() for g in grads), *saved, *found, *ctx.rest, **ctx.options)
+        return *found, None, None, None, None
+
+
+def run(
+    means: Tensor,
+    quaternions: Tensor,
+    scales: Tensor,
+    opacities: Tensor,
+    harmonics: Tensor,
+    view: View,
+    bands: int,
+    blur: float,
+    compensate: bool,
+) -> tuple[Tensor, ...]:
+    tensors = (x.contiguous() for x in (means, quaternions, scales, opacities, harmonics))
+    return _Project.apply(*tensors, view.numbers().to(means), bands, blur, compensate)
