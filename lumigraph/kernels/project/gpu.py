@@ -1,21 +1,21 @@
-"""Triton: one lane takes one Gaussian.
+"""Triton: one lane takes one Gaussian. On the way back everything is worked out again rather than kept.
 
-Backward, from the picture to the world. A bar marks the loss's derivative, (k_xx, k_xy, k_yy) is the conic, L = Q diag(scale),
-T = N L with N = J R, and C = T T^T + blur I = (a b; b c). Rows of matrices are written T_0, T_1.
+Backward, from the picture to the world. x' is the loss's derivative in x; (k_xx, k_xy, k_yy) is the conic,
+L = Q diag(scale), T = N L with N = J R, and C = T T^T + blur I = (a b; b c). T_0 and T_1 are a matrix's rows.
 
-    conic   det = |n|^2 + blur (a + c - blur), n = T_0 x T_1
-            det_ = -(k_xx k_xx_ + k_xy k_xy_ + k_yy k_yy_) / det
-            a_ = k_yy_ / det + blur det_      b_ = -k_xy_ / det      c_ = k_xx_ / det + blur det_
-    opacity share = |n|^2 / det; where it is above 1e-8:  share_ = o o'_ / (2 sqrt(share)),
-            |n|^2_ = det_ + share_ / det      det_ -= share_ share / det      (before a_ and c_ take theirs)
-    T       n_ = 2 |n|^2_ n      T_0_ = 2 a_ T_0 + b_ T_1 + T_1 x n_      T_1_ = 2 c_ T_1 + b_ T_0 + n_ x T_0
-    world   L_ = N^T T_      Q_ = L_ diag(scale)      scale_j_ = sum_i Q_ij L_ij_      J_ = T_ L^T R^T
-    J       = S O, S = diag(focal) B(x, y) and O = (1 0 -x; 0 1 -y) / z, with (x, y) = (X, Y) held within the limits
-            S_ = J_ O^T + u_ (X - x, Y - y)^T      z_ = -<J_, J> / z      (x, y)_ = -S^T J_{.2} / z + B_ : dB
-    lens    u = focal bent(x, y) + S (X - x, Y - y) + centre. What u owes to (x, y) through bent and through X - x cancels:
-            (X, Y)_ = S^T u_ + (x, y)_ where not held
-    B       is a gradient's slope, so its derivatives are symmetric, and four numbers tell them all
-    p       p_x_ = X_ / z      p_y_ = Y_ / z      p_z_ = z_ - (X X_ + Y Y_) / z      mean_ = R^T p_ + by way of d
+    conic    det = |n|^2 + blur (a + c - blur), n = T_0 x T_1
+             det' = -(k_xx k_xx' + k_xy k_xy' + k_yy k_yy') / det
+    opacity  o = opacity sqrt(share), share = |n|^2 / det; where that is above 1e-8:
+             opacity' = sqrt(share) o'      share' = opacity o' / (2 sqrt(share))      det' -= share' share / det
+    C        a' = k_yy' / det + blur det'      b' = -k_xy' / det      c' = k_xx' / det + blur det'
+    T        n' = 2 (det' + share' / det) n
+             T_0' = 2 a' T_0 + b' T_1 + T_1 x n'      T_1' = 2 c' T_1 + b' T_0 + n' x T_0
+    world    L' = N^T T'      Q' = L' diag(scale)      scale_j' = sum_i Q_ij L_ij'      J' = T' L^T R^T
+    J        = S O, S = diag(focal) B(x, y), O = (1 0 -x; 0 1 -y) / z; (x, y) is (X, Y) = p_xy / z held within limits
+             S' = J' O^T + u' (X - x, Y - y)      (x, y)' = S' : dS - S^T J_.2' / z      z' = -<J', J> / z
+    lens     u = focal bent(x, y) + S (X - x, Y - y) + centre; what u owes to (x, y) through bent and X - x cancels
+             (X, Y)' = S^T u' + (x, y)' where nothing was held
+    mean     p' = ((X, Y)' / z, z' - (X X' + Y Y') / z)      mean' = R^T p' + (d' - d (d . d')) / |mean - eye|
 """
 
 from __future__ import annotations
@@ -129,7 +129,8 @@ def _matrix_backward(q, inverse, D):
     dy = 2 * (x * (D[0][1] + D[1][0]) + z * (D[1][2] + D[2][1]) + w * (D[0][2] - D[2][0])) - 4 * y * (D[0][0] + D[2][2])
     dz = 2 * (x * (D[0][2] + D[2][0]) + y * (D[1][2] + D[2][1]) + w * (D[1][0] - D[0][1])) - 4 * z * (D[0][0] + D[1][1])
     along = w * dw + x * dx + y * dy + z * dz
-    return (dw - along * w) * inverse, (dx - along * x) * inverse, (dy - along * y) * inverse, (dz - along * z) * inverse
+    dw, dx, dy, dz = dw - along * w, dx - along * x, dy - along * y, dz - along * z
+    return dw * inverse, dx * inverse, dy * inverse, dz * inverse
 
 
 @triton.jit
@@ -170,7 +171,7 @@ def _bend(x, y, view):
 
 @triton.jit
 def _bend_backward(x, y, d_xx, d_xy, d_yy, view):
-    """The gradient in (x, y) by way of the slope. That is symmetric in all three derivatives: xx_y = xy_x, yy_x = xy_y."""
+    """The gradient in (x, y) by way of the slope, whose own is symmetric: xx_y = xy_x, yy_x = xy_y."""
     p1, p2 = tl.load(view + DISTORTION + 2), tl.load(view + DISTORTION + 3)
     _, slope, curve = _radial(x * x + y * y, view)
     xxx, yyy = x * (3 * slope + x * x * curve) + 6 * p2, y * (3 * slope + y * y * curve) + 6 * p1
@@ -203,9 +204,11 @@ def _lens_backward(X, Y, z, S, J, d_u, d_J, view):
     """The gradient in p = z (X, Y, 1)."""
     fx, fy = tl.load(view + FOCAL), tl.load(view + FOCAL + 1)
     x, y = _held(X, view + LIMITS), _held(Y, view + LIMITS + 2)
-    d_S00, d_S01 = (d_J[0][0] - x * d_J[0][2]) / z + d_u[0] * (X - x), (d_J[0][1] - y * d_J[0][2]) / z + d_u[0] * (Y - y)
-    d_S10, d_S11 = (d_J[1][0] - x * d_J[1][2]) / z + d_u[1] * (X - x), (d_J[1][1] - y * d_J[1][2]) / z + d_u[1] * (Y - y)
-    d_x, d_y = _bend_backward(x, y, fx * d_S00, fx * d_S01 + fy * d_S10, fy * d_S11, view)
+    d_xx = fx * ((d_J[0][0] - x * d_J[0][2]) / z + d_u[0] * (X - x))
+    d_xy = fx * ((d_J[0][1] - y * d_J[0][2]) / z + d_u[0] * (Y - y))
+    d_xy += fy * ((d_J[1][0] - x * d_J[1][2]) / z + d_u[1] * (X - x))
+    d_yy = fy * ((d_J[1][1] - y * d_J[1][2]) / z + d_u[1] * (Y - y))
+    d_x, d_y = _bend_backward(x, y, d_xx, d_xy, d_yy, view)
     d_x -= (S[0][0] * d_J[0][2] + S[1][0] * d_J[1][2]) / z
     d_y -= (S[0][1] * d_J[0][2] + S[1][1] * d_J[1][2]) / z
     d_X = S[0][0] * d_u[0] + S[1][0] * d_u[1] + tl.where(x == X, d_x, 0.0)
@@ -398,6 +401,7 @@ def _backward(
     harmonics,
     view,
     depths,
+    colours,
     d_means,
     d_quaternions,
     d_scales,
@@ -445,8 +449,8 @@ def _backward(
     d_v = _across((d_p[0], d_p[1], d_p[2] + tl.load(d_depths + i, mask=seen, other=0.0)), R)
 
     d, shrink = _direction(v)
-    colour, g = _colour(harmonics, i, d, seen, K, BANDS), _load(d_colours, i, seen)
-    g = tl.where(colour[0] >= 0, g[0], 0.0), tl.where(colour[1] >= 0, g[1], 0.0), tl.where(colour[2] >= 0, g[2], 0.0)
+    colour, g = _load(colours, i, seen), _load(d_colours, i, seen)
+    g = tl.where(colour[0] > 0, g[0], 0.0), tl.where(colour[1] > 0, g[1], 0.0), tl.where(colour[2] > 0, g[2], 0.0)
     d_d = 0 * z, 0 * z, 0 * z
     for k in tl.static_range(K):
         if k < BANDS * BANDS:
@@ -479,7 +483,7 @@ class _Project(torch.autograd.Function):
         ctx.grid, ctx.rest, ctx.options = (triton.cdiv(count, BLOCK),), (count, float(blur)), options
         if count:
             _forward[ctx.grid](*inputs, *outputs, *ctx.rest, **options)
-        ctx.save_for_backward(*inputs, outputs[2])
+        ctx.save_for_backward(*inputs, outputs[2], outputs[3])
         return tuple(outputs)
 
     @staticmethod

@@ -44,6 +44,9 @@ def cases(generator: torch.Generator):
         (60, (35, 21), 8, 1e-2),
     ]:
         yield _steady(*footprints(count, size, generator), size, side, stop, generator)
+    centres, conics, opacities, depths = footprints(60, (20, 18), generator)
+    conics[:20], opacities[:20] = torch.tensor([0.04, 0.01, 0.05]), 1.0  # so wide that 0.99 cuts off whole pixels
+    yield _steady(centres, conics, 0.5 + opacities / 2, depths, (20, 18), 8, 0.1, generator)  # little is seen behind
     centres, conics, opacities, depths = footprints(150, (37, 50), generator)
     yield _steady(centres, conics, 0.5 + opacities / 2, depths, (37, 50), 32, 1e-4, generator)  # walls
     depths = (4 * depths).round()  # coincident

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Float, Int
@@ -25,6 +25,9 @@ class Tiles:
     starts: Int[Tensor, " tile_plus_one"]
     size: tuple[int, int]
     side: int
+
+    def to(self, device: torch.device | str) -> Tiles:
+        return replace(self, order=self.order.to(device), starts=self.starts.to(device))
 
     @property
     def across(self) -> int:

@@ -1,0 +1,219 @@
+"""Triton: one program takes a square of up to 16 x 16 pixels of a tile, and its list a few Gaussians at a time.
+
+Backward goes the same way again, and sums over a program's pixels meet in atomic adds. With g_i the derivative of the
+loss in w_i, dL/da_i = T_i g_i - sum_{j>i} w_j g_j / (1 - a_i), where the sum over all j is known from the outputs.
+"""
+
+from __future__ import annotations
+
+import torch
+import triton
+import triton.language as tl
+from torch import Tensor
+
+from .._dispatch import empty
+from ..project import FAINTEST as _FAINTEST
+from ..tile import Tiles
+from . import OPAQUEST as _OPAQUEST
+
+FAINTEST, OPAQUEST = tl.constexpr(_FAINTEST), tl.constexpr(_OPAQUEST)
+SQUARE = 16  # pixels along a program's share of a tile, at most
+DARK = 1e-37  # less light is none, and a program without any has ended
+GAUSSIANS = 8  # looked at together; a matrix with a row for each and a column for each pixel must fit into registers
+
+
+@triton.jit
+def _pixels(width, height, SIDE: tl.constexpr, SQUARE: tl.constexpr):
+    """The program's tile, its pixels' centres and places in the picture, and which of them are inside."""
+    shares: tl.constexpr = (SIDE // SQUARE) * (SIDE // SQUARE)
+    k, share = tl.program_id(0) // shares, tl.program_id(0) % shares
+    across = (width + SIDE - 1) // SIDE
+    pixel = tl.arange(0, SQUARE * SQUARE)
+    x = k % across * SIDE + share % (SIDE // SQUARE) * SQUARE + pixel % SQUARE
+    y = k // across * SIDE + share // (SIDE // SQUARE) * SQUARE + pixel // SQUARE
+    return k, x + 0.5, y + 0.5, y.to(tl.int64) * width + x, (x < width) & (y < height)
+
+
+@triton.jit
+def _gaussians(i, here, order, centres, conics, opacities, colours, depths):
+    """Numbers, centres, conics, opacities and values of the tile's Gaussians at i; opacity 0 after the last."""
+    n = tl.load(order + i, mask=here, other=0).to(tl.int64)
+    cx, cy = tl.load(centres + 2 * n, mask=here, other=0.0), tl.load(centres + 2 * n + 1, mask=here, other=0.0)
+    a = tl.load(conics + 3 * n, mask=here, other=0.0)
+    b = tl.load(conics + 3 * n + 1, mask=here, other=0.0)
+    c = tl.load(conics + 3 * n + 2, mask=here, other=0.0)
+    red = tl.load(colours + 3 * n, mask=here, other=0.0)
+    green = tl.load(colours + 3 * n + 1, mask=here, other=0.0)
+    blue = tl.load(colours + 3 * n + 2, mask=here, other=0.0)
+    opacity, depth = tl.load(opacities + n, mask=here, other=0.0), tl.load(depths + n, mask=here, other=0.0)
+    return n, (cx, cy), (a, b, c), opacity, (red, green, blue, depth)
+
+
+@triton.jit
+def _steady(conic):
+    """q as a sum of squares, a (dx + b/a dy)^2 + (c - b^2/a) dy^2: along a needle its three terms would cancel."""
+    a, b, c = conic
+    a = tl.maximum(a, 1e-30)
+    square = b * b
+    det = tl.fma(a, c, -square) - tl.fma(b, b, -square)
+    return a, b / a, det / a
+
+
+@triton.jit
+def _light(dx, dy, conic, opacity, through, stop):
+    """Gaussian by pixel: opacity before and after the thresholds, the light T before and behind each, and w."""
+    a, tilt, rest = _steady(conic)
+    t = tl.fma(tilt[:, None], dy, dx)
+    raw = opacity[:, None] * tl.exp(-0.5 * (a[:, None] * t * t + rest[:, None] * dy * dy))
+    alpha = tl.where(raw < FAINTEST, 0.0, tl.minimum(raw, OPAQUEST))
+    behind = through[None, :] * tl.cumprod(1 - alpha, 0)
+    before = behind / (1 - alpha)
+    return raw, alpha, before, behind, tl.where(before < stop, 0.0, alpha * before)
+
+
+@triton.jit
+def _of_pixel(picture, depth, weight, at, inside):
+    """What the outputs, or their gradients, hold for each pixel."""
+    red = tl.load(picture + 3 * at, mask=inside, other=0.0)
+    green = tl.load(picture + 3 * at + 1, mask=inside, other=0.0)
+    blue = tl.load(picture + 3 * at + 2, mask=inside, other=0.0)
+    return red, green, blue, tl.load(depth + at, mask=inside, other=0.0), tl.load(weight + at, mask=inside, other=0.0)
+
+
+@triton.jit(do_not_specialize=["width", "height"])
+def _forward(
+    centres,
+    conics,
+    opacities,
+    colours,
+    depths,
+    order,
+    starts,
+    picture,
+    depth,
+    weight,
+    width,
+    height,
+    stop,
+    SIDE: tl.constexpr,
+    SQUARE: tl.constexpr,
+    GAUSSIANS: tl.constexpr,
+):
+    k, x, y, at, inside = _pixels(width, height, SIDE, SQUARE)
+    first, last = tl.load(starts + k), tl.load(starts + k + 1)
+    through = tl.where(inside, 1.0, 0.0)
+    red, green, blue = tl.zeros_like(through), tl.zeros_like(through), tl.zeros_like(through)
+    sum_depth, sum_w = tl.zeros_like(through), tl.zeros_like(through)
+    while (first < last) & (tl.max(through, 0) >= stop):
+        i = first + tl.arange(0, GAUSSIANS)
+        _, centre, conic, opacity, v = _gaussians(i, i < last, order, centres, conics, opacities, colours, depths)
+        dx, dy = x[None, :] - centre[0][:, None], y[None, :] - centre[1][:, None]
+        _, _, _, behind, w = _light(dx, dy, conic, opacity, through, stop)
+        red += tl.sum(w * v[0][:, None], 0)
+        green += tl.sum(w * v[1][:, None], 0)
+        blue += tl.sum(w * v[2][:, None], 0)
+        sum_depth += tl.sum(w * v[3][:, None], 0)
+        sum_w += tl.sum(w, 0)
+        through = tl.min(behind, 0)  # it only ever grows darker
+        first += GAUSSIANS
+    tl.store(picture + 3 * at, red, mask=inside)
+    tl.store(picture + 3 * at + 1, green, mask=inside)
+    tl.store(picture + 3 * at + 2, blue, mask=inside)
+    tl.store(depth + at, sum_depth, mask=inside)
+    tl.store(weight + at, sum_w, mask=inside)
+
+
+@triton.jit
+def _add(pointer, n, value, here):
+    """Zeros, which most are where a Gaussian is small, need not travel."""
+    tl.atomic_add(pointer + n, value, mask=here & (value != 0), sem="relaxed")
+
+
+@triton.jit(do_not_specialize=["width", "height"])
+def _backward(
+    d_picture,
+    d_depth,
+    d_weight,
+    centres,
+    conics,
+    opacities,
+    colours,
+    depths,
+    order,
+    starts,
+    picture,
+    depth,
+    weight,
+    d_centres,
+    d_conics,
+    d_opacities,
+    d_colours,
+    d_depths,
+    width,
+    height,
+    stop,
+    SIDE: tl.constexpr,
+    SQUARE: tl.constexpr,
+    GAUSSIANS: tl.constexpr,
+):
+    k, x, y, at, inside = _pixels(width, height, SIDE, SQUARE)
+    first, last = tl.load(starts + k), tl.load(starts + k + 1)
+    through = tl.where(inside, 1.0, 0.0)
+    g = _of_pixel(d_picture, d_depth, d_weight, at, inside)
+    seen = _of_pixel(picture, depth, weight, at, inside)
+    rest = g[0] * seen[0] + g[1] * seen[1] + g[2] * seen[2] + g[3] * seen[3] + g[4] * seen[4]  # sum of w_j g_j to come
+    while (first < last) & (tl.max(through, 0) >= stop):
+        i = first + tl.arange(0, GAUSSIANS)
+        here = i < last
+        n, centre, conic, opacity, v = _gaussians(i, here, order, centres, conics, opacities, colours, depths)
+        dx, dy = x[None, :] - centre[0][:, None], y[None, :] - centre[1][:, None]
+        raw, alpha, before, behind, w = _light(dx, dy, conic, opacity, through, stop)
+        worth = v[0][:, None] * g[0][None, :] + v[1][:, None] * g[1][None, :] + v[2][:, None] * g[2][None, :]
+        worth += v[3][:, None] * g[3][None, :] + g[4][None, :]
+        after = rest[None, :] - tl.cumsum(w * worth, 0)
+        moves = (raw >= FAINTEST) & (raw <= OPAQUEST) & (before >= stop)
+        d_power = tl.where(moves, raw * (before * worth - after / (1 - alpha)), 0.0)
+        _add(d_colours, 3 * n, tl.sum(w * g[0][None, :], 1), here)
+        _add(d_colours, 3 * n + 1, tl.sum(w * g[1][None, :], 1), here)
+        _add(d_colours, 3 * n + 2, tl.sum(w * g[2][None, :], 1), here)
+        _add(d_depths, n, tl.sum(w * g[3][None, :], 1), here)
+        _add(d_opacities, n, tl.sum(d_power, 1) / tl.where(opacity > 0, opacity, 1.0), here)
+        sum_x, sum_y = tl.sum(d_power * dx, 1), tl.sum(d_power * dy, 1)
+        _add(d_centres, 2 * n, conic[0] * sum_x + conic[1] * sum_y, here)
+        _add(d_centres, 2 * n + 1, conic[1] * sum_x + conic[2] * sum_y, here)
+        _add(d_conics, 3 * n, -0.5 * tl.sum(d_power * dx * dx, 1), here)
+        _add(d_conics, 3 * n + 1, -tl.sum(d_power * dx * dy, 1), here)
+        _add(d_conics, 3 * n + 2, -0.5 * tl.sum(d_power * dy * dy, 1), here)
+        rest -= tl.sum(w * worth, 0)
+        through = tl.min(behind, 0)
+        first += GAUSSIANS
+
+
+class _Rasterize(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, centres, conics, opacities, colours, depths, tiles, stop):
+        (width, height), device = tiles.size, centres.device
+        inputs = centres, conics, opacities, colours, depths, tiles.order, tiles.starts
+        outputs = [empty(*shape, device=device) for shape in ((height, width, 3), (height, width), (height, width))]
+        square = min(tiles.side, SQUARE)
+        ctx.grid = (tiles.across * tiles.down * (tiles.side // square) ** 2,)
+        ctx.rest = width, height, max(float(stop), DARK)
+        ctx.options = {"SIDE": tiles.side, "SQUARE": square, "GAUSSIANS": GAUSSIANS}
+        _forward[ctx.grid](*inputs, *outputs, *ctx.rest, **ctx.options)
+        ctx.save_for_backward(*inputs, *outputs)
+        return tuple(outputs)
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx, *grads):
+        saved = ctx.saved_tensors
+        found = [torch.zeros_like(x) for x in saved[:5]]
+        _backward[ctx.grid](*(g.contiguous() for g in grads), *saved, *found, *ctx.rest, **ctx.options)
+        return *found, None, None
+
+
+def run(
+    centres: Tensor, conics: Tensor, opacities: Tensor, colours: Tensor, depths: Tensor, tiles: Tiles, stop: float
+) -> tuple[Tensor, Tensor, Tensor]:
+    tensors = (x.contiguous() for x in (centres, conics, opacities, colours, depths))
+    return _Rasterize.apply(*tensors, tiles, stop)
