@@ -18,7 +18,7 @@ FLOORS: list[set[str]] = [
     {"files", "plain", "lens", "rays"},
     {"camera", "images", "kernels", "charts", "figures", "metrics"},
     {"volume", "gaussians", "scene"},
-    {"components", "capture", "method", "paths"},
+    {"components", "capture", "exchange", "method", "paths"},
     {"display"},
     {"methods", "export", "viewer"},
     {"run", "evaluate"},

@@ -1,0 +1,94 @@
+"""The layout in which the first release of 3-D Gaussian splatting wrote its clouds (Kerbl 2023), known to all programs.
+
+One row of float32 per Gaussian: x y z, a normal that nobody reads (zeros), f_dc_0..2, f_rest_* with all of red's
+coefficients before green's and blue's, opacity (logit), scale_0..2 (logarithms), rot_0..3 (w, x, y, z). Nothing is
+lost. A Gaussian takes 56 + 12 K bytes, 248 at degree 3. That it is antialiased is said in two comments (`ply_header`).
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import plyfile
+from jaxtyping import Float
+
+from ..errors import LumigraphError
+from ..files import replacing
+from ..gaussians import Gaussians
+from .codes import array, cloud
+from .ply_header import ANTIALIASED, Header, columns, read_header, read_rows
+
+MEAN = ["x", "y", "z"]
+NORMAL = ["nx", "ny", "nz"]
+COLOUR = ["f_dc_0", "f_dc_1", "f_dc_2"]
+OPACITY = ["opacity"]
+SCALE = ["scale_0", "scale_1", "scale_2"]
+ROTATION = ["rot_0", "rot_1", "rot_2", "rot_3"]
+
+
+def read(path: Path, header: Header | None = None) -> Gaussians:
+    """Text and both binary orders, and any plain types. Raises LumigraphError if it holds points, or too little."""
+    header = header or read_header(path)
+    here = header.properties.get("vertex", [])
+    missing = [name for name in [*MEAN, *COLOUR, *OPACITY, *SCALE, *ROTATION] if name not in here]
+    if not {*COLOUR, *OPACITY, *SCALE, *ROTATION} & {*here}:
+        raise LumigraphError(
+            f"{path} holds {header.counts.get('vertex', 0)} points and no Gaussians, for it has neither scales nor "
+            "rotations; name a file that a program for Gaussian splatting has written"
+        )
+    if missing:
+        raise LumigraphError(f"{path} lacks {', '.join(missing)} and so is no cloud of Gaussians; export it again")
+    rest = rest_names(path, here)
+    rows = read_rows(path)["vertex"]
+    return cloud(
+        columns(rows, MEAN),
+        columns(rows, ROTATION),
+        columns(rows, SCALE),
+        columns(rows, OPACITY)[:, 0],
+        np.concatenate([columns(rows, COLOUR)[:, None], by_coefficient(columns(rows, rest))], 1),
+        header.antialiased,
+    )
+
+
+def write(path: Path, gaussians: Gaussians) -> None:
+    rest = by_channel(array(gaussians.harmonics[:, 1:]))
+    names = [*MEAN, *NORMAL, *COLOUR, *(f"f_rest_{i}" for i in range(rest.shape[1])), *OPACITY, *SCALE, *ROTATION]
+    parts = [
+        array(gaussians.means),
+        np.zeros((len(gaussians), 3), np.float32),
+        array(gaussians.harmonics[:, 0]),
+        rest,
+        array(gaussians.opacities)[:, None],
+        array(gaussians.log_scales),
+        array(gaussians.quaternions),
+    ]
+    rows = np.concatenate(parts, 1).astype("<f4").view([(name, "<f4") for name in names])[:, 0]
+    save(path, [plyfile.PlyElement.describe(rows, "vertex")], gaussians.antialiased)
+
+
+def save(path: Path, elements: list[plyfile.PlyElement], antialiased: bool) -> None:
+    comments = ["written by Lumigraph", *(ANTIALIASED if antialiased else [])]
+    with replacing(path) as partial, open(partial, "wb") as file:
+        plyfile.PlyData(elements, byte_order="<", comments=comments).write(file)
+
+
+def rest_names(path: Path, properties: list[str]) -> list[str]:
+    """f_rest_0, f_rest_1, ... as far as they go. Raises LumigraphError if that is no whole degree from 0 to 3."""
+    count = sum(name.startswith("f_rest_") for name in properties)
+    names = [f"f_rest_{i}" for i in range(count)]
+    if count not in (0, 9, 24, 45) or not {*names} <= {*properties}:
+        raise LumigraphError(
+            f"{path} has {count} properties f_rest_*, where f_rest_0 and on are 0, 9, 24 or 45 for harmonics of degree "
+            "0 to 3; export it with one of these degrees"
+        )
+    return names
+
+
+def by_channel(rest: Float[np.ndarray, "gaussian coefficient 3"]) -> Float[np.ndarray, "gaussian rest"]:
+    """All of red's coefficients, then green's, then blue's."""
+    return rest.transpose(0, 2, 1).reshape(len(rest), rest.shape[1] * 3)
+
+
+def by_coefficient(rest: Float[np.ndarray, "gaussian rest"]) -> Float[np.ndarray, "gaussian coefficient 3"]:
+    return rest.reshape(len(rest), 3, rest.shape[1] // 3).transpose(0, 2, 1)

@@ -1,0 +1,63 @@
+"""The format of the first viewer in a browser, https://github.com/antimatter15/splat: no header, 32 bytes per Gaussian.
+
+Three float32 of position and three of scale (no logarithms), red, green, blue and opacity as bytes, and w, x, y, z of
+the rotation as bytes round(128 q + 128). Positions and scales are exact, colours and opacities within 1/510 where they
+lie in [0, 1], each component of a rotation within 1/128. Harmonics beyond the plain colour have no place, nor has
+`antialiased`. The order stays: the viewer's own converter puts the most visible Gaussians first, so that they load
+first, but all viewers sort by depth anyway.
+"""
+
+from __future__ import annotations
+
+import string
+from pathlib import Path
+
+import numpy as np
+
+from ..errors import LumigraphError
+from ..files import write_bytes
+from ..gaussians import Gaussians
+from ..kernels.spherical_harmonics import K00
+from .codes import LOGITS, alpha_to_byte, array, cloud, to_byte, unit
+
+RECORD = np.dtype(
+    [("mean", "<f4", 3), ("scale", "<f4", 3), ("colour", "u1", 3), ("alpha", "u1"), ("rotation", "u1", 4)]
+)
+THIN, WIDE = np.finfo(np.float32).tiny, np.finfo(np.float32).max  # what a scale can be and have a logarithm
+
+
+def read(path: Path) -> Gaussians:
+    """Raises LumigraphError for what is no whole number of records, and for text. A cut between two goes unnoticed."""
+    data = path.read_bytes()
+    if not data[:1024].strip(string.printable.encode()):
+        raise LumigraphError(f"{path} is text and holds no Gaussians; name another file")
+    if len(data) % RECORD.itemsize:
+        raise LumigraphError(
+            f"{path} is truncated or no .splat file, for its {len(data)} bytes are no multiple of {RECORD.itemsize}; "
+            "copy or download it again"
+        )
+    records = np.frombuffer(data, RECORD)
+    with np.errstate(invalid="ignore"):  # a negative scale has no logarithm, and is found later
+        scales = records["scale"].astype(np.float64)
+        log_scales = np.log(np.where(scales == 0, THIN, scales))
+    return cloud(
+        records["mean"],
+        records["rotation"] / 128 - 1,
+        log_scales,
+        LOGITS[records["alpha"]],
+        (records["colour"][:, None] / 255 - 0.5) / K00,
+    )
+
+
+def write(path: Path, gaussians: Gaussians) -> None:
+    """Raises LumigraphError for a cloud of none, which nobody could tell from a file that was lost."""
+    if not len(gaussians):
+        raise LumigraphError(f"{path} cannot hold a cloud of no Gaussians; write it as .ply")
+    records = np.empty(len(gaussians), RECORD)
+    records["mean"] = array(gaussians.means)
+    with np.errstate(over="ignore"):
+        records["scale"] = np.exp(array(gaussians.log_scales).astype(np.float64)).clip(THIN, WIDE)
+    records["colour"] = to_byte(255 * (K00 * array(gaussians.harmonics[:, 0]) + 0.5))
+    records["alpha"] = alpha_to_byte(array(gaussians.opacities))
+    records["rotation"] = to_byte(128 * unit(array(gaussians.quaternions)) + 128)
+    write_bytes(path, records.tobytes())

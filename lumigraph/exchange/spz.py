@@ -1,0 +1,168 @@
+"""Niantic's compact format, https://github.com/nianticlabs/spz: gzip around a header and one stream per quantity.
+
+Versions 1 to 3 are read and 3 is written, which gives a rotation three components of 10 bits instead of 8. Version 2
+is within 1/255 a component, so that a half turn, whose w is near 0, can come back turned by 13 degrees. Version 4,
+another container with zstd inside, is named as such.
+
+Axes are x right, y up, z back; PLY files and this house have y down and z forward. Half a turn around x lies between
+them, so y and z change their signs, and with them those harmonics that are odd in y and z together.
+
+What is lost: positions are fixed-point numbers of 24 bits, within 2^-17 while all lie inside ±128, coarser for wider
+clouds. Scales are within 1/32 (3%) of their logarithm from -10 to 5.9. Opacities are within 1/510, plain colours within
+0.0037 from -0.44 to 1.44; harmonics, cut to [-1, 1), within 1/32 for degree 1 and 1/16 for 2 and 3. Components of a
+rotation other than the largest are within 0.0007. Before gzip a Gaussian takes 20 bytes and 3 (K - 1) of harmonics.
+"""
+
+from __future__ import annotations
+
+import gzip
+import io
+import math
+import struct
+import zlib
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from ..errors import LumigraphError
+from ..files import write_bytes
+from ..gaussians import Gaussians
+from .codes import LOGITS, alpha_to_byte, array, cloud, to_byte, with_largest, without_largest
+
+HEADER = struct.Struct("<4sIIBBBB")  # magic, version, count, degree, bits behind the point, flags, reserved
+MAGIC, VERSION = b"NGSP", 3
+ANTIALIASED, EXTENDED = 1, 2  # flags
+MOST_BITS = 16  # behind the binary point; Niantic's metres have 12, ours are units of a scene in [-1, 1]^3
+FARTHEST = 2**23 - 1
+COLOUR = 0.15  # instead of Y_00 = 0.28, so that colours outside [0, 1] have a place
+STEPS = np.repeat(np.array([8, 16], np.float32), [3, 12])[:, None]  # 5 bits for harmonics of degree 1, 4 beyond
+DENSEST = 1032  # times that deflate can shrink what it is given
+LONGEST_EXTENSIONS = 1 << 20  # bytes
+PIECE = 1 << 24  # bytes
+LEVEL = 4  # of gzip; 6, the usual one, takes up to four times as long and saves 1% at most
+
+# Half a turn around x, as signs. Of harmonics: y, z, x | xy, yz, z^2, xz, x^2 - y^2 | and so on.
+TURN_MEAN = np.array([1, -1, -1])
+TURN_ROTATION = np.array([1, 1, -1, -1])
+TURN_HARMONICS = np.array([1, -1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1], np.float32)[:, None]
+
+
+def read(path: Path) -> Gaussians:
+    """Versions 1, 2 and 3. Extensions are passed over. Raises LumigraphError for others and for damaged files."""
+    data = path.read_bytes()
+    stream: io.BufferedIOBase
+    if data[:4] == MAGIC:  # version 4 and later; or earlier ones, before gzip
+        stream = io.BytesIO(data)
+    elif data[:2] == b"\x1f\x8b":
+        stream = gzip.GzipFile(fileobj=io.BytesIO(data))
+    else:
+        raise LumigraphError(f"{path} is no .spz file, for it does not begin like one; name another one")
+    try:
+        return _decode(path, stream, DENSEST * len(data))
+    except (EOFError, zlib.error, gzip.BadGzipFile) as fault:
+        raise LumigraphError(f"{path} is truncated or damaged ({fault}); copy or download it again") from fault
+
+
+def write(path: Path, gaussians: Gaussians) -> None:
+    """Version 3. Raises LumigraphError if the cloud is wider than 24 bits can say."""
+    extent = float(gaussians.means.abs().max()) if len(gaussians) else 0.0
+    if extent > FARTHEST:
+        raise LumigraphError(
+            f"{path} cannot hold positions beyond {FARTHEST}; scale the cloud down or write it as .ply"
+        )
+    bits = min(MOST_BITS, math.floor(math.log2(FARTHEST / extent))) if extent > FARTHEST / 2**MOST_BITS else MOST_BITS
+    flags = ANTIALIASED if gaussians.antialiased else 0
+    fixed = np.rint(array(gaussians.means).astype(np.float64) * TURN_MEAN * 2**bits).clip(-FARTHEST, FARTHEST)
+    harmonics = array(gaussians.harmonics) * TURN_HARMONICS[: gaussians.harmonics.shape[1]]
+    streams = [
+        fixed.astype("<i4").reshape(-1, 1).view(np.uint8)[:, :3],
+        alpha_to_byte(array(gaussians.opacities)),
+        to_byte(255 * (COLOUR * harmonics[:, 0] + 0.5)),
+        to_byte(16 * (array(gaussians.log_scales) + 10)),
+        _smallest_three(array(gaussians.quaternions) * TURN_ROTATION),
+        _in_buckets(harmonics[:, 1:]),
+    ]
+    header = HEADER.pack(MAGIC, VERSION, len(gaussians), gaussians.degree, bits, flags, 0)
+    content = b"".join([header, *(stream.tobytes() for stream in streams)])
+    write_bytes(path, gzip.compress(content, LEVEL, mtime=0))
+
+
+def _decode(path: Path, stream: io.BufferedIOBase, limit: int) -> Gaussians:
+    """The Gaussians of an opened stream that cannot hold more than `limit` bytes."""
+    magic, version = struct.unpack("<4sI", _take(stream, 8))
+    if magic != MAGIC:
+        raise LumigraphError(f"{path} is no .spz file, for inside it does not begin with NGSP; name another one")
+    if not 1 <= version <= VERSION:
+        raise LumigraphError(
+            f"{path} is of version {version} of .spz, of which 1 to {VERSION} can be read; "
+            f"save it as version {VERSION} or as .ply, for instance with splat-transform"
+        )
+    count, degree, bits, flags, _ = struct.unpack("<IBBBB", _take(stream, 8))
+    if degree > 3:
+        raise LumigraphError(f"{path} has harmonics of degree {degree}; save it with degree 0 to 3")
+    widths = [6 if version == 1 else 9, 1, 3, 3, 4 if version == 3 else 3, 3 * ((degree + 1) ** 2 - 1)]
+    if count * sum(widths) > limit:
+        raise EOFError(f"{count} Gaussians are promised and cannot be there")
+    positions, alphas, colours, scales, rotations, rest = (
+        np.frombuffer(_take(stream, count * width), np.uint8).reshape(count, width) for width in widths
+    )
+    behind = stream.read(LONGEST_EXTENSIONS + 1)  # to the end, where gzip's checksum is
+    if len(behind) > (LONGEST_EXTENSIONS if flags & EXTENDED else 0):
+        raise LumigraphError(f"{path} goes on after the {count} Gaussians that it promises; copy or download it again")
+    means = positions.view("<f2").astype(np.float64) if version == 1 else _fixed_point(positions) / 2.0**bits
+    plain = (colours / 255 - 0.5) / COLOUR
+    harmonics = np.concatenate([plain[:, None], (rest.reshape(count, widths[-1] // 3, 3) - 128.0) / 128], 1)
+    return cloud(
+        means * TURN_MEAN,
+        (_from_smallest_three(rotations) if version == 3 else _from_first_three(rotations)) * TURN_ROTATION,
+        scales / 16 - 10,
+        LOGITS[alphas[:, 0]],
+        harmonics * TURN_HARMONICS[: harmonics.shape[1]],
+        bool(flags & ANTIALIASED),
+    )
+
+
+def _take(stream: io.BufferedIOBase, size: int) -> bytes:
+    """Exactly `size` bytes, in pieces, so that memory grows with what is there and not with what is promised."""
+    pieces = []
+    while size:
+        piece = stream.read(min(size, PIECE))
+        if not piece:
+            raise EOFError("it ends early")
+        pieces.append(piece)
+        size -= len(piece)
+    return b"".join(pieces)
+
+
+def _fixed_point(positions: UInt8[np.ndarray, "gaussian 9"]) -> Float[np.ndarray, "gaussian 3"]:
+    """Signed integers of 24 bits, read as the upper ones of 32."""
+    wide = np.zeros((3 * len(positions), 4), np.uint8)
+    wide[:, 1:] = positions.reshape(-1, 3)
+    return (wide.view("<i4").reshape(-1, 3) >> 8).astype(np.float64)
+
+
+def _from_first_three(rotations: UInt8[np.ndarray, "gaussian 3"]) -> Float[np.ndarray, "gaussian 4"]:
+    """Versions 1 and 2: x, y, z, and w not negative."""
+    return with_largest(np.zeros(len(rotations), np.int64), rotations / 127.5 - 1)
+
+
+def _from_smallest_three(rotations: UInt8[np.ndarray, "gaussian 4"]) -> Float[np.ndarray, "gaussian 4"]:
+    """Version 3: 2 bits name the largest of x, y, z, w; each of the others has a sign and 9 bits of sqrt(1/2)."""
+    code = rotations.view("<u4").astype(np.int64)
+    parts = code >> np.array([20, 10, 0])
+    rest = np.where(parts & 512, -1, 1) * (parts & 511) * (math.sqrt(0.5) / 511)
+    return np.roll(with_largest((code >> 30)[:, 0], rest), 1, -1)
+
+
+def _smallest_three(quaternions: Float[np.ndarray, "gaussian 4"]) -> UInt8[np.ndarray, "gaussian 4"]:
+    largest, rest = without_largest(np.roll(quaternions, -1, -1))
+    sizes = np.rint(np.abs(rest) * (511 / math.sqrt(0.5))).clip(0, 511).astype(np.int64)
+    parts = (np.where(rest < 0, 512, 0) | sizes) << np.array([20, 10, 0])
+    return (largest << 30 | parts.sum(-1)).astype("<u4")[:, None].view(np.uint8)
+
+
+def _in_buckets(harmonics: Float[np.ndarray, "gaussian rest 3"]) -> UInt8[np.ndarray, "gaussian rest 3"]:
+    """128 + 128 h to the nearest multiple of the band's step: fewer different bytes, which gzip packs better."""
+    steps = STEPS[: harmonics.shape[1]]
+    return to_byte(np.rint((harmonics + 1) * (128 / steps)) * steps)
