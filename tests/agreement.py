@@ -15,7 +15,7 @@ from torch import Tensor
 from lumigraph import kernels
 from lumigraph.rays import Samples
 
-OPERATIONS = ["spherical_harmonics", "composite", "hash_encode", "march", "perceptron"]
+OPERATIONS = ["spherical_harmonics", "composite", "hash_encode", "march", "perceptron", "ssim"]
 ENGINES = ["cpu", "gpu"]
 DEVICES = {"reference": "cpu", "cpu": "cpu", "gpu": "cuda" if torch.cuda.is_available() else "cpu"}
 
@@ -52,6 +52,8 @@ def outputs_and_gradients(name: str, engine: str, inputs: tuple, wanted=None, us
     for i, output in enumerate(outputs):
         if output.requires_grad and (used is None or i in used):
             weight = torch.randn(output.shape, generator=torch.Generator().manual_seed(i))
+            if not output.ndim:  # a mean, whose gradient has a norm of about 1 / sqrt(n)
+                weight = torch.tensor(inputs[0].numel() ** 0.5)
             mixture.append((output * weight.to(output)).sum())
     if not mixture:
         return list(outputs)

@@ -34,8 +34,9 @@ def test_no_index_leaves_its_array(name, tmp_path, monkeypatch):
         ("composite", "weights[i] = w", "weights[i + 1] = w"),
         ("hash_encode", "np.int32(resolution - 1))\n", "np.int32(resolution))\n"),  # the point 1.0, a cell too far
         ("perceptron", "whole = across - across % TILE\n", "whole = across\n"),
+        ("ssim", "x[at + 10 * step]", "x[at + 11 * step]"),
     ],
-    ids=["composite", "hash_encode", "perceptron"],
+    ids=["composite", "hash_encode", "perceptron", "ssim"],
 )
 def test_an_index_astray_is_noticed(name, sound, astray, tmp_path, monkeypatch):
     def edit(source: str) -> str:

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import numba
 import numpy as np
 import pytest
 import torch
 from agreement import ENGINES, OPERATIONS, assert_agrees, cases, module, outputs_and_gradients
 
-from lumigraph import kernels
+from lumigraph import kernels, metrics
 
 DIFFERENTIABLE = {"spherical_harmonics": [0], "composite": [0, 1], "hash_encode": [0, 1], "perceptron": [0, 1, 2]}
+DIFFERENTIABLE |= {"ssim": [0, 1]}
 TYPICAL = {"spherical_harmonics": 4, "composite": 13, "hash_encode": 2, "march": 2, "perceptron": 4}  # a case of each
+TYPICAL |= {"ssim": 1}
 
 
 @pytest.mark.parametrize("engine", ENGINES)
@@ -68,6 +71,34 @@ def test_marching_ends_where_rays_never_enter(engine):
     assert samples.ray_starts.tolist() == [0, 0, 0, 0]
 
 
+@pytest.mark.parametrize("engine", ["reference", *ENGINES])
+def test_an_image_is_like_itself(engine, generator):
+    image = torch.rand(13, 29, 3, generator=generator)
+    with kernels.using(engine):
+        assert kernels.ssim(image, image.clone()).item() == pytest.approx(1, abs=1e-6)
+
+
+@pytest.mark.parametrize("engine", ["reference", *ENGINES])
+def test_similarity_is_the_score_of_images_with_a_black_margin(engine, generator):
+    """Around an image's own pixels the score's windows then lie inside the picture."""
+    a, b = torch.rand(2, 17, 90, 3, generator=generator)
+    margins = (torch.nn.functional.pad(image, (0, 0, 5, 5, 5, 5)) for image in (a, b))
+    with kernels.using(engine):
+        assert kernels.ssim(a, b).item() == pytest.approx(metrics.ssim(*margins), abs=1e-6)
+
+
+def test_similarity_does_not_depend_on_the_number_of_threads(generator):
+    a, b = torch.rand(2, 70, 50, 3, generator=generator)
+    a.requires_grad_()
+    found, threads = [], numba.get_num_threads()
+    for number in (1, threads):
+        numba.set_num_threads(number)
+        with kernels.using("cpu"):
+            value = kernels.ssim(a, b)
+        found.append((value, *torch.autograd.grad(value, a)))
+    assert all(torch.equal(*pair) for pair in zip(*found, strict=True))
+
+
 # The references themselves, asked for mathematics
 
 
@@ -83,6 +114,8 @@ def test_reference_gradient_is_the_slope(name):
         ]
     if name == "composite":
         inputs = list(cases(name)[15])  # with early termination
+    if name == "ssim":
+        inputs = [image[:3, :4, :2] for image in inputs]
     wanted = DIFFERENTIABLE[name]
     inputs = [x.double() if torch.is_tensor(x) and x.is_floating_point() else x for x in inputs]
 

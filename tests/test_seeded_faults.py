@@ -48,6 +48,14 @@ FAULTS = {
     "the last block's rest counted twice": Fault(
         "perceptron", "cpu", "_fetch", "block[(row + f) * BLOCK : (row + f + 1) * BLOCK] = 0", "pass"
     ),
+    # structural similarity
+    "the wrong image": Fault("ssim", "cpu", "_gradient", "other[x] * products", "own[x] * products"),
+    "the variance's sign": Fault("ssim", "cpu", "_likeness", "= -S * B1 * r", "= S * B1 * r"),
+    "the other image's derivative": Fault("ssim", "cpu", "backward", "MEAN_B if i and", "MEAN_A if i and"),
+    "the loss's gradient forgotten": Fault("ssim", "cpu", "backward", "grad.item() / a", "1 / a"),
+    "a square's slope": Fault("ssim", "gpu", "_gradient", "2 * mine", "mine"),
+    "a slope's sign": Fault("ssim", "gpu", "_likeness", "(B1 - B2)", "(B2 - B1)"),
+    "the neighbouring channel": Fault("ssim", "gpu", "_along", "(k - REACH) * C", "k - REACH"),
     # marching has no backward pass
     "empty cells counted": Fault("march", "gpu", "_march", "count += kept", "count += held"),
     "a cell too far": Fault("march", "gpu", "_first_at", "- 0.02)", "+ 1.0)"),

@@ -11,5 +11,6 @@ from .project import View as View
 from .project import project as project
 from .rasterize import rasterize as rasterize
 from .spherical_harmonics import spherical_harmonics as spherical_harmonics
+from .ssim import ssim as ssim
 from .tile import Tiles as Tiles
 from .tile import tile as tile

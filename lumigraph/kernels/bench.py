@@ -26,6 +26,10 @@ UNITS = {
     "march": "rays",
     "spherical_harmonics": "directions",
     "perceptron": "samples",
+    "ssim": "pixels",
+}
+COUNTS: dict[str, Callable[..., int]] = {  # units in a case, where the first input is not a list of them
+    "ssim": lambda image, _: image.shape[0] * image.shape[1],
 }
 PATIENCE = 5.0  # seconds: what takes longer is repeated less often, but three times at least
 
@@ -42,7 +46,7 @@ def bench_kernels(
 
     operations: their names; all by default
     device:     "cpu" for `reference` and `cpu`, "cuda" for `reference` and `gpu`; None for CUDA where there is one
-    size:       samples or directions in each operation's benchmark case; marching takes one ray for every 64
+    size:       samples, directions or pixels in each operation's benchmark case; marching takes one ray for every 64
     repeats:    how many calls each median is taken over, after a first one that is reported by itself
                 because it compiles or loads what was compiled before
 
@@ -58,17 +62,18 @@ def bench_kernels(
             x.detach().to(device).requires_grad_(x.requires_grad) if isinstance(x, Tensor) else x
             for x in case(torch.Generator().manual_seed(0), size)
         ]
-        engines = {engine: _measure(name, engine, inputs, repeats) for engine in (fast, "reference")}
+        count = COUNTS.get(name, lambda first, *_: len(first))(*inputs)
+        engines = {engine: _measure(name, engine, inputs, count, repeats) for engine in (fast, "reference")}
         ratios = {k: v / engines["reference"][k] for k, v in engines[fast].items() if k.endswith("per_second")}
         engines[fast] |= {k.replace("per_second", "ratio"): v for k, v in ratios.items()}
-        result["operations"][name] = {"unit": UNITS[name], "count": len(inputs[0]), "engines": engines}
+        result["operations"][name] = {"unit": UNITS[name], "count": count, "engines": engines}
     _print(result, console or Console())
     if output is not None:
         write_json(output, result)
     return result
 
 
-def _measure(name: str, engine: Engine, inputs: list[Any], repeats: int) -> dict[str, float]:
+def _measure(name: str, engine: Engine, inputs: list[Any], count: int, repeats: int) -> dict[str, float]:
     operation = getattr(importlib.import_module(f"{__package__}.{name}"), name)
     wanted = [x for x in inputs if isinstance(x, Tensor) and x.requires_grad]
 
@@ -80,7 +85,7 @@ def _measure(name: str, engine: Engine, inputs: list[Any], repeats: int) -> dict
         return found if isinstance(found, tuple) else (found,)
 
     first, seconds = _time(forward, inputs[0].device, repeats)
-    row = {"forward_per_second": len(inputs[0]) / seconds, "forward_first_seconds": first}
+    row = {"forward_per_second": count / seconds, "forward_first_seconds": first}
     if wanted:
         outputs = forward()
         gradients = [torch.randn_like(x) for x in outputs]  # laid out in memory as the outputs are
@@ -89,7 +94,7 @@ def _measure(name: str, engine: Engine, inputs: list[Any], repeats: int) -> dict
             return torch.autograd.grad(outputs, wanted, gradients, retain_graph=True)
 
         first, seconds = _time(backward, inputs[0].device, repeats)
-        row |= {"backward_per_second": len(inputs[0]) / seconds, "backward_first_seconds": first}
+        row |= {"backward_per_second": count / seconds, "backward_first_seconds": first}
     return row
 
 

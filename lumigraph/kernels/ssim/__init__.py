@@ -1,0 +1,61 @@
+"""Structural similarity of two images, as a loss needs it."""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from .._dispatch import implementation
+
+WINDOW, DEVIATION = 11, 1.5  # pixels
+C1, C2 = 0.01**2, 0.03**2  # (K1 L)^2 and (K2 L)^2 for values up to L = 1
+
+
+def weights() -> list[float]:
+    """The window along one axis: a Gaussian whose sum is 1."""
+    offsets = torch.arange(WINDOW, dtype=torch.float64) - WINDOW // 2
+    gaussian = torch.exp(-0.5 * (offsets / DEVIATION) ** 2)
+    return (gaussian / gaussian.sum()).tolist()
+
+
+def ssim(a: Float[Tensor, "height width channel"], b: Float[Tensor, "height width channel"]) -> Float[Tensor, ""]:
+    """Mean structural similarity (Wang 2004, eqs. 13 and 14) of two images with values in [0, 1].
+
+        S = (2 m_a m_b + C1) (2 s_ab + C2) / ((m_a^2 + m_b^2 + C1) (s_aa + s_bb + C2))
+        m_a = w * a,   s_ab = w * (a b) - m_a m_b      means and (co)variances around a pixel
+
+    w is a Gaussian of 11 x 11 pixels with deviation 1.5; K1 = 0.01, K2 = 0.03. A window stands around every pixel, and
+    both images count as zero beyond their border, as in the original loss of 3D Gaussian Splatting (Kerbl 2023, eq. 7).
+    (`metrics.ssim` is the score, whose windows lie inside the image.)
+
+    Returns the mean of S over pixels and channels, which is symmetric, and differentiable in a and b.
+    """
+    return implementation("ssim", a)(a, b)
+
+
+def cases(generator: torch.Generator):
+    """Inputs that every engine must agree on: images smaller than the window, odd sizes, equal and constant images."""
+    for height, width, channels in [(1, 1, 1), (5, 7, 3), (11, 11, 1), (16, 33, 3), (40, 23, 3), (3, 90, 3)]:
+        yield _inputs(height, width, channels, generator)
+    a, b = _inputs(16, 33, 3, generator)
+    yield a, a.clone()
+    yield a, torch.rand(a.shape, generator=generator)
+    yield a, torch.full_like(a, 0.25)
+    yield torch.full_like(a, 0.25), torch.full_like(a, 0.125)
+    yield torch.zeros_like(a), b
+
+
+def benchmark_case(generator: torch.Generator, size: int = 2**18):
+    """A square image of about so many pixels and its photograph, which wants no gradient."""
+    side = max(round(size**0.5), 1)
+    a, b = _inputs(side, side, 3, generator)
+    return a.requires_grad_(), b
+
+
+def _inputs(height: int, width: int, channels: int, generator: torch.Generator):
+    """A smooth picture, and what is almost the same."""
+    y, x = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
+    phase = 6 * torch.rand(channels, generator=generator)
+    a = 0.5 + 0.4 * (0.4 * x[..., None] + 0.3 * y[..., None] + phase).sin()
+    return a, (a + 0.1 * torch.randn(a.shape, generator=generator)).clamp(0, 1)

@@ -1,0 +1,151 @@
+"""Triton: a row is one line of width x channels numbers. One pass blurs along the line, another across the lines."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import torch
+import triton
+import triton.language as tl
+from torch import Tensor
+
+from .._dispatch import empty
+from . import C1, C2, WINDOW, weights
+
+TAPS, REACH = tl.constexpr(WINDOW), tl.constexpr(WINDOW // 2)
+K1, K2 = tl.constexpr(C1), tl.constexpr(C2)
+BLOCK = 256
+MEAN_A, MEAN_B = 0, 3  # of the maps
+
+
+@triton.jit
+def _place(length, BLOCK: tl.constexpr):
+    """This program's row, its numbers along it, and which of them exist."""
+    x = tl.program_id(1) * BLOCK + tl.arange(0, BLOCK)
+    return tl.program_id(0).to(tl.int64), x, x < length
+
+
+@triton.jit
+def _across(plane, window, x, y, size, length, here, BLOCK: tl.constexpr):
+    """One blur across the lines, of rows that are blurred along."""
+    total = tl.zeros([BLOCK], tl.float32)
+    for k in tl.static_range(TAPS):
+        at = (y + (k - REACH)) * length + x
+        there = here & (at >= 0) & (at < size)
+        total += tl.load(window + k) * tl.load(plane + at, mask=there, other=0.0)
+    return total
+
+
+@triton.jit(do_not_specialize=["height", "length"])
+def _moments(a, b, window, rows, height, length, C: tl.constexpr, BLOCK: tl.constexpr):
+    """Along the lines: both images, their squares' sum, their product."""
+    y, x, here = _place(length, BLOCK)
+    mean_a = tl.zeros([BLOCK], tl.float32)
+    mean_b = tl.zeros([BLOCK], tl.float32)
+    squares = tl.zeros([BLOCK], tl.float32)
+    products = tl.zeros([BLOCK], tl.float32)
+    for k in tl.static_range(TAPS):
+        at = x + (k - REACH) * C
+        there = (at >= 0) & (at < length)
+        w = tl.load(window + k)
+        value_a = tl.load(a + y * length + at, mask=there, other=0.0)
+        value_b = tl.load(b + y * length + at, mask=there, other=0.0)
+        mean_a += w * value_a
+        mean_b += w * value_b
+        squares += w * (value_a * value_a + value_b * value_b)
+        products += w * value_a * value_b
+    place, size = rows + y * length + x, height.to(tl.int64) * length
+    tl.store(place, mean_a, mask=here)
+    tl.store(place + size, mean_b, mask=here)
+    tl.store(place + 2 * size, squares, mask=here)
+    tl.store(place + 3 * size, products, mask=here)
+
+
+@triton.jit(do_not_specialize=["height", "length"])
+def _likeness(rows, window, out, maps, height, length, MAPS: tl.constexpr, BLOCK: tl.constexpr):
+    """S, and its derivatives in the mean of a, the squares' mean, the products' mean, and the mean of b."""
+    y, x, here = _place(length, BLOCK)
+    size = height.to(tl.int64) * length
+    a = _across(rows, window, x, y, size, length, here, BLOCK)
+    b = _across(rows + size, window, x, y, size, length, here, BLOCK)
+    squares = _across(rows + 2 * size, window, x, y, size, length, here, BLOCK)
+    products = _across(rows + 3 * size, window, x, y, size, length, here, BLOCK)
+    A1, A2 = 2 * a * b + K1, 2 * (products - a * b) + K2
+    B1, B2 = a * a + b * b + K1, squares - (a * a + b * b) + K2
+    S = A1 * A2 / (B1 * B2)
+    tl.store(out + y * length + x, S, mask=here)
+    place = maps + y * length + x
+    p, q = 2 * (A2 - A1) / (B1 * B2), 2 * S * (B1 - B2) / (B1 * B2)
+    if MAPS:
+        tl.store(place, b * p + a * q, mask=here)
+        tl.store(place + size, -S / B2, mask=here)
+        tl.store(place + 2 * size, 2 * A1 / (B1 * B2), mask=here)
+    if MAPS == 4:
+        tl.store(place + 3 * size, a * p + b * q, mask=here)
+
+
+@triton.jit(do_not_specialize=["height", "length"])
+def _along(maps, window, rows, height, length, C: tl.constexpr, BLOCK: tl.constexpr):
+    y, x, here = _place(length, BLOCK)
+    start = (tl.program_id(2) * height.to(tl.int64) + y) * length
+    total = tl.zeros([BLOCK], tl.float32)
+    for k in tl.static_range(TAPS):
+        at = x + (k - REACH) * C
+        there = (at >= 0) & (at < length)
+        total += tl.load(window + k) * tl.load(maps + start + at, mask=there, other=0.0)
+    tl.store(rows + start + x, total, mask=here)
+
+
+@triton.jit(do_not_specialize=["height", "length", "mean"])
+def _gradient(rows, window, own, other, grad, d_own, height, length, mean, share, BLOCK: tl.constexpr):
+    """Every derivative spreads to where it was gathered: the window is symmetric, so that is the same blur."""
+    y, x, here = _place(length, BLOCK)
+    size = height.to(tl.int64) * length
+    to_mean = _across(rows + mean * size, window, x, y, size, length, here, BLOCK)
+    to_squares = _across(rows + size, window, x, y, size, length, here, BLOCK)
+    to_products = _across(rows + 2 * size, window, x, y, size, length, here, BLOCK)
+    place = y * length + x
+    mine, its = tl.load(own + place, mask=here), tl.load(other + place, mask=here)
+    to_own = to_mean + 2 * mine * to_squares + its * to_products
+    tl.store(d_own + place, tl.load(grad) * share * to_own, mask=here)
+
+
+@cache
+def _window(device: torch.device) -> Tensor:
+    return torch.tensor(weights(), dtype=torch.float32, device=device)
+
+
+class _SSIM(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, a, b):
+        height, width, channels = a.shape
+        length = width * channels
+        ctx.grid, ctx.window = (height, triton.cdiv(length, BLOCK)), _window(a.device)
+        wanted = ctx.needs_input_grad
+        first, second = (b, a) if wanted == (False, True) else (a, b)  # S is symmetric
+        count = 3 + all(wanted) if any(wanted) else 0
+        rows, out, maps = (empty(n, height, length, device=a.device) for n in (4, 1, count))
+        _moments[ctx.grid](first, second, ctx.window, rows, height, length, C=channels, BLOCK=BLOCK)
+        _likeness[ctx.grid](rows, ctx.window, out, maps, height, length, MAPS=count, BLOCK=BLOCK)
+        ctx.save_for_backward(a, b, maps)
+        return out.mean()
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx, grad):
+        a, b, maps = ctx.saved_tensors
+        count, height, length = maps.shape
+        rows = empty(*maps.shape, device=a.device)
+        _along[(*ctx.grid, count)](maps, ctx.window, rows, height, length, C=a.shape[2], BLOCK=BLOCK)
+        gradients: list[Tensor | None] = [None, None]
+        for i, (own, other) in enumerate([(a, b), (b, a)]):
+            if ctx.needs_input_grad[i]:
+                mean = MEAN_B if i and count > MEAN_B else MEAN_A
+                found = gradients[i] = empty(*a.shape, device=a.device)
+                given = rows, ctx.window, own, other, grad.contiguous(), found
+                _gradient[ctx.grid](*given, height, length, mean, 1 / a.numel(), BLOCK=BLOCK)
+        return (*gradients,)
+
+
+def run(a: Tensor, b: Tensor) -> Tensor:
+    return _SSIM.apply(a.contiguous(), b.contiguous())
