@@ -20,6 +20,7 @@ from .commands.bench import Bench
 from .commands.common import say
 from .commands.demo import Demo
 from .commands.eval import Eval
+from .commands.export import Export
 from .commands.info import Info
 from .commands.methods import Methods
 from .commands.render import Render
@@ -35,6 +36,7 @@ COMMANDS: dict[str, type] = {
     "resume": Resume,
     "eval": Eval,
     "render": Render,
+    "export": Export,
     "report": Report,
     "info": Info,
     "methods": Methods,

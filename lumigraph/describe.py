@@ -7,6 +7,7 @@ from typing import Any
 
 from rich.tree import Tree
 
+from .gaussians import Gaussians
 from .run import Run
 from .scene import Frame, Scene
 
@@ -46,6 +47,20 @@ def scene_tree(scene: Scene) -> Tree:
     branch(tree, "frame", frame_rows(scene.frame))
     if scene.points is not None:
         branch(tree, "points", {"count": len(scene.points)})
+    return tree
+
+
+def cloud_tree(name: str, cloud: Gaussians) -> Tree:
+    tree = Tree(f"[bold]{name}[/bold]  a cloud of {len(cloud):,} Gaussians")
+    rows: dict[str, Any] = {"file": size(Path(name)), "harmonics": f"degree {cloud.degree}"}
+    rows["opacities"] = "antialiased (Mip-Splatting's 2-D filter)" if cloud.antialiased else "as in the first release"
+    if len(cloud):
+        low, high = cloud.means.amin(0), cloud.means.amax(0)
+        rows["bounds"] = f"{vector(tuple(low.tolist()))} to {vector(tuple(high.tolist()))}"
+        rows["middle"] = vector(tuple(cloud.means.median(0).values.tolist()))
+        rows["deviation"] = f"{cloud.log_scales.mean(-1).median().exp().item():.4g}, in the middle"
+        rows["opacity"] = f"{cloud.opacities.sigmoid().median().item():.3g}, in the middle"
+    branch(tree, "cloud", rows)
     return tree
 
 

@@ -13,7 +13,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn
 from torch import Tensor
 
 from .method import Method
-from .scene import Batch
+from .scene import Batch, Photograph
 
 REFRESH = 0.5  # seconds between looks at a bar
 LINES = 10.0  # seconds between lines where there is no terminal
@@ -62,13 +62,13 @@ class TrainingDisplay:
         step: int,
         seconds: float,
         progress: float,
-        batch: Batch,
+        batch: Batch | Photograph,
         terms: dict[str, Tensor],
         method: Method,
         needed: bool,
     ) -> dict[str, Any]:
         """Note a step. Gives its figures if they are needed; otherwise it may skip finding them, which is cheaper."""
-        self._rays += len(batch.rays)
+        self._rays += len(batch)
         now = time.perf_counter()
         due = now >= self._next
         if not (needed or due):

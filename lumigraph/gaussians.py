@@ -1,4 +1,4 @@
-"""Gaussians: a scene as a cloud of soft, coloured ellipsoids (Kerbl 2023), as methods learn it and splat files hold it."""
+"""Gaussians: a scene as a cloud of soft, coloured ellipsoids (Kerbl 2023), as methods learn it and files hold it."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ class Gaussians:
     quaternions: rotations (w, x, y, z), of any length but zero
     log_scales:  natural logarithm of the standard deviation along each of the rotated axes
     opacities:   logits; the sigmoid is the opacity at the centre
-    harmonics:   colour, sRGB-encoded: c(d) = 1/2 + sum_k Y_k(d) h_k, negative ones cut to 0, where d points from the eye
-                 to the centre and Y_k are those of `kernels.spherical_harmonics`; K is 1, 4, 9 or 16
+    harmonics:   colour, sRGB-encoded: c(d) = 1/2 + sum_k Y_k(d) h_k, negative ones cut to 0, where d points from the
+                 eye to the centre and Y_k are those of `kernels.spherical_harmonics`; K is 1, 4, 9 or 16
     antialiased: whether opacities are meant for the 2-D filter that keeps a small Gaussian's light (Yu 2024)
     """
 
@@ -53,7 +53,9 @@ class Gaussians:
         similarity = similarity.double().cpu()
         scale = torch.linalg.det(similarity[:3, :3]) ** (1 / 3)
         rotation = similarity[:3, :3] / scale
-        means = self.means.double() @ similarity[:3, :3].T.to(self.means.device) + similarity[:3, 3].to(self.means.device)
+        means = self.means.double() @ similarity[:3, :3].T.to(self.means.device) + similarity[:3, 3].to(
+            self.means.device
+        )
         turn = to_quaternion(rotation).to(self.quaternions)
         return replace(
             self,

@@ -10,8 +10,10 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from .camera import Camera
+from .errors import LumigraphError
+from .gaussians import Gaussians
 from .rays import Rays, Rendering
-from .scene import Batch, Frame, Scene
+from .scene import Batch, Frame, Photograph, Scene
 
 
 class Method(nn.Module, ABC):
@@ -35,11 +37,11 @@ class Method(nn.Module, ABC):
         return cls.Config()
 
     @abstractmethod
-    def batch(self, scene: Scene, generator: torch.Generator) -> Batch:
+    def batch(self, scene: Scene, generator: torch.Generator) -> Batch | Photograph:
         """What one step learns from. All randomness comes from `generator`, on the CPU."""
 
     @abstractmethod
-    def loss(self, batch: Batch, step: int) -> dict[str, Tensor]:
+    def loss(self, batch: Any, step: int) -> dict[str, Tensor]:
         """The terms to minimise, by name; the trainer sums them."""
 
     @abstractmethod
@@ -62,6 +64,12 @@ class Method(nn.Module, ABC):
     def statistics(self) -> dict[str, float]:
         """Figures of the last step worth a line in metrics.jsonl, e.g. rays and samples."""
         return {}
+
+    def gaussians(self) -> Gaussians:
+        """The scene as a cloud of Gaussians, in the scene's frame. Raises LumigraphError for methods without one."""
+        raise LumigraphError(
+            f"{type(self).__name__} holds no Gaussians, so no splats can be made of it; train gaussian-splatting"
+        )
 
     @property
     def device(self) -> torch.device:

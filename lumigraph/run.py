@@ -103,6 +103,11 @@ class Run:
         self.config["budget"] = budget
         files.write_json(self.folder / "config.json", self.config)
 
+    @property
+    def renders(self) -> Path:
+        """Where films go."""
+        return self.folder / "renders"
+
     # What was trained on what
 
     @property

@@ -6,7 +6,7 @@ from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import torch
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
 from .camera import Camera
@@ -74,6 +74,30 @@ class Batch:
 
 
 @dataclass(frozen=True)
+class Photograph:
+    """One whole photograph, and what took it.
+
+    rgb:   sRGB-encoded, not multiplied by alpha
+    alpha: opacity, where the photographs have it
+    mask:  which pixels are to be trusted; None for all
+    """
+
+    camera: Camera
+    rgb: Float[Tensor, "height width 3"]
+    alpha: Float[Tensor, "height width"] | None = None
+    mask: Bool[Tensor, "height width"] | None = None
+
+    def __len__(self) -> int:
+        """Pixels."""
+        return self.rgb.shape[0] * self.rgb.shape[1]
+
+    def to(self, device: torch.device | str) -> Photograph:
+        rgb, alpha, mask = (None if x is None else x.to(device) for x in (self.rgb, self.alpha, self.mask))
+        assert rgb is not None
+        return Photograph(self.camera.to(device), rgb, alpha, mask)
+
+
+@dataclass(frozen=True)
 class Scene:
     """Image i was taken by camera i and is called names[i].
 
@@ -106,12 +130,11 @@ class Scene:
         alpha = drawn.rgba[:, 3].float().div_(255) if self.images.has_alpha else None
         return Batch(rays, rgb, alpha)
 
-    def sample_view(
-        self, generator: torch.Generator, split: str = "train"
-    ) -> tuple[Camera, Float[Tensor, "height width channel"]]:
-        """A random whole photograph; its number is the camera's image_index."""
-        choices = self.splits[split]
-        return self.view(int(choices[torch.randint(len(choices), (), generator=generator)]))
+    def photograph(self, index: int) -> Photograph:
+        """One photograph with all that is known of it."""
+        camera, image = self.view(index)
+        alpha = image[..., 3] if image.shape[-1] == 4 else None
+        return Photograph(camera, image[..., :3].contiguous(), alpha, self.images.mask(index))
 
     def view(self, index: int) -> tuple[Camera, Float[Tensor, "height width channel"]]:
         """One photograph and its camera: sRGB-encoded in [0, 1], a fourth channel where the photographs have alpha."""

@@ -19,7 +19,7 @@ from .errors import LumigraphError
 from .figures import save_picture
 from .method import Method
 from .run import Run, State
-from .scene import Batch, Scene
+from .scene import Batch, Photograph, Scene
 
 FIRST_SAVE = 10.0  # seconds of training; a fault or a kill in the first minute should not cost all of it
 PREVIEWS = (0.01, 0.03, 0.1, 0.3, 1.0)  # shares of the budget at which a view is kept
@@ -220,7 +220,9 @@ def rehearse(method: Method, scene: Scene, step: int) -> float:
     return time.perf_counter() - begin
 
 
-def find_fault(method: Method, terms: dict[str, Tensor], batch: Batch, step: int, thorough: bool) -> str | None:
+def find_fault(
+    method: Method, terms: dict[str, Tensor], batch: Batch | Photograph, step: int, thorough: bool
+) -> str | None:
     """The loss term that is not finite, or whose gradient is not; None if all is well.
 
     thorough: look at all gradients. Small ones, which everything flows through, are always looked at.

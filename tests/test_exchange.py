@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import gzip
 import math
 import os
@@ -13,6 +14,7 @@ import numpy as np
 import plyfile
 import pytest
 import torch
+import zstandard
 
 from lumigraph.errors import LumigraphError
 from lumigraph.exchange import SUFFIXES, is_splat_file, read_gaussians, write_gaussians
@@ -612,7 +614,8 @@ def spz(version: int = 3, count: int = 1, degree: int = 0, magic: bytes = b"NGSP
         (spz(version=0), "version 0"),
         (spz(version=4), "version 4"),
         (spz(version=2**32 - 1), "version 4294967295"),
-        (gzip.decompress(spz(version=4)), "version 4"),  # it has its own container, not gzip's
+        (gzip.decompress(spz(version=5)), "version 5"),
+        (gzip.decompress(spz(version=4)), "no table"),  # it has its own container, not gzip's
         (b"NGSP\x04", "ends early"),
         (spz(degree=4), "degree 4"),
         (spz(degree=1), "truncated"),
@@ -631,6 +634,37 @@ def spz(version: int = 3, count: int = 1, degree: int = 0, magic: bytes = b"NGSP
 def test_spz_files_that_cannot_be_read(tmp_path, data, said):
     (tmp_path / "a.spz").write_bytes(data)
     assert said in refusal(tmp_path / "a.spz")
+
+
+def tabled(data: bytes) -> bytes:
+    """A file of version 3 as version 4: the same bytes in a table of streams."""
+    plain = gzip.decompress(data)
+    count, degree, bits, flags = struct.unpack_from("<IBBB", plain, 8)
+    widths, at, streams = [9, 1, 3, 3, 4] + [3 * ((degree + 1) ** 2 - 1)] * (degree > 0), 16, []
+    for width in widths:
+        streams.append(plain[at : at + count * width])
+        at += count * width
+    packed = [zstandard.ZstdCompressor().compress(stream) for stream in streams]
+    header = struct.pack("<4sIIBBBBI12x", b"NGSP", 4, count, degree, bits, flags, len(streams), 32)
+    table = b"".join(struct.pack("<QQ", len(a), len(b)) for a, b in zip(packed, streams, strict=True))
+    return header + table + b"".join(packed)
+
+
+@pytest.mark.parametrize("degree", [0, 2])
+def test_spz_version_4_says_the_same(tmp_path, degree):
+    write_gaussians(tmp_path / "three.spz", make(70, degree, antialiased=True))
+    data = tabled((tmp_path / "three.spz").read_bytes())
+    (tmp_path / "four.spz").write_bytes(data)
+    three, four = (read_gaussians(tmp_path / f"{name}.spz") for name in ("three", "four"))
+    for name in ("means", "quaternions", "log_scales", "opacities", "harmonics", "antialiased"):
+        assert np.array_equal(getattr(three, name), getattr(four, name)), name
+    for end in range(1, len(data) - 1, 7):
+        (tmp_path / "cut.spz").write_bytes(data[:end])
+        refusal(tmp_path / "cut.spz")
+    for at in range(8, 112, 3):  # the header and the table, and a byte of them wrong
+        (tmp_path / "wrong.spz").write_bytes(data[:at] + bytes([data[at] ^ 0x55]) + data[at + 1 :])
+        with contextlib.suppress(LumigraphError):
+            read_gaussians(tmp_path / "wrong.spz")
 
 
 def test_a_splat_file_of_nothing_is_not_written(tmp_path):

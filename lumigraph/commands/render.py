@@ -17,14 +17,14 @@ PathName = Literal["orbit", "spiral", "interpolate", "held-out"]
 
 @dataclass(frozen=True)
 class Render:
-    """Fly a camera through a run: colour and depth, as films and as pictures.
+    """Fly a camera through a run or a splat file: colour and depth, as films and as pictures.
 
     Paths keep to where the photographs were taken from. orbit goes round (or to and fro), spiral twice round while
     rising, interpolate passes smoothly through photographs' places, held-out visits the test photographs' own cameras.
     """
 
-    run_folder: Annotated[Positional[Path], needed("RUN")]
-    """Folder of the run."""
+    source: Annotated[Positional[Path], needed("RUN_OR_FILE")]
+    """Folder of the run, or a splat file: .ply, .compressed.ply, .spz, .splat."""
     path: PathName = "orbit"
     """Where the camera goes."""
     frames: Annotated[int | None, option("N", "120; every held-out view")] = None
@@ -33,18 +33,20 @@ class Render:
     """Frames per second."""
     size: Annotated[int | None, option("PIXELS", f"that of the photographs, at most {LONGEST}")] = None
     """Longer side of the picture."""
-    output: Annotated[Path | None, option("FILE.mp4", "RUN/renders/PATH.mp4")] = None
+    output: Annotated[Path | None, option("FILE.mp4", "RUN/renders/PATH.mp4, or renders/FILE/PATH.mp4")] = None
     """The film. FILE-depth.mp4, FILE.json and the folder FILE of pictures go beside it."""
     device: Annotated[str, option("NAME")] = "auto"
     """auto, cpu, cuda, cuda:1."""
 
     def run(self) -> int:
+        from ..exchange import is_splat_file
         from ..export.film import film
         from ..run import Run
+        from ..splat_file import SplatFile
 
         check_film(self.frames, self.fps, self.size)
-        run = Run(self.run_folder)
-        output = self.output or run.folder / "renders" / f"{self.path}.mp4"
+        run = SplatFile(self.source) if is_splat_file(self.source) else Run(self.source)
+        output = self.output or run.renders / f"{self.path}.mp4"
         if output.suffix != ".mp4":
             raise LumigraphError(f"{output} should end in .mp4, the one kind of film there is; rename it")
         cameras = film_cameras(run, self.path, self.frames, self.size)
@@ -73,10 +75,8 @@ def film_cameras(run: Any, path: str, frames: int | None, size: int | None) -> A
         return camera_path(path, train, run.frame, 120 if frames is None else frames, film_size(train, longest))
     views = cameras.get("test")
     if views is None or not len(views):
-        raise LumigraphError(f"{run.folder} has no held-out views; choose another --path")
+        raise LumigraphError("There are no held-out views here; choose another --path")
     if len(views.size.unique(dim=0)) > 1:
-        raise LumigraphError(
-            f"{run.folder} has held-out views of several sizes, which no film holds; choose another --path"
-        )
+        raise LumigraphError("The held-out views are of several sizes, which no film holds; choose another --path")
     longest = size or min(LONGEST, int(views.size.max()))
     return views[: frames or len(views)].resized(longest / int(views.size.max()))

@@ -1,8 +1,8 @@
-"""Niantic's compact format, https://github.com/nianticlabs/spz: gzip around a header and one stream per quantity.
+"""Niantic's compact format, https://github.com/nianticlabs/spz: a header and one stream of bytes per quantity.
 
-Versions 1 to 3 are read and 3 is written, which gives a rotation three components of 10 bits instead of 8. Version 2
-is within 1/255 a component, so that a half turn, whose w is near 0, can come back turned by 13 degrees. Version 4,
-another container with zstd inside, is named as such.
+Versions 1 to 3 have gzip around all of it, version 4 a table of streams, each packed by zstd. All four are read. 3 is
+written: most programs know it, and it gives a rotation three components of 10 bits instead of 8. Version 2 is within
+1/255 a component, so that a half turn, whose w is near 0, can come back turned by 13 degrees.
 
 Axes are x right, y up, z back; PLY files and this house have y down and z forward. Half a turn around x lies between
 them, so y and z change their signs, and with them those harmonics that are odd in y and z together.
@@ -15,14 +15,17 @@ rotation other than the largest are within 0.0007. Before gzip a Gaussian takes 
 
 from __future__ import annotations
 
+import contextlib
 import gzip
 import io
 import math
 import struct
 import zlib
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
+import zstandard
 from jaxtyping import Float, UInt8
 
 from ..errors import LumigraphError
@@ -31,13 +34,15 @@ from ..gaussians import Gaussians
 from .codes import LOGITS, alpha_to_byte, array, cloud, to_byte, with_largest, without_largest
 
 HEADER = struct.Struct("<4sIIBBBB")  # magic, version, count, degree, bits behind the point, flags, reserved
-MAGIC, VERSION = b"NGSP", 3
+MAGIC, VERSION, NEWEST = b"NGSP", 3, 4
+TABLED = struct.Struct("<4sIIBBBBI12x")  # version 4: ..., flags, number of streams, where their table begins
+STREAM = struct.Struct("<QQ")  # packed and unpacked bytes
 ANTIALIASED, EXTENDED = 1, 2  # flags
 MOST_BITS = 16  # behind the binary point; Niantic's metres have 12, ours are units of a scene in [-1, 1]^3
 FARTHEST = 2**23 - 1
 COLOUR = 0.15  # instead of Y_00 = 0.28, so that colours outside [0, 1] have a place
 STEPS = np.repeat(np.array([8, 16], np.float32), [3, 12])[:, None]  # 5 bits for harmonics of degree 1, 4 beyond
-DENSEST = 1032  # times that deflate can shrink what it is given
+DENSEST, DENSEST_ZSTD = 1032, 1 << 15  # times that deflate, and zstd, can shrink what they are given
 LONGEST_EXTENSIONS = 1 << 20  # bytes
 PIECE = 1 << 24  # bytes
 LEVEL = 4  # of gzip; 6, the usual one, takes up to four times as long and saves 1% at most
@@ -49,18 +54,28 @@ TURN_HARMONICS = np.array([1, -1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 
 
 
 def read(path: Path) -> Gaussians:
-    """Versions 1, 2 and 3. Extensions are passed over. Raises LumigraphError for others and for damaged files."""
+    """Versions 1 to 4. Extensions are passed over. Raises LumigraphError for others and for damaged files."""
     data = path.read_bytes()
     stream: io.BufferedIOBase
-    if data[:4] == MAGIC:  # version 4 and later; or earlier ones, before gzip
+    if data[:8] == MAGIC + struct.pack("<I", NEWEST):
+        with _told(path):
+            return _decode_tabled(path, data)
+    if data[:4] == MAGIC:  # earlier ones, before gzip
         stream = io.BytesIO(data)
     elif data[:2] == b"\x1f\x8b":
         stream = gzip.GzipFile(fileobj=io.BytesIO(data))
     else:
         raise LumigraphError(f"{path} is no .spz file, for it does not begin like one; name another one")
-    try:
+    with _told(path):
         return _decode(path, stream, DENSEST * len(data))
-    except (EOFError, zlib.error, gzip.BadGzipFile) as fault:
+
+
+@contextlib.contextmanager
+def _told(path: Path) -> Iterator[None]:
+    """What goes wrong in unpacking, as one sentence."""
+    try:
+        yield
+    except (EOFError, zlib.error, gzip.BadGzipFile, zstandard.ZstdError) as fault:
         raise LumigraphError(f"{path} is truncated or damaged ({fault}); copy or download it again") from fault
 
 
@@ -93,29 +108,63 @@ def _decode(path: Path, stream: io.BufferedIOBase, limit: int) -> Gaussians:
     magic, version = struct.unpack("<4sI", _take(stream, 8))
     if magic != MAGIC:
         raise LumigraphError(f"{path} is no .spz file, for inside it does not begin with NGSP; name another one")
-    if not 1 <= version <= VERSION:
+    if not 1 <= version < NEWEST:
         raise LumigraphError(
-            f"{path} is of version {version} of .spz, of which 1 to {VERSION} can be read; "
+            f"{path} is of version {version} of .spz, of which 1 to {NEWEST} can be read; "
             f"save it as version {VERSION} or as .ply, for instance with splat-transform"
         )
     count, degree, bits, flags, _ = struct.unpack("<IBBBB", _take(stream, 8))
-    if degree > 3:
-        raise LumigraphError(f"{path} has harmonics of degree {degree}; save it with degree 0 to 3")
-    widths = [6 if version == 1 else 9, 1, 3, 3, 4 if version == 3 else 3, 3 * ((degree + 1) ** 2 - 1)]
+    widths = _widths(path, version, degree)
     if count * sum(widths) > limit:
         raise EOFError(f"{count} Gaussians are promised and cannot be there")
-    positions, alphas, colours, scales, rotations, rest = (
-        np.frombuffer(_take(stream, count * width), np.uint8).reshape(count, width) for width in widths
-    )
+    columns = [np.frombuffer(_take(stream, count * width), np.uint8).reshape(count, width) for width in widths]
     behind = stream.read(LONGEST_EXTENSIONS + 1)  # to the end, where gzip's checksum is
     if len(behind) > (LONGEST_EXTENSIONS if flags & EXTENDED else 0):
         raise LumigraphError(f"{path} goes on after the {count} Gaussians that it promises; copy or download it again")
+    return _cloud(columns, version, bits, flags)
+
+
+def _decode_tabled(path: Path, data: bytes) -> Gaussians:
+    """Version 4. Only as much is unpacked as the header's count makes of each stream."""
+    if len(data) < TABLED.size:
+        raise EOFError("it ends early")
+    _, version, count, degree, bits, flags, streams, table = TABLED.unpack_from(data)
+    widths = _widths(path, version, degree)
+    if streams < len([width for width in widths if width]) or table + streams * STREAM.size > len(data):
+        raise EOFError(f"it has no table of {streams} streams")
+    entries = [STREAM.unpack_from(data, table + i * STREAM.size) for i in range(streams)]
+    at, columns = table + streams * STREAM.size, []
+    for width, (packed, unpacked) in zip(widths, [*entries, (0, 0)], strict=False):
+        if unpacked != count * width or at + packed > len(data):
+            raise EOFError(f"{count} Gaussians are promised and cannot be there")
+        found = b""
+        if unpacked:
+            if unpacked > DENSEST_ZSTD * packed:
+                raise EOFError(f"{count} Gaussians are promised and cannot be there")
+            reader = zstandard.ZstdDecompressor().stream_reader(data[at : at + packed])
+            found = _take(reader, unpacked)
+        columns.append(np.frombuffer(found, np.uint8).reshape(count, width))
+        at += packed
+    return _cloud(columns, version, bits, flags)
+
+
+def _widths(path: Path, version: int, degree: int) -> list[int]:
+    """Bytes of one Gaussian in each stream: position, opacity, colour, scale, rotation, harmonics beyond the first."""
+    if degree > 3:
+        raise LumigraphError(f"{path} has harmonics of degree {degree}; save it with degree 0 to 3")
+    return [6 if version == 1 else 9, 1, 3, 3, 4 if version >= 3 else 3, 3 * ((degree + 1) ** 2 - 1)]
+
+
+def _cloud(columns: list[np.ndarray], version: int, bits: int, flags: int) -> Gaussians:
+    positions, alphas, colours, scales, rotations, rest = columns
     means = positions.view("<f2").astype(np.float64) if version == 1 else _fixed_point(positions) / 2.0**bits
     plain = (colours / 255 - 0.5) / COLOUR
-    harmonics = np.concatenate([plain[:, None], (rest.reshape(count, widths[-1] // 3, 3) - 128.0) / 128], 1)
+    harmonics = np.concatenate(
+        [plain[:, None], (rest.reshape(*rest.shape[:1], rest.shape[1] // 3, 3) - 128.0) / 128], 1
+    )
     return cloud(
         means * TURN_MEAN,
-        (_from_smallest_three(rotations) if version == 3 else _from_first_three(rotations)) * TURN_ROTATION,
+        (_from_smallest_three(rotations) if version >= 3 else _from_first_three(rotations)) * TURN_ROTATION,
         scales / 16 - 10,
         LOGITS[alphas[:, 0]],
         harmonics * TURN_HARMONICS[: harmonics.shape[1]],

@@ -16,7 +16,7 @@ from numba.core.datamodel import models
 from numba.core.typing.templates import AbstractTemplate, infer_global, signature
 from numba.extending import intrinsic, lower_builtin, lower_cast, overload, register_model
 
-from ._vectors import F32, FLOATS, I32, INTS, LANES, all_lanes, data, load, store, vector_at
+from ._vectors import FLOATS, I32, INTS, LANES, all_lanes, data, load, store, vector_at
 
 BOOLS = ir.VectorType(ir.IntType(1), LANES)
 FMA = ("contract", "nsz")  # products and sums may fuse; infinities and NaN keep their meaning

@@ -19,6 +19,7 @@ from torch import Tensor
 from ..files import write_json
 from ..rays import Samples
 from ._dispatch import Engine, using
+from .tile import Tiles
 
 UNITS = {
     "hash_encode": "samples",
@@ -26,6 +27,9 @@ UNITS = {
     "march": "rays",
     "spherical_harmonics": "directions",
     "perceptron": "samples",
+    "project": "gaussians",
+    "tile": "gaussians",
+    "rasterize": "gaussians",
     "ssim": "pixels",
 }
 COUNTS: dict[str, Callable[..., int]] = {  # units in a case, where the first input is not a list of them
@@ -58,10 +62,7 @@ def bench_kernels(
     result: dict[str, Any] = {"protocol": _protocol(device, size, repeats), "operations": {}}
     for name in operations:
         case = importlib.import_module(f"{__package__}.{name}").benchmark_case
-        inputs = [
-            x.detach().to(device).requires_grad_(x.requires_grad) if isinstance(x, Tensor) else x
-            for x in case(torch.Generator().manual_seed(0), size)
-        ]
+        inputs = [_moved(x, device) for x in case(torch.Generator().manual_seed(0), size)]
         count = COUNTS.get(name, lambda first, *_: len(first))(*inputs)
         engines = {engine: _measure(name, engine, inputs, count, repeats) for engine in (fast, "reference")}
         ratios = {k: v / engines["reference"][k] for k, v in engines[fast].items() if k.endswith("per_second")}
@@ -73,6 +74,12 @@ def bench_kernels(
     return result
 
 
+def _moved(x: Any, device: torch.device) -> Any:
+    if isinstance(x, Tensor):
+        return x.detach().to(device).requires_grad_(x.requires_grad)
+    return x.to(device) if hasattr(x, "to") else x
+
+
 def _measure(name: str, engine: Engine, inputs: list[Any], count: int, repeats: int) -> dict[str, float]:
     operation = getattr(importlib.import_module(f"{__package__}.{name}"), name)
     wanted = [x for x in inputs if isinstance(x, Tensor) and x.requires_grad]
@@ -82,6 +89,8 @@ def _measure(name: str, engine: Engine, inputs: list[Any], count: int, repeats: 
             found = operation(*inputs)
         if isinstance(found, Samples):
             return found.t_start, found.t_end
+        if isinstance(found, Tiles):
+            return found.order, found.starts
         return found if isinstance(found, tuple) else (found,)
 
     first, seconds = _time(forward, inputs[0].device, repeats)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Float
@@ -36,6 +36,10 @@ class View:
     size: tuple[int, int]
     near: float
 
+    def to(self, device: torch.device | str) -> View:
+        names = ("rotation", "eye", "focal", "centre", "distortion", "limits")
+        return replace(self, **{name: getattr(self, name).to(device) for name in names})
+
     def numbers(self) -> Float[Tensor, " 31"]:
         """All of it in a row: rotation by rows, eye, focal, centre, distortion, limits, size, near."""
         parts = self.rotation.reshape(9), self.eye, self.focal, self.centre, self.distortion, self.limits
@@ -59,7 +63,7 @@ def project(
     Float[Tensor, "gaussian 3"],
     Float[Tensor, " gaussian"],
 ]:
-    """Each Gaussian's footprint, to first order about its centre, and its colour from here (Zwicker 2002; Kerbl 2023, 4).
+    """Each Gaussian's footprint, to first order about its centre, and its colour from here (Zwicker 2002; Kerbl 2023).
 
         p = R (mean - eye)      u = lens(p_x / p_z, p_y / p_z)      J = du / dp
         Sigma = Q diag(scale)^2 Q^T      C = J R Sigma R^T J^T + blur I
@@ -100,6 +104,8 @@ def cases(generator: torch.Generator):
     opacities[20:23] = torch.tensor([0.0, 0.003, 1.0])
     yield means, quaternions, scales, opacities, *inputs[4:]
     yield means, quaternions, scales, opacities, *inputs[4:8], False
+    *tensors, view, _, blur, _ = _cloud(20, 4, False, generator)
+    yield *tensors, view, 2, blur, False  # two bands are not in use yet
 
 
 def benchmark_case(generator: torch.Generator, size: int = 2**18):

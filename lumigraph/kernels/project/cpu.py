@@ -136,7 +136,9 @@ def _direction(means, i, v):
 
 
 @njit(parallel=True, **FAST)
-def _forward(means, quaternions, scales, opacities, harmonics, v, bands, blur, compensate, centres, conics, depths, colours, seen):
+def _forward(
+    means, quaternions, scales, opacities, harmonics, v, bands, blur, compensate, centres, conics, depths, colours, seen
+):
     parts = 64
     for part in prange(parts):
         Y = np.empty(16, np.float32)
@@ -226,7 +228,9 @@ def _backward(
             gB = (_dot(Q[0], gUs), _dot(Q[1], gUs), _dot(Q[2], gUs))
             for n in range(3):
                 q0, q1, q2 = Q[0][n], Q[1][n], Q[2][n]
-                to_scales[i, n] = (A[0] * q0 + A[1] * q1 + A[2] * q2) * gT[n] + (B[0] * q0 + B[1] * q1 + B[2] * q2) * gU[n]
+                to_scales[i, n] = (A[0] * q0 + A[1] * q1 + A[2] * q2) * gT[n] + (
+                    B[0] * q0 + B[1] * q1 + B[2] * q2
+                ) * gU[n]
             G00, G01, G02 = A[0] * gTs[0] + B[0] * gUs[0], A[0] * gTs[1] + B[0] * gUs[1], A[0] * gTs[2] + B[0] * gUs[2]
             G10, G11, G12 = A[1] * gTs[0] + B[1] * gUs[0], A[1] * gTs[1] + B[1] * gUs[1], A[1] * gTs[2] + B[1] * gUs[2]
             G20, G21, G22 = A[2] * gTs[0] + B[2] * gUs[0], A[2] * gTs[1] + B[2] * gUs[1], A[2] * gTs[2] + B[2] * gUs[2]
@@ -263,7 +267,11 @@ def _backward(
             green = g_colours[i, 1] if colours[i, 1] > 0 else np.float32(0)
             blue = g_colours[i, 2] if colours[i, 2] > 0 else np.float32(0)
             for n in range(bands * bands):
-                to_harmonics[i, n, 0], to_harmonics[i, n, 1], to_harmonics[i, n, 2] = Y[n] * red, Y[n] * green, Y[n] * blue
+                to_harmonics[i, n, 0], to_harmonics[i, n, 1], to_harmonics[i, n, 2] = (
+                    Y[n] * red,
+                    Y[n] * green,
+                    Y[n] * blue,
+                )
                 worth[n] = red * harmonics[i, n, 0] + green * harmonics[i, n, 1] + blue * harmonics[i, n, 2]
             tx, ty, tz = slope(dx, dy, dz, bands, worth)
             inward = tx * dx + ty * dy + tz * dz

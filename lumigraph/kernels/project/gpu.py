@@ -1,15 +1,13 @@
 """Triton: one lane takes one Gaussian. On the way back everything is worked out again rather than kept.
 
-Backward, from the picture to the world. x' is the loss's derivative in x; (k_xx, k_xy, k_yy) is the conic,
-L = Q diag(scale), T = N L with N = J R, and C = T T^T + blur I = (a b; b c). T_0 and T_1 are a matrix's rows.
+Backward, from the picture to the world. x' is the loss's derivative in x. L = Q diag(scale), T = N L with N = J R,
+C = T T^T + blur I = (a b; b c), K = C^-1 the conic; T_0 and T_1 are a matrix's rows.
 
-    conic    det = |n|^2 + blur (a + c - blur), n = T_0 x T_1
-             det' = -(k_xx k_xx' + k_xy k_xy' + k_yy k_yy') / det
+    conic    T' = -2 K K' K T, the halves of xy' to either side. K T cancels where a footprint is large; the same is
+             K T = (blur T_0 + T_1 x n; blur T_1 + n x T_0) / det,  n = T_0 x T_1,  det = |n|^2 + blur (a + c - blur)
     opacity  o = opacity sqrt(share), share = |n|^2 / det; where that is above 1e-8:
-             opacity' = sqrt(share) o'      share' = opacity o' / (2 sqrt(share))      det' -= share' share / det
-    C        a' = k_yy' / det + blur det'      b' = -k_xy' / det      c' = k_xx' / det + blur det'
-    T        n' = 2 (det' + share' / det) n
-             T_0' = 2 a' T_0 + b' T_1 + T_1 x n'      T_1' = 2 c' T_1 + b' T_0 + n' x T_0
+             opacity' = sqrt(share) o'      share' = opacity o' / (2 sqrt(share))
+             T_0' += 2 share' blur / det ((a + c - blur) / det T_1 x n - share T_0)      T_1' likewise, with n x T_0
     world    L' = N^T T'      Q' = L' diag(scale)      scale_j' = sum_i Q_ij L_ij'      J' = T' L^T R^T
     J        = S O, S = diag(focal) B(x, y), O = (1 0 -x; 0 1 -y) / z; (x, y) is (X, Y) = p_xy / z held within limits
              S' = J' O^T + u' (X - x, Y - y)      (x, y)' = S' : dS - S^T J_.2' / z      z' = -<J', J> / z
@@ -226,15 +224,18 @@ def _covariance(T, blur):
 
 @triton.jit
 def _covariance_backward(T, d_conic, d_share, blur):
-    """The gradient in T, of the conic and of what share of det is left without the blur."""
+    """The gradient in T, of the conic K = C^-1 and of the share of det that is left without the blur."""
     a, b, c, det, n = _covariance(T, blur)
-    share = _dot(n, n) / det
-    d_det = -(d_conic[0] * c - d_conic[1] * b + d_conic[2] * a) / (det * det) - d_share * share / det
-    d_a, d_b, d_c = d_conic[2] / det + blur * d_det, -d_conic[1] / det, d_conic[0] / det + blur * d_det
-    twice = 2 * (d_det + d_share / det)
-    d_n = twice * n[0], twice * n[1], twice * n[2]
-    d_T0 = _mix(1.0, _mix(2 * d_a, T[0], d_b, T[1]), 1.0, _cross(T[1], d_n))
-    d_T1 = _mix(1.0, _mix(2 * d_c, T[1], d_b, T[0]), 1.0, _cross(d_n, T[0]))
+    xx, xy, yy = c / det, -b / det, a / det
+    up, down = _cross(T[1], n), _cross(n, T[0])  # half the slope of |n|^2 in T_0, in T_1
+    KT0, KT1 = _mix(blur / det, T[0], 1 / det, up), _mix(blur / det, T[1], 1 / det, down)
+    GKT0 = _mix(d_conic[0], KT0, 0.5 * d_conic[1], KT1)
+    GKT1 = _mix(0.5 * d_conic[1], KT0, d_conic[2], KT1)
+    d_T0, d_T1 = _mix(-2 * xx, GKT0, -2 * xy, GKT1), _mix(-2 * xy, GKT0, -2 * yy, GKT1)
+    steep = 2 * d_share * blur / det
+    narrow, wide = steep * (a + c - blur) / det, -steep * _dot(n, n) / det
+    d_T0 = _mix(1.0, d_T0, 1.0, _mix(narrow, up, wide, T[0]))
+    d_T1 = _mix(1.0, d_T1, 1.0, _mix(narrow, down, wide, T[1]))
     return d_T0, d_T1
 
 

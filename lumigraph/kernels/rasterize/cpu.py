@@ -133,7 +133,9 @@ def _forward(rows, order, starts, shares, size, side, stop, table, rgb, depth, o
 
 
 @njit(parallel=True, **FAST)
-def _backward(to_rgb, to_depth, to_opacity, rgb, depth, opacity, rows, order, starts, shares, size, side, stop, table, masks, sums):
+def _backward(
+    to_rgb, to_depth, to_opacity, rgb, depth, opacity, rows, order, starts, shares, size, side, stop, table, masks, sums
+):
     """With c_i what one unit of weight is worth to the loss, and a_i = opacity exp(-q / 2) where that counts,
 
         dL / d ln a_i = w_i c_i - a_i / (1 - a_i) sum_{j>i} w_j c_j
@@ -196,7 +198,9 @@ def _backward(to_rgb, to_depth, to_opacity, rgb, depth, opacity, rows, order, st
 
 
 @njit(parallel=True, **FAST)
-def _gather(sums, masks, order, rows, conics, opacities, parts, to_centres, to_conics, to_opacities, to_colours, to_depths):
+def _gather(
+    sums, masks, order, rows, conics, opacities, parts, to_centres, to_conics, to_opacities, to_colours, to_depths
+):
     """Each thread adds up its own Gaussians' sums, in the order of tiles, and makes gradients of them."""  # fmt: skip
     n = len(to_depths)
     for part in prange(parts):

@@ -1,0 +1,170 @@
+"""3D Gaussian Splatting: a scene as a cloud of soft, coloured ellipsoids (Kerbl et al. 2023, arXiv 2308.04079)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import torch
+from torch import Tensor
+
+from .. import kernels
+from ..camera import Camera
+from ..components.cloud import Cloud, CloudAdam
+from ..components.density_control import AdaptiveDensity, MarkovChain
+from ..components.initial_cloud import initial_cloud, random_cloud
+from ..gaussians import Gaussians
+from ..method import Method
+from ..rays import Rendering
+from ..scene import Frame, Photograph, Scene
+from ..splatting import Splatted, render, splat, view_of
+
+
+@dataclass(frozen=True)
+class Config:
+    """The paper's numbers, with where it gives them; those without a section are the authors' release's."""
+
+    degree: int = 3  # of the spherical harmonics, section 5.1
+    raise_degree_every: int = 1000  # steps, section 7.1; sooner where the budget is short
+    ssim: float = 0.2  # share of D-SSIM in the loss, eq. 7
+    strategy: Literal["adaptive", "mcmc"] = "adaptive"  # density control: section 5, or Kheradmand 2024
+    most: int = 1_000_000  # Gaussians
+    initial: int = 100_000  # random Gaussians where a capture has no points, section 7.1
+    refine_every: int = 100  # steps between changes of the cloud, section 5.2
+    refine_from: int = 500  # step
+    refine_until: float = 0.5  # share of the budget; section 7.1: 15 000 of 30 000 steps
+    pull: float = 2e-4  # gradient that asks for more Gaussians, section 5.2
+    reset_every: int = 3000  # steps between resets of opacity, section 5.2
+    means_rate: float = 1.6e-4  # times the extent of the cameras
+    last_means_rate: float = 1.6e-6
+    harmonics_rate: float = 2.5e-3  # a twentieth of it beyond the first band
+    opacities_rate: float = 0.05
+    scales_rate: float = 5e-3
+    quaternions_rate: float = 1e-3
+    opacity_weight: float = 0.01  # of the mean opacity in the loss, for mcmc (Kheradmand 2024, eq. 11)
+    scale_weight: float = 0.01  # of the mean deviation, in extents, for mcmc
+    stop: float = 1e-4  # transmittance at which a pixel is finished, appendix C
+    antialiased: bool = False  # Mip-Splatting's 2-D filter (Yu 2024, section 5.2)
+    smooth: bool = False  # Mip-Splatting's 3-D filter (Yu 2024, section 5.1)
+    seed: int = 0
+
+
+class GaussianSplatting(Method):
+    """A photograph at a time: splat the cloud, compare, step; now and then change how many Gaussians there are."""
+
+    Config = Config
+    extent: Tensor
+    drawn: Tensor
+
+    def __init__(self, frame: Frame, config: Any = None):
+        config = config or Config()
+        super().__init__(frame, config)
+        placeholder = random_cloud(frame, min(1000, config.most), config.degree, self._random(0))
+        self.cloud = Cloud(placeholder)
+        self.cloud.antialiased = config.antialiased
+        self.density_control = AdaptiveDensity(len(self.cloud), config.pull)
+        self.exploration = MarkovChain()
+        self.register_buffer("extent", torch.tensor(1.0))
+        self.register_buffer("drawn", torch.tensor(0))
+        self._bands = config.degree + 1
+        self._progress = 0.0
+        self._optimizer: CloudAdam | None = None
+        self._seen: Splatted | None = None
+        self._figures: dict[str, float] = {}
+
+    def begin(self, scene: Scene) -> None:
+        config = self.config
+        found = initial_cloud(scene, config.initial, config.most, config.degree, self._random(1))
+        self.cloud.replace(found)
+        self.density_control.begin(len(found))
+        positions = scene.cameras.position[scene.splits["train"]]
+        self.extent.fill_(1.1 * float((positions - positions.mean(0)).norm(dim=-1).max()))
+
+    def batch(self, scene: Scene, generator: torch.Generator) -> Photograph:
+        """Every photograph once, in a random order, then again."""
+        train = scene.splits["train"]
+        turn, place = divmod(int(self.drawn), len(train))
+        self.drawn += 1
+        order = torch.randperm(len(train), generator=self._random(1_000_000 + turn))
+        return scene.photograph(int(train[order[place]])).to(self.device)
+
+    def loss(self, batch: Photograph, step: int) -> dict[str, Tensor]:
+        config, cloud = self.config, self.cloud.gaussians()
+        seen = splat(cloud, view_of(batch.camera, self.frame.near), self._bands, config.stop)
+        rgb, target = seen.rgb, batch.rgb
+        background = torch.tensor(self.frame.background, device=rgb.device)
+        if batch.alpha is not None:  # a random colour behind everything, so that only opacity can imitate opacity
+            background = torch.rand(3, generator=self._random(~step)).to(rgb.device)
+            target = background + batch.alpha[..., None] * (target - background)
+        if background.any():
+            rgb = rgb + (1 - seen.opacity)[..., None] * background
+        if batch.mask is not None:
+            target = torch.where(batch.mask[..., None], target, rgb.detach())
+        if seen.centres.requires_grad:
+            seen.centres.retain_grad()
+        self._seen = seen
+        difference = (rgb - target).abs()
+        self._figures = {"mse": float((rgb - target).detach().square().mean()), "gaussians": len(self.cloud)}
+        terms = {"l1": (1 - config.ssim) * difference.mean(), "ssim": config.ssim * (1 - kernels.ssim(rgb, target))}
+        if config.strategy == "mcmc":
+            terms["opacity"] = config.opacity_weight * cloud.opacities.sigmoid().mean()
+            terms["scale"] = config.scale_weight / float(self.extent) * cloud.log_scales.exp().mean()
+        return terms
+
+    def optimizers(self) -> list[torch.optim.Optimizer]:
+        c, cloud = self.config, self.cloud
+        columns = [1.0] * 3 + [1 / 20] * (3 * (c.degree + 1) ** 2 - 3)
+        groups = [
+            {"params": [cloud.means], "lr": c.means_rate},
+            {"params": [cloud.quaternions], "lr": c.quaternions_rate},
+            {"params": [cloud.log_scales], "lr": c.scales_rate},
+            {"params": [cloud.opacities], "lr": c.opacities_rate},
+            {"params": [cloud.harmonics], "lr": c.harmonics_rate, "columns": columns},
+        ]
+        self._optimizer = CloudAdam(groups)
+        return [self._optimizer]
+
+    def before_step(self, step: int, progress: float) -> None:
+        config, self._progress = self.config, progress
+        assert self._optimizer is not None
+        fall = (config.last_means_rate / config.means_rate) ** progress
+        self._optimizer.param_groups[0]["lr"] = config.means_rate * float(self.extent) * fall
+        self._bands = 1 + min(step // config.raise_degree_every, config.degree)
+
+    @torch.no_grad()
+    def after_step(self, step: int) -> None:
+        config, seen, optimizer = self.config, self._seen, self._optimizer
+        assert seen is not None and optimizer is not None
+        if config.strategy == "mcmc":
+            self._chain(step, optimizer)
+        elif self._progress < config.refine_until:
+            assert seen.centres.grad is not None
+            height, width = seen.opacity.shape
+            self.density_control.note(seen.centres.grad, seen.opacities > 0, (width, height))
+            if step >= config.refine_from and step % config.refine_every == 0:
+                most, chance = config.most, self._random(step)
+                self.density_control.refine(self.cloud, optimizer, float(self.extent), most, chance)
+            if step and step % config.reset_every == 0:
+                self.density_control.reset_opacity(self.cloud, optimizer)
+        self._seen = None
+
+    def _chain(self, step: int, optimizer: CloudAdam) -> None:
+        config, chance = self.config, self._random(step)
+        if self._progress < 0.9 and step >= config.refine_from and step % config.refine_every == 0:
+            grown = int(1.05 * len(self.cloud)) if self._progress < config.refine_until else len(self.cloud)
+            self.exploration.refine(self.cloud, optimizer, min(grown, config.most), chance)
+        self.exploration.explore(self.cloud, optimizer.param_groups[0]["lr"], chance)
+
+    def gaussians(self) -> Gaussians:
+        """The cloud, in the scene's frame."""
+        return self.cloud.gaussians()
+
+    def render(self, camera: Camera) -> Rendering:
+        return render(self.gaussians(), camera.to(self.device), self.frame.background, self.frame.near)
+
+    def statistics(self) -> dict[str, float]:
+        return self._figures
+
+    def _random(self, number: int) -> torch.Generator:
+        """Random numbers that depend on the seed and the step alone, so that a resumed run draws the same."""
+        return torch.Generator().manual_seed((self.config.seed << 40) + (number % (1 << 40)))
