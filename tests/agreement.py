@@ -15,7 +15,17 @@ from torch import Tensor
 from lumigraph import kernels
 from lumigraph.rays import Samples
 
-OPERATIONS = ["spherical_harmonics", "composite", "hash_encode", "march", "perceptron", "ssim"]
+OPERATIONS = [
+    "spherical_harmonics",
+    "composite",
+    "hash_encode",
+    "march",
+    "perceptron",
+    "project",
+    "tile",
+    "rasterize",
+    "ssim",
+]
 ENGINES = ["cpu", "gpu"]
 DEVICES = {"reference": "cpu", "cpu": "cpu", "gpu": "cuda" if torch.cuda.is_available() else "cpu"}
 
@@ -35,6 +45,8 @@ def call(name: str, engine: str, inputs: tuple) -> tuple[Tensor, ...]:
         found = getattr(module(name), name)(*inputs)
     if isinstance(found, Samples):
         return found.t_start, found.t_end, found.ray_starts
+    if isinstance(found, kernels.Tiles):
+        return found.order, found.starts
     return found if isinstance(found, tuple) else (found,)
 
 
@@ -45,7 +57,8 @@ def outputs_and_gradients(name: str, engine: str, inputs: tuple, wanted=None, us
     used:   the outputs that take part in the mixture; all if None
     """
     real = [i for i, x in enumerate(inputs) if torch.is_tensor(x) and x.is_floating_point()]
-    inputs = [x.detach().to(DEVICES[engine]) if torch.is_tensor(x) else x for x in inputs]
+    inputs = [x.detach() if torch.is_tensor(x) else x for x in inputs]
+    inputs = [x.to(DEVICES[engine]) if hasattr(x, "to") else x for x in inputs]
     wanted = [inputs[i].requires_grad_() for i in real if wanted is None or i in wanted]
     outputs = call(name, engine, tuple(inputs))
     mixture = []

@@ -17,7 +17,16 @@ from lumigraph import kernels
 
 TARGETS = [GPUTarget("cuda", 90, 32), GPUTarget("hip", "gfx942", 64)]
 # For each operation, the case whose options reach most of the code.
-CASES = {"spherical_harmonics": 0, "composite": 15, "hash_encode": 3, "march": 7, "ssim": 4}
+CASES = {
+    "spherical_harmonics": 0,
+    "composite": 15,
+    "hash_encode": 3,
+    "march": 7,
+    "project": 5,
+    "tile": 6,
+    "rasterize": 3,
+    "ssim": 4,
+}
 
 
 class Absent:

@@ -56,6 +56,23 @@ FAULTS = {
     "a square's slope": Fault("ssim", "gpu", "_gradient", "2 * mine", "mine"),
     "a slope's sign": Fault("ssim", "gpu", "_likeness", "(B1 - B2)", "(B2 - B1)"),
     "the neighbouring channel": Fault("ssim", "gpu", "_along", "(k - REACH) * C", "k - REACH"),
+    # projecting
+    "held, yet with gradient": Fault("project", "gpu", "_lens_backward", "where(x == X", "where(z > 0"),
+    "a lens's second slope": Fault("project", "gpu", "_bend_backward", "6 * p2", "2 * p2"),
+    "blur in the compensation": Fault("project", "gpu", "_covariance_backward", "(a + c - blur)", "(a + c)"),
+    "a quaternion's length": Fault("project", "gpu", "_matrix_backward", "along * y", "0 * y"),
+    "a colour below zero": Fault("project", "gpu", "_backward", "colour[1] > 0", "seen"),
+    "the direction's length": Fault("project", "gpu", "_backward", "-_dot(d, d_d)", "0.0"),
+    # tiling
+    "the box for the ellipse": Fault("tile", "gpu", "_tile", "& (least <= reach)", ""),
+    "a tile too few": Fault("tile", "gpu", "_span", "last - first + 1", "last - first"),
+    "another row's tile": Fault("tile", "gpu", "_tile", "row * across + column", "column * down + row"),
+    # rasterising
+    "light not lost": Fault("rasterize", "gpu", "_backward", "after / (1 - alpha)", "after"),
+    "cut off, yet with gradient": Fault("rasterize", "gpu", "_backward", " & (raw <= OPAQUEST)", ""),
+    "an opacity behind the stop": Fault("rasterize", "gpu", "_backward", " & (before >= stop)", ""),
+    "all that is behind, again": Fault("rasterize", "gpu", "_backward", "rest -= tl.sum(w * worth, 0)", "rest -= 0"),
+    "the other axis": Fault("rasterize", "gpu", "_backward", "conic[2] * sum_y", "conic[0] * sum_y"),
     # marching has no backward pass
     "empty cells counted": Fault("march", "gpu", "_march", "count += kept", "count += held"),
     "a cell too far": Fault("march", "gpu", "_first_at", "- 0.02)", "+ 1.0)"),
