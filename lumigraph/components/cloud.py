@@ -32,12 +32,10 @@ class Cloud(nn.Module):
         return Gaussians(*(getattr(self, name) for name in NAMES), antialiased=self.antialiased)
 
     @torch.no_grad()
-    def replace(self, gaussians: Gaussians) -> None:
-        """Another cloud in this one's place. Parameters stay the same objects, so that an optimizer keeps knowing them."""
+    def replace(self, gaussians: Gaussians, optimizer: CloudAdam | None = None) -> None:
+        """Another cloud in this one's place, which the optimizer is to move from now on, without any memory."""
         for name in NAMES:
-            parameter = getattr(self, name)
-            parameter.grad = None
-            parameter.data = getattr(gaussians, name).detach().to(parameter.device).clone()
+            self._exchange(name, getattr(gaussians, name).detach().clone(), optimizer)
 
     @torch.no_grad()
     def rebuild(self, optimizer: CloudAdam, source: Int[Tensor, " new"], fresh: Bool[Tensor, " new"]) -> None:
@@ -46,20 +44,31 @@ class Cloud(nn.Module):
         One operation for all that density control does: a clone is a number twice, a pruned one a number left out.
         """
         for name in NAMES:
-            parameter = getattr(self, name)
-            parameter.grad = None
-            parameter.data = parameter.data[source]
-            state = optimizer.state.get(parameter, {})
+            old = getattr(self, name)
+            state = optimizer.state.get(old, {})
             for moment in ("mean", "square"):
                 if moment in state:
                     state[moment] = state[moment][source]
                     state[moment][fresh] = 0
+            self._exchange(name, old.data[source], optimizer, state)
+
+    def _exchange(self, name: str, values: Tensor, optimizer: CloudAdam | None, state: dict | None = None) -> None:
+        """A new parameter for an old one, whose size the graph of the last step still remembers."""
+        old = getattr(self, name)
+        new = nn.Parameter(values.to(old.device))
+        setattr(self, name, new)
+        if optimizer is not None:
+            optimizer.state.pop(old, None)
+            if state:
+                optimizer.state[new] = state
+            for group in optimizer.param_groups:
+                group["params"] = [new if p is old else p for p in group["params"]]
 
     def _load_from_state_dict(self, state_dict, prefix, *rest):
         for name in NAMES:
             parameter, saved = getattr(self, name), state_dict.get(prefix + name)
             if saved is not None and saved.shape != parameter.shape:
-                parameter.data = parameter.data.new_empty(saved.shape)
+                setattr(self, name, nn.Parameter(parameter.data.new_empty(saved.shape)))
         super()._load_from_state_dict(state_dict, prefix, *rest)
 
 

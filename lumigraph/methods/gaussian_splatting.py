@@ -75,7 +75,7 @@ class GaussianSplatting(Method):
     def begin(self, scene: Scene) -> None:
         config = self.config
         found = initial_cloud(scene, config.initial, config.most, config.degree, self._random(1))
-        self.cloud.replace(found)
+        self.cloud.replace(found, self._optimizer)
         self.density_control.begin(len(found))
         positions = scene.cameras.position[scene.splits["train"]]
         self.extent.fill_(1.1 * float((positions - positions.mean(0)).norm(dim=-1).max()))
