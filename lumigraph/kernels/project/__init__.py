@@ -104,6 +104,9 @@ def cases(generator: torch.Generator):
     opacities[20:23] = torch.tensor([0.0, 0.003, 1.0])
     yield means, quaternions, scales, opacities, *inputs[4:]
     yield means, quaternions, scales, opacities, *inputs[4:8], False
+    means, quaternions, _, *others = _cloud(60, 2, True, generator)
+    scales = torch.exp(2 * torch.randn(60, 3, generator=generator) - 4)  # long and thin, on a large picture
+    yield means, quaternions, scales, *others[:2], some_view(True, (1600, 1200)), *others[3:]
     *tensors, view, _, blur, _ = _cloud(20, 4, False, generator)
     yield *tensors, view, 2, blur, False  # two bands are not in use yet
 

@@ -1,6 +1,4 @@
 """Numba: threads share the Gaussians. On the way back everything is worked out again rather than kept.
-
-Numbers that cancel (a needle's determinant, slopes of conics) are in double precision where that costs nothing.
 """
 
 import math
@@ -128,6 +126,16 @@ def _footprint(T, U, blur):
 
 
 @njit(**FAST)
+def _pulled(n, T, U, Un, nT, blur, det, gxx, gxy, gyy, kxx, kxy, kyy, fade, turn):
+    """Component n of the gradients of T and U: -2 K G W, and what the compensation adds."""
+    w0, w1 = (blur * T[n] + Un[n]) / det, (blur * U[n] + nT[n]) / det
+    x0, x1 = gxx * w0 + gxy * w1, gxy * w0 + gyy * w1
+    to_t = -TWO * (kxx * x0 + kxy * x1) + turn * Un[n] - fade * T[n]
+    to_u = -TWO * (kxy * x0 + kyy * x1) + turn * nT[n] - fade * U[n]
+    return to_t, to_u
+
+
+@njit(**FAST)
 def _direction(means, i, v):
     """From the eye to a Gaussian, unit length, and the distance."""
     x, y, z = means[i, 0] - v[EYE], means[i, 1] - v[EYE + 1], means[i, 2] - v[EYE + 2]
@@ -198,30 +206,28 @@ def _backward(
             T, U = _row(A, Q, sx, sy, sz), _row(B, Q, sx, sy, sz)
             a, b, c, det, narrow = _footprint(T, U, blur)
 
-            # The footprint's entries, for K = C^-1: dL/dC = -K G K. to_b counts both places of b.
-            kxx, kxy, kyy = np.float64(c / det), np.float64(-b / det), np.float64(a / det)
-            gxx, gxy, gyy = np.float64(g_conics[i, 0]), np.float64(g_conics[i, 1]) / 2, np.float64(g_conics[i, 2])
-            lx, ly = kxx * gxx + kxy * gxy, kxx * gxy + kxy * gyy
-            mx, my = kxy * gxx + kyy * gxy, kxy * gxy + kyy * gyy
-            to_a, to_b, to_c = -(lx * kxx + ly * kxy), -2 * (lx * kxy + ly * kyy), -(mx * kxy + my * kyy)
-            to_opacity = g_seen[i]
+            # Rows T and U of the footprint's root, for K = C^-1 and W = K (T, U): dL/d(T, U) = -2 K G W. With n = T x U,
+            # W is (blur T + U x n, blur U + n x T) / det, in which nothing cancels, however long the footprint.
+            nx, ny, nz = T[1] * U[2] - T[2] * U[1], T[2] * U[0] - T[0] * U[2], T[0] * U[1] - T[1] * U[0]
+            Un = (U[1] * nz - U[2] * ny, U[2] * nx - U[0] * nz, U[0] * ny - U[1] * nx)
+            nT = (ny * T[2] - nz * T[1], nz * T[0] - nx * T[2], nx * T[1] - ny * T[0])
+            kxx, kxy, kyy = c / det, -b / det, a / det
+            gxx, gxy, gyy = g_conics[i, 0], HALF * g_conics[i, 1], g_conics[i, 2]
+            to_opacity, fade, turn = g_seen[i], np.float32(0), np.float32(0)
             if compensate:
-                share = narrow / det
+                share = max(narrow / det, NARROWEST)
                 if share > NARROWEST:
-                    to_opacity *= math.sqrt(share)
-                    to_share = g_seen[i] * opacities[i] * HALF / math.sqrt(share)
-                    to_a += to_share * ((c - blur) - share * c) / det
-                    to_c += to_share * ((a - blur) - share * a) / det
-                    to_b += to_share * -2 * b * (ONE - share) / det
-                else:
-                    to_opacity *= math.sqrt(NARROWEST)
+                    fade = g_seen[i] * opacities[i] / math.sqrt(share) * blur / det
+                    turn = fade * (a + c - blur) / det
+                    fade *= share
+                to_opacity *= math.sqrt(share)
             to_opacities[i] = to_opacity
+            t0, u0 = _pulled(0, T, U, Un, nT, blur, det, gxx, gxy, gyy, kxx, kxy, kyy, fade, turn)
+            t1, u1 = _pulled(1, T, U, Un, nT, blur, det, gxx, gxy, gyy, kxx, kxy, kyy, fade, turn)
+            t2, u2 = _pulled(2, T, U, Un, nT, blur, det, gxx, gxy, gyy, kxx, kxy, kyy, fade, turn)
+            gT, gU = (t0, t1, t2), (u0, u1, u2)
 
-            # Rows T and U, and what made them: the slopes A and B, the rotation Q, the scales.
-            fa, fb, fc = np.float32(2 * to_a), np.float32(to_b), np.float32(2 * to_c)
-            gT = (fa * T[0] + fb * U[0], fa * T[1] + fb * U[1], fa * T[2] + fb * U[2])
-            gU = (fc * U[0] + fb * T[0], fc * U[1] + fb * T[1], fc * U[2] + fb * T[2])
-            s = (sx, sy, sz)
+            # What made them: the slopes A and B, the rotation Q, the scales.
             gTs = (gT[0] * sx, gT[1] * sy, gT[2] * sz)
             gUs = (gU[0] * sx, gU[1] * sy, gU[2] * sz)
             gA = (_dot(Q[0], gTs), _dot(Q[1], gTs), _dot(Q[2], gTs))
