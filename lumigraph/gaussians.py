@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Float
@@ -66,8 +66,9 @@ class Gaussians:
         )
 
     def _map(self, change: Callable[[Tensor], Tensor]) -> Gaussians:
-        tensors = (getattr(self, field.name) for field in fields(self) if field.name != "antialiased")
-        return Gaussians(*(change(x) for x in tensors), antialiased=self.antialiased)
+        tensors = self.means, self.quaternions, self.log_scales, self.opacities, self.harmonics
+        means, quaternions, log_scales, opacities, harmonics = map(change, tensors)
+        return Gaussians(means, quaternions, log_scales, opacities, harmonics, self.antialiased)
 
 
 def turned(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 import torch
@@ -95,6 +95,28 @@ class Photograph:
         rgb, alpha, mask = (None if x is None else x.to(device) for x in (self.rgb, self.alpha, self.mask))
         assert rgb is not None
         return Photograph(self.camera.to(device), rgb, alpha, mask)
+
+    def reduced(self, factor: int) -> Photograph:
+        """A whole number of times smaller: means over squares of pixels. What does not fill a square is left out."""
+        if factor == 1:
+            return self
+        height, width = (n // factor * factor for n in self.rgb.shape[:2])
+
+        def mean(x: Tensor) -> Tensor:
+            x = x[:height, :width]
+            return x.reshape(height // factor, factor, width // factor, factor, *x.shape[2:]).mean((1, 3))
+
+        rgb, alpha, mask = self.rgb, self.alpha, self.mask
+        if alpha is not None:  # colours count as much as they cover
+            covered = mean(alpha)
+            rgb = mean(rgb * alpha[..., None]) / covered.clamp_min(1e-6)[..., None]
+            alpha = covered
+        else:
+            rgb = mean(rgb)
+        mask = None if mask is None else mean(mask.float()) == 1
+        lens = self.camera.lens.resized(torch.full((1, 2), 1 / factor, device=self.rgb.device))
+        size = self.camera.size.new_tensor([[width // factor, height // factor]])
+        return Photograph(replace(self.camera, lens=lens, size=size), rgb, alpha, mask)
 
 
 @dataclass(frozen=True)

@@ -205,7 +205,7 @@ def added(x, i, d, w, f, down, across, y, o, g, lanes):
 
 def plain_lanes(source: str) -> str:
     """An engine's source with its vector operations written out in numbers."""
-    assert "lanes import" not in source or any(line in source for line in PLAIN_LANES)
+    assert "from .lanes import" not in source or any(line in source for line in PLAIN_LANES)
     for line, plain in PLAIN_LANES.items():
         source = source.replace(line, plain)
     return source

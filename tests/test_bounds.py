@@ -23,6 +23,8 @@ def checked(monkeypatch):
 
 @pytest.mark.parametrize("name", OPERATIONS)
 def test_no_index_leaves_its_array(name, tmp_path, monkeypatch):
+    if name == "rasterize":  # its lanes check themselves where they are rows of NumPy
+        monkeypatch.setattr(numba.config, "DISABLE_JIT", True)
     edit_engine(name, "cpu", plain_lanes, tmp_path, monkeypatch)
     for inputs in cases(name):
         assert_agrees(name, "cpu", inputs)

@@ -18,6 +18,12 @@ NAMES = ("means", "quaternions", "log_scales", "opacities", "harmonics")
 class Cloud(nn.Module):
     """The tensors of `Gaussians` as parameters. Loading a state of another size resizes them."""
 
+    means: nn.Parameter
+    quaternions: nn.Parameter
+    log_scales: nn.Parameter
+    opacities: nn.Parameter
+    harmonics: nn.Parameter
+
     def __init__(self, gaussians: Gaussians):
         super().__init__()
         self.antialiased = gaussians.antialiased
@@ -29,7 +35,7 @@ class Cloud(nn.Module):
 
     def gaussians(self) -> Gaussians:
         """The cloud as it is; gradients flow back into the parameters."""
-        return Gaussians(*(getattr(self, name) for name in NAMES), antialiased=self.antialiased)
+        return Gaussians(**{name: getattr(self, name) for name in NAMES}, antialiased=self.antialiased)
 
     @torch.no_grad()
     def replace(self, gaussians: Gaussians, optimizer: CloudAdam | None = None) -> None:
@@ -100,12 +106,13 @@ class CloudAdam(torch.optim.Optimizer):
         rate = group["lr"] * math.sqrt(1 - b2**t) / (1 - b1**t)
         width = math.prod(p.shape[1:])
         rates = rate * torch.tensor(group["columns"] or [1.0] * width, device=p.device)
-        tensors = [x.detach().view(-1, width) for x in (p, p.grad.contiguous(), state["mean"], state["square"])]
+        given = p, p.grad.contiguous(), state["mean"], state["square"]
+        values, grad, mean, square = (x.detach().view(-1, width) for x in given)
         if p.is_cuda:
-            _rows(*tensors, rates, b1, b2, group["eps"])
+            _rows(values, grad, mean, square, rates, b1, b2, group["eps"])
         else:
             numbers = (np.float32(x) for x in (b1, b2, group["eps"]))
-            _rows_cpu(*(x.numpy() for x in tensors), rates.numpy(), *numbers)
+            _rows_cpu(*(x.numpy() for x in (values, grad, mean, square, rates)), *numbers)
 
 
 def _rows(

@@ -137,7 +137,8 @@ class MarkovChain(nn.Module):
 def shared_out(gaussians: Gaussians, copies: Int[Tensor, " gaussian"]) -> Gaussians:
     """Opacity and size of each of n copies at one place that together look as the one did (Kheradmand 2024, eq. 10).
 
-    Opacity o' = 1 - (1 - o)^(1/n); scale times o / sum_{i=1..n} sum_{k<i} binomial(i - 1, k) (-1)^k o'^(k+1) / sqrt(k+1).
+    Opacity o' = 1 - (1 - o)^(1/n);
+    scale times o / sum_{i=1..n} sum_{k<i} binomial(i - 1, k) (-1)^k o'^(k+1) / sqrt(k + 1).
     """
     opacity, most = gaussians.opacities.double().sigmoid(), 51  # more copies than that are taken for so many
     n = copies.clamp(max=most).double()

@@ -23,6 +23,7 @@ import struct
 import zlib
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import zstandard
@@ -172,7 +173,7 @@ def _cloud(columns: list[np.ndarray], version: int, bits: int, flags: int) -> Ga
     )
 
 
-def _take(stream: io.BufferedIOBase, size: int) -> bytes:
+def _take(stream: Any, size: int) -> bytes:
     """Exactly `size` bytes, in pieces, so that memory grows with what is there and not with what is promised."""
     pieces = []
     while size:

@@ -147,7 +147,8 @@ def first_bit(x):
 @intrinsic
 def _fetch(typing, array, at):
     def generate(context, builder, sig, args):
-        return load(builder, vector_at(builder, *data(context, builder, sig, args, 0), args[1]))
+        (array_,) = data(context, builder, sig, args, 0)
+        return load(builder, vector_at(builder, array_, args[1]))
 
     return lanes(array, types.int64), generate
 
@@ -155,7 +156,8 @@ def _fetch(typing, array, at):
 @intrinsic
 def _put(typing, array, at, x):
     def generate(context, builder, sig, args):
-        store(builder, args[2], vector_at(builder, *data(context, builder, sig, args, 0), args[1]))
+        (array_,) = data(context, builder, sig, args, 0)
+        store(builder, args[2], vector_at(builder, array_, args[1]))
         return context.get_dummy_value()
 
     return types.void(array, types.int64, lanes), generate

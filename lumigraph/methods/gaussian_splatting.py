@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -13,6 +14,9 @@ from ..camera import Camera
 from ..components.cloud import Cloud, CloudAdam
 from ..components.density_control import AdaptiveDensity, MarkovChain
 from ..components.initial_cloud import initial_cloud, random_cloud
+from ..components.memory import room_for
+from ..components.smoothing import sampling_interval, smoothed
+from ..errors import LumigraphWarning
 from ..gaussians import Gaussians
 from ..method import Method
 from ..rays import Rendering
@@ -25,11 +29,13 @@ class Config:
     """The paper's numbers, with where it gives them; those without a section are the authors' release's."""
 
     degree: int = 3  # of the spherical harmonics, section 5.1
-    raise_degree_every: int = 1000  # steps, section 7.1; sooner where the budget is short
+    raise_degree_every: int = 1000  # steps, section 7.1; or the share below of the budget, if that is sooner
+    raise_degree_share: float = 1 / 8
     ssim: float = 0.2  # share of D-SSIM in the loss, eq. 7
     strategy: Literal["adaptive", "mcmc"] = "adaptive"  # density control: section 5, or Kheradmand 2024
     most: int = 1_000_000  # Gaussians
     initial: int = 100_000  # random Gaussians where a capture has no points, section 7.1
+    half_until: float = 0.0  # share of the budget that is learnt at half size, and a quarter of that at a quarter
     refine_every: int = 100  # steps between changes of the cloud, section 5.2
     refine_from: int = 500  # step
     refine_until: float = 0.5  # share of the budget; section 7.1: 15 000 of 30 000 steps
@@ -49,12 +55,19 @@ class Config:
     seed: int = 0
 
 
+SMALLEST = 64  # pixels of a photograph's shorter side that are kept when it is reduced
+GROWTH = 1.05  # of the number at each change, for mcmc (Kheradmand 2024, section 3.2)
+LAST_MOVE = 0.9  # share of the budget from which on nobody is moved any more, so that all settle
+BYTES = 4096  # that one more Gaussian needs while it learns: itself, its gradient and moments, its share of a picture
+
+
 class GaussianSplatting(Method):
     """A photograph at a time: splat the cloud, compare, step; now and then change how many Gaussians there are."""
 
     Config = Config
     extent: Tensor
     drawn: Tensor
+    interval: Tensor
 
     def __init__(self, frame: Frame, config: Any = None):
         config = config or Config()
@@ -66,30 +79,49 @@ class GaussianSplatting(Method):
         self.exploration = MarkovChain()
         self.register_buffer("extent", torch.tensor(1.0))
         self.register_buffer("drawn", torch.tensor(0))
+        self.register_buffer("interval", torch.zeros(len(self.cloud) if config.smooth else 0))
         self._bands = config.degree + 1
         self._progress = 0.0
+        self._cameras: Camera | None = None
+        self._told_full = False
         self._optimizer: CloudAdam | None = None
         self._seen: Splatted | None = None
         self._figures: dict[str, float] = {}
+
+    @classmethod
+    def preset(cls, device: torch.device) -> Any:
+        """On a GPU the paper's numbers; on a CPU a smaller cloud, which learns more in the same time."""
+        return Config() if device.type == "cuda" else Config(most=200_000, initial=20_000, half_until=0.3)
 
     def begin(self, scene: Scene) -> None:
         config = self.config
         found = initial_cloud(scene, config.initial, config.most, config.degree, self._random(1))
         self.cloud.replace(found, self._optimizer)
         self.density_control.begin(len(found))
+        if config.smooth:
+            self._cameras = scene.cameras[scene.splits["train"]]
+            self.interval = sampling_interval(self.cloud.means, self._cameras, self.frame.near)
         positions = scene.cameras.position[scene.splits["train"]]
         self.extent.fill_(1.1 * float((positions - positions.mean(0)).norm(dim=-1).max()))
 
     def batch(self, scene: Scene, generator: torch.Generator) -> Photograph:
         """Every photograph once, in a random order, then again."""
         train = scene.splits["train"]
+        self._cameras = scene.cameras[train]
         turn, place = divmod(int(self.drawn), len(train))
         self.drawn += 1
         order = torch.randperm(len(train), generator=self._random(1_000_000 + turn))
-        return scene.photograph(int(train[order[place]])).to(self.device)
+        photograph = scene.photograph(int(train[order[place]]))
+        return photograph.reduced(self._reduction(min(photograph.rgb.shape[:2]))).to(self.device)
+
+    def _reduction(self, shorter: int) -> int:
+        """How many times smaller photographs are for now; none gets smaller than SMALLEST pixels."""
+        half = self.config.half_until
+        wanted = 4 if self._progress < half / 4 else 2 if self._progress < half else 1
+        return max(1, min(wanted, shorter // SMALLEST))
 
     def loss(self, batch: Photograph, step: int) -> dict[str, Tensor]:
-        config, cloud = self.config, self.cloud.gaussians()
+        config, cloud = self.config, self.gaussians()
         seen = splat(cloud, view_of(batch.camera, self.frame.near), self._bands, config.stop)
         rgb, target = seen.rgb, batch.rgb
         background = torch.tensor(self.frame.background, device=rgb.device)
@@ -129,41 +161,68 @@ class GaussianSplatting(Method):
         assert self._optimizer is not None
         fall = (config.last_means_rate / config.means_rate) ** progress
         self._optimizer.param_groups[0]["lr"] = config.means_rate * float(self.extent) * fall
-        self._bands = 1 + min(step // config.raise_degree_every, config.degree)
+        raised = max(step // config.raise_degree_every, int(progress / config.raise_degree_share))
+        self._bands = 1 + min(raised, config.degree)
 
     @torch.no_grad()
     def after_step(self, step: int) -> None:
         config, seen, optimizer = self.config, self._seen, self._optimizer
         assert seen is not None and optimizer is not None
+        self._seen, size = None, len(self.cloud)
+        due = step >= config.refine_from and step % config.refine_every == 0
         if config.strategy == "mcmc":
-            self._chain(step, optimizer)
+            self._sample(due, optimizer, self._random(step))
         elif self._progress < config.refine_until:
-            assert seen.centres.grad is not None
-            height, width = seen.opacity.shape
-            self.density_control.note(seen.centres.grad, seen.opacities > 0, (width, height))
-            if step >= config.refine_from and step % config.refine_every == 0:
-                most, chance = config.most, self._random(step)
-                self.density_control.refine(self.cloud, optimizer, float(self.extent), most, chance)
-            if step and step % config.reset_every == 0:
-                self.density_control.reset_opacity(self.cloud, optimizer)
-        self._seen = None
+            self._densify(step, due, seen, optimizer)
+        if config.smooth and (due or len(self.cloud) != size):
+            assert self._cameras is not None
+            self.interval = sampling_interval(self.cloud.means, self._cameras, self.frame.near)
 
-    def _chain(self, step: int, optimizer: CloudAdam) -> None:
-        config, chance = self.config, self._random(step)
-        if self._progress < 0.9 and step >= config.refine_from and step % config.refine_every == 0:
-            grown = int(1.05 * len(self.cloud)) if self._progress < config.refine_until else len(self.cloud)
-            self.exploration.refine(self.cloud, optimizer, min(grown, config.most), chance)
+    def _densify(self, step: int, due: bool, seen: Splatted, optimizer: CloudAdam) -> None:
+        height, width = seen.opacity.shape
+        assert seen.centres.grad is not None
+        control = self.density_control
+        control.note(seen.centres.grad, seen.opacities > 0, (width, height))
+        if due and control.refine(self.cloud, optimizer, float(self.extent), self._most(), self._random(step)):
+            self._tell_full()
+        if step and step % self.config.reset_every == 0:
+            control.reset_opacity(self.cloud, optimizer)
+
+    def _sample(self, due: bool, optimizer: CloudAdam, chance: torch.Generator) -> None:
+        if due and self._progress < LAST_MOVE:
+            count = len(self.cloud)
+            wanted = int(GROWTH * count) if self._progress < self.config.refine_until else count
+            if wanted > max(most := self._most(), count) and most < self.config.most:
+                self._tell_full()
+            self.exploration.refine(self.cloud, optimizer, min(wanted, max(most, count)), chance)
         self.exploration.explore(self.cloud, optimizer.param_groups[0]["lr"], chance)
 
+    def _most(self) -> int:
+        """How many Gaussians there may be: as told, or as the memory at hand allows."""
+        return min(self.config.most, len(self.cloud) + room_for(BYTES, self.device))
+
+    def _tell_full(self) -> None:
+        """Once: the cloud would grow further, and may not."""
+        if not self._told_full:
+            self._told_full = True
+            why = "--most says so" if len(self.cloud) >= 0.95 * self.config.most else "memory is short"
+            warnings.warn(f"The cloud stops growing at {len(self.cloud):,} Gaussians, for {why}", LumigraphWarning, 2)
+
     def gaussians(self) -> Gaussians:
-        """The cloud, in the scene's frame."""
-        return self.cloud.gaussians()
+        """The cloud, in the scene's frame; with the 3-D filter in it, where that is used."""
+        cloud = self.cloud.gaussians()
+        return smoothed(cloud, self.interval) if self.config.smooth else cloud
 
     def render(self, camera: Camera) -> Rendering:
         return render(self.gaussians(), camera.to(self.device), self.frame.background, self.frame.near)
 
     def statistics(self) -> dict[str, float]:
         return self._figures
+
+    def _load_from_state_dict(self, state_dict, prefix, *rest):
+        if prefix + "interval" in state_dict:
+            self.interval = self.interval.new_empty(state_dict[prefix + "interval"].shape)
+        super()._load_from_state_dict(state_dict, prefix, *rest)
 
     def _random(self, number: int) -> torch.Generator:
         """Random numbers that depend on the seed and the step alone, so that a resumed run draws the same."""

@@ -1,5 +1,4 @@
-"""Numba: threads share the Gaussians. On the way back everything is worked out again rather than kept.
-"""
+"""Numba: threads share the Gaussians. On the way back everything is worked out again rather than kept."""
 
 import math
 
@@ -206,8 +205,8 @@ def _backward(
             T, U = _row(A, Q, sx, sy, sz), _row(B, Q, sx, sy, sz)
             a, b, c, det, narrow = _footprint(T, U, blur)
 
-            # Rows T and U of the footprint's root, for K = C^-1 and W = K (T, U): dL/d(T, U) = -2 K G W. With n = T x U,
-            # W is (blur T + U x n, blur U + n x T) / det, in which nothing cancels, however long the footprint.
+            # Rows T and U of the footprint's root. For K = C^-1 and W = K (T, U), dL/d(T, U) = -2 K G W. With
+            # n = T x U, W = (blur T + U x n, blur U + n x T) / det, in which nothing cancels, however long it is.
             nx, ny, nz = T[1] * U[2] - T[2] * U[1], T[2] * U[0] - T[0] * U[2], T[0] * U[1] - T[1] * U[0]
             Un = (U[1] * nz - U[2] * ny, U[2] * nx - U[0] * nz, U[0] * ny - U[1] * nx)
             nT = (ny * T[2] - nz * T[1], nz * T[0] - nx * T[2], nx * T[1] - ny * T[0])
@@ -301,8 +300,8 @@ class _Project(torch.autograd.Function):
     def backward(ctx, *grads):
         *inputs, colours, seen = (x.detach().numpy() for x in ctx.saved_tensors)
         results = [empty(*x.shape) for x in inputs]
-        grads = (x.contiguous().numpy() for x in grads)
-        _backward(*grads, *inputs, *ctx.numbers, colours, seen, *(x.numpy() for x in results))
+        given = (x.contiguous().numpy() for x in grads)
+        _backward(*given, *inputs, *ctx.numbers, colours, seen, *(x.numpy() for x in results))
         return *results, None, None, None, None
 
 

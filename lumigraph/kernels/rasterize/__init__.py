@@ -8,7 +8,7 @@ from torch import Tensor
 
 from .._dispatch import implementation
 from ..project import FAINTEST
-from ..tile import SIDE, Tiles, footprints, tile
+from ..tile import Tiles, footprints, tile
 
 OPAQUEST = 0.99  # no Gaussian hides more than this of what is behind it (Kerbl 2023, appendix C)
 
@@ -24,7 +24,7 @@ def rasterize(
 ) -> tuple[Float[Tensor, "height width 3"], Float[Tensor, "height width"], Float[Tensor, "height width"]]:
     """Composite each pixel's Gaussians in the order of its tile's list (Kerbl 2023, eq. 3 and appendix C).
 
-        a_i = min(0.99, opacity_i exp(-d^T conic_i d / 2))      d from the centre to the pixel's centre; 0 if below 1/255
+        a_i = min(0.99, opacity_i exp(-d^T conic_i d / 2))      d from its centre to the pixel's; 0 if below 1/255
         T_i = prod_{j<i} (1 - a_j)      light that comes through to i
         w_i = a_i T_i                   0 once T_i < stop
 

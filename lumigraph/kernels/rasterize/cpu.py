@@ -1,8 +1,8 @@
 """Numba: a thread takes a run of tiles; blocks of 4 x 4 pixels are sixteen lanes; each Gaussian visits the blocks that
 its ellipse touches and that still want light.
 
-Gradients of one Gaussian from one tile are summed in registers and kept by themselves; a second pass adds them up in the
-order of tiles, so that no two threads add to one place and the result is the same each time.
+Gradients of one Gaussian from one tile are summed in registers and kept by themselves; a second pass adds them up in
+the order of tiles, so that no two threads add to one place and the result is the same each time.
 """
 
 import math
@@ -140,8 +140,9 @@ def _backward(
 
         dL / d ln a_i = w_i c_i - a_i / (1 - a_i) sum_{j>i} w_j c_j
 
-    which is then weighted by 1, dx, dy, dx^2, dx dy, dy^2 and summed over pixels; beside them sum w_i dL/drgb, dL/ddepth.
-    """  # fmt: skip
+    which is then weighted by 1, dx, dy, dx^2, dx dy, dy^2 and summed over pixels; beside them sum w_i dL/drgb and
+    sum w_i dL/ddepth.
+    """
     width, height = size
     across = (width + side - 1) // side
     for share in prange(len(shares) - 1):
@@ -182,7 +183,8 @@ def _backward(
                     alpha = where((raw >= FAINTEST) & (light >= stop), lowest(raw, nothing + OPAQUEST), nothing)
                     weight = alpha * light
                     put(state, at, light - weight)
-                    r, g, b, d = (fetch(state, at + 2 * LANES), fetch(state, at + 3 * LANES), fetch(state, at + 4 * LANES), fetch(state, at + 5 * LANES))  # fmt: skip
+                    r, g = fetch(state, at + 2 * LANES), fetch(state, at + 3 * LANES)
+                    b, d = fetch(state, at + 4 * LANES), fetch(state, at + 5 * LANES)
                     worth = fetch(state, at + 6 * LANES) + r * rows[i + RED] + g * rows[i + GREEN]
                     worth = (worth + b * rows[i + BLUE] + d * rows[i + DEPTH]) * weight
                     behind = fetch(state, at + LANES) - worth
@@ -250,8 +252,8 @@ class _Rasterize(torch.autograd.Function):
     def backward(ctx, *grads):
         (rows, order, starts, masks), saved = ctx.kept, [x.detach().numpy() for x in ctx.saved_tensors]
         n, sums = len(saved[3]), np.empty(len(order) * LANES, np.float32)
-        grads = (x.contiguous().numpy() for x in grads)
-        _backward(*grads, *saved[:3], rows, order, starts, *ctx.numbers, masks, sums)
+        given = (x.contiguous().numpy() for x in grads)
+        _backward(*given, *saved[:3], rows, order, starts, *ctx.numbers, masks, sums)
         results = empty(n, 2), empty(n, 3), empty(n), empty(n, 3), empty(n)
         _gather(sums, masks, order, rows, *saved[3:], get_num_threads(), *(x.numpy() for x in results))
         return *results, None, None

@@ -60,14 +60,14 @@ def tile(
     if side not in (4, 8, 16, 32):
         raise ValueError(f"a tile of side {side} cannot be; it is 4, 8, 16 or 32 pixels")
     run = implementation("tile", centres)
-    return Tiles(*run(*(x.detach() for x in (centres, conics, opacities, depths)), size, side), size, side)
+    order, starts = run(centres.detach(), conics.detach(), opacities.detach(), depths.detach(), size, side)
+    return Tiles(order, starts, size, side)
 
 
 def cases(generator: torch.Generator):
     """Inputs that every engine must agree on, without ellipses that end upon a tile's border."""
-    for count, size, side in [
-        (0, (70, 45), 16), (1, (5, 3), 32), (60, (70, 45), 16), (60, (70, 45), 32), (50, (33, 65), 8), (200, (40, 40), 4),
-    ]:  # fmt: skip
+    many = (60, (70, 45), 16), (60, (70, 45), 32), (50, (33, 65), 8), (200, (40, 40), 4)
+    for count, size, side in ((0, (70, 45), 16), (1, (5, 3), 32), *many):
         yield _steady(*footprints(count, size, generator), size, side)
     centres, conics, opacities, depths = footprints(60, (70, 45), generator)
     depths[10:50] = 2.0  # coincident
@@ -84,7 +84,7 @@ def benchmark_case(generator: torch.Generator, size: int = 2**18):
     return *footprints(size // 8, (width, width), generator), (width, width), SIDE
 
 
-def footprints(count: int, size: tuple[int, int], generator: torch.Generator):
+def footprints(count: int, size: tuple[int, int], generator: torch.Generator) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Centres, conics, opacities and depths of ellipses on and around a picture, a few pixels in size."""
 
     def uniform(*shape):
@@ -101,10 +101,9 @@ def _steady(centres, conics, opacities, depths, size, side):
     """Only the Gaussians whose tiles stay the same when their opacity changes by more than float32 rounds."""
     from .reference import touches
 
-    keep = torch.ones(len(centres), dtype=torch.bool)
-    for nudge in (1 - 1e-3, 1 + 1e-3):
-        keep &= (
-            touches(*(x.double() for x in (centres, conics, opacities)), size, side)
-            == touches(*(x.double() for x in (centres, conics, opacities * nudge)), size, side)
-        ).all(-1)
+    fewer, more = (
+        touches(centres.double(), conics.double(), opacities.double() * nudge, size, side)
+        for nudge in (1 - 1e-3, 1 + 1e-3)
+    )
+    keep = (fewer == more).all(-1)
     return *(x[keep] for x in (centres, conics, opacities, depths)), size, side

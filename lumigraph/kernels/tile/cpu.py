@@ -1,4 +1,4 @@
-"""Numba: Gaussians are sorted by depth once; then each thread takes some rows of tiles and hands them out in that order."""
+"""Numba: Gaussians are sorted by depth once; then each thread takes some rows of tiles and hands out in that order."""
 
 import math
 
@@ -18,21 +18,16 @@ HALF, ONE = np.float32(0.5), np.float32(1)
 def _near_first(depths, opacities):
     """Numbers of the visible Gaussians by depth; equal depths keep their order. Bits of floats >= 0 sort as they do."""
     bits = depths.view(np.uint32)
-    order = np.empty(len(depths), np.int32)
-    n = 0
-    for i in range(len(depths)):
-        if opacities[i] > FAINTEST:
-            order[n] = i
-            n += 1
-    order, other = order[:n], np.empty(n, np.int32)
+    order = np.flatnonzero(opacities > FAINTEST).astype(np.int32)
+    other = np.empty_like(order)
     for shift in (0, BITS, 2 * BITS):
         counts = np.zeros(2**BITS + 1, np.int64)
-        for i in order:
-            counts[((bits[i] >> np.uint32(shift)) & np.uint32(2**BITS - 1)) + 1] += 1
+        for k in range(len(order)):
+            counts[((bits[order[k]] >> np.uint32(shift)) & np.uint32(2**BITS - 1)) + 1] += 1
         counts = np.cumsum(counts)
-        for i in order:
-            key = (bits[i] >> np.uint32(shift)) & np.uint32(2**BITS - 1)
-            other[counts[key]] = i
+        for k in range(len(order)):
+            key = (bits[order[k]] >> np.uint32(shift)) & np.uint32(2**BITS - 1)
+            other[counts[key]] = order[k]
             counts[key] += 1
         order, other = other, order
     return order
@@ -40,8 +35,8 @@ def _near_first(depths, opacities):
 
 @njit(parallel=True, **FAST)
 def _measure(order, centres, conics, opacities, size, side, ellipses, rows):
-    """Of each Gaussian, by depth: its ellipse as `_span` wants it, its first and last row of tiles, and how many columns
-    it may touch."""
+    """Of each Gaussian, by depth: its ellipse as `_span` wants it, its first and last row of tiles, and how many
+    columns it may touch."""
     down, across = (size[1] + side - 1) // side, (size[0] + side - 1) // side
     for k in prange(len(order)):
         i = order[k]

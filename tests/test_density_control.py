@@ -1,0 +1,190 @@
+"""How a cloud learns and how its number changes: the lazy optimiser, both strategies, the filter, the beginning."""
+
+from __future__ import annotations
+
+import pytest
+import tiny
+import torch
+from test_gaussians import NAMES, cloud
+
+from lumigraph.components.cloud import Cloud, CloudAdam
+from lumigraph.components.density_control import FAINT, AdaptiveDensity, MarkovChain, sample_by, shared_out
+from lumigraph.components.initial_cloud import initial_cloud, nearest_distance
+from lumigraph.components.smoothing import VARIANCE, sampling_interval, smoothed
+
+
+def optimizer_of(some: Cloud, rate: float = 0.01) -> CloudAdam:
+    return CloudAdam([{"params": [getattr(some, name)], "lr": rate} for name in NAMES])
+
+
+def stepped(some: Cloud, optimizer: CloudAdam) -> None:
+    """One step, so that every moment is there."""
+    for name in NAMES:
+        getattr(some, name).grad = torch.ones_like(getattr(some, name))
+    optimizer.step()
+    optimizer.zero_grad()
+
+
+def test_where_everything_moves_it_is_adam(generator):
+    start = torch.randn(7, 5, generator=generator)
+    a, b = torch.nn.Parameter(start.clone()), torch.nn.Parameter(start.clone())
+    lazy, plain = CloudAdam([{"params": [a], "lr": 0.02}]), torch.optim.Adam([b], lr=0.02, eps=1e-15)
+    for _ in range(5):
+        a.grad = torch.randn(7, 5, generator=generator)
+        b.grad = a.grad.clone()
+        lazy.step()
+        plain.step()
+    torch.testing.assert_close(a, b, rtol=1e-5, atol=1e-6)
+
+
+def test_rows_without_gradient_stay_and_columns_have_their_own_rates(generator):
+    p = torch.nn.Parameter(torch.zeros(3, 2))
+    optimizer = CloudAdam([{"params": [p], "lr": 0.1, "columns": [1.0, 0.5]}])
+    p.grad = torch.tensor([[1.0, 1.0], [0.0, 0.0], [0.0, 3.0]])
+    optimizer.step()
+    torch.testing.assert_close(p.detach(), torch.tensor([[-0.1, -0.05], [0.0, 0.0], [0.0, -0.05]]))
+    assert (optimizer.state[p]["mean"][1] == 0).all()
+
+
+def test_rebuilding_takes_moments_along(generator):
+    some = Cloud(cloud(6))
+    optimizer = optimizer_of(some)
+    stepped(some, optimizer)
+    means, square = some.means.detach().clone(), optimizer.state[some.means]["square"].clone()
+    some.rebuild(optimizer, torch.tensor([5, 0, 0]), torch.tensor([False, False, True]))
+    assert len(some) == 3 and torch.equal(some.means.detach(), means[[5, 0, 0]])
+    assert torch.equal(optimizer.state[some.means]["square"][:2], square[[5, 0]])
+    assert (optimizer.state[some.means]["square"][2] == 0).all()
+    stepped(some, optimizer)  # and it goes on moving what it now holds
+    assert not torch.equal(some.means.detach(), means[[5, 0, 0]])
+
+
+def test_small_ones_are_cloned_large_ones_split_and_faint_ones_go(generator):
+    some = Cloud(cloud(4))
+    with torch.no_grad():
+        some.log_scales[:] = torch.tensor([0.001, 0.5, 0.01, 0.01]).log()[:, None]
+        some.opacities[:] = torch.tensor([0.5, 0.5, 0.5, FAINT / 2]).logit()
+    before = some.gaussians().means.detach().clone()
+    optimizer, control = optimizer_of(some, rate=0.0), AdaptiveDensity(4, pull=0.5)
+    stepped(some, optimizer)
+    pull = torch.tensor([[1.0, 0.0], [0.0, 1.0], [0.1, 0.1], [9.0, 9.0]])
+    control.note(pull, torch.ones(4, dtype=torch.bool), (2, 2))
+    assert not control.refine(some, optimizer, 1.0, 100, generator)
+    assert len(some) == 5 and len(control.pulls) == 5
+    means, scales = some.means.detach(), some.log_scales.detach().exp()[:, 0]
+    assert torch.equal(means[0], before[0]) and torch.equal(means[3], before[0])  # the clone lies upon its original
+    assert torch.equal(means[2], before[2])
+    for half in (1, 4):  # both halves are smaller, and elsewhere
+        assert not torch.equal(means[half], before[1]) and scales[half].item() == pytest.approx(0.5 / 1.6)
+
+
+def test_a_cloud_grows_no_further_than_it_may_and_says_so(generator):
+    some = Cloud(cloud(10))
+    with torch.no_grad():
+        some.opacities[:] = 0.0
+    optimizer, control = optimizer_of(some), AdaptiveDensity(10, pull=0.5)
+    stepped(some, optimizer)
+    with torch.no_grad():
+        some.log_scales[:] = -9.0
+    control.note(torch.arange(10.0)[:, None].repeat(1, 2), torch.ones(10, dtype=torch.bool), (2, 2))
+    strongest = some.means.detach()[[8, 9]].clone()
+    assert control.refine(some, optimizer, 1.0, 12, generator)
+    assert len(some) == 12 and torch.equal(some.means.detach()[10:], strongest)
+
+
+def test_opacity_is_reset_for_all_but_the_faint():
+    some, control = Cloud(cloud(20)), AdaptiveDensity(20, pull=1.0)
+    optimizer = optimizer_of(some)
+    stepped(some, optimizer)
+    control.reset_opacity(some, optimizer)
+    assert (some.opacities.sigmoid() <= 2 * FAINT + 1e-6).all()
+    assert (optimizer.state[some.opacities]["mean"] == 0).all()
+
+
+@pytest.mark.parametrize("copies", [2, 3, 7])
+def test_copies_together_look_as_the_one_did(copies):
+    """On the axis through the centre exactly in opacity; over the whole footprint in light, which eq. 10 preserves."""
+    one = cloud(1)
+    few = shared_out(one, torch.tensor([copies]))
+    x = torch.linspace(-40, 40, 80_001, dtype=torch.float64)
+
+    def row(gaussians, n):
+        """Opacity of n copies along a line, in deviations of the original."""
+        width = float((gaussians.log_scales - one.log_scales)[0, 0].double().exp())
+        each = float(gaussians.opacities.double().sigmoid()) * torch.exp(-0.5 * (x / width) ** 2)
+        return 1 - (1 - each) ** n
+
+    before, after = row(one, 1), row(few, copies)
+    assert abs(after.max() - before.max()) < 1e-5
+    assert abs(after.sum() / before.sum() - 1) < 1e-4
+
+
+def test_the_dead_move_to_the_living_and_new_ones_join(generator):
+    some = Cloud(cloud(12))
+    with torch.no_grad():
+        some.opacities[:] = torch.tensor([0.9] * 4 + [FAINT / 5] * 8).logit()
+    optimizer = optimizer_of(some, rate=0.0)
+    stepped(some, optimizer)
+    living = some.means.detach()[:4].clone()
+    MarkovChain().refine(some, optimizer, 15, generator)
+    assert len(some) == 15
+    distance = (some.means.detach()[:, None] - living).norm(dim=-1).amin(1)
+    assert (distance == 0).all() and (some.opacities.sigmoid() > FAINT).all()
+
+
+def test_noise_moves_the_transparent_and_leaves_the_opaque(generator):
+    some = Cloud(cloud(40))
+    with torch.no_grad():
+        some.opacities[:20], some.opacities[20:] = torch.tensor(0.9).logit(), torch.tensor(0.001).logit()
+    before = some.means.detach().clone()
+    MarkovChain().explore(some, 1e-4, generator)
+    moved = (some.means.detach() - before).norm(dim=-1)
+    assert (moved[:20] == 0).all() and (moved[20:] > 0).all()
+
+
+def test_sampling_follows_the_weights(generator):
+    drawn = sample_by(torch.tensor([0.0, 1.0, 3.0, 0.0]), 20_000, generator)
+    share = torch.bincount(drawn, minlength=4) / 20_000
+    torch.testing.assert_close(share, torch.tensor([0.0, 0.25, 0.75, 0.0]), rtol=0, atol=0.02)
+
+
+def test_a_filtered_cloud_keeps_its_light():
+    """The 3-D filter convolves: wider, and fainter by as much (opacity times the root of the determinant stays)."""
+    some = cloud(30)
+    wider = smoothed(some, torch.full((30,), 0.1))
+    torch.testing.assert_close((2 * wider.log_scales).exp(), (2 * some.log_scales).exp() + VARIANCE * 0.01)
+    for a in (some, wider):
+        a_light = a.opacities.sigmoid() * a.log_scales.sum(-1).exp()
+        torch.testing.assert_close(a_light, some.opacities.sigmoid() * some.log_scales.sum(-1).exp(), rtol=1e-4, atol=0)
+
+
+def test_the_sampling_interval_is_depth_over_focal_length():
+    scene = tiny.scene()
+    interval = sampling_interval(torch.zeros(1, 3), scene.cameras, 0.1)
+    torch.testing.assert_close(interval, torch.tensor([tiny.DISTANCE / tiny.FOCAL]), rtol=1e-4, atol=0)
+
+
+def test_a_cloud_without_points_begins_inside_the_silhouettes(generator):
+    begun = initial_cloud(tiny.scene(), 500, 1000, 2, generator)
+    assert len(begun) == 500 and begun.degree == 2
+    assert (begun.means.norm(dim=-1) < 0.85).all()  # the ball has a radius of 0.6, and cells a size
+
+
+def test_a_cloud_with_points_begins_at_them(generator):
+    from dataclasses import replace
+
+    points = torch.randn(50, 3, generator=generator) * 0.3
+    colours = torch.randint(0, 256, (50, 3), generator=generator).byte()
+    begun = initial_cloud(replace(tiny.scene(), points=points, point_colours=colours), 500, 40, 1, generator)
+    assert len(begun) == 40  # no more than may be
+    which = torch.cdist(begun.means, points).argmin(1)
+    assert torch.equal(begun.means, points[which])
+    seen = begun.harmonics[:, 0] * 0.28209479 + 0.5
+    torch.testing.assert_close(seen, colours[which].float() / 255, rtol=0, atol=1e-5)
+
+
+def test_nearest_distances():
+    points = torch.tensor([[0.0, 0, 0], [1.0, 0, 0], [0.0, 2.0, 0]])
+    expected = torch.tensor([(1 + 4) / 2, (1 + 5) / 2, (4 + 5) / 2]).sqrt()
+    torch.testing.assert_close(nearest_distance(points), expected)
+    assert nearest_distance(points[:1]).tolist() == [1.0]
