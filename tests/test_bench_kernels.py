@@ -11,7 +11,6 @@ from rich.console import Console
 
 from lumigraph.kernels.bench import UNITS, bench_kernels
 
-
 FORWARD_ONLY = {"march", "tile"}
 
 

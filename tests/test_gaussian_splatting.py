@@ -1,4 +1,4 @@
-"""The method, its files, and its commands: it learns, resumes to the bit while its cloud grows, and exports in place."""
+"""The method, its files, its commands: it learns, resumes to the bit while its cloud grows, and exports in place."""
 
 from __future__ import annotations
 
