@@ -167,7 +167,8 @@ def test_the_sampling_interval_is_depth_over_focal_length():
 def test_a_cloud_without_points_begins_inside_the_silhouettes(generator):
     begun = initial_cloud(tiny.scene(), 500, 1000, 2, generator)
     assert len(begun) == 500 and begun.degree == 2
-    assert (begun.means.norm(dim=-1) < 1).all()  # the ball has a radius of 0.6, a pixel 0.1; corners are at 1.7
+    away = begun.means.norm(dim=-1)  # the ball has a radius of 0.6 and a pixel 0.1; of the box 38 % lie within 0.9
+    assert (away < 0.9).float().mean() > 0.9
 
 
 def test_a_cloud_with_points_begins_at_them(generator):

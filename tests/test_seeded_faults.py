@@ -69,7 +69,7 @@ FAULTS = {
     "the cross product's order": Fault("project", "cpu", "_pulled", "turn * nT[n]", "-turn * nT[n]"),
     # tiling
     "the circle for the ellipse": Fault("tile", "cpu", "_span", " - ellipse[4] * y\n    y =", "\n    y ="),
-    "equal depths the other way round": Fault("tile", "cpu", "_near_first", "order[k]", "order[-1 - k]"),
+    "equal depths the other way round": Fault("tile", "cpu", "_near_first", "= order[k]", "= order[-1 - k]"),
     "a column too many": Fault("tile", "cpu", "_hand_out", "- side + HALF", "- side - ONE"),
     "the box for the ellipse": Fault("tile", "gpu", "_tile", "& (least <= reach)", ""),
     "a tile too few": Fault("tile", "gpu", "_span", "last - first + 1", "last - first"),
@@ -85,7 +85,7 @@ FAULTS = {
     "light not lost on the cpu": Fault("rasterize", "cpu", "_backward", "behind / (ONE - alpha)", "behind"),
     "0.99, yet with gradient on the cpu": Fault("rasterize", "cpu", "_backward", "raw < OPAQUEST", "raw >= ZERO"),
     "half a square": Fault("rasterize", "cpu", "_gather", "-HALF * s[5]", "-s[5]"),
-    "another thread's sums": Fault("rasterize", "cpu", "_gather", "begin <= i < end and masks[p]", "masks[p] == 1"),
+    "only one block's sums": Fault("rasterize", "cpu", "_gather", "and masks[p]", "and masks[p] == 1"),
     # marching has no backward pass
     "empty cells counted": Fault("march", "gpu", "_march", "count += kept", "count += held"),
     "a cell too far": Fault("march", "gpu", "_first_at", "- 0.02)", "+ 1.0)"),
