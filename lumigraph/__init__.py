@@ -9,6 +9,7 @@ if TYPE_CHECKING:
     from .camera import Camera as Camera
     from .capture import open_scene as open_scene
     from .errors import LumigraphError as LumigraphError
+    from .gaussians import Gaussians as Gaussians
     from .lens import Lens as Lens
     from .method import Method as Method
     from .method import RayMethod as RayMethod
@@ -24,6 +25,7 @@ __version__ = "0.1.0"
 
 _homes = {
     "Camera": "camera",
+    "Gaussians": "gaussians",
     "Lens": "lens",
     "LumigraphError": "errors",
     "Method": "method",

@@ -37,12 +37,34 @@ def test_where_everything_moves_it_is_adam(generator):
     torch.testing.assert_close(a, b, rtol=1e-5, atol=1e-6)
 
 
+@pytest.mark.parametrize("device", ["cpu", "as on a GPU"])
+def test_a_row_seen_now_and_then_goes_as_far_as_adam_would_take_it(device, monkeypatch):
+    """A row with a gradient in every 20th step: the same as Adam, which moves it in all of them, in the end."""
+    from lumigraph.components import cloud as module
+
+    if device != "cpu":
+        monkeypatch.setattr(module, "_rows_cpu", lambda *given: module._rows(*map(tensor_or_number, given)))
+    a, b = torch.nn.Parameter(torch.zeros(1, 2)), torch.nn.Parameter(torch.zeros(1, 2))
+    ours, plain = CloudAdam([{"params": [a], "lr": 0.01}]), torch.optim.Adam([b], lr=0.01, eps=1e-15)
+    for step in range(1, 400):
+        gradient = torch.tensor([[1.0, -3.0]]) if step % 20 == 0 else torch.zeros(1, 2)
+        a.grad, b.grad = gradient, gradient.clone()
+        ours.step()
+        plain.step()
+    torch.testing.assert_close(a, b, rtol=0.05, atol=0)
+
+
+def tensor_or_number(x):
+    return torch.from_numpy(x) if hasattr(x, "shape") and x.shape else float(x)
+
+
 def test_rows_without_gradient_stay_and_columns_have_their_own_rates(generator):
     p = torch.nn.Parameter(torch.zeros(3, 2))
     optimizer = CloudAdam([{"params": [p], "lr": 0.1, "columns": [1.0, 0.5]}])
     p.grad = torch.tensor([[1.0, 1.0], [0.0, 0.0], [0.0, 3.0]])
     optimizer.step()
     torch.testing.assert_close(p.detach(), torch.tensor([[-0.1, -0.05], [0.0, 0.0], [0.0, -0.05]]))
+    assert optimizer.state[p]["last"].tolist() == [1, 0, 1]
     assert (optimizer.state[p]["mean"][1] == 0).all()
 
 

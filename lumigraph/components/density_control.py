@@ -72,8 +72,10 @@ class AdaptiveDensity(nn.Module):
     def reset_opacity(self, cloud: Cloud, optimizer: CloudAdam) -> None:
         """Nobody may stay opaque who is not wanted (section 5.2): at most twice what counts as faint."""
         cloud.opacities.clamp_(max=float(torch.tensor(2 * FAINT).logit()))
+        state = optimizer.state[cloud.opacities]
         for moment in ("mean", "square"):
-            optimizer.state[cloud.opacities].get(moment, torch.zeros(())).zero_()
+            state[moment].zero_()
+        state["last"].fill_(float(state["step"]))
 
     def _load_from_state_dict(self, state_dict, prefix, *rest):
         for name in ("pulls", "sightings"):

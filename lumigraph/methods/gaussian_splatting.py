@@ -56,6 +56,7 @@ class Config:
 
 
 SMALLEST = 64  # pixels of a photograph's shorter side that are kept when it is reduced
+RECOVERY = 3  # times reset_every: steps that must be left after opacities are reset, or the pictures stay dim
 GROWTH = 1.05  # of the number at each change, for mcmc (Kheradmand 2024, section 3.2)
 LAST_MOVE = 0.9  # share of the budget from which on nobody is moved any more, so that all settle
 BYTES = 4096  # that one more Gaussian needs while it learns: itself, its gradient and moments, its share of a picture
@@ -67,6 +68,7 @@ class GaussianSplatting(Method):
     Config = Config
     extent: Tensor
     drawn: Tensor
+    began: Tensor
     interval: Tensor
 
     def __init__(self, frame: Frame, config: Any = None):
@@ -79,6 +81,7 @@ class GaussianSplatting(Method):
         self.exploration = MarkovChain()
         self.register_buffer("extent", torch.tensor(1.0))
         self.register_buffer("drawn", torch.tensor(0))
+        self.register_buffer("began", torch.tensor(len(self.cloud)))
         self.register_buffer("interval", torch.zeros(len(self.cloud) if config.smooth else 0))
         self._bands = config.degree + 1
         self._progress = 0.0
@@ -91,13 +94,14 @@ class GaussianSplatting(Method):
     @classmethod
     def preset(cls, device: torch.device) -> Any:
         """On a GPU the paper's numbers; on a CPU a smaller cloud, which learns more in the same time."""
-        return Config() if device.type == "cuda" else Config(most=200_000, initial=20_000, half_until=0.3)
+        return Config() if device.type == "cuda" else Config(most=120_000, initial=20_000, half_until=0.3)
 
     def begin(self, scene: Scene) -> None:
         config = self.config
         found = initial_cloud(scene, config.initial, config.most, config.degree, self._random(1))
         self.cloud.replace(found, self._optimizer)
         self.density_control.begin(len(found))
+        self.began.fill_(len(found))
         if config.smooth:
             self._cameras = scene.cameras[scene.splits["train"]]
             self.interval = sampling_interval(self.cloud.means, self._cameras, self.frame.near)
@@ -183,9 +187,13 @@ class GaussianSplatting(Method):
         assert seen.centres.grad is not None
         control = self.density_control
         control.note(seen.centres.grad, seen.opacities > 0, (width, height))
-        if due and control.refine(self.cloud, optimizer, float(self.extent), self._most(), self._random(step)):
-            self._tell_full()
-        if step and step % self.config.reset_every == 0:
+        if due:
+            most, chance = self._most_by_now(), self._random(step)
+            wanted_more = control.refine(self.cloud, optimizer, float(self.extent), most, chance)
+            if wanted_more and len(self.cloud) >= 0.99 * self._most():
+                self._tell_full()
+        every = self.config.reset_every
+        if step and step % every == 0 and step / max(self._progress, 1e-6) - step >= RECOVERY * every:
             control.reset_opacity(self.cloud, optimizer)
 
     def _sample(self, due: bool, optimizer: CloudAdam, chance: torch.Generator) -> None:
@@ -200,6 +208,12 @@ class GaussianSplatting(Method):
     def _most(self) -> int:
         """How many Gaussians there may be: as told, or as the memory at hand allows."""
         return min(self.config.most, len(self.cloud) + room_for(BYTES, self.device))
+
+    def _most_by_now(self) -> int:
+        """The same at this moment: the number may grow evenly, so that early steps are quick ones."""
+        began, most = int(self.began), self._most()
+        share = min(1.0, self._progress / self.config.refine_until)
+        return min(most, int(began + share * max(most - began, 0)))
 
     def _tell_full(self) -> None:
         """Once: the cloud would grow further, and may not."""

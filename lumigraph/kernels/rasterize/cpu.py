@@ -73,6 +73,12 @@ def _span(n, side, first):
 
 
 @njit(inline="always")
+def _place(x, y, planes):
+    """Where a pixel of a tile has its first number, if each block has so many planes of sixteen."""
+    return (y // 4 * 8 + x // 4) * planes * LANES + y % 4 * 4 + x % 4
+
+
+@njit(inline="always")
 def _all_blocks(columns, rows):
     found = np.uint64(0)
     for r in range(rows):
@@ -94,7 +100,7 @@ def _forward(rows, order, starts, shares, size, side, stop, table, rgb, depth, o
             state[:] = 0
             for y in range(min(side, height - top)):
                 for x in range(min(side, width - left)):
-                    state[((y // 4 * 8 + x // 4) * 5) * LANES + y % 4 * 4 + x % 4] = 1
+                    state[_place(x, y, 5)] = 1
             for p in range(starts[k], starts[k + 1]):
                 i = np.int64(order[p]) * LANES
                 todo = alive & _blocks(rows, i, np.float32(left), np.float32(top), table) if alive else alive
@@ -125,7 +131,7 @@ def _forward(rows, order, starts, shares, size, side, stop, table, rgb, depth, o
                         alive &= ~(np.uint64(1) << np.uint64(block))
             for y in range(min(side, height - top)):
                 for x in range(min(side, width - left)):
-                    at = ((y // 4 * 8 + x // 4) * 5) * LANES + y % 4 * 4 + x % 4
+                    at = _place(x, y, 5)
                     opacity[top + y, left + x] = ONE - state[at]
                     for c in range(3):
                         rgb[top + y, left + x, c] = state[at + (c + 1) * LANES]
@@ -153,7 +159,7 @@ def _backward(
             state[:] = 0
             for y in range(min(side, height - top)):
                 for x in range(min(side, width - left)):
-                    at = ((y // 4 * 8 + x // 4) * 7) * LANES + y % 4 * 4 + x % 4
+                    at = _place(x, y, 7)
                     py, px = top + y, left + x
                     behind = to_depth[py, px] * depth[py, px] + to_opacity[py, px] * opacity[py, px]
                     for c in range(3):
@@ -200,10 +206,8 @@ def _backward(
 
 
 @njit(parallel=True, **FAST)
-def _gather(
-    sums, masks, order, rows, conics, opacities, parts, to_centres, to_conics, to_opacities, to_colours, to_depths
-):
-    """Each thread adds up its own Gaussians' sums, in the order of tiles, and makes gradients of them."""  # fmt: skip
+def _gather(sums, masks, order, conics, opacities, parts, to_centres, to_conics, to_opacities, to_colours, to_depths):
+    """Each thread adds up its own Gaussians' sums, in the order of tiles, and makes gradients of them."""
     n = len(to_depths)
     for part in prange(parts):
         begin, end = n * part // parts, n * (part + 1) // parts
@@ -255,7 +259,7 @@ class _Rasterize(torch.autograd.Function):
         given = (x.contiguous().numpy() for x in grads)
         _backward(*given, *saved[:3], rows, order, starts, *ctx.numbers, masks, sums)
         results = empty(n, 2), empty(n, 3), empty(n), empty(n, 3), empty(n)
-        _gather(sums, masks, order, rows, *saved[3:], get_num_threads(), *(x.numpy() for x in results))
+        _gather(sums, masks, order, *saved[3:], get_num_threads(), *(x.numpy() for x in results))
         return *results, None, None
 
 
