@@ -55,6 +55,7 @@ class Config:
     seed: int = 0
 
 
+NEAR = 0.1  # of the distance within which, as the scene says, nothing is
 SMALLEST = 64  # pixels of a photograph's shorter side that are kept when it is reduced
 RECOVERY = 3  # times reset_every: steps that must be left after opacities are reset, or the pictures stay dim
 GROWTH = 1.05  # of the number at each change, for mcmc (Kheradmand 2024, section 3.2)
@@ -91,6 +92,11 @@ class GaussianSplatting(Method):
         self._seen: Splatted | None = None
         self._figures: dict[str, float] = {}
 
+    @property
+    def _near(self) -> float:
+        """Well ahead of all that is there: what a camera does not see it cannot teach to vanish."""
+        return NEAR * self.frame.near
+
     @classmethod
     def preset(cls, device: torch.device) -> Any:
         """On a GPU the paper's numbers; on a CPU a smaller cloud, which learns more in the same time."""
@@ -104,7 +110,7 @@ class GaussianSplatting(Method):
         self.began.fill_(len(found))
         if config.smooth:
             self._cameras = scene.cameras[scene.splits["train"]]
-            self.interval = sampling_interval(self.cloud.means, self._cameras, self.frame.near)
+            self.interval = sampling_interval(self.cloud.means, self._cameras, self._near)
         positions = scene.cameras.position[scene.splits["train"]]
         self.extent.fill_(1.1 * float((positions - positions.mean(0)).norm(dim=-1).max()))
 
@@ -126,7 +132,7 @@ class GaussianSplatting(Method):
 
     def loss(self, batch: Photograph, step: int) -> dict[str, Tensor]:
         config, cloud = self.config, self.gaussians()
-        seen = splat(cloud, view_of(batch.camera, self.frame.near), self._bands, config.stop)
+        seen = splat(cloud, view_of(batch.camera, self._near), self._bands, config.stop)
         rgb, target = seen.rgb, batch.rgb
         background = torch.tensor(self.frame.background, device=rgb.device)
         if batch.alpha is not None:  # a random colour behind everything, so that only opacity can imitate opacity
@@ -180,7 +186,7 @@ class GaussianSplatting(Method):
             self._densify(step, due, seen, optimizer)
         if config.smooth and (due or len(self.cloud) != size):
             assert self._cameras is not None
-            self.interval = sampling_interval(self.cloud.means, self._cameras, self.frame.near)
+            self.interval = sampling_interval(self.cloud.means, self._cameras, self._near)
 
     def _densify(self, step: int, due: bool, seen: Splatted, optimizer: CloudAdam) -> None:
         height, width = seen.opacity.shape
@@ -228,7 +234,7 @@ class GaussianSplatting(Method):
         return smoothed(cloud, self.interval) if self.config.smooth else cloud
 
     def render(self, camera: Camera) -> Rendering:
-        return render(self.gaussians(), camera.to(self.device), self.frame.background, self.frame.near)
+        return render(self.gaussians(), camera.to(self.device), self.frame.background, self._near)
 
     def statistics(self) -> dict[str, float]:
         return self._figures
