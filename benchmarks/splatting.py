@@ -58,7 +58,8 @@ def main(options: Options) -> None:
 def steps(options: Options, device: torch.device) -> list[dict]:
     """Milliseconds of each part of a training step, at several sizes of the cloud."""
     scene, kind = open_scene(str(options.scene), downscale=options.downscale), methods.find("gaussian-splatting")
-    config = dataclasses.replace(kind.preset(device), refine_from=100, raise_degree_every=1, most=max(options.sizes))
+    numbers = {"refine_from": 100, "raise_degree_every": 1, "half_until": 0.0, "most": 2 * max(options.sizes)}
+    config = dataclasses.replace(kind.preset(device), **numbers)
     method = build(kind, scene.frame, config, device, 0)
     (optimizer,), generator = method.optimizers(), torch.Generator().manual_seed(0)
     method.begin(scene)

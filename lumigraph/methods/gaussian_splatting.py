@@ -145,9 +145,12 @@ class GaussianSplatting(Method):
         if seen.centres.requires_grad:
             seen.centres.retain_grad()
         self._seen = seen
-        difference = (rgb - target).abs()
-        self._figures = {"mse": float((rgb - target).detach().square().mean()), "gaussians": len(self.cloud)}
-        terms = {"l1": (1 - config.ssim) * difference.mean(), "ssim": config.ssim * (1 - kernels.ssim(rgb, target))}
+        difference = rgb - target
+        self._figures = {"mse": float(difference.detach().square().mean()), "gaussians": len(self.cloud)}
+        terms = {
+            "l1": (1 - config.ssim) * difference.abs().mean(),
+            "ssim": config.ssim * (1 - kernels.ssim(rgb, target)),
+        }
         if config.strategy == "mcmc":
             terms["opacity"] = config.opacity_weight * cloud.opacities.sigmoid().mean()
             terms["scale"] = config.scale_weight / float(self.extent) * cloud.log_scales.exp().mean()
