@@ -12,6 +12,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
 from ..gaussians import Gaussians
+from ..kernels.project.reference import to_matrix
 from .cloud import Cloud, CloudAdam
 
 FAINT = 0.005  # opacity below which a Gaussian is as good as none (both papers)
@@ -164,6 +165,4 @@ def sample_by(weights: Float[Tensor, " gaussian"], count: int, generator: torch.
 
 
 def rotations(gaussians: Gaussians) -> Float[Tensor, "gaussian 3 3"]:
-    from ..kernels.project.reference import to_matrix
-
     return to_matrix(gaussians.quaternions)

@@ -35,18 +35,21 @@ def initial_cloud(scene: Scene, count: int, most: int, degree: int, generator: t
 
 def random_cloud(frame: Frame, count: int, degree: int, generator: torch.Generator) -> Gaussians:
     """A cloud that knows nothing but the box of interest."""
-    low, high = torch.tensor(frame.bounds)
-    means = low + (high - low) * torch.rand(count, 3, generator=generator)
+    means = points_in_box(frame, count, generator)
     return round_gaussians(means, torch.rand(count, 3, generator=generator), degree)
 
 
 def random_points(scene: Scene, count: int, generator: torch.Generator) -> Float[Tensor, "point 3"]:
     if not scene.images.has_alpha or scene.frame.reach > 1:
-        low, high = torch.tensor(scene.frame.bounds)
-        return low + (high - low) * torch.rand(count, 3, generator=generator)
+        return points_in_box(scene.frame, count, generator)
     cells = visual_hull(scene, HULL_CELLS).nonzero()
     chosen = cells[torch.randint(len(cells), (count,), generator=generator)]
     return (chosen + torch.rand(count, 3, generator=generator)) * (2 / HULL_CELLS) - 1
+
+
+def points_in_box(frame: Frame, count: int, generator: torch.Generator) -> Float[Tensor, "point 3"]:
+    low, high = torch.tensor(frame.bounds)
+    return low + (high - low) * torch.rand(count, 3, generator=generator)
 
 
 def round_gaussians(means: Float[Tensor, "gaussian 3"], colours: Float[Tensor, "gaussian 3"], degree: int) -> Gaussians:

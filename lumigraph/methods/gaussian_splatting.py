@@ -117,7 +117,8 @@ class GaussianSplatting(Method):
     def batch(self, scene: Scene, generator: torch.Generator) -> Photograph:
         """Every photograph once, in a random order, then again."""
         train = scene.splits["train"]
-        self._cameras = scene.cameras[train]
+        if self.config.smooth and self._cameras is None:  # in a run that was resumed
+            self._cameras = scene.cameras[train]
         turn, place = divmod(int(self.drawn), len(train))
         self.drawn += 1
         order = torch.randperm(len(train), generator=self._random(1_000_000 + turn))
