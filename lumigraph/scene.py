@@ -160,7 +160,7 @@ class Scene:
 
     def view(self, index: int) -> tuple[Camera, Float[Tensor, "height width channel"]]:
         """One photograph and its camera: sRGB-encoded in [0, 1], a fourth channel where the photographs have alpha."""
-        return self.cameras[index], self.images[index].float().div_(255)
+        return self.cameras[index], self.images[index].div(255)
 
 
 def as_tuples(value: Any) -> Any:

@@ -43,7 +43,12 @@ def test_a_row_seen_now_and_then_goes_as_far_as_adam_would_take_it(device, monke
     from lumigraph.components import cloud as module
 
     if device != "cpu":
-        monkeypatch.setattr(module, "_rows_cpu", lambda *given: module._rows(*map(tensor_or_number, given)))
+
+        def rows(*given):  # powers 0, 1, 2, ... where the other wants the first
+            tensors, (t, powers1, powers2, eps) = map(torch.from_numpy, given[:6]), given[6:]
+            module._rows(*tensors, float(t), float(powers1[1]), float(powers2[1]), float(eps))
+
+        monkeypatch.setattr(module, "_rows_cpu", rows)
     a, b = torch.nn.Parameter(torch.zeros(1, 2)), torch.nn.Parameter(torch.zeros(1, 2))
     ours, plain = CloudAdam([{"params": [a], "lr": 0.01}]), torch.optim.Adam([b], lr=0.01, eps=1e-15)
     for step in range(1, 400):
@@ -52,10 +57,6 @@ def test_a_row_seen_now_and_then_goes_as_far_as_adam_would_take_it(device, monke
         ours.step()
         plain.step()
     torch.testing.assert_close(a, b, rtol=0.05, atol=0)
-
-
-def tensor_or_number(x):
-    return torch.from_numpy(x) if hasattr(x, "shape") and x.shape else float(x)
 
 
 def test_rows_without_gradient_stay_and_columns_have_their_own_rates(generator):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import lru_cache
 
 import numpy as np
 import torch
@@ -113,11 +114,16 @@ class CloudAdam(torch.optim.Optimizer):
         given = p, p.grad.contiguous(), state["mean"], state["square"]
         values, grad, mean, square = (x.detach().view(-1, width) for x in given)
         if p.is_cuda:
-            _rows(values, grad, mean, square, state["last"], t, rates, b1, b2, group["eps"])
+            _rows(values, grad, mean, square, state["last"], rates, t, b1, b2, group["eps"])
         else:
-            tensors = values, grad, mean, square, state["last"]
-            numbers = (np.float32(x) for x in (b1, b2, group["eps"]))
-            _rows_cpu(*(x.numpy() for x in tensors), np.float32(t), rates.numpy(), *numbers)
+            tensors = values, grad, mean, square, state["last"], rates
+            _rows_cpu(*(x.numpy() for x in tensors), np.float32(t), _powers(b1), _powers(b2), np.float32(group["eps"]))
+
+
+@lru_cache
+def _powers(base: float, count: int = 1 << 14) -> np.ndarray:
+    """base^n for n from 0; a look at them is quicker than a power. Beyond the last one nothing is left of a moment."""
+    return (base ** np.arange(count)).astype(np.float32)
 
 
 def _rows(
@@ -126,8 +132,8 @@ def _rows(
     mean: Float[Tensor, "row column"],
     square: Float[Tensor, "row column"],
     last: Float[Tensor, " row"],
-    t: float,
     rates: Float[Tensor, " column"],
+    t: float,
     b1: float,
     b2: float,
     eps: float,
@@ -142,14 +148,16 @@ def _rows(
 
 
 @njit(parallel=True, fastmath=True, cache=True)
-def _rows_cpu(p, grad, mean, square, last, t, rates, b1, b2, eps):
+def _rows_cpu(p, grad, mean, square, last, rates, t, powers1, powers2, eps):
     one, width = np.float32(1), p.shape[1]
+    b1, b2 = powers1[1], powers2[1]
     for i in prange(len(p)):
         size = np.float32(0)
         for j in range(width):
             size += abs(grad[i, j])
         if size > 0:
-            kept1, kept2 = b1 ** (t - last[i]), b2 ** (t - last[i])
+            away = min(np.int64(t - last[i]), len(powers1) - 1)
+            kept1, kept2 = powers1[away], powers2[away]
             far = (one - kept1) / (one - b1)
             last[i] = t
             for j in range(width):

@@ -90,7 +90,7 @@ class GaussianSplatting(Method):
         self._told_full = False
         self._optimizer: CloudAdam | None = None
         self._seen: Splatted | None = None
-        self._figures: dict[str, float] = {}
+        self._difference = torch.zeros(0)
 
     @property
     def _near(self) -> float:
@@ -147,7 +147,7 @@ class GaussianSplatting(Method):
             seen.centres.retain_grad()
         self._seen = seen
         difference = rgb - target
-        self._figures = {"mse": float(difference.detach().square().mean()), "gaussians": len(self.cloud)}
+        self._difference = difference.detach()
         terms = {
             "l1": (1 - config.ssim) * difference.abs().mean(),
             "ssim": config.ssim * (1 - kernels.ssim(rgb, target)),
@@ -241,7 +241,7 @@ class GaussianSplatting(Method):
         return render(self.gaussians(), camera.to(self.device), self.frame.background, self._near)
 
     def statistics(self) -> dict[str, float]:
-        return self._figures
+        return {"mse": float(self._difference.square().mean()), "gaussians": len(self.cloud)}
 
     def _load_from_state_dict(self, state_dict, prefix, *rest):
         if prefix + "interval" in state_dict:

@@ -12,7 +12,7 @@ import torch
 from numba import get_num_threads, njit, prange
 
 from .._dispatch import empty
-from .._lanes import bytes_between, exp2, fetch, first_bit, highest, lowest, put, root, some, totals, where
+from .._lanes import bytes_between, exp2, fetch, first_bit, highest, inverse, lowest, put, root, some, totals, where
 from ..project import FAINTEST as FAINTEST_
 from . import OPAQUEST as OPAQUEST_
 
@@ -20,6 +20,7 @@ FAST = {"cache": True, "fastmath": {"contract", "nsz", "arcp"}, "error_model": "
 LANES, BLOCKS = 16, 64  # pixels of a block; blocks of the largest tile, in eight rows of eight
 FAINTEST, OPAQUEST = np.float32(FAINTEST_), np.float32(OPAQUEST_)
 ZERO, ONE, HALF = np.float32(0), np.float32(1), np.float32(0.5)
+TILE, PAIR = 8, 8  # what a tile takes in pairs, and a pair in visits to a block: measured, to share work out by
 LOG2_E, LOG2_255 = math.log2(math.e), math.log2(255)
 
 # Rows of a table of constants: a block's columns and rows; a tile's rows of blocks, and right (+) and left (-) edges.
@@ -49,6 +50,8 @@ def _pack(centres, conics, opacities, colours, depths, rows):
             for k in range(3):
                 row[RED + k] = colours[i, k]
             row[DEPTH] = depths[i]
+        else:
+            row[:] = 0
 
 
 @njit(inline="always")
@@ -64,6 +67,30 @@ def _blocks(rows, i, left, top, table):
     # Columns of a block are 0.5 to 3.5 from its left; where nothing is left of the ellipse, right is left of left.
     edge = (edge + (rows[i + X] - left - np.float32(2)) + sign * np.float32(1.5)) * np.float32(0.25)
     return bytes_between(where(room >= ZERO, edge, sign * np.float32(-100)))
+
+
+@njit(inline="always")
+def _frame(rows, i, left, top, columns, lines):
+    """What is the same for all of a tile's blocks: slopes of the exponent's two roots, these roots at a block's pixels
+    relative to its corner, and where the tile's corner is seen from the centre."""
+    along, down = rows[i + ALONG], rows[i + DOWN]
+    slant = along * rows[i + SKEW]
+    x, y = np.float32(left) + HALF - rows[i + X], np.float32(top) + HALF - rows[i + Y]
+    return along, slant, down, columns * along + lines * slant, lines * down, x, y
+
+
+@njit(inline="always")
+def _bell(rows, i, frame, block):
+    """A block's corner seen from the centre, and opacity exp(-q / 2) at its pixels."""
+    along, slant, down, u, v, x, y = frame
+    x, y = x + np.float32(4 * (block & 7)), y + np.float32(4 * (block >> 3))
+    u, v = u + (along * x + slant * y), v + down * y
+    return x, y, exp2(rows[i + BRIGHT] - u * u - v * v)
+
+
+@njit(inline="always")
+def _alpha(raw, light, stop):
+    return where((raw >= FAINTEST) & (light >= stop), lowest(raw, OPAQUEST), ZERO)
 
 
 @njit(inline="always")
@@ -87,7 +114,7 @@ def _all_blocks(columns, rows):
 
 
 @njit(parallel=True, **FAST)
-def _forward(rows, order, starts, shares, size, side, stop, table, rgb, depth, opacity, masks):
+def _forward(rows, order, starts, shares, size, side, stop, table, rgb, depth, opacity, masks, visits):
     width, height = size
     across = (width + side - 1) // side
     for share in prange(len(shares) - 1):
@@ -101,27 +128,21 @@ def _forward(rows, order, starts, shares, size, side, stop, table, rgb, depth, o
             for y in range(min(side, height - top)):
                 for x in range(min(side, width - left)):
                     state[_place(x, y, 5)] = 1
+            visited = 0
             for p in range(starts[k], starts[k + 1]):
                 i = np.int64(order[p]) * LANES
                 todo = alive & _blocks(rows, i, np.float32(left), np.float32(top), table) if alive else alive
                 masks[p] = todo
                 if not todo:
                     continue
-                along, down = rows[i + ALONG], rows[i + DOWN]
-                slant = along * rows[i + SKEW]
-                u, v = columns * along + lines * slant, lines * down
-                x0, y0 = np.float32(left) + HALF - rows[i + X], np.float32(top) + HALF - rows[i + Y]
+                frame = _frame(rows, i, left, top, columns, lines)
                 while todo:
                     block = first_bit(todo)
                     todo &= todo - np.uint64(1)
-                    x, y = x0 + np.float32(4 * (block & 7)), y0 + np.float32(4 * (block >> 3))
                     at = block * (5 * LANES)
-                    ub, vb = u + (along * x + slant * y), v + down * y
-                    raw = exp2(rows[i + BRIGHT] - ub * ub - vb * vb)
+                    _, _, raw = _bell(rows, i, frame, block)
                     light = fetch(state, at)
-                    nothing = light * ZERO
-                    alpha = where((raw >= FAINTEST) & (light >= stop), lowest(raw, nothing + OPAQUEST), nothing)
-                    weight = alpha * light
+                    weight = _alpha(raw, light, stop) * light
                     light = light - weight
                     put(state, at, light)
                     for c in range(4):
@@ -129,6 +150,8 @@ def _forward(rows, order, starts, shares, size, side, stop, table, rgb, depth, o
                         put(state, to, fetch(state, to) + weight * rows[i + RED + c])
                     if not some(light >= stop):
                         alive &= ~(np.uint64(1) << np.uint64(block))
+                    visited += 1
+            visits[k] = visited
             for y in range(min(side, height - top)):
                 for x in range(min(side, width - left)):
                     at = _place(x, y, 5)
@@ -172,21 +195,15 @@ def _backward(
                 if not todo:
                     continue
                 i = np.int64(order[p]) * LANES
-                along, down = rows[i + ALONG], rows[i + DOWN]
-                slant = along * rows[i + SKEW]
-                u, v = columns * along + lines * slant, lines * down
-                x0, y0 = np.float32(left) + HALF - rows[i + X], np.float32(top) + HALF - rows[i + Y]
-                nothing = columns * ZERO
-                s = sx = sy = sxx = sxy = syy = red = green = blue = far = nothing
+                frame = _frame(rows, i, left, top, columns, lines)
+                s = sx = sy = sxx = sxy = syy = red = green = blue = far = columns * ZERO
                 while todo:
                     block = first_bit(todo)
                     todo &= todo - np.uint64(1)
-                    x, y = x0 + np.float32(4 * (block & 7)), y0 + np.float32(4 * (block >> 3))
                     at = block * (7 * LANES)
-                    ub, vb = u + (along * x + slant * y), v + down * y
-                    raw = exp2(rows[i + BRIGHT] - ub * ub - vb * vb)
+                    x, y, raw = _bell(rows, i, frame, block)
                     light = fetch(state, at)
-                    alpha = where((raw >= FAINTEST) & (light >= stop), lowest(raw, nothing + OPAQUEST), nothing)
+                    alpha = _alpha(raw, light, stop)
                     weight = alpha * light
                     put(state, at, light - weight)
                     r, g = fetch(state, at + 2 * LANES), fetch(state, at + 3 * LANES)
@@ -195,8 +212,8 @@ def _backward(
                     worth = (worth + b * rows[i + BLUE] + d * rows[i + DEPTH]) * weight
                     behind = fetch(state, at + LANES) - worth
                     put(state, at + LANES, behind)
-                    slope = worth - alpha * behind / (ONE - alpha)
-                    slope = where(raw < OPAQUEST, slope, nothing)
+                    slope = worth - alpha * behind * inverse(ONE - alpha)
+                    slope = where(raw < OPAQUEST, slope, ZERO)
                     dx, dy = columns + x, lines + y
                     gx, gy = slope * dx, slope * dy
                     s, sx, sy = s + slope, sx + gx, sy + gy
@@ -228,12 +245,11 @@ def _gather(sums, masks, order, conics, opacities, parts, to_centres, to_conics,
             to_depths[i] = s[9]
 
 
-def _shares(starts):
-    """Runs of tiles, one for each thread, with about as many pairs."""
-    threads = get_num_threads()
-    work = starts + 8 * np.arange(len(starts))
-    cuts = np.searchsorted(work, work[-1] * np.arange(1, threads) / threads)
-    return np.concatenate([[0], cuts, [len(starts) - 1]])
+def _shares(work):
+    """Runs of tiles, one for each thread, with about as much work."""
+    threads, done = get_num_threads(), np.cumsum(work)
+    cuts = np.searchsorted(done, done[-1] * np.arange(1, threads) / threads)
+    return np.concatenate([[0], cuts, [len(work)]])
 
 
 class _Rasterize(torch.autograd.Function):
@@ -241,23 +257,25 @@ class _Rasterize(torch.autograd.Function):
     def forward(ctx, centres, conics, opacities, colours, depths, tiles, stop):
         width, height = tiles.size
         order, starts = tiles.order.numpy(), tiles.starts.numpy()
-        rows = np.zeros(len(centres) * LANES, np.float32)
+        rows = np.empty(len(centres) * LANES, np.float32)
         _pack(*(x.detach().numpy() for x in (centres, conics, opacities, colours, depths)), rows)
         rgb, depth, opacity = empty(height, width, 3), empty(height, width), empty(height, width)
-        masks = np.empty(len(order), np.uint64)
-        ctx.numbers = _shares(starts), tiles.size, tiles.side, np.float32(stop), TABLE
-        _forward(rows, order, starts, *ctx.numbers, *(x.numpy() for x in (rgb, depth, opacity)), masks)
-        ctx.kept = rows, order, starts, masks
+        pairs = np.diff(starts)
+        masks, visits = np.empty(len(order), np.uint64), np.empty(len(pairs), np.int64)
+        ctx.numbers = tiles.size, tiles.side, np.float32(stop), TABLE
+        pictures = (x.numpy() for x in (rgb, depth, opacity))
+        _forward(rows, order, starts, _shares(pairs + TILE), *ctx.numbers, *pictures, masks, visits)
+        ctx.kept = rows, order, starts, masks, _shares(visits + PAIR * pairs + TILE)
         ctx.save_for_backward(rgb, depth, opacity, conics, opacities)
         return rgb, depth, opacity
 
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx, *grads):
-        (rows, order, starts, masks), saved = ctx.kept, [x.detach().numpy() for x in ctx.saved_tensors]
+        (rows, order, starts, masks, shares), saved = ctx.kept, [x.detach().numpy() for x in ctx.saved_tensors]
         n, sums = len(saved[3]), np.empty(len(order) * LANES, np.float32)
         given = (x.contiguous().numpy() for x in grads)
-        _backward(*given, *saved[:3], rows, order, starts, *ctx.numbers, masks, sums)
+        _backward(*given, *saved[:3], rows, order, starts, shares, *ctx.numbers, masks, sums)
         results = empty(n, 2), empty(n, 3), empty(n), empty(n, 3), empty(n)
         _gather(sums, masks, order, *saved[3:], get_num_threads(), *(x.numpy() for x in results))
         return *results, None, None
