@@ -20,7 +20,7 @@ FAST = {"cache": True, "fastmath": {"contract", "nsz", "arcp"}, "error_model": "
 LANES, BLOCKS = 16, 64  # pixels of a block; blocks of the largest tile, in eight rows of eight
 FAINTEST, OPAQUEST = np.float32(FAINTEST_), np.float32(OPAQUEST_)
 ZERO, ONE, HALF = np.float32(0), np.float32(1), np.float32(0.5)
-TILE, PAIR = 8, 8  # what a tile takes in pairs, and a pair in visits to a block: measured, to share work out by
+TILE, PAIR = 8, 8  # about what a tile costs in pairs, and a pair in visits to a block, to share work out by
 LOG2_E, LOG2_255 = math.log2(math.e), math.log2(255)
 
 # Rows of a table of constants: a block's columns and rows; a tile's rows of blocks, and right (+) and left (-) edges.
@@ -260,12 +260,12 @@ class _Rasterize(torch.autograd.Function):
         rows = np.empty(len(centres) * LANES, np.float32)
         _pack(*(x.detach().numpy() for x in (centres, conics, opacities, colours, depths)), rows)
         rgb, depth, opacity = empty(height, width, 3), empty(height, width), empty(height, width)
-        pairs = np.diff(starts)
-        masks, visits = np.empty(len(order), np.uint64), np.empty(len(pairs), np.int64)
+        work = np.diff(starts) + TILE
+        masks, visits = np.empty(len(order), np.uint64), np.empty(len(work), np.int64)
         ctx.numbers = tiles.size, tiles.side, np.float32(stop), TABLE
         pictures = (x.numpy() for x in (rgb, depth, opacity))
-        _forward(rows, order, starts, _shares(pairs + TILE), *ctx.numbers, *pictures, masks, visits)
-        ctx.kept = rows, order, starts, masks, _shares(visits + PAIR * pairs + TILE)
+        _forward(rows, order, starts, _shares(work), *ctx.numbers, *pictures, masks, visits)
+        ctx.kept = rows, order, starts, masks, _shares(visits + PAIR * work)
         ctx.save_for_backward(rgb, depth, opacity, conics, opacities)
         return rgb, depth, opacity
 
