@@ -26,6 +26,7 @@ class Method(nn.Module, ABC):
     """
 
     Config: ClassVar[type]
+    any_lens: ClassVar[bool] = False  # whether `render` follows every lens, or flat pictures alone
 
     def __init__(self, frame: Frame, config: Any):
         super().__init__()
@@ -71,6 +72,12 @@ class Method(nn.Module, ABC):
             f"{type(self).__name__} holds no Gaussians, so no splats can be made of it; train gaussian-splatting"
         )
 
+    def density(self, points: Float[Tensor, "point 3"]) -> Float[Tensor, " point"]:
+        """Density per scene unit at points of the scene. Raises LumigraphError for methods without a field."""
+        raise LumigraphError(
+            f"{type(self).__name__} holds no density at points; what is made of it comes from its renderings instead"
+        )
+
     @property
     def device(self) -> torch.device:
         return next(self.parameters()).device
@@ -79,6 +86,7 @@ class Method(nn.Module, ABC):
 class RayMethod(Method):
     """A Method that sees one ray at a time: write `render_rays`, inherit the rest."""
 
+    any_lens: ClassVar[bool] = True
     rays_per_chunk: int = 16_384
 
     @abstractmethod

@@ -61,7 +61,7 @@ def test_another_seed_gives_another_result(tmp_path):
     for seed in (0, 0, 1):
         method = tiny.method(scene.frame, seed=0)
         fit(method, scene, steps=5, seed=seed, show=False)
-        results.append(method.density.detach().clone())
+        results.append(method.logits.detach().clone())
     assert torch.equal(results[0], results[1]) and not torch.equal(results[0], results[2])
 
 
@@ -143,7 +143,7 @@ def spoil_loss(kind, at: int, spoil):
 def test_a_loss_that_is_not_finite_stops_with_step_and_term(tmp_path, monkeypatch):
     run = tiny.new_run(tmp_path / "run")
     method = run.new_method()
-    spoilt = spoil_loss(type(method), 23, lambda self: self.density.sum() * float("nan"))
+    spoilt = spoil_loss(type(method), 23, lambda self: self.logits.sum() * float("nan"))
     monkeypatch.setattr(type(method), "loss", spoilt)
     with pytest.raises(LumigraphError, match=r"step 23 because the loss term 'edge' is nan; the state after step 23"):
         fit(method, tiny.scene(), run, steps=50, show=False)
@@ -168,7 +168,7 @@ def test_a_spoilt_state_never_replaces_a_good_one(tmp_path, monkeypatch, save_ev
 
     def spoil(self, step):
         if step == 30:
-            self.density.data.view(-1)[5] = float("inf")
+            self.logits.data.view(-1)[5] = float("inf")
 
     monkeypatch.setattr(type(run.new_method()), "after_step", spoil)
     with pytest.raises(LumigraphError, match=rf"stopped at step 31 .* the state after step {kept} is kept"):

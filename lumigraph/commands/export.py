@@ -3,46 +3,22 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
-from tyro.conf import Positional
+from tyro.conf import OmitArgPrefixes, OmitSubcommandPrefixes, subcommand
 
-from .common import needed, show
+from .exports.points import Points
+from .exports.splats import Splats
+
+# One line for each thing that can be written; the files are in exports/.
+What = Annotated[Points, subcommand("points")] | Annotated[Splats, subcommand("splats")]
 
 
 @dataclass(frozen=True)
 class Export:
-    """Write a trained cloud of Gaussians for splat viewers, or turn one splat format into another.
+    """Write a trained scene for other programs."""
 
-    The ending says which format: .ply (all there is), .compressed.ply, .spz, .splat (no view-dependent colour). What a
-    run exports lies in the frame of the photographs it was trained on.
-    """
-
-    what: Annotated[Positional[Literal["splats"]], needed("splats")]
-    """What to write."""
-    source: Annotated[Positional[Path], needed("RUN_OR_FILE")]
-    """Folder of a run, or a splat file."""
-    output: Annotated[Positional[Path], needed("FILE")]
-    """The new file."""
+    what: OmitSubcommandPrefixes[OmitArgPrefixes[What]]
 
     def run(self) -> int:
-        from ..exchange import is_splat_file, read_gaussians, write_gaussians
-        from ..export.splats import export_splats
-        from ..run import Run
-
-        if is_splat_file(self.source):
-            written = read_gaussians(self.source)
-            write_gaussians(self.output, written)
-        else:
-            method = Run(self.source).method()
-            written = export_splats(method.gaussians(), method.frame, self.output)
-        size = self.output.stat().st_size
-        show(
-            {
-                "file": str(self.output),
-                "Gaussians": f"{len(written):,}",
-                "size": f"{size / 1e6:.1f} MB, {size / max(len(written), 1):.1f} bytes each",
-            }
-        )
-        return 0
+        return self.what.run()

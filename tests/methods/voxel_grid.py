@@ -33,7 +33,7 @@ class VoxelGrid(RayMethod):
     def __init__(self, frame, config):
         super().__init__(frame, config)
         n, (a, b) = config.grids.cells, config.grids.channels
-        self.density = nn.Parameter(0.1 * torch.randn(1, a, n, n, n))
+        self.logits = nn.Parameter(0.1 * torch.randn(1, a, n, n, n))
         self.colour = nn.Parameter(0.1 * torch.randn(1, b, n, n, n))
         self.register_buffer("steps", torch.zeros((), dtype=torch.int64))
 
@@ -49,7 +49,7 @@ class VoxelGrid(RayMethod):
         start = (edges[:, :-1] + (jitter - 0.5) * step).reshape(-1)
         samples = Samples(start, start + step, torch.arange(len(rays) + 1) * count)
         points, _ = samples.along(rays)
-        grid = torch.cat([self.density, self.colour], 1)
+        grid = torch.cat([self.logits, self.colour], 1)
         values = nn.functional.grid_sample(grid, points.flip(-1)[None, None, None], align_corners=True)[0, :, 0, 0].T
         inside = (points.abs() < 1).all(-1)
         density = nn.functional.softplus(10 * values[:, 0] - 2) * inside
@@ -62,14 +62,14 @@ class VoxelGrid(RayMethod):
         seen = self.render_rays(batch.rays, torch.tensor([self.frame.background]), self.jitter)
         error = (seen.rgb - target).square().mean()
         self.mse = error.item()
-        return {"colour": error, "thin": 1e-4 * self.density.abs().mean()}
+        return {"colour": error, "thin": 1e-4 * self.logits.abs().mean()}
 
     def optimizers(self):
         if not self.config.momentum:
-            self.kept = [torch.optim.Adam([self.density, self.colour], lr=self.config.learning_rate)]
+            self.kept = [torch.optim.Adam([self.logits, self.colour], lr=self.config.learning_rate)]
         else:
             self.kept = [
-                torch.optim.Adam([self.density], lr=self.config.learning_rate, amsgrad=True),
+                torch.optim.Adam([self.logits], lr=self.config.learning_rate, amsgrad=True),
                 torch.optim.SGD([self.colour], lr=self.config.learning_rate, momentum=0.9),
             ]
         return self.kept

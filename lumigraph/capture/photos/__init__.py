@@ -1,0 +1,5 @@
+"""Bare photographs and videos: what there is to work with, before anybody knows where it was taken from."""
+
+from .photo import Intake, Photo
+
+__all__ = ["Intake", "Photo"]

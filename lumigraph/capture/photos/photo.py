@@ -1,0 +1,52 @@
+"""Photo and Intake: pictures whose poses nobody knows yet."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+
+@dataclass(frozen=True)
+class Photo:
+    """One picture, upright, and what its file says of how it was taken.
+
+    name:      of the picture within the scene, unique, with "/" between folders
+    path:      the file, upright as it lies on disk (no EXIF rotation is left to do), which OpenCV and COLMAP can read
+    size:      (width, height) in pixels
+    device:    what took it: photographs with the same text may share a lens; None where the file does not say
+    focal:     focal length in pixels, from EXIF; None where it does not say
+    gps:       latitude and longitude in degrees (WGS 84), altitude in metres
+    time:      of exposure, in seconds; since 1970 for photographs, since the beginning for a video's frames
+    sharpness: how much fine detail there is, comparable among pictures of one subject
+    brightness: mean of log2 of the linear luminance, so that one stop more is 1 more
+    """
+
+    name: str
+    path: Path
+    size: tuple[int, int]
+    device: str | None = None
+    focal: float | None = None
+    gps: tuple[float, float, float] | None = None
+    time: float | None = None
+    sharpness: float = 0.0
+    brightness: float = 0.0
+
+
+@dataclass(frozen=True)
+class Intake:
+    """Everything that there is to find cameras for.
+
+    photos:     sorted by name, or in the order of exposure where `in_order`
+    in_order:   whether neighbours in the list overlap, as the frames of a video do
+    blurred:    names of photos too blurred to trust, with why in a few words; they are in `photos` all the same
+    duplicates: names of photos that show what another one shows, pixel for pixel or nearly; value: that other one's
+                name. They are in `photos` all the same
+    unreadable: names of files that are no pictures, with why in a few words
+    """
+
+    source: str
+    photos: list[Photo]
+    in_order: bool = False
+    blurred: dict[str, str] = field(default_factory=dict)
+    duplicates: dict[str, str] = field(default_factory=dict)
+    unreadable: dict[str, str] = field(default_factory=dict)
