@@ -11,6 +11,7 @@ import lumigraph  # first, because it sets how OpenMP waits before PyTorch is lo
 
 import pytest  # isort: skip
 import torch  # isort: skip
+from browser import chromium, faults, page  # noqa: F401  # isort: skip
 from jaxtyping import install_import_hook  # isort: skip
 
 PACKAGE = Path(lumigraph.__file__).parent
