@@ -1,0 +1,133 @@
+"""What a photograph's file says of how it was taken: lens, place and time."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from typing import Any
+
+from PIL import ExifTags, Image
+
+Tag, Gps = ExifTags.Base, ExifTags.GPS
+
+FULL_FRAME = math.hypot(36, 24)  # mm, the diagonal that "35 mm equivalent" refers to (CIPA DCG-001)
+UNITS = {1: 25.4, 2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}  # mm, of FocalPlaneResolutionUnit
+SENSORS = (2.0, 80.0)  # mm, widths that a sensor may have; else the file's numbers are wrong
+CROPPED = 0.02  # ratio of sides that may differ from the one at exposure, by rounding
+
+
+@dataclass(frozen=True)
+class Facts:
+    """What is known of one exposure; None where the file does not say, or says nonsense.
+
+    device, focal, time: as in Photo
+    gps: latitude and longitude in degrees, altitude in metres, NaN where that alone is missing
+    """
+
+    device: str | None = None
+    focal: float | None = None
+    gps: tuple[float, float, float] | None = None
+    time: float | None = None
+
+
+def read_facts(exif: Image.Exif, size: tuple[int, int]) -> Facts:
+    """The facts in an image's EXIF.
+
+    size: (width, height) in pixels as stored
+    """
+    details = {**exif, **exif.get_ifd(ExifTags.IFD.Exif)}
+    return Facts(
+        device(details, size),
+        focal_length(details, size),
+        position(exif.get_ifd(ExifTags.IFD.GPSInfo)),
+        moment(details),
+    )
+
+
+def device(tags: dict[int, Any], size: tuple[int, int]) -> str | None:
+    """Make, model, focal length and size. Pictures of one zoom at one setting say the same, others do not."""
+    make, model = text(tags.get(Tag.Make)), text(tags.get(Tag.Model))
+    if not model:
+        return None
+    name = model if not make or model.lower().startswith(make.lower().split()[0]) else f"{make} {model}"
+    focal = number(tags.get(Tag.FocalLength)) or number(tags.get(Tag.FocalLengthIn35mmFilm))
+    parts = [name, *([f"{focal:g} mm"] if focal else []), f"{max(size)}x{min(size)}"]
+    return ", ".join(parts)
+
+
+def focal_length(tags: dict[int, Any], size: tuple[int, int]) -> float | None:
+    """In pixels of a picture of `size`, supposing that it was reduced since exposure but not cropped.
+
+    From the 35 mm equivalent f35, which compares diagonals: f35 / 43.27 mm = f / diagonal. Otherwise from the focal
+    length in mm and the sensor's pixels per length.
+    """
+    exposed = number(tags.get(Tag.ExifImageWidth)), number(tags.get(Tag.ExifImageHeight))
+    if exposed[0] and exposed[1] and abs(math.log(max(exposed) / min(exposed) * min(size) / max(size))) > CROPPED:
+        return None
+    if equivalent := number(tags.get(Tag.FocalLengthIn35mmFilm)):
+        return equivalent / FULL_FRAME * math.hypot(*size)
+    length, density = number(tags.get(Tag.FocalLength)), number(tags.get(Tag.FocalPlaneXResolution))
+    if not (length and density):
+        return None
+    unit = UNITS.get(int(number(tags.get(Tag.FocalPlaneResolutionUnit)) or 2), 25.4)
+    # The width at exposure lies along x as stored; software that turned the picture may have left it as it was.
+    width = exposed[0] or max(size)
+    sensor = width / density * unit
+    longest = max(size) if width == max(width, exposed[1] or 0) else min(size)
+    return length / sensor * longest if SENSORS[0] < sensor < SENSORS[1] else None
+
+
+def position(tags: dict[int, Any]) -> tuple[float, float, float] | None:
+    latitude = degrees(tags.get(Gps.GPSLatitude), tags.get(Gps.GPSLatitudeRef))
+    longitude = degrees(tags.get(Gps.GPSLongitude), tags.get(Gps.GPSLongitudeRef))
+    if latitude is None or longitude is None or abs(latitude) > 90 or abs(longitude) > 180:
+        return None
+    if latitude == 0 and longitude == 0:  # what receivers write that have found no satellite
+        return None
+    altitude = finite(tags.get(Gps.GPSAltitude))
+    if altitude is None:
+        return latitude, longitude, math.nan
+    below_sea = tags.get(Gps.GPSAltitudeRef) in (1, b"\x01", "\x01", "1")
+    return latitude, longitude, -altitude if below_sea else altitude
+
+
+def degrees(parts: Any, side: Any) -> float | None:
+    """From degrees, minutes and seconds; south and west are negative."""
+    values = [finite(x) for x in parts] if isinstance(parts, tuple) else []
+    if len(values) != 3 or values[0] is None:
+        return None
+    angle = sum((x or 0.0) / unit for x, unit in zip(values, (1, 60, 3600), strict=True))
+    return -angle if text(side).upper() in ("S", "W") else angle
+
+
+def moment(tags: dict[int, Any]) -> float | None:
+    """Seconds since 1970. Where the file does not name its time zone, Greenwich's is taken."""
+    try:
+        taken = datetime.strptime(text(tags.get(Tag.DateTimeOriginal)), "%Y:%m:%d %H:%M:%S")
+    except ValueError:
+        return None
+    try:
+        zone = datetime.strptime(text(tags.get(Tag.OffsetTimeOriginal)), "%z").tzinfo
+    except ValueError:
+        zone = UTC
+    fraction = text(tags.get(Tag.SubsecTimeOriginal))
+    return taken.replace(tzinfo=zone).timestamp() + (float(f"0.{fraction}") if fraction.isdecimal() else 0.0)
+
+
+def number(value: Any) -> float | None:
+    """A number above zero; EXIF writes zero for unknown."""
+    found = finite(value)
+    return found if found and found > 0 else None
+
+
+def finite(value: Any) -> float | None:
+    try:
+        found = float(value)
+    except (TypeError, ValueError, ZeroDivisionError):
+        return None
+    return found if math.isfinite(found) else None
+
+
+def text(value: Any) -> str:
+    return value.strip(" \t\n\0") if isinstance(value, str) else ""

@@ -1,0 +1,60 @@
+"""Pictures as every program reads them: those that are turned by EXIF or in a rare format become copies."""
+
+from __future__ import annotations
+
+import contextlib
+import importlib
+import os
+from pathlib import Path
+
+from PIL import Image, ImageOps
+
+from ...files import replacing
+from ..pictures import EXIF_ORIENTATION, EXIF_UPRIGHT, eight_bits
+
+QUALITY = 95  # of JPEG, with colours at full size: no difference can be seen
+PNG_DEPTH = 24  # the byte of a PNG's header that says how many bits a channel has
+
+
+def learn_formats() -> None:
+    """Let Pillow read HEIC, where the package for it happens to be installed."""
+    with contextlib.suppress(ImportError):
+        importlib.import_module("pillow_heif").register_heif_opener()
+
+
+def is_plain(image: Image.Image, path: Path) -> bool:
+    """Whether OpenCV and COLMAP read this file as it is meant: JPEG or PNG, upright, 8 bits of grey or colour."""
+    if image.getexif().get(EXIF_ORIENTATION) not in EXIF_UPRIGHT:
+        return False
+    if image.format in ("JPEG", "MPO"):
+        return image.mode in ("L", "RGB")
+    return image.format == "PNG" and image.mode in ("L", "RGB", "RGBA") and bits(path) == 8
+
+
+def bits(png: Path) -> int:
+    with open(png, "rb") as file:
+        return file.read(PNG_DEPTH + 1)[-1]
+
+
+def suffix(image: Image.Image) -> str:
+    """Of a copy. Only PNG keeps alpha."""
+    return ".png" if image.has_transparency_data else ".jpg"
+
+
+def copy(image: Image.Image, source: Path, path: Path) -> None:
+    """An upright copy of an opened image in 8 bits: JPEG, or PNG without loss, by the suffix of `path`.
+
+    A copy carries its source's date, by which `is_current` knows it again.
+    Raises LumigraphError where the disk refuses, and whatever Pillow raises for a damaged image.
+    """
+    upright = eight_bits(ImageOps.exif_transpose(image))
+    with replacing(path) as partial:
+        options = {"quality": QUALITY, "subsampling": 0} if path.suffix == ".jpg" else {}
+        upright.save(partial, icc_profile=image.info.get("icc_profile"), **options)
+        stat = source.stat()
+        os.utime(partial, ns=(stat.st_atime_ns, stat.st_mtime_ns))
+
+
+def is_current(path: Path, source: Path) -> bool:
+    """Whether a copy of this source lies there already."""
+    return path.is_file() and path.stat().st_mtime_ns == source.stat().st_mtime_ns
