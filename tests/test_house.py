@@ -19,7 +19,7 @@ FLOORS: list[set[str]] = [
     {"camera", "images", "kernels", "charts", "figures", "metrics"},
     {"volume", "gaussians", "scene"},
     {"splatting"},
-    {"components", "capture", "exchange", "method", "paths"},
+    {"components", "capture", "exchange", "method", "paths", "keyframes"},
     {"display"},
     {"methods", "export", "viewer"},
     {"run", "evaluate", "splat_file"},
