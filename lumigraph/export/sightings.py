@@ -1,0 +1,189 @@
+"""Sightings: what the cameras of a scene see of its surfaces, the common ground of meshes and points."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Bool, Float
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from ..camera import Camera
+from ..display import track
+from ..errors import LumigraphError
+from ..method import Method
+
+SOLID = 0.5  # opacity from which on a pixel shows a surface
+FAR = 1e6  # scene units: the depth of pixels that show none
+
+
+@dataclass(frozen=True)
+class Sighting:
+    """One camera, and what it sees. Rows of pixels, on the CPU.
+
+    depth:   distance along the ray, scene units; FAR where there is no surface
+    opacity: share of light that the scene stops, in [0, 1]
+    rgb:     sRGB-encoded, without the background
+    normals: of the surface, unit length, towards the camera
+    facing:  cosine between the surface's normal and the way back to the camera; 0 where there is no surface
+    """
+
+    camera: Camera
+    depth: Float[Tensor, "height width"]
+    opacity: Float[Tensor, "height width"]
+    rgb: Float[Tensor, "height width 3"]
+    normals: Float[Tensor, "height width 3"]
+    facing: Float[Tensor, "height width"]
+
+
+class Compared(NamedTuple):
+    """Points beside what a camera sees.
+
+    ahead:  how far the surface lies behind each point along its ray, scene units; negative for hidden points, NaN for
+            points outside the picture
+    smooth: whether the surface is one there, rather than an edge in front of something else
+    pixels: where they are in the picture
+    away:   distance from the camera, scene units
+    """
+
+    ahead: Float[Tensor, " point"]
+    smooth: Bool[Tensor, " point"]
+    pixels: Float[Tensor, "point 2"]
+    away: Float[Tensor, " point"]
+
+
+@torch.no_grad()
+def look_around(method: Method, cameras: Camera, size: int = 400, most: int = 64) -> list[Sighting]:
+    """What evenly chosen cameras see. Raises LumigraphError where they see no surface at all.
+
+    size: longer side of the pictures at most, pixels
+    most: cameras at most
+    """
+    chosen = torch.linspace(0, len(cameras) - 1, min(most, len(cameras))).round().long().tolist()
+    sightings = []
+    for i in track(chosen, "Looking around", len(chosen)):
+        camera = cameras[i].to("cpu")
+        sightings.append(sighted(method, camera.resized(min(1.0, size / int(camera.size.max())))))
+    if not any((seen.depth < FAR).any() for seen in sightings):
+        raise LumigraphError(
+            "No camera sees anything solid here, so there is no surface to export; train for longer and try again"
+        )
+    return sightings
+
+
+def sighted(method: Method, camera: Camera) -> Sighting:
+    """What one camera sees."""
+    seen = method.render(camera).cpu()
+    background = torch.tensor(method.frame.background)
+    solid = (seen.opacity > SOLID) & seen.depth.isfinite()
+    covered = seen.opacity[..., None].clamp_min(SOLID)
+    rgb = ((seen.rgb - (1 - seen.opacity[..., None]) * background) / covered).clamp(0, 1)
+    depth = torch.where(solid, seen.depth, FAR)
+    normals, facing = surface_normals(camera, depth)
+    return Sighting(camera, depth, seen.opacity, rgb, normals, facing * solid)
+
+
+def surface_normals(
+    camera: Camera, depth: Float[Tensor, "height width"]
+) -> tuple[Float[Tensor, "height width 3"], Float[Tensor, "height width"]]:
+    """Unit normals towards the camera, from differences between pixels; and their cosine with the way back."""
+    rays = camera.rays(camera.pixels())
+    points = rays.at(depth.reshape(-1)).reshape(*depth.shape, 3).double()
+    # On each side the neighbour that is nearer in depth: differences do not reach across edges.
+    across, down = (nearer_difference(points, depth, axis) for axis in (1, 0))
+    normals = torch.nn.functional.normalize(torch.linalg.cross(across, down), dim=-1).float()
+    back = -rays.directions.reshape(normals.shape)
+    facing = (normals * back).sum(-1)
+    return normals * facing.sign()[..., None], facing.abs()
+
+
+def nearer_difference(
+    points: Float[Tensor, "height width 3"], depth: Float[Tensor, "height width"], axis: int
+) -> Float[Tensor, "height width 3"]:
+    """From the last pixel or to the next one along an axis, whichever is the smaller step in depth."""
+    step, jump = points.diff(dim=axis), depth.diff(dim=axis).abs()
+    place = torch.arange(depth.shape[axis])
+    onward, back = place.clamp(max=len(place) - 2), (place - 1).clamp_min(0)
+    nearer = jump.index_select(axis, onward) <= jump.index_select(axis, back)
+    return torch.where(nearer[..., None], step.index_select(axis, onward), step.index_select(axis, back))
+
+
+def compare(sighting: Sighting, points: Float[Tensor, "point 3"], jump: float) -> Compared:
+    """Points beside the surface that a camera sees, whose depth is interpolated between pixels.
+
+    jump: difference in depth between neighbouring pixels from which on there is an edge, scene units. There a point
+          counts as seen only if it lies in front of both sides.
+    """
+    camera, (height, width) = sighting.camera, sighting.depth.shape
+    pixels, valid = camera.project(points)
+    inside = valid & (pixels >= 0).all(-1) & (pixels < torch.tensor([width, height])).all(-1)
+    corner = (torch.where(inside[:, None], pixels, 0.5) - 0.5).clamp_min(0)
+    corner = torch.minimum(corner, torch.tensor([width - 1.0, height - 1.0]))
+    x, y = corner.long().unbind(-1)
+    dx, dy = (corner - corner.floor()).unbind(-1)
+    right, below = (x + 1).clamp(max=width - 1), (y + 1).clamp(max=height - 1)
+    depth = sighting.depth.reshape(-1)
+    taps = torch.stack([depth[v * width + u] for v in (y, below) for u in (x, right)])
+    nearest = taps.amin(0)
+    smooth = inside & (taps.amax(0) - nearest < jump)
+    top, bottom = torch.lerp(taps[0], taps[1], dx), torch.lerp(taps[2], taps[3], dx)
+    away = (points - camera.position).norm(dim=-1)
+    ahead = torch.where(smooth, torch.lerp(top, bottom, dy), nearest) - away
+    return Compared(torch.where(inside, ahead, torch.nan), smooth, pixels, away)
+
+
+def unseen(
+    points: Float[Tensor, "point 3"], sightings: Sequence[Sighting], margin: float
+) -> Bool[Tensor, " point"]:
+    """Whether points lie hidden from every camera, or outside all pictures.
+
+    margin: how far behind a surface a point still counts as seen, scene units
+    """
+    left = torch.arange(len(points))
+    for sighting in sightings:
+        seen = compare(sighting, points[left], margin).ahead >= -margin
+        left = left[~seen]
+    hidden = torch.zeros(len(points), dtype=torch.bool)
+    hidden[left] = True
+    return hidden
+
+
+def look_up(values: Float[Tensor, "height width *channels"], pixels: Float[Tensor, "point 2"]) -> Tensor:
+    """Values of the pixels that points (x, y) lie in; those outside take the nearest."""
+    height, width = values.shape[:2]
+    x, y = pixels.nan_to_num().floor().long().unbind(-1)
+    return values[y.clamp(0, height - 1), x.clamp(0, width - 1)]
+
+
+def colours(
+    points: Float[Tensor, "point 3"],
+    normals: Float[Tensor, "point 3"],
+    sightings: Sequence[Sighting],
+    tolerance: float,
+) -> Float[Tensor, "point 3"]:
+    """The colour of each point of a surface: the mean of what those cameras see that look at it squarely.
+
+    A camera counts with the square of the cosine at which it looks, over the area that its pixel covers there. What no
+    camera sees takes the colour of the nearest point that some camera does.
+    tolerance: how far from a camera's own surface a point may lie to be seen by it, scene units
+    """
+    total, weight = torch.zeros(len(points), 3), torch.zeros(len(points))
+    for sighting in sightings:
+        seen = compare(sighting, points, tolerance)
+        back = torch.nn.functional.normalize(sighting.camera.position - points, dim=-1)
+        cosine = (normals * back).sum(-1)
+        good = seen.smooth & (seen.ahead.abs() < tolerance) & (cosine > 0.05)
+        share = torch.where(good, (cosine / seen.away).square(), 0.0)
+        total += share[:, None] * look_up(sighting.rgb, seen.pixels)
+        weight += share
+    known = weight > 0
+    if not known.any():
+        return torch.full_like(total, 0.5)
+    found = total / weight.clamp_min(1e-12)[:, None]
+    if not known.all():
+        nearest = cKDTree(points[known].numpy()).query(points[~known].numpy())[1]
+        found[~known] = found[known][torch.from_numpy(nearest)]
+    return found
