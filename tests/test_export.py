@@ -5,21 +5,24 @@ from __future__ import annotations
 import html.parser
 import json
 import math
+import re
 
 import av
 import numpy as np
 import pytest
 import tiny
 import torch
-from PIL import Image
+from PIL import Image, ImageSequence
 
 from lumigraph.camera import Camera
 from lumigraph.charts import Series, line_chart, number, ticks
+from lumigraph.cli import main
 from lumigraph.errors import LumigraphError
 from lumigraph.evaluate import evaluate
 from lumigraph.export.film import film
 from lumigraph.export.video import open_video
 from lumigraph.figures import NOTHING, RAMP, colour_depth, colour_error, depth_range, hex_colour, save_picture
+from lumigraph.keyframes import CameraPath, Keyframe
 from lumigraph.lens import Equirectangular, Pinhole
 from lumigraph.paths import PATHS, Surroundings, angle_of_view, camera_path, film_size, look_at
 from lumigraph.report import write_report
@@ -154,8 +157,69 @@ def test_a_video_holds_its_frames_in_their_colours(tmp_path):
         assert float(stream.average_rate or 0) == 12
 
 
-def test_a_video_appears_whole_or_not_at_all(tmp_path):
-    path, frame = tmp_path / "a.mp4", torch.zeros(32, 32, 3, dtype=torch.uint8)
+def moving_ramp(count: int) -> list[torch.Tensor]:
+    """A colour ramp that drifts over a grey one that stays, so that both motion and stillness show."""
+    x = torch.linspace(0, 1, 90)
+    frames = []
+    for i in range(count):
+        moving = torch.stack([x, (x + 0.05 * i) % 1, 1 - x], -1).expand(40, 90, 3)
+        frames.append((torch.cat([moving, (0.2 + 0.5 * x)[None, :, None].expand(40, 90, 3)]) * 255).byte())
+    return frames
+
+
+def pictures_of(path) -> list[np.ndarray]:
+    with Image.open(path) as image:
+        return [np.asarray(frame.convert("RGB")).astype(int) for frame in ImageSequence.Iterator(image)]
+
+
+@pytest.mark.parametrize(("ending", "error"), [("gif", 12), ("webp", 5)])
+def test_moving_pictures_hold_their_frames_and_last_as_long(ending, error, tmp_path):
+    given = moving_ramp(9)
+    with open_video(tmp_path / f"a.{ending}", fps=30) as video:
+        for frame in given:
+            video.add(frame)
+    with Image.open(tmp_path / f"a.{ending}") as image:
+        assert image.n_frames == 9 and image.size == (90, 80)
+        assert image.info["loop"] == 0  # for ever
+        times = []
+        for i in range(9):
+            image.seek(i)
+            image.load()
+            times.append(image.info["duration"])
+    assert sum(times) == pytest.approx(300, abs=10) and max(times) <= 40
+    for a, b in zip(pictures_of(tmp_path / f"a.{ending}"), given, strict=True):
+        blurred = (a - b.numpy()).reshape(10, 8, 15, 6, 3).mean((1, 3))  # what dithering keeps
+        assert np.abs(a - b.numpy()).mean() < error and np.abs(blurred).mean() < 3
+    assert [x.name for x in tmp_path.iterdir()] == [f"a.{ending}"]
+
+
+def test_a_gifs_dithering_stands_still_and_spends_one_palette(tmp_path):
+    with open_video(tmp_path / "a.gif", fps=20) as video:
+        for frame in moving_ramp(6):
+            video.add(frame)
+    frames = pictures_of(tmp_path / "a.gif")
+    for frame in frames[1:]:
+        assert np.array_equal(frame[41:], frames[0][41:])
+    shades = np.unique(np.concatenate(frames).reshape(-1, 3), axis=0)
+    assert 100 < len(shades) <= 255
+    steps = np.abs(np.diff(frames[0][60:].mean((0, 2)).reshape(15, 6).mean(1)))
+    assert steps.max() < 20  # dithered: eyes see a ramp, not bands
+
+
+def test_films_that_cannot_be(tmp_path):
+    with (
+        pytest.raises(LumigraphError, match=r"a\.avi should end in \.mp4, \.gif, \.webp"),
+        open_video(tmp_path / "a.avi"),
+    ):
+        pass
+    with pytest.raises(LumigraphError, match="60 frames per second"), open_video(tmp_path / "a.gif", fps=60):
+        pass
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("ending", ["mp4", "gif", "webp"])
+def test_a_video_appears_whole_or_not_at_all(ending, tmp_path):
+    path, frame = tmp_path / f"a.{ending}", torch.zeros(32, 32, 3, dtype=torch.uint8)
     with pytest.raises(RuntimeError), open_video(path) as video:
         video.add(frame)
         raise RuntimeError
@@ -208,6 +272,43 @@ def test_a_film_of_a_method(trained, tmp_path):
     assert json.loads((out / "orbit.json").read_text())["frames"] == 7 == about["frames"]
     film(method, path[:2], out / "orbit.mp4")  # again: replaced, not mixed
     assert len(frames_of(out / "orbit.mp4")) == 2 and len(list((out / "orbit").iterdir())) == 4
+
+
+def test_a_film_as_a_moving_picture_has_a_twin_of_depth(trained, tmp_path):
+    path = camera_path("orbit", trained.cameras()["train"], trained.frame, 3, (26, 24))
+    film(trained.method(), path, tmp_path / "orbit.webp", fps=10)
+    assert sorted(x.name for x in tmp_path.iterdir()) == ["orbit", "orbit-depth.webp", "orbit.json", "orbit.webp"]
+    assert len(pictures_of(tmp_path / "orbit.webp")) == len(pictures_of(tmp_path / "orbit-depth.webp")) == 3
+
+
+def test_a_film_along_keyframes(trained, tmp_path, capsys):
+    """The command, on a path saved by hand and on what lies beside another film."""
+    poses = trained.cameras()["train"].pose[:2].tolist()  # this capture's frame is its source's
+    keys = [Keyframe(tuple(map(tuple, pose)), 40.0, 0.2 * i) for i, pose in enumerate(poses)]
+    CameraPath(tuple(keys), fps=20).save(tmp_path / "walk.json")
+    command = ["render", str(trained.folder), "--size", "24", "--device", "cpu"]
+    assert main([*command, "--path", str(tmp_path / "walk.json"), "--output", str(tmp_path / "film.gif")]) == 0
+    about = json.loads((tmp_path / "film.json").read_text())
+    assert (about["frames"], about["fps"], about["size"]) == (5, 20, [24, 24])
+    torch.testing.assert_close(torch.tensor(about["poses"])[[0, 4]], torch.tensor(poses), atol=1e-5, rtol=0)
+    again = [*command, "--path", str(tmp_path / "film.json"), "--frames", "3"]
+    assert main([*again, "--output", str(tmp_path / "second.webp")]) == 0
+    second = json.loads((tmp_path / "second.json").read_text())
+    torch.testing.assert_close(torch.tensor(second["poses"])[[0, 2]], torch.tensor(poses), atol=1e-5, rtol=0)
+    before = (tmp_path / "walk.json").read_bytes()
+    capsys.readouterr()
+    (tmp_path / "nonsense.json").write_text('{"format": "lumigraph camera path 1", "keyframes": [1]}')
+    for name, output, words in (
+        ("walk.json", "walk.mp4", "would be replaced"),
+        ("nonsense.json", "a.mp4", "damaged camera path"),
+        ("none.json", "a.mp4", "does not exist"),
+        ("obrit", "a.mp4", "does not exist|There is no path called"),
+    ):
+        assert main([*command, "--path", str(tmp_path / name), "--output", str(tmp_path / output)]) == 2
+        lines = capsys.readouterr().err.strip().splitlines()
+        assert len(lines) == 1 and re.search(words, lines[0])
+    assert (tmp_path / "walk.json").read_bytes() == before and not (tmp_path / "a.mp4").exists()
+    assert main([*command, "--path", "obrit"]) == 2 and "orbit, spiral" in capsys.readouterr().err
 
 
 def test_a_broken_film_leaves_nothing(trained, tmp_path, monkeypatch):

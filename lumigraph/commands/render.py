@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 from tyro.conf import Positional
 
@@ -12,7 +12,7 @@ from ..errors import LumigraphError
 from .common import check_film, choose_device, needed, option, show
 
 LONGEST = 480  # pixels of a film, if nobody asks for more
-PathName = Literal["orbit", "spiral", "interpolate", "held-out"]
+PATHS = ("orbit", "spiral", "interpolate", "held-out")
 
 
 @dataclass(frozen=True)
@@ -21,37 +21,42 @@ class Render:
 
     Paths keep to where the photographs were taken from. orbit goes round (or to and fro), spiral twice round while
     rising, interpolate passes smoothly through photographs' places, held-out visits the test photographs' own cameras.
+    A path of your own is a JSON file: keyframes saved in the viewer, or what lies beside a film of the same capture.
     """
 
     source: Annotated[Positional[Path], needed("RUN_OR_FILE")]
     """Folder of the run, or a splat file: .ply, .compressed.ply, .spz, .splat."""
-    path: PathName = "orbit"
+    path: Annotated[str, option("{" + ",".join(PATHS) + ",FILE.json}")] = "orbit"
     """Where the camera goes."""
-    frames: Annotated[int | None, option("N", "120; every held-out view")] = None
+    frames: Annotated[int | None, option("N", "120; every held-out view; as long as keyframes say")] = None
     """Length in frames."""
-    fps: Annotated[float, option("N")] = 30.0
+    fps: Annotated[float | None, option("N", "30, or what the path's file says")] = None
     """Frames per second."""
     size: Annotated[int | None, option("PIXELS", f"that of the photographs, at most {LONGEST}")] = None
     """Longer side of the picture."""
-    output: Annotated[Path | None, option("FILE.mp4", "RUN/renders/PATH.mp4, or renders/FILE/PATH.mp4")] = None
-    """The film. FILE-depth.mp4, FILE.json and the folder FILE of pictures go beside it."""
+    output: Annotated[Path | None, option("FILE", "RUN/renders/PATH.mp4, or renders/FILE/PATH.mp4")] = None
+    """The film: .mp4, .gif or .webp. Depth (FILE-depth), FILE.json and the folder FILE of pictures go beside it."""
     device: Annotated[str, option("NAME")] = "auto"
     """auto, cpu, cuda, cuda:1."""
 
     def run(self) -> int:
         from ..exchange import is_splat_file
         from ..export.film import film
+        from ..export.video import kind_of
         from ..run import Run
         from ..splat_file import SplatFile
 
-        check_film(self.frames, self.fps, self.size)
+        check_film(self.frames, 30.0 if self.fps is None else self.fps, self.size)
+        flight = None if self.path in PATHS else read_path(self.path, self.fps)
+        fps = self.fps or (flight.fps if flight else 30.0)
         run = SplatFile(self.source) if is_splat_file(self.source) else Run(self.source)
-        output = self.output or run.renders / f"{self.path}.mp4"
-        if output.suffix != ".mp4":
-            raise LumigraphError(f"{output} should end in .mp4, the one kind of film there is; rename it")
-        cameras = film_cameras(run, self.path, self.frames, self.size)
+        output = self.output or run.renders / f"{Path(self.path).stem}.mp4"
+        kind_of(output, fps)
+        if flight and output.with_suffix(".json").resolve() == Path(self.path).resolve():
+            raise LumigraphError(f"{self.path} would be replaced by what goes beside the film; give another --output")
+        cameras = film_cameras(run, flight or self.path, self.frames, self.size)
         method = run.method(choose_device(self.device))
-        about = film(method, cameras, output, self.fps)
+        about = film(method, cameras, output, fps)
         width, height = about["size"]
         show(
             {
@@ -64,15 +69,33 @@ class Render:
         return 0
 
 
-def film_cameras(run: Any, path: str, frames: int | None, size: int | None) -> Any:
-    """The cameras of a film of a Run, one for each frame. size: longer side; None as the photographs, up to a limit."""
+def read_path(name: str, fps: float | None) -> Any:
+    """The CameraPath in a file, at another speed of frames if asked. Raises LumigraphError if it is none."""
+    from ..keyframes import CameraPath
+
+    file = Path(name)
+    if not file.exists() and not file.suffix:
+        raise LumigraphError(f"There is no path called {name!r}; choose {', '.join(PATHS)}, or a JSON file")
+    flight = CameraPath.load(file)
+    return replace(flight, fps=fps or flight.fps)
+
+
+def film_cameras(run: Any, path: Any, frames: int | None, size: int | None) -> Any:
+    """The cameras of a film of a Run, one for each frame.
+
+    path: one of PATHS, or a CameraPath
+    size: longer side; None as the photographs, up to a limit
+    """
     from ..paths import camera_path, film_size
 
     cameras = run.cameras()
     if path != "held-out":
         train = cameras["train"]
         longest = size or min(LONGEST, int(train.size[0].max()))
-        return camera_path(path, train, run.frame, 120 if frames is None else frames, film_size(train, longest))
+        shape = film_size(train, longest)
+        if isinstance(path, str):
+            return camera_path(path, train, run.frame, 120 if frames is None else frames, shape)
+        return path.cameras(run.frame, shape, frames)
     views = cameras.get("test")
     if views is None or not len(views):
         raise LumigraphError("There are no held-out views here; choose another --path")
