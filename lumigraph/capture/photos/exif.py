@@ -62,20 +62,20 @@ def focal_length(tags: dict[int, Any], size: tuple[int, int]) -> float | None:
     From the 35 mm equivalent f35, which compares diagonals: f35 / 43.27 mm = f / diagonal. Otherwise from the focal
     length in mm and the sensor's pixels per length.
     """
-    exposed = number(tags.get(Tag.ExifImageWidth)), number(tags.get(Tag.ExifImageHeight))
-    if exposed[0] and exposed[1] and abs(math.log(max(exposed) / min(exposed) * min(size) / max(size))) > CROPPED:
-        return None
+    width, height = number(tags.get(Tag.ExifImageWidth)), number(tags.get(Tag.ExifImageHeight))
+    if width and height:
+        if abs(math.log(max(width, height) / min(width, height) * min(size) / max(size))) > CROPPED:
+            return None
     if equivalent := number(tags.get(Tag.FocalLengthIn35mmFilm)):
         return equivalent / FULL_FRAME * math.hypot(*size)
     length, density = number(tags.get(Tag.FocalLength)), number(tags.get(Tag.FocalPlaneXResolution))
     if not (length and density):
         return None
     unit = UNITS.get(int(number(tags.get(Tag.FocalPlaneResolutionUnit)) or 2), 25.4)
-    # The width at exposure lies along x as stored; software that turned the picture may have left it as it was.
-    width = exposed[0] or max(size)
-    sensor = width / density * unit
-    longest = max(size) if width == max(width, exposed[1] or 0) else min(size)
-    return length / sensor * longest if SENSORS[0] < sensor < SENSORS[1] else None
+    # Its width at exposure. Software that turns a picture may leave these tags as they were, hence the longer side.
+    exposed = max(width or 0, height or 0) or max(size)
+    sensor = exposed / density * unit
+    return length / sensor * max(size) if SENSORS[0] < sensor < SENSORS[1] else None
 
 
 def position(tags: dict[int, Any]) -> tuple[float, float, float] | None:

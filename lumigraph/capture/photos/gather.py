@@ -5,35 +5,27 @@ from __future__ import annotations
 import math
 import os
 import statistics
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
-from PIL import Image
+from PIL import Image, UnidentifiedImageError
 
 from ...errors import LumigraphError
-from ..pictures import EXIF_ORIENTATION, EXIF_SIDEWAYS, describe, reductions
+from ..pictures import describe, reductions
 from . import upright
 from .exif import read_facts
+from .judge import Look, blurred, duplicates, look
 from .photo import Intake, Photo
+from .track import Track, untracked
+from .video import extract, is_video
 
+HEIC = (".heic", ".heif")
 PHOTOGRAPHS = {
     ".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".bmp", ".heic", ".heif", ".avif"
 }  # fmt: skip
-POSES = (
-    "transforms.json",
-    "transforms_train.json",
-    "sparse",
-    "checkpoints",
-)  # folders with these were made by programs
-
-Track = Callable[[Iterable[Any], str, int], Iterator[Any]]  # the items one by one, while somebody is told how many
-
-
-def untracked(items: Iterable[Any], description: str, total: int) -> Iterator[Any]:
-    yield from items
+MADE = ("transforms.json", "transforms_train.json", "sparse", "checkpoints")  # a folder with these is a program's
 
 
 def gather(sources: Sequence[Path], work: Path, frames: int | None = None, track: Track = untracked) -> Intake:
@@ -45,14 +37,67 @@ def gather(sources: Sequence[Path], work: Path, frames: int | None = None, track
     track:   shows progress, as display.track does
     Raises LumigraphError where there is no picture to be had.
     """
+    films = [source for source in sources if is_video(source)]
+    if films and len(sources) > 1:
+        raise LumigraphError(f"{films[0]} is a video among other things; name it alone, or photographs without it")
+    source = ", ".join(map(str, sources)) if len(sources) < 4 else f"{sources[0]} and {len(sources) - 1} more"
+    if films:
+        return of_video(films[0], source, work, frames, track)
     upright.learn_formats()
     files = named_files(list_photographs(sources, work))
-    with ThreadPoolExecutor(min(os.cpu_count() or 1, 16)) as pool:
-        found = pool.map(lambda item: take(*item, work / "upright"), files.items())
-        taken = dict(zip(files, track(found, "Looking at photographs", len(files)), strict=True))
+    taken = examine(files, work / "upright", track)
     unreadable = {name: why for name, why in taken.items() if isinstance(why, str)}
-    photos = sorted((p for p in taken.values() if isinstance(p, Photo)), key=lambda p: p.name)
-    return Intake(", ".join(map(str, sources)), with_altitudes(photos), unreadable=unreadable)
+    seen = [one for _, one in sorted(taken.items()) if isinstance(one, Seen)]
+    if not seen:
+        raise LumigraphError(nothing(source, unreadable))
+    return assess(Intake(source, with_altitudes([one.photo for one in seen]), unreadable=unreadable), seen)
+
+
+def of_video(path: Path, source: str, work: Path, frames: int | None, track: Track) -> Intake:
+    found = extract(path, work / "frames", frames, track)
+    taken = examine({file.name: file for file, _ in found}, work / "upright", track)
+    seen = [one for one in taken.values() if isinstance(one, Seen)]
+    photos = [replace(one.photo, device=path.name, time=seconds) for one, (_, seconds) in zip(seen, found, strict=True)]
+    return assess(Intake(source, photos, in_order=True), seen)
+
+
+def examine(files: Mapping[str, Path], copies: Path, track: Track) -> dict[str, Seen | str]:
+    """Look at all files, several at a time."""
+    with ThreadPoolExecutor(min(os.cpu_count() or 1, 16)) as pool:
+        found = pool.map(lambda name: take(name, files[name], copies), files)
+        try:
+            return dict(zip(files, track(found, "Looking at photographs", len(files)), strict=True))
+        except BaseException:
+            pool.shutdown(wait=False, cancel_futures=True)
+            raise
+
+
+def assess(intake: Intake, seen: Sequence[Seen]) -> Intake:
+    """The same with the blurred and the duplicates named: of two that show the same the sharper, larger one stays."""
+    bad = blurred({one.photo.name: one.photo.sharpness for one in seen})
+    sizes = {one.photo.name: one.photo.size for one in seen}
+
+    def worth(one: Seen) -> tuple[bool, int, int, str]:
+        return one.photo.name in bad, -math.prod(one.photo.size), -one.bytes, one.photo.name
+
+    signatures = {one.photo.name: one.look.signature for one in sorted(seen, key=worth)}
+    return replace(intake, blurred=bad, duplicates=dict(sorted(duplicates(signatures, sizes).items())))
+
+
+def nothing(source: str, unreadable: Mapping[str, str]) -> str:
+    if not unreadable:
+        return f"{source} holds no photographs ({', '.join(sorted(PHOTOGRAPHS))}); name the folder or the video to use"
+    name, why = next(iter(unreadable.items()))
+    return f"{source} holds no photograph that can be read ({name}: {why}); convert them to JPEG"
+
+
+def is_bare(path: Path) -> bool:
+    """Whether this is a video, or a folder with photographs but without poses that a reader knows."""
+    from .. import READERS  # that package may import this one
+
+    if not path.is_dir():
+        return is_video(path)
+    return not any(r.recognises(path) for r in READERS.values()) and next(walk(path), None) is not None
 
 
 def list_photographs(sources: Sequence[Path], work: Path) -> list[Path]:
@@ -65,7 +110,7 @@ def list_photographs(sources: Sequence[Path], work: Path) -> list[Path]:
     return list(files.values())
 
 
-def walk(folder: Path, work: Path) -> Iterator[Path]:
+def walk(folder: Path, work: Path | None = None) -> Iterator[Path]:
     """Photographs below a folder, sorted: no hidden ones, none that a program reduced or rendered."""
     entries = sorted(folder.iterdir())
     folders = [entry for entry in entries if entry.is_dir()]
@@ -74,7 +119,7 @@ def walk(folder: Path, work: Path) -> Iterator[Path]:
         if entry.name.startswith(".") or entry in reduced or entry.resolve() == work:
             continue
         if entry.is_dir():
-            if not any((entry / name).exists() for name in POSES):
+            if not any((entry / name).exists() for name in MADE):
                 yield from walk(entry, work)
         elif entry.suffix.lower() in PHOTOGRAPHS:
             yield entry
@@ -88,23 +133,43 @@ def named_files(files: list[Path]) -> dict[str, Path]:
     return {file.absolute().relative_to(common).as_posix(): file for file in files}
 
 
-def take(name: str, path: Path, copies: Path) -> Photo | str:
-    """One photograph, copied where it has to be; or why it is none."""
+@dataclass(frozen=True)
+class Seen:
+    """A photo, what a look at it found, and how many bytes its source has."""
+
+    photo: Photo
+    look: Look
+    bytes: int
+
+
+def take(name: str, path: Path, copies: Path) -> Seen | str:
+    """One photograph, copied where it has to be, and judged; or why it is none.
+
+    Raises LumigraphError where the disk refuses the copy.
+    """
     try:
         with Image.open(path) as image:
             facts = read_facts(image.getexif(), image.size)
-            sideways = image.getexif().get(EXIF_ORIENTATION) in EXIF_SIDEWAYS
-            size = image.size[::-1] if sideways else image.size
+            upright_file = path
             if not upright.is_plain(image, path):
-                copied = copies / f"{name}{upright.suffix(image)}"
-                if not upright.is_current(copied, path):
-                    upright.copy(image, path, copied)
-                name, path = copied.relative_to(copies).as_posix(), copied
-        return Photo(name, path, size, facts.device, facts.focal, facts.gps, facts.time)
+                upright_file = copies / f"{name}{upright.suffix(image)}"
+                if not upright.is_current(upright_file, path):
+                    upright.copy(image, path, upright_file)
+                name = upright_file.relative_to(copies).as_posix()
+        with Image.open(upright_file) as image:
+            size, found = image.size, look(image)
     except LumigraphError:
         raise
     except Exception as fault:  # image libraries raise anything for a damaged file
-        return describe(fault)
+        return unread(path, fault)
+    photo = Photo(name, upright_file, size, facts.device, facts.focal, facts.gps, facts.time)
+    return Seen(replace(photo, sharpness=found.sharpness, brightness=found.brightness), found, path.stat().st_size)
+
+
+def unread(path: Path, fault: Exception) -> str:
+    if path.suffix.lower() in HEIC and isinstance(fault, UnidentifiedImageError):
+        return "HEIC can be read once pillow-heif is installed (pip install pillow-heif)"
+    return describe(fault)
 
 
 def with_altitudes(photos: list[Photo]) -> list[Photo]:

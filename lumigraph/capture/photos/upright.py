@@ -49,10 +49,17 @@ def copy(image: Image.Image, source: Path, path: Path) -> None:
     """
     upright = eight_bits(ImageOps.exif_transpose(image))
     with replacing(path) as partial:
-        options = {"quality": QUALITY, "subsampling": 0} if path.suffix == ".jpg" else {}
-        upright.save(partial, icc_profile=image.info.get("icc_profile"), **options)
+        save(upright, partial, image.info.get("icc_profile"))
         stat = source.stat()
         os.utime(partial, ns=(stat.st_atime_ns, stat.st_mtime_ns))
+
+
+def save(image: Image.Image, path: Path, profile: bytes | None = None) -> None:
+    """As JPEG or PNG, by the suffix. profile: of the image's colours (ICC)."""
+    if path.suffix == ".jpg":
+        image.save(path, icc_profile=profile, quality=QUALITY, subsampling=0)
+    else:
+        image.save(path, icc_profile=profile)
 
 
 def is_current(path: Path, source: Path) -> bool:

@@ -1,0 +1,147 @@
+"""What the pixels say of a picture's worth: sharp or blurred, bright or dark, new or seen before.
+
+All is judged on the luminance at 640 pixels along the longer side, where a picture from a phone has no noise to speak
+of, and blur that can only be seen by enlarging does no harm.
+
+Sharpness compares slopes over a short and over a long distance, in four directions θ:
+
+    s = min over θ of  mean (Δ_θ,2 Y / 2)²  /  mean (Δ_θ,8 Y / 8)²
+
+Δ_θ,d is the difference between two pixels that lie d apart. A picture that is smooth over 8 pixels has s = 1, perfect
+edges have 4, fine texture up to 16. As numerator and denominator see the same edges, contrast and the amount of detail
+cancel. Motion blurs along its own direction only, hence the minimum. Related to Crété-Roffet et al. 2007, "The Blur
+Effect", which compares slopes before and after blurring.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+from PIL import Image
+from scipy.ndimage import gaussian_filter
+
+from ..pictures import eight_bits, same_shape
+
+WORKING = 640  # pixels, the longer side of what is judged
+SHORT, LONG = 2, 8  # pixels; along diagonals half as many steps, each √2 long
+ROUNDING = 1 / 6 / LONG**2  # squared slope that rounding to whole numbers may feign
+
+MUDDY = 1.4  # sharpness below which nobody would call a picture sharp; clean edges blurred with σ = 1.2 have it
+SOFT = 1.8  # below this a picture is soft, if others of the subject are not; σ = 0.9
+CRISP = 3.5  # above this a picture is no worse than its subject
+LESS = 1.6  # times less sharp than the others' median is noticeable, and
+DEVIATIONS = 4.0  # standard deviations of the logarithm below it is unusual
+
+GRID = 96  # pixels to a side of a signature
+DETAIL = 3.0  # σ in pixels of the grid; what is larger says little, for all pictures of one subject share it
+SAME = 0.95  # correlation of signatures; neighbours of a walk around a subject stay below 0.8
+
+
+@dataclass(frozen=True)
+class Look:
+    """What a look at the pixels found.
+
+    sharpness: see above, 1 to 16
+    brightness: mean log2 of the linear luminance
+    signature: the detail of a small square version with length 1, or 0 where there is no detail
+    """
+
+    sharpness: float
+    brightness: float
+    signature: Float[np.ndarray, " cell"]
+
+
+def look(image: Image.Image) -> Look:
+    """Judge a picture. A JPEG that nobody has read yet is decoded at a fraction of its size, which is quick.
+
+    Turning a picture upright changes none of the figures but the signature, so judge it upright or turned, but alike.
+    Raises whatever Pillow raises for damaged files.
+    """
+    image.draft("L", (WORKING, WORKING))
+    grey = eight_bits(image).convert("L")
+    times = max(grey.size) / WORKING
+    if times > 1:
+        grey = grey.resize(
+            (max(round(grey.width / times), 1), max(round(grey.height / times), 1)), Image.Resampling.BOX
+        )
+    luminance = np.asarray(grey, np.float32)
+    return Look(sharpness(luminance), brightness(luminance), signature(grey))
+
+
+def sharpness(luminance: Float[np.ndarray, "height width"]) -> float:
+    """From 1, smooth, to 16, nothing but fine texture. luminance: 0 to 255."""
+    pairs = zip(slopes(luminance, SHORT), slopes(luminance, LONG), strict=True)
+    return min((short + ROUNDING) / (long + ROUNDING) for short, long in pairs)
+
+
+def slopes(y: Float[np.ndarray, "height width"], d: int) -> list[float]:
+    """Mean squared slope over a distance d, across, down and along both diagonals."""
+    h = d // 2
+    ends = [
+        (y[:, d:], y[:, :-d], d**2),
+        (y[d:], y[:-d], d**2),
+        (y[h:, h:], y[:-h, :-h], 2 * h**2),
+        (y[h:, :-h], y[:-h, h:], 2 * h**2),
+    ]
+    return [float(np.square(a - b).mean()) / length if a.size else 0.0 for a, b, length in ends]
+
+
+def brightness(luminance: Float[np.ndarray, "height width"]) -> float:
+    """Mean log2 of the linear luminance, the brightest possible being 0; nothing is darker than 1/255 encoded."""
+    encoded = np.maximum(luminance, 1) / 255
+    linear = np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
+    return float(np.log2(linear).mean())
+
+
+def signature(grey: Image.Image) -> Float[np.ndarray, " cell"]:
+    small = np.asarray(grey.resize((GRID, GRID), Image.Resampling.BOX), np.float32)
+    detail = (small - gaussian_filter(small, DETAIL)).ravel()
+    length = float(np.linalg.norm(detail))
+    return detail / length if length > math.sqrt(ROUNDING) * GRID else np.zeros_like(detail)
+
+
+def blurred(sharpness: Mapping[str, float]) -> dict[str, str]:
+    """Which pictures are too blurred to trust, by name, and why in a few words.
+
+    Muddy ones in any case. Otherwise those that are noticeably less sharp than the others, and either soft or unusual
+    as well, unless they are crisp. The others' spread is taken from the median absolute deviation of log s, so that the
+    blurred ones themselves, while they are a minority, do not widen it. Where all are equally sharp none is named;
+    where all are muddy all are.
+    """
+    if not sharpness:
+        return {}
+    logs = np.log(list(sharpness.values()))
+    median = float(np.median(logs))
+    spread = 1.4826 * float(np.median(np.abs(logs - median)))
+    usual, unusual = math.exp(median), math.exp(median - DEVIATIONS * spread)
+    limit = min(usual / LESS, max(unusual, SOFT), CRISP)
+    found = {}
+    for name, value in sharpness.items():
+        if value < limit:
+            found[name] = f"far less sharp than the others: {value:.1f} where they have {usual:.1f}"
+        elif value < MUDDY:
+            found[name] = f"no fine detail: sharpness {value:.1f} where clean edges have 4"
+    return found
+
+
+def duplicates(
+    signatures: Mapping[str, Float[np.ndarray, " cell"]], sizes: Mapping[str, tuple[int, int]]
+) -> dict[str, str]:
+    """Which pictures show what an earlier one shows, pixel for pixel or nearly, by name, and that one's name.
+
+    signatures: the one to keep comes first
+    Two are the same if their signatures correlate by more than SAME and their sides have the same ratio.
+    """
+    names = list(signatures)
+    table = np.stack([signatures[name] for name in names]) if names else np.zeros((0, 1), np.float32)
+    alike = np.triu(table @ table.T > SAME, 1)
+    found: dict[str, str] = {}
+    for i, j in np.argwhere(alike).tolist():
+        first, second = names[i], names[j]
+        if first not in found and second not in found and same_shape(sizes[first], sizes[second]):
+            found[second] = first
+    return found

@@ -1,0 +1,198 @@
+"""The frames of a video that are worth having: sharp, evenly spread over what the camera saw, no two the same.
+
+The film is watched twice. First every frame, or every second or fourth of a fast film, is judged small: how sharp it is
+and how far the picture has moved since the beginning. The film is then cut into as many stretches as frames are wanted,
+each with equal movement, so that a resting camera gives few frames and a quick turn many; a share of TIME goes by the
+clock, for what the eye does not see move. The sharpest frame of each stretch is written the second time, unless it
+shows what a frame before it shows.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import warnings
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import av
+import numpy as np
+from av.container import InputContainer
+from av.video.frame import VideoFrame
+from jaxtyping import Float
+from PIL import Image
+
+from ...errors import LumigraphError, LumigraphWarning
+from ...files import read_json, replacing, write_json
+from .judge import SAME, WORKING, sharpness, signature
+from .movement import Odometer
+from .track import Track, untracked
+from .upright import save
+
+VIDEOS = {
+    ".mp4", ".mov", ".m4v", ".mkv", ".webm", ".avi", ".mpg", ".mpeg", ".mts", ".m2ts", ".3gp", ".wmv", ".ogv", ".flv"
+}  # fmt: skip
+PER_SECOND, FEWEST, MOST = 2.5, 20, 150  # frames, where the user asks for no number
+JUDGED = 15.0  # frames per second that are looked at, or
+CANDIDATES = 4  # for each frame that is wanted, if that is more
+TIME = 0.2  # share of the clock in what counts as even
+WATCHED = 192  # pixels, the longer side of what movement is seen in
+
+
+def is_video(path: Path) -> bool:
+    """Whether a file is a film, by its suffix."""
+    return path.suffix.lower() in VIDEOS and path.is_file()
+
+
+def extract(path: Path, folder: Path, frames: int | None = None, track: Track = untracked) -> list[tuple[Path, float]]:
+    """Frames of a video as upright JPEGs in `folder`, in order, and when each was seen, in seconds from the first on.
+
+    frames: how many; None: PER_SECOND, but at least FEWEST and at most MOST. There are fewer where the film is shorter
+            or shows the same again
+    The folder is used as it is if it was made of the same file and with the same options; else it is replaced.
+    Raises LumigraphError where the film cannot be read or has no frames.
+    """
+    if frames is not None and frames < 2:
+        raise LumigraphError(f"{frames} frames of {path} are too few to find cameras for; ask for 2 at least")
+    stat = path.stat()
+    identity = {"video": path.name, "modified": stat.st_mtime_ns, "bytes": stat.st_size, "asked": frames}
+    index = folder / "frames.json"
+    known = read_json(index) if index.is_file() else {}
+    if {key: known.get(key) for key in identity} != identity:
+        chosen = choose(*judge(path, frames, track), frames)
+        with replacing(folder) as partial:
+            partial.mkdir()
+            written = write(path, partial, chosen, track)
+            write_json(partial / "frames.json", {**identity, "frames": written})
+        known = read_json(index)
+    return [(folder / name, seconds) for name, seconds in known["frames"].items()]
+
+
+def judge(
+    path: Path, frames: int | None, track: Track
+) -> tuple[list[int], Float[np.ndarray, " frame"], Float[np.ndarray, " frame"], Float[np.ndarray, " frame"]]:
+    """Of the frames looked at: their numbers, seconds from the first on, sharpness, how far the picture had moved."""
+    rows: list[tuple[int, float, float, float]] = []
+    odometer = Odometer()
+    with opened(path) as film:
+        total = length(film)
+        step = max(int(min(speed(film) / JUDGED, total / (CANDIDATES * frames) if frames else math.inf)), 1)
+        for number, (frame, seconds) in enumerate(track(decoded(path, film), f"Watching {path.name}", total)):
+            if number % step == 0:
+                luminance = grey(frame, WORKING)
+                travelled = odometer.show(grey(frame, WATCHED))
+                rows.append((number, seconds, sharpness(luminance), travelled))
+    if not rows:
+        raise LumigraphError(f"{path} has no frames; record it again or take it from its source")
+    numbers = [number for number, *_ in rows]
+    times, sharp, travelled = np.array([figures for _, *figures in rows]).T
+    return numbers, times - times[0], sharp, travelled
+
+
+def choose(
+    numbers: Sequence[int],
+    seconds: Float[np.ndarray, " frame"],
+    sharp: Float[np.ndarray, " frame"],
+    travelled: Float[np.ndarray, " frame"],
+    frames: int | None = None,
+) -> list[int]:
+    """The numbers of the sharpest frames of equal stretches, ascending. All arguments are as `judge` gives them."""
+    duration = float(seconds[-1])
+    count = frames or min(max(round(PER_SECOND * duration), FEWEST), MOST)
+    clock = seconds / max(duration, 1e-9)
+    way = travelled / travelled[-1] if travelled[-1] > 0 else clock
+    stretch = np.minimum(((1 - TIME) * way + TIME * clock) * count, count - 1).astype(int)
+    best: dict[int, int] = {}
+    for i, s in enumerate(stretch.tolist()):
+        if s not in best or sharp[i] > sharp[best[s]]:
+            best[s] = i
+    return [numbers[i] for i in best.values()]
+
+
+def write(path: Path, folder: Path, chosen: Sequence[int], track: Track) -> dict[str, float]:
+    """Write the chosen frames but those that repeat an earlier one; names and seconds from the first frame on."""
+    written: dict[str, float] = {}
+    signatures: list[np.ndarray] = []
+    for number, frame, seconds in track(picked(path, chosen), f"Taking frames of {path.name}", len(chosen)):
+        image = upright(frame)
+        new = signature(image.convert("L"))
+        if not any(new @ old > SAME for old in signatures):
+            name = f"{number:06d}.jpg"
+            save(image, folder / name)
+            signatures.append(new)
+            written[name] = seconds
+    return written
+
+
+def picked(path: Path, chosen: Sequence[int]) -> Iterator[tuple[int, VideoFrame, float]]:
+    wanted, beginning = set(chosen), 0.0
+    with opened(path) as film:
+        for number, (frame, seconds) in enumerate(decoded(path, film)):
+            beginning = seconds if number == 0 else beginning
+            if number in wanted:
+                yield number, frame, seconds - beginning
+            if number == chosen[-1]:
+                return
+
+
+@contextlib.contextmanager
+def opened(path: Path) -> Iterator[InputContainer]:
+    """A film with pictures. Raises LumigraphError where there are none."""
+    try:
+        container = av.open(str(path))
+    except (av.FFmpegError, ValueError) as fault:
+        raise LumigraphError(
+            f"{path} cannot be read as a video ({why(fault)}); take it from its source again, or convert it to MP4"
+        ) from fault
+    with container:
+        if not container.streams.video:
+            raise LumigraphError(f"{path} holds no pictures, only other tracks such as sound; name another video")
+        container.streams.video[0].thread_type = "AUTO"
+        yield container
+
+
+def decoded(path: Path, film: InputContainer) -> Iterator[tuple[VideoFrame, float]]:
+    """Frames in order, and when each is shown, in seconds. A film that is damaged ends there, with a warning."""
+    rate, count, seconds = speed(film), 0, 0.0
+    try:
+        for frame in film.decode(video=0):
+            seconds = count / rate if frame.time is None else float(frame.time)
+            count += 1
+            yield frame, seconds
+    except av.FFmpegError as fault:
+        if count == 0:
+            raise LumigraphError(
+                f"{path} cannot be decoded ({why(fault)}); take it from its source again, or convert it to MP4"
+            ) from fault
+        warnings.warn(
+            LumigraphWarning(f"{path} is damaged after {seconds:.1f} s ({why(fault)}); what comes before is used"),
+            stacklevel=2,
+        )
+
+
+def speed(film: InputContainer) -> float:
+    """Frames per second, on average."""
+    stream = film.streams.video[0]
+    return float(stream.average_rate or stream.guessed_rate or 30)
+
+
+def length(film: InputContainer) -> int:
+    """About how many frames there are; 1 where the file does not say."""
+    seconds = (film.duration or 0) / av.time_base
+    return film.streams.video[0].frames or max(round(seconds * speed(film)), 1)
+
+
+def grey(frame: VideoFrame, longest: int) -> Float[np.ndarray, "height width"]:
+    """Luminance from 0 to 255, reduced so that the longer side is at most `longest` pixels. Not turned upright."""
+    times = max(frame.width / longest, frame.height / longest, 1.0)
+    width, height = (max(round(side / times), 1) for side in (frame.width, frame.height))
+    return frame.reformat(width, height, format="gray", interpolation="AREA").to_ndarray().astype(np.float32)
+
+
+def upright(frame: VideoFrame) -> Image.Image:
+    """A frame as it is meant to be seen, in sRGB bytes."""
+    return frame.to_image().rotate(frame.rotation, expand=True)
+
+
+def why(fault: Exception) -> str:
+    return (getattr(fault, "strerror", None) or str(fault)).lower()
