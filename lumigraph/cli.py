@@ -27,6 +27,7 @@ from .commands.render import Render
 from .commands.report import Report
 from .commands.resume import Resume
 from .commands.train import Train, with_options_of
+from .commands.view import View
 from .errors import LumigraphError, LumigraphWarning
 from .files import refusal
 
@@ -36,6 +37,7 @@ COMMANDS: dict[str, type] = {
     "resume": Resume,
     "eval": Eval,
     "render": Render,
+    "view": View,
     "export": Export,
     "report": Report,
     "info": Info,

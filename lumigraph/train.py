@@ -8,8 +8,9 @@ import math
 import signal
 import threading
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
+from typing import Any, Protocol
 
 import torch
 from torch import Tensor
@@ -42,6 +43,21 @@ class Outcome:
     saving_seconds: float = 0.0
 
 
+class Watch(Protocol):
+    """Somebody who looks on while a method learns, from other threads: the viewer. It may hold training up between
+    steps, which does not count as training, and changes nothing of what is learnt."""
+
+    @property
+    def asked(self) -> bool:
+        """Whether it wants to be given way before the next step. Asked before each step, so it must be quick."""
+
+    def give_way(self, stopping: Callable[[], object]) -> None:
+        """Render, in eval mode; return at once where stopping() is true."""
+
+    def note(self, step: int, progress: float, row: dict[str, Any]) -> None:
+        """So many steps are done. row: the line of metrics.jsonl, empty for most steps."""
+
+
 def fit(
     method: Method,
     scene: Scene,
@@ -54,6 +70,7 @@ def fit(
     save_every: float = 60.0,
     log_every: int = 10,
     show: bool = True,
+    watch: Watch | None = None,
 ) -> Outcome:
     """Train a method on a scene until its steps are done or its seconds are spent.
 
@@ -62,7 +79,9 @@ def fit(
     seed:       of all random choices
     pause_at:   stop at this step as if interrupted; the schedule still follows the whole budget
     save_every: seconds of training between states
-    Seconds count what training needs; compiling kernels ahead of it, and saving, are counted apart.
+    watch:      who looks on meanwhile
+    Seconds count what training needs; compiling kernels ahead of it, saving, and giving way to who looks on are
+    counted apart.
     Ctrl-C and SIGTERM end the step at hand, save and return; a second one breaks off.
     Raises LumigraphError when a loss or gradient is not finite, with the last good state saved.
     """
@@ -76,7 +95,7 @@ def fit(
             run.restore_training(optimizers, generator)
             run.forget_after(state.step)
         method.train()
-        clock, step = Clock(state.seconds), state.step
+        clock, step, watched = Clock(state.seconds), state.step, 0.0
         if step == 0:
             method.begin(scene)
         next_save = clock.seconds + min(FIRST_SAVE, save_every)
@@ -93,6 +112,9 @@ def fit(
             return now
 
         while (progress := budget.progress(step, clock.seconds)) < 1 and step != pause_at and not interrupt.signal:
+            if watch and watch.asked:
+                watched += give_way(watch, method, clock, interrupt)
+                continue
             method.before_step(step, progress)
             batch = method.batch(scene, generator)
             terms = method.loss(batch, step)
@@ -107,6 +129,8 @@ def fit(
             method.after_step(step)
             step += 1
             row = display.update(step, clock.seconds, progress, batch, terms, method, needed=logged)
+            if watch:
+                watch.note(step, progress, row)
             if run and logged:
                 run.log(row | {"learning_rate": [g["lr"] for o in optimizers for g in o.param_groups if "lr" in g]})
             if clock.seconds >= next_save:
@@ -119,7 +143,7 @@ def fit(
         final = save()
         display.done(step, final.seconds, budget.progress(step, final.seconds))
     method.eval()
-    return Outcome(final, budget.progress(step, final.seconds) >= 1, interrupt.signal, clock.pauses)
+    return Outcome(final, budget.progress(step, final.seconds) >= 1, interrupt.signal, clock.pauses - watched)
 
 
 @dataclass(frozen=True)
@@ -202,6 +226,16 @@ class Previews:
         self.method.eval()
         save_picture(self.run.folder / "previews" / f"{step:06d}.png", self.method.render(self.camera).rgb)
         self.method.train()
+
+
+def give_way(watch: Watch, method: Method, clock: Clock, interrupt: Interrupt) -> float:
+    """Let somebody look, who has asked. Returns the seconds it took."""
+    before = clock.pauses
+    with clock.paused():
+        method.eval()
+        watch.give_way(lambda: interrupt.signal)
+        method.train()
+    return clock.pauses - before
 
 
 def rehearse(method: Method, scene: Scene, step: int) -> float:

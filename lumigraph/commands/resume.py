@@ -28,11 +28,18 @@ class Resume:
     """auto, cpu, cuda, cuda:1."""
     pause_at: Annotated[int | None, option("STEP", "never")] = None
     """Stop at this step as if interrupted."""
+    view: bool = False
+    """Show the scene in the browser while it is learnt, and afterwards until Ctrl-C."""
+    host: Annotated[str, option("ADDRESS", "127.0.0.1, this machine alone")] = "127.0.0.1"
+    """Where --view listens; 0.0.0.0 lets other machines look too."""
+    port: Annotated[int | None, option("N", "8080, or the next that is free")] = None
+    """Port that --view listens at."""
 
     def run(self) -> int:
         from ..run import Run
         from ..train import Budget, fit
         from .train import tell_outcome
+        from .view import keep_showing, watching
 
         run = Run(self.run_folder)
         budget = budget_of(self.steps, self.seconds) or run.config["budget"]
@@ -46,6 +53,8 @@ class Resume:
         method, scene = run.new_method(device), run.scene(self.scene)
         if budget != run.config["budget"]:
             run.set_budget(**budget)
-        outcome = fit(method, scene, run, **budget, seed=run.config["seed"], pause_at=self.pause_at)
-        tell_outcome(run, outcome)
+        with watching(self.view, method, scene, run, self.host, self.port) as watch:
+            outcome = fit(method, scene, run, **budget, seed=run.config["seed"], pause_at=self.pause_at, watch=watch)
+            tell_outcome(run, outcome)
+            keep_showing(watch, outcome.signal)
         return exit_code(outcome.signal)

@@ -55,11 +55,18 @@ class Train:
     """Which machine the method's own defaults are for; auto is that of --device."""
     pause_at: Annotated[int | None, option("STEP", "never")] = None
     """Stop at this step as if interrupted. The schedule still follows the whole budget."""
+    view: bool = False
+    """Show the scene in the browser while it is learnt, and afterwards until Ctrl-C."""
+    host: Annotated[str, option("ADDRESS", "127.0.0.1, this machine alone")] = "127.0.0.1"
+    """Where --view listens; 0.0.0.0 lets other machines look too."""
+    port: Annotated[int | None, option("N", "8080, or the next that is free")] = None
+    """Port that --view listens at."""
 
     def run(self) -> int:
         from ..capture import open_scene
         from ..run import Run, build, check_new
         from ..train import fit
+        from .view import keep_showing, watching
 
         budget = budget_of(self.steps, self.seconds) or {"seconds": DEFAULT_SECONDS}
         kind, device = methods.find(self.method), choose_device(self.device)
@@ -71,8 +78,10 @@ class Train:
         seed = getattr(config, "seed", self.seed)
         method = build(kind, scene.frame, config, device, seed)
         run = Run.create(output, method, scene, seed=seed, options=options, budget=budget)
-        outcome = fit(method, scene, run, **budget, seed=seed, pause_at=self.pause_at)
-        tell_outcome(run, outcome)
+        with watching(self.view, method, scene, run, self.host, self.port) as watch:
+            outcome = fit(method, scene, run, **budget, seed=seed, pause_at=self.pause_at, watch=watch)
+            tell_outcome(run, outcome)
+            keep_showing(watch, outcome.signal)
         return exit_code(outcome.signal)
 
     def method_config(self, kind: Any) -> Any:

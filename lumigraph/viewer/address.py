@@ -1,0 +1,105 @@
+"""Where the viewer listens: a host, a port that is free, and what to say about them."""
+
+from __future__ import annotations
+
+import ipaddress
+import socket
+import warnings
+from dataclasses import dataclass
+
+from ..errors import LumigraphError, LumigraphWarning
+
+HOST, PORT = "127.0.0.1", 8080
+TRIED = 100  # ports after the usual one
+
+
+@dataclass(frozen=True)
+class Address:
+    """host: as the user named it; port: free a moment ago."""
+
+    host: str
+    port: int
+
+    @property
+    def url(self) -> str:
+        """What to open in a browser on this machine."""
+        return self.urls[0]
+
+    @property
+    def urls(self) -> list[str]:
+        """Everything that the viewer answers to, as far as this machine knows its own names."""
+        hosts = own_addresses() if is_wildcard(self.host) else [self.host]
+        return [f"http://{f'[{host}]' if ':' in host else host}:{self.port}" for host in hosts]
+
+
+def choose_address(host: str = HOST, port: int | None = None) -> Address:
+    """A place to listen at. Without a port, the first free one from 8080 on.
+
+    Warns, with the addresses, where others than this machine can reach it.
+    Raises LumigraphError if the host is not this machine's or the port is not to be had.
+    """
+    if port is not None and not 0 <= port <= 65535:
+        raise LumigraphError(f"There is no port {port}; give --port a number from 1 to 65535")
+    wanted = range(PORT, PORT + TRIED) if port is None else [port]
+    found = next((free for number in wanted if (free := free_port(host, number)) is not None), None)
+    if found is None and port is None:
+        raise LumigraphError(f"Ports {PORT} to {PORT + TRIED - 1} are all in use; choose another by --port")
+    if found is None:
+        raise LumigraphError(f"Port {port} is in use; choose another by --port, or leave it out to get a free one")
+    address = Address(host, found)
+    if not is_local(host):
+        warnings.warn(
+            f"Whoever can reach this machine can look at the scene and use the viewer: {', '.join(address.urls)}",
+            LumigraphWarning,
+            stacklevel=2,
+        )
+    return address
+
+
+def free_port(host: str, port: int) -> int | None:
+    """The port itself if it can be listened at (any free one for 0), None if it is in use."""
+    try:
+        family, kind, *_, place = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)[0]
+        with socket.create_server(place[:2], family=family, reuse_port=False) as listening:
+            return listening.getsockname()[1]
+    except socket.gaierror as error:
+        raise LumigraphError(
+            f"Host {host!r} is not known ({error.strerror}); give --host an address of this machine"
+        ) from error
+    except PermissionError as error:
+        raise LumigraphError(f"Port {port} may not be used by this user; give --port one from 1024 on") from error
+    except OSError as error:
+        if "in use" in str(error).lower():
+            return None
+        raise LumigraphError(
+            f"{host} is not an address that this machine can listen at ({error.strerror}); "
+            "give --host one of its own, or 0.0.0.0 for all"
+        ) from error
+
+
+def is_wildcard(host: str) -> bool:
+    return host in ("", "0.0.0.0", "::")
+
+
+def is_local(host: str) -> bool:
+    """Whether only this machine can reach it."""
+    if is_wildcard(host):
+        return False
+    places = {entry[4][0] for entry in socket.getaddrinfo(host, None)}
+    return all(ipaddress.ip_address(str(place).partition("%")[0]).is_loopback for place in places)
+
+
+def own_addresses() -> list[str]:
+    """This machine's addresses: the loopback first, then those by which others may know it."""
+    found = ["127.0.0.1"]
+    try:
+        found += [str(entry[4][0]) for entry in socket.getaddrinfo(socket.gethostname(), None, socket.AF_INET)]
+    except socket.gaierror:
+        pass
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:  # says which address is used; sends nothing
+        try:
+            probe.connect(("192.0.2.1", 9))
+            found.append(probe.getsockname()[0])
+        except OSError:
+            pass
+    return list(dict.fromkeys(found))

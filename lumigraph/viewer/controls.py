@@ -1,0 +1,136 @@
+"""Controls: what one client can set about its own view."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any, cast
+
+import numpy as np
+
+from ..scene import Frame, Vector
+from .crop import Box
+from .modes import MODES, Mode
+from .scenery import CAMERAS, POINTS
+
+SHARPEST = 1024  # pixels along the longer side, unless the client wants another
+NARROWEST, WIDEST = 10.0, 120.0  # degrees
+
+
+class Controls:
+    """A client's tab `View`.
+
+    client:  viser's
+    tab:     what holds it
+    changed: called when anything that is drawn changes
+    cloud:   whether the method is a cloud of Gaussians, which the browser can draw
+    """
+
+    def __init__(self, client: Any, tab: Any, frame: Frame, cloud: bool, changed: Callable[[], None]):
+        self._client, self._frame, self._changed = client, frame, changed
+        gui = client.gui
+        with tab:
+            self._mode = gui.add_dropdown("Show", [mode.capitalize() for mode in MODES])
+            self._here = gui.add_checkbox(
+                "Draw exactly", False, visible=cloud, hint="Drawn by our own renderer and sent, not by the browser"
+            )
+            self._angle = gui.add_slider(
+                "Angle of view", NARROWEST, WIDEST, 1.0, 50.0, hint="Degrees, from top to bottom"
+            )
+            self._sharpest = gui.add_slider(
+                "Sharpest", 240, 2048, 16, SHARPEST, hint="Pixels along the longer side, once the camera rests"
+            )
+            self._background = gui.add_rgb("Background", to_bytes(frame.background))
+            self._cameras = gui.add_checkbox("Cameras", True, hint="Click on one to fly there")
+            self._points = gui.add_checkbox("Sparse points", False, visible=False)
+            with gui.add_folder("Crop", expand_by_default=False):
+                self._crop = gui.add_checkbox("Inside this box alone", False)
+                lower, upper = frame.bounds
+                self._lower = gui.add_vector3("Lower", lower, step=0.01)
+                self._upper = gui.add_vector3("Upper", upper, step=0.01)
+            self.status = gui.add_markdown("")
+        for drawn in (self._mode, self._here, self._sharpest, self._background, self._crop, self._lower, self._upper):
+            drawn.on_update(lambda _: self._update())
+        self._cameras.on_update(lambda _: self._update())
+        self._points.on_update(lambda _: self._update())
+        self._angle.on_update(lambda _: self._set_angle())
+        self._shadows = {CAMERAS: True, POINTS: True}
+        self._box: Any = None
+        self._update()
+
+    @property
+    def mode(self) -> Mode:
+        return cast(Mode, self._mode.value.lower())
+
+    @property
+    def here(self) -> bool:
+        return self._here.value
+
+    @property
+    def longest(self) -> int:
+        return int(self._sharpest.value)
+
+    @property
+    def background(self) -> Vector:
+        """Exactly the scene's own until another is chosen."""
+        chosen = tuple(self._background.value)
+        own = self._frame.background
+        return own if chosen == to_bytes(own) else (chosen[0] / 255, chosen[1] / 255, chosen[2] / 255)
+
+    @property
+    def box(self) -> Box | None:
+        """Of what is shown, if not everything is."""
+        if not self._crop.value:
+            return None
+        a, b = self._lower.value, self._upper.value
+        lower, upper = (tuple(float(x) for x in pick(a, b)) for pick in (np.minimum, np.maximum))
+        return Box(cast(Vector, lower), cast(Vector, upper))
+
+    @property
+    def surrounded(self) -> bool:
+        """Whether anything is drawn beside the scene itself."""
+        return bool(self._cameras.value or self._points.value or self._crop.value)
+
+    def offer_points(self) -> None:
+        """There are points now."""
+        self._points.visible = True
+
+    def tell_angle(self, radians: float) -> None:
+        """The camera has another angle of view."""
+        degrees = float(min(max(round(math.degrees(radians)), NARROWEST), WIDEST))
+        if degrees != self._angle.value:
+            self._angle.value = degrees
+
+    def _set_angle(self) -> None:
+        camera = self._client.camera
+        if abs(math.degrees(camera.fov) - self._angle.value) > 0.51:  # not when it was only told, and rounded
+            camera.fov = math.radians(self._angle.value)
+
+    def _update(self) -> None:
+        # What all clients share is hidden from one of them by a node of its own in the same place.
+        for name, shown in ((CAMERAS, self._cameras.value), (POINTS, self._points.value)):
+            if shown != self._shadows[name]:
+                self._client.scene.add_frame(name, show_axes=False, visible=shown)
+                self._shadows[name] = shown
+        self._show_box()
+        self._changed()
+
+    def _show_box(self) -> None:
+        if self._box is not None:
+            self._box.remove()
+            self._box = None
+        box = self.box
+        if box is not None:
+            lower, upper = np.array(box.lower), np.array(box.upper)
+            self._box = self._client.scene.add_box(
+                "/crop",
+                color=(240, 190, 80),
+                dimensions=tuple(np.maximum(upper - lower, 1e-4)),
+                position=(lower + upper) / 2,
+                wireframe=True,
+            )
+
+
+def to_bytes(colour: Vector) -> tuple[int, int, int]:
+    red, green, blue = (round(255 * x) for x in colour)
+    return red, green, blue

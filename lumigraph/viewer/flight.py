@@ -1,0 +1,77 @@
+"""Flight: a client's camera, moved from here."""
+
+from __future__ import annotations
+
+import time
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+STEP = 1 / 25  # seconds
+SECONDS = 0.6  # that a flight to a photograph takes
+UP = np.array([0.0, 0.0, 1.0])
+
+
+class Flight:
+    """The camera of one client. A new flight ends the one before."""
+
+    def __init__(self, client: Any):
+        self._client, self._number = client, 0
+
+    def stop(self) -> None:
+        self._number += 1
+
+    def place(
+        self, pose: Float[np.ndarray, "3 4"], distance: float, angle: float, up: Float[np.ndarray, " 3"] | None = None
+    ) -> None:
+        """Put it at a pose, turning about a point so far ahead, with a vertical angle of view in radians."""
+        camera = self._client.camera
+        with self._client.atomic():
+            camera.up_direction = upwards(pose) if up is None else up
+            camera.position = pose[:, 3]
+            camera.look_at = pose[:, 3] + distance * pose[:, 2]
+            camera.fov = angle
+
+    def fly(self, pose: Float[np.ndarray, "3 4"], distance: float, angle: float) -> None:
+        """Go there smoothly. Returns on arrival, or when another flight begins."""
+        self._number += 1
+        number, camera = self._number, self._client.camera
+        begin = np.array(camera.position), np.array(camera.look_at), np.array(camera.up_direction), camera.fov
+        goal = pose[:, 3], pose[:, 3] + distance * pose[:, 2], upwards(pose), angle
+        count = round(SECONDS / STEP)
+        for i in range(1, count):
+            if number != self._number:
+                return
+            t = i / count
+            t = t * t * (3 - 2 * t)
+            position, ahead, up, fov = (a + t * (b - a) for a, b in zip(begin, goal, strict=True))
+            with self._client.atomic():
+                camera.up_direction = up
+                camera.position = position
+                camera.look_at = ahead
+                camera.fov = fov
+            time.sleep(STEP)
+        self.place(pose, distance, angle)
+
+    def play(self, poses: Float[np.ndarray, "frame 3 4"], distance: float, angles: list[float], seconds: float) -> bool:
+        """Follow a path in so many seconds, leaving out what there is no time for. Says whether it came to its end."""
+        self._number += 1
+        number, begin = self._number, time.perf_counter()
+        while (now := time.perf_counter() - begin) < seconds:
+            if number != self._number:
+                return False
+            i = min(int(now / seconds * len(poses)), len(poses) - 1)
+            self.place(poses[i], distance, angles[i])
+            time.sleep(STEP)
+        self.place(poses[-1], distance, angles[-1])
+        return True
+
+
+def upwards(pose: Float[np.ndarray, "3 4"]) -> Float[np.ndarray, " 3"]:
+    """What the browser takes for up, so that it shows the pose's own roll: as near to the scene's up as can be."""
+    right = pose[:, 0]
+    up = UP - (UP @ right) * right
+    if up @ -pose[:, 1] < 0.05:  # upside down, or nearly level with the axis
+        up = -pose[:, 1]
+    return up / np.linalg.norm(up)

@@ -1,0 +1,126 @@
+"""Scenery: what stands around the scene for all clients alike - the photographs' cameras and the sparse points."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from jaxtyping import UInt8
+from torch import Tensor
+
+from ..camera import Camera
+from ..errors import LumigraphError
+from ..gaussians import to_quaternion
+from ..scene import Scene
+from .look import angles
+
+CAMERAS, POINTS = "/cameras", "/points"
+MOST_CAMERAS, MOST_POINTS = 250, 200_000  # more only fill the browser
+THUMBNAIL = 96  # pixels along the longer side
+TRAIN, TEST = (86, 134, 214), (232, 140, 60)
+SHARE = 0.4  # of the distance between neighbouring cameras, as the size of a frustum
+NARROWEST, WIDEST = 0.01, 0.1  # of the distance to the middle of all cameras
+
+
+class Scenery:
+    """The cameras at once; thumbnails and points once the photographs have been opened, if they can be.
+
+    server:   viser's
+    cameras:  by split
+    clicked:  told of a client and the camera that it clicked on
+    """
+
+    def __init__(self, server: Any, cameras: dict[str, Camera], clicked: Callable[[Any, Camera], None]):
+        self._server = server
+        self._frusta: dict[int, Any] = {}  # by image number
+        self.has_points = False
+        server.scene.add_frame(CAMERAS, show_axes=False)
+        server.scene.add_frame(POINTS, show_axes=False)
+        everyone = Camera.cat(list(cameras.values()))
+        self._size, step = frustum_size(everyone), -(-len(everyone) // MOST_CAMERAS)
+        self._names: list[str] = []
+        for split, group in cameras.items():
+            for i in range(0, len(group), step):
+                self._add(split, group[i], f"{CAMERAS}/{split}/{i}", clicked)
+        self._positions = Camera.cat([group[::step] for group in cameras.values()]).position.cpu().double()
+
+    def around(self, place: tuple[float, ...]) -> str | None:
+        """The name of the frustum that holds a place or nearly does, and so would hide everything from there."""
+        distance = (self._positions - torch.tensor(place, dtype=torch.double)).norm(dim=-1)
+        nearest = int(distance.argmin())
+        return self._names[nearest] if distance[nearest] < 1.5 * self._size else None
+
+    def _add(self, split: str, camera: Camera, name: str, clicked: Callable[[Any, Camera], None]) -> None:
+        across, down = angles(camera)
+        self._names.append(name)
+        frustum = self._server.scene.add_camera_frustum(
+            name,
+            fov=down,
+            aspect=float(torch.tensor(across / 2).tan() / torch.tensor(down / 2).tan()),
+            scale=self._size,
+            thickness=1.5,
+            thickness_units="screen",
+            color=TRAIN if split == "train" else TEST,
+            wxyz=to_quaternion(camera.pose[0, :, :3].cpu()).numpy(),
+            position=camera.position[0].cpu().double().numpy(),
+        )
+        frustum.on_click(lambda event: clicked(event.client, camera))
+        if camera.image_index is not None:
+            self._frusta[int(camera.image_index[0])] = frustum
+
+    def fill(self, open_scene: Callable[[], Scene], done: Callable[[str | None], None]) -> None:
+        """Open the photographs in the background, and add what they tell. done: told what went wrong, if anything."""
+
+        def work() -> None:
+            try:
+                self.show(open_scene())
+            except LumigraphError as error:
+                done(str(error))
+            else:
+                done(None)
+
+        threading.Thread(target=work, name="photographs", daemon=True).start()
+
+    def show(self, scene: Scene) -> None:
+        """Thumbnails and points of a scene."""
+        if scene.points is not None and len(scene.points):
+            some = slice(None, None, -(-len(scene.points) // MOST_POINTS))
+            colours = scene.point_colours
+            spread = (scene.points - scene.points.median(0).values).norm(dim=-1).median()
+            self._server.scene.add_point_cloud(
+                f"{POINTS}/sparse",
+                scene.points[some].numpy(),
+                (120, 120, 120) if colours is None else colours[some].numpy(),
+                point_size=0.006 * float(spread),
+                point_shape="circle",
+                point_shading="flat",
+                precision="float32",
+            )
+            self.has_points = True
+        for number, frustum in self._frusta.items():
+            frustum.image = thumbnail(scene.images[number]).numpy()
+
+
+def frustum_size(cameras: Camera) -> float:
+    """Small enough for neighbours not to cover each other, where they stand apart."""
+    position = cameras.position.cpu().double()
+    distance = torch.cdist(position, position)
+    spread = float((position - position.median(0).values).norm(dim=-1).median())
+    spread = spread or 1.0
+    nearest = distance.fill_diagonal_(torch.inf).amin(-1).median().item() if len(position) > 1 else spread
+    return min(max(SHARE * nearest, NARROWEST * spread), WIDEST * spread)
+
+
+def thumbnail(image: UInt8[Tensor, "height width channel"]) -> UInt8[Tensor, "_ _ 3"]:
+    """A photograph made small; what is see-through is white."""
+    height, width, channels = image.shape
+    share = min(1.0, THUMBNAIL / max(height, width))
+    small = (max(1, round(share * height)), max(1, round(share * width)))
+    values = image.permute(2, 0, 1)[None].float()
+    rgb = values[:, :3]
+    if channels == 4:
+        alpha = values[:, 3:] / 255
+        rgb = rgb * alpha + 255 * (1 - alpha)
+    return torch.nn.functional.interpolate(rgb, small, mode="area")[0].permute(1, 2, 0).round().to(torch.uint8)

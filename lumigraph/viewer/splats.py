@@ -1,0 +1,51 @@
+"""Splats: a cloud of Gaussians as the browser draws it. It knows one colour for each, so colours are those towards
+one place, and are worked out anew where the eye comes to rest."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from .. import kernels
+from ..gaussians import Gaussians
+from ..kernels.project.reference import to_matrix
+from ..paths import unit
+
+# The browser's covariances are half-precision numbers: in units this much smaller, what is fine keeps its shape.
+ENLARGED = 16.0
+LARGEST = 250.0  # standard deviation in those units; its square still is a half-precision number
+
+
+@dataclass(frozen=True)
+class Splats:
+    """What the browser is told, with lengths multiplied by ENLARGED."""
+
+    centres: Float[np.ndarray, "gaussian 3"]
+    covariances: Float[np.ndarray, "gaussian 3 3"]
+    colours: Float[np.ndarray, "gaussian 3"]
+    opacities: Float[np.ndarray, "gaussian 1"]
+
+
+@torch.no_grad()
+def splats(cloud: Gaussians, eye: Float[Tensor, " 3"]) -> Splats:
+    """A cloud with its colours towards an eye, both in the scene's frame."""
+    deviations = (ENLARGED * cloud.log_scales.detach().exp()).clamp_max(LARGEST)
+    axes = to_matrix(cloud.quaternions.detach()) * deviations[:, None, :]
+    return Splats(
+        (ENLARGED * cloud.means.detach()).cpu().numpy(),
+        (axes @ axes.mT).cpu().numpy(),
+        colours(cloud, eye).cpu().numpy(),
+        cloud.opacities.detach().sigmoid()[:, None].cpu().numpy(),
+    )
+
+
+@torch.no_grad()
+def colours(cloud: Gaussians, eye: Float[Tensor, " 3"]) -> Float[Tensor, "gaussian 3"]:
+    """What each Gaussian looks like from one place, in [0, 1] (Kerbl 2023; the constant is that of `Gaussians`)."""
+    directions = unit(cloud.means.detach() - eye.to(cloud.means))
+    values = kernels.spherical_harmonics(directions, cloud.degree + 1)
+    return (0.5 + torch.einsum("nk,nkc->nc", values, cloud.harmonics.detach())).clamp(0, 1)

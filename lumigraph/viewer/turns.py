@@ -1,0 +1,101 @@
+"""Turns: one method, and many threads that want it."""
+
+from __future__ import annotations
+
+import contextlib
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Iterator
+
+SHARE = 0.5  # of the time that renderings may take from training while someone moves
+IDLE_SHARE = 0.03  # and while nobody does
+LOOK = 0.1  # seconds between looks at whether one should stop waiting
+
+
+class NotWantedError(Exception):
+    """Nobody wants the turn any more."""
+
+
+class Turns:
+    """Renderings take turns, in the order in which they asked. Training has the method by default and gives way
+    between steps, never so often that renderings take more than their share of the time.
+
+    training: whether someone trains; `give_way` must then be called between steps, until `end_training`
+    """
+
+    def __init__(self, training: bool = False):
+        self.training, self.paused = training, False
+        self._condition = threading.Condition()
+        self._waiting: deque[object] = deque()
+        self._open = False  # training gives way at the moment
+        self._busy = False  # a rendering has its turn
+        self._served = 0
+        self._own_until = 0.0  # until then training need not give way
+        self._idle_until = 0.0  # until then nobody at rest may ask for a newer picture
+
+    @contextlib.contextmanager
+    def turn(self, wanted: Callable[[], bool] = lambda: True) -> Iterator[None]:
+        """Have the method to oneself. Raises NotWantedError if it is not wanted any more before the turn has come."""
+        ticket = object()
+        with self._condition:
+            self._waiting.append(ticket)
+            try:
+                while not self._free_for(ticket):
+                    self._condition.wait(LOOK)
+                    if not wanted():
+                        raise NotWantedError
+                self._busy = True
+            finally:
+                self._waiting.remove(ticket)
+                self._condition.notify_all()
+        begin = time.perf_counter()
+        try:
+            yield
+        finally:
+            end = time.perf_counter()
+            with self._condition:
+                self._busy, self._served = False, self._served + 1
+                self._own_until = end + (end - begin) * (1 / SHARE - 1)
+                self._condition.notify_all()
+
+    def _free_for(self, ticket: object) -> bool:
+        return not self._busy and (self._open or not self.training) and self._waiting[0] is ticket
+
+    @property
+    def asked(self) -> bool:
+        """Whether training should give way now: someone waits and training had its own share, or it is paused."""
+        return self.paused or bool(self._waiting) and time.perf_counter() >= self._own_until
+
+    def give_way(self, stopping: Callable[[], object] = lambda: False) -> None:
+        """Called by training between two steps: one turn to whoever waits longest; while paused, to all who ask.
+
+        stopping: whether training should not be held up any longer
+        """
+        with self._condition:
+            before, self._open = self._served, True
+            self._condition.notify_all()
+            while (self.paused or (self._served == before and self._waiting) or self._busy) and not (
+                stopping() and not self._busy
+            ):
+                self._condition.wait(LOOK)
+            self._open = False
+
+    def end_training(self) -> None:
+        """From now on nobody trains."""
+        with self._condition:
+            self.training = self.paused = False
+            self._condition.notify_all()
+
+    def claim_refresh(self) -> bool:
+        """Whether someone at rest may draw anew what training has changed; the others then wait for `refreshed`."""
+        with self._condition:
+            if self.training and not self.paused and time.perf_counter() < self._idle_until:
+                return False
+            self._idle_until = float("inf") if self.training else 0.0
+            return True
+
+    def refreshed(self, seconds: float) -> None:
+        """A refresh is over and took so long."""
+        with self._condition:
+            self._idle_until = time.perf_counter() + seconds / IDLE_SHARE

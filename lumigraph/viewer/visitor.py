@@ -1,0 +1,214 @@
+"""Visitor: one client of the viewer - what it sees, where its camera is, and the painter that works for it."""
+
+from __future__ import annotations
+
+import os
+import sys
+import time
+import traceback
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+from jaxtyping import UInt8
+
+from ..camera import Camera
+from ..errors import LumigraphError
+from ..figures import to_bytes
+from ..rays import Rendering
+from ..scene import Vector
+from .controls import Controls
+from .flight import Flight
+from .look import Look, angle_for, pose_of, rows
+from .modes import along_axis, picture
+from .pace import Pace
+from .painter import MOVING, Painter
+from .path_panel import PathPanel
+from .splats import ENLARGED, colours, splats
+from .turns import NotWantedError
+
+if TYPE_CHECKING:
+    from .viewer import Viewer
+
+DEPTH_SIZE = 320  # pixels along the longer side of the depth that goes with a picture
+DEPTH_STEP = 256e-5  # scene units, to which that depth is rounded so that it packs well
+QUALITY, QUALITY_MOVING = 90, 70  # of JPEG
+MOST_RECOLOURED = 500_000  # Gaussians; more are too many to send again whenever the camera rests
+TURNED = 0.03  # how far the eye must move, as a share of its distance to the middle, for colours to change
+Wanted = Callable[[], bool]
+
+
+class Visitor:
+    """Made when a client has come, stopped when it has left."""
+
+    def __init__(self, viewer: Viewer, client: Any):
+        self._viewer, self._client = viewer, client
+        self._pace, self._said = Pace(), ""
+        self._splats: Any = None
+        self._sent: tuple[Any, ...] = ()  # which splats the client has
+        self._eye = torch.zeros(3)  # towards which their colours are
+        self._flat: Vector | None = None  # the background behind splats
+        self._inside: tuple[str | None, Any] = None, None  # the frustum that the eye is in, and what hides it
+        self.painter = Painter(self._draw, viewer.turns, self._tell_fault, lambda: viewer.stage)
+        self.flight = Flight(client)
+        self.controls = Controls(client, viewer.view_tab, viewer.subject.frame, viewer.is_cloud, self.painter.ask)
+        self.path = PathPanel(client, viewer.path_tab, viewer.subject, self.flight, self.tell)
+        self._seen: tuple[Any, ...] = ()
+        client.camera.on_update(self._moved)
+        self.controls.tell_angle(client.camera.fov)
+        if viewer.scenery.has_points:
+            self.controls.offer_points()
+        self.painter.ask()
+        self.painter.start()
+
+    def stop(self) -> None:
+        self.flight.stop()
+        self.painter.stop()
+
+    def tell(self, title: str, text: str = "") -> None:
+        """Say something to the client."""
+        if self._here:
+            self._client.add_notification(title, text, auto_close_seconds=8.0)
+
+    def fly_to(self, camera: Camera, distance: float) -> None:
+        """Go where a photograph was taken, and see as much as it does."""
+        pose = camera.pose[0].double().cpu().numpy()
+        self.flight.fly(pose, distance, angle_for(camera.to("cpu"), self._client.camera.aspect))
+
+    @property
+    def _here(self) -> bool:
+        return self._viewer.knows(self._client)
+
+    async def _moved(self, camera: Any) -> None:
+        """In the server's own thread, so that this costs next to nothing."""
+        seen = *camera.wxyz, *camera.position, camera.fov, camera.image_width, camera.image_height
+        if seen != self._seen:
+            self._seen = seen
+            self.controls.tell_angle(camera.fov)
+            self.painter.ask()
+
+    def look(self) -> Look:
+        """What the client wants to see now."""
+        camera, controls = self._client.camera, self.controls
+        return Look(
+            pose_of(camera.wxyz, camera.position),
+            float(camera.fov),
+            (max(1, int(camera.image_width)), max(1, int(camera.image_height))),
+            controls.longest,
+            controls.mode,
+            controls.background,
+            controls.here,
+            controls.box,
+            controls.surrounded or self.path.drawn,
+        )
+
+    def _draw(self, seconds: float, wanted: Wanted) -> bool:
+        """Show the best picture that should take so many seconds; says whether that is the best there is."""
+        look = self.look()
+        self._step_out(tuple(row[3] for row in look.pose))
+        if self._viewer.is_cloud and look.mode == "colour" and not look.here:
+            return self._draw_splats(look, seconds, wanted)
+        if self._splats is not None:
+            self._splats.visible = False
+        size = look.full if seconds == float("inf") else self._pace.size(look.full, seconds)
+        begin = time.perf_counter()
+        rendering, camera = self._render(look, size, wanted)
+        took = time.perf_counter() - begin
+        self._pace.note(size[0] * size[1], took)
+        self._show(rendering, camera, look, QUALITY_MOVING if seconds == MOVING else QUALITY)
+        self._say(f"{size[0]} x {size[1]} in {1000 * took:.0f} ms")
+        return size == look.full
+
+    def _render(self, look: Look, size: tuple[int, int], wanted: Wanted) -> tuple[Rendering, Camera]:
+        """A picture in bands short enough for others to have their turn, and to stop soon if nobody wants it."""
+        camera, height = look.camera(size), size[1]
+        band = self._pace.size((size[0] * height, 1), MOVING)[0] // size[0]  # rows
+        band = height if band >= 0.7 * height else max(8, band)
+        parts = []
+        for first in range(0, height, band):
+            if not wanted():
+                raise NotWantedError
+            with self._viewer.turns.turn(wanted):
+                parts.append(self._viewer.render(rows(camera, first, min(first + band, height)), look.box))
+        return Rendering.cat(parts), camera
+
+    def _show(self, rendering: Rendering, camera: Camera, look: Look, quality: int) -> None:
+        shown = picture(rendering, camera, look.mode, self._viewer.subject.frame.background, look.background)
+        depth = None
+        if look.depth:
+            step = -(-max(look.full) // DEPTH_SIZE) if max(rendering.depth.shape) > DEPTH_SIZE else 1
+            depth = along_axis(rendering, camera).nan_to_num(1e3, 1e3)[step // 2 :: step, step // 2 :: step].numpy()
+            depth = np.round(np.clip(depth, 0, 1e3) / DEPTH_STEP) * DEPTH_STEP
+        self._stream(to_bytes(shown).numpy(), quality, depth)
+        self._flat = None
+
+    def _stream(self, pixels: UInt8[np.ndarray, "height width 3"], quality: int, depth: np.ndarray | None) -> None:
+        if not self._here:
+            raise NotWantedError
+        self._client.scene.set_background_image(pixels, "jpeg", jpeg_quality=quality, depth=depth)
+
+    def _draw_splats(self, look: Look, seconds: float, wanted: Wanted) -> bool:
+        """See to it that the browser has what it needs to draw the cloud itself."""
+        if self._flat != look.background:
+            self._stream(np.full((2, 2, 3), np.round(255 * np.array(look.background)), np.uint8), 95, None)
+            self._flat = look.background
+        if self._splats is not None:
+            self._splats.visible = True
+        now, eye = (self._viewer.stage, look.box), torch.tensor(look.pose)[:, 3]
+        if self._splats is None or (seconds > MOVING and self._sent != now):
+            self._send_splats(look, eye, wanted)
+            self._sent, self._eye = now, eye
+        elif seconds > MOVING and self._turned(eye):
+            self._recolour(look, eye, wanted)
+            self._eye = eye
+        return seconds > MOVING
+
+    def _send_splats(self, look: Look, eye: torch.Tensor, wanted: Wanted) -> None:
+        with self._viewer.turns.turn(wanted):
+            begin = time.perf_counter()
+            cloud = self._viewer.cloud(look.box)
+            made = splats(cloud, eye)
+        if not self._here:
+            raise NotWantedError
+        arrays = made.centres, made.covariances, made.colours, made.opacities
+        if self._splats is None:
+            self._splats = self._client.scene.add_gaussian_splats("/gaussians", *arrays, scale=1 / ENLARGED)
+        else:
+            self._splats.set_gaussians(*arrays)
+        self._say(f"{len(cloud)} Gaussians, prepared in {1000 * (time.perf_counter() - begin):.0f} ms")
+
+    def _recolour(self, look: Look, eye: torch.Tensor, wanted: Wanted) -> None:
+        """Colours towards where the eye rests now."""
+        with self._viewer.turns.turn(wanted):
+            cloud = self._viewer.cloud(look.box)
+            if cloud.degree == 0 or len(cloud) > MOST_RECOLOURED:
+                return
+            rgb = colours(cloud, eye).cpu().numpy()
+        if self._here and len(rgb) == len(self._splats.buffer):
+            self._splats.rgbs = rgb
+
+    def _turned(self, eye: torch.Tensor) -> bool:
+        middle = torch.tensor(self._viewer.subject.frame.bounds).mean(0)
+        return float((eye - self._eye).norm()) > TURNED * max(float((self._eye - middle).norm()), 0.1)
+
+    def _step_out(self, eye: tuple[float, ...]) -> None:
+        """Hide the frustum that the eye is in, from this client alone, by a node of its own in the same place."""
+        name, (hidden, node) = self._viewer.scenery.around(eye), self._inside
+        if name == hidden or not self._here:
+            return
+        if node is not None:
+            node.remove()
+        self._inside = name, name and self._client.scene.add_frame(name, show_axes=False, visible=False)
+
+    def _say(self, text: str) -> None:
+        """In the panel, unless it says so already."""
+        if text != self._said and self._here:
+            self._said = self.controls.status.content = text
+
+    def _tell_fault(self, error: Exception) -> None:
+        text = str(error) if isinstance(error, LumigraphError) else f"{type(error).__name__}: {error}"
+        print(f"lumigraph: a client's picture failed: {' '.join(text.split())}", file=sys.stderr, flush=True)
+        if os.environ.get("LUMIGRAPH_DEBUG"):
+            traceback.print_exception(error)
+        self.tell("This could not be drawn", text)
