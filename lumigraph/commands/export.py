@@ -9,9 +9,14 @@ from tyro.conf import OmitArgPrefixes, OmitSubcommandPrefixes, subcommand
 
 from .exports.points import Points
 from .exports.splats import Splats
+from .exports.web import Web
 
 # One line for each thing that can be written; the files are in exports/.
-What = Annotated[Points, subcommand("points")] | Annotated[Splats, subcommand("splats")]
+What = (
+    Annotated[Points, subcommand("points")]
+    | Annotated[Splats, subcommand("splats")]
+    | Annotated[Web, subcommand("web")]
+)
 
 
 @dataclass(frozen=True)

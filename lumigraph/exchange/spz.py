@@ -42,7 +42,7 @@ ANTIALIASED, EXTENDED = 1, 2  # flags
 MOST_BITS = 16  # behind the binary point; Niantic's metres have 12, ours are units of a scene in [-1, 1]^3
 FARTHEST = 2**23 - 1
 COLOUR = 0.15  # instead of Y_00 = 0.28, so that colours outside [0, 1] have a place
-STEPS = np.repeat(np.array([8, 16], np.float32), [3, 12])[:, None]  # 5 bits for harmonics of degree 1, 4 beyond
+STEPS = 8, 16  # of 1/128, for harmonics of degree 1 and beyond: 5 and 4 bits
 DENSEST, DENSEST_ZSTD = 1032, 1 << 15  # times that deflate, and zstd, can shrink what they are given
 LONGEST_EXTENSIONS = 1 << 20  # bytes
 PIECE = 1 << 24  # bytes
@@ -82,10 +82,15 @@ def _told(path: Path) -> Iterator[None]:
 
 def write(path: Path, gaussians: Gaussians) -> None:
     """Version 3. Raises LumigraphError if the cloud is wider than 24 bits can say."""
-    extent = float(gaussians.means.abs().max()) if len(gaussians) else 0.0
+    write_bytes(path, encode(gaussians, str(path)))
+
+
+def encode(gaussians: Gaussians, name: str = "a .spz file", steps: tuple[int, int] = STEPS) -> bytes:
+    """What `write` writes. steps: of 1/128, to which harmonics of degree 1 and beyond are rounded; 1 is the finest."""
+    extent = float(np.abs(array(gaussians.means)).max()) if len(gaussians) else 0.0
     if extent > FARTHEST:
         raise LumigraphError(
-            f"{path} cannot hold positions beyond {FARTHEST}; scale the cloud down or write it as .ply"
+            f"{name} cannot hold positions beyond {FARTHEST}; scale the cloud down or write it as .ply"
         )
     bits = min(MOST_BITS, math.floor(math.log2(FARTHEST / extent))) if extent > FARTHEST / 2**MOST_BITS else MOST_BITS
     flags = ANTIALIASED if gaussians.antialiased else 0
@@ -97,11 +102,11 @@ def write(path: Path, gaussians: Gaussians) -> None:
         to_byte(255 * (COLOUR * harmonics[:, 0] + 0.5)),
         to_byte(16 * (array(gaussians.log_scales) + 10)),
         _smallest_three(array(gaussians.quaternions) * TURN_ROTATION),
-        _in_buckets(harmonics[:, 1:]),
+        _in_buckets(harmonics[:, 1:], steps),
     ]
     header = HEADER.pack(MAGIC, VERSION, len(gaussians), gaussians.degree, bits, flags, 0)
     content = b"".join([header, *(stream.tobytes() for stream in streams)])
-    write_bytes(path, gzip.compress(content, LEVEL, mtime=0))
+    return gzip.compress(content, LEVEL, mtime=0)
 
 
 def _decode(path: Path, stream: io.BufferedIOBase, limit: int) -> Gaussians:
@@ -212,7 +217,9 @@ def _smallest_three(quaternions: Float[np.ndarray, "gaussian 4"]) -> UInt8[np.nd
     return (largest << 30 | parts.sum(-1)).astype("<u4")[:, None].view(np.uint8)
 
 
-def _in_buckets(harmonics: Float[np.ndarray, "gaussian rest 3"]) -> UInt8[np.ndarray, "gaussian rest 3"]:
+def _in_buckets(
+    harmonics: Float[np.ndarray, "gaussian rest 3"], steps: tuple[int, int]
+) -> UInt8[np.ndarray, "gaussian rest 3"]:
     """128 + 128 h to the nearest multiple of the band's step: fewer different bytes, which gzip packs better."""
-    steps = STEPS[: harmonics.shape[1]]
-    return to_byte(np.rint((harmonics + 1) * (128 / steps)) * steps)
+    size = np.repeat(np.array(steps, np.float32), [3, 12])[: harmonics.shape[1], None]
+    return to_byte(np.rint((harmonics + 1) * (128 / size)) * size)

@@ -1,0 +1,102 @@
+"""`lumigraph export web`: a trained scene as one page to share."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from tyro.conf import Positional, arg
+
+from ...errors import LumigraphError
+from ..common import choose_device, needed, option, show
+
+FACES = 300_000  # of a mesh in a page, at most: about 4 MB
+Kind = Literal["auto", "splats", "mesh", "views"]
+
+
+@dataclass(frozen=True)
+class Web:
+    """One HTML file that opens from disk, in any browser, without a server or a network.
+
+    Gaussians are drawn as splats. Other methods become pictures rendered here from all around, which dragging turns
+    over, or a coloured mesh to move around freely: pictures look better, a mesh shows the scene from everywhere.
+    """
+
+    source: Annotated[Positional[Path], needed("RUN_OR_FILE")]
+    """Folder of a run, or a splat file."""
+    output: Annotated[Positional[Path], needed("FILE.html")]
+    """The page."""
+    kind: Annotated[Kind, arg(name="as", help_behavior_hint="(default: splats for Gaussians, views for the rest)")] = (
+        "auto"
+    )
+    """What the page holds."""
+    title: Annotated[str | None, option("TEXT", "the scene's name")] = None
+    """What the page is called."""
+    background: Annotated[str | None, option("#RRGGBB", "the one that the scene was trained with")] = None
+    """Colour behind splats or the mesh."""
+    views: Annotated[int, option("N")] = 72
+    """Pictures in a page of views."""
+    size: Annotated[int, option("PIXELS")] = 720
+    """Longer side of these pictures."""
+    device: Annotated[str, option("NAME")] = "auto"
+    """auto, cpu, cuda, cuda:1."""
+
+    def run(self) -> int:
+        from ...exchange import is_splat_file
+        from ...export.page import look_at_scene
+        from ...report import scene_title
+        from ...run import Run
+        from ...splat_file import SplatFile
+
+        if self.output.suffix.lower() not in (".html", ".htm"):
+            raise LumigraphError(f"{self.output} should end in .html, as pages do; rename it")
+        if not 2 <= self.views <= 1000:
+            raise LumigraphError(f"A page cannot hold {self.views} views; give --views a number from 2 to 1000")
+        if not 16 <= self.size <= 4096:
+            raise LumigraphError(f"A view cannot be {self.size} pixels large; give --size a number from 16 to 4096")
+        run: Any = SplatFile(self.source) if is_splat_file(self.source) else Run(self.source)
+        title = self.title or (scene_title(run) if isinstance(run, Run) else self.source.name.partition(".")[0])
+        cameras, frame = run.cameras()["train"], run.frame
+        look = look_at_scene(title, cameras, frame, self._background())
+        method = run.method(choose_device(self.device))
+        held = self._write(method, cameras, look)
+        show(
+            {
+                "page": str(self.output),
+                "holds": held,
+                "size": f"{self.output.stat().st_size / 1e6:.1f} MB",
+            }
+        )
+        return 0
+
+    def _write(self, method: Any, cameras: Any, look: Any) -> str:
+        """Write the page, and say what it holds."""
+        from ...export.mesh import extract_mesh
+        from ...export.page import mesh_page, splats_page, views_page
+        from ...method import Method
+
+        kind = self.kind
+        if kind == "auto":
+            kind = "views" if type(method).gaussians is Method.gaussians else "splats"
+        if kind == "splats":
+            gaussians = method.gaussians()
+            splats_page(self.output, gaussians, look)
+            return f"{len(gaussians):,} Gaussians, harmonics of degree {gaussians.degree}"
+        if kind == "views":
+            views_page(self.output, method, cameras, look, self.views, self.size)
+            return f"{self.views} views"
+        mesh = extract_mesh(method, cameras, faces=FACES)
+        mesh_page(self.output, mesh, look)
+        return f"{len(mesh.faces):,} triangles"
+
+    def _background(self) -> tuple[float, float, float] | None:
+        from ...figures import hex_colour
+
+        if self.background is None:
+            return None
+        if not re.fullmatch(r"#[0-9a-fA-F]{6}", self.background):
+            raise LumigraphError(f"{self.background!r} is no colour; give --background one such as '#101114'")
+        red, green, blue = hex_colour(self.background).tolist()
+        return red, green, blue

@@ -1,0 +1,184 @@
+"""A page to share: one HTML file that opens from disk, with the scene and the program that draws it inside.
+
+The programs in web/ are built from the folder `web` of the repository (three.js and Spark for clouds, three.js for
+meshes, neither for pictures). They are compressed into the page, and so is what they show.
+"""
+
+from __future__ import annotations
+
+import base64
+import gzip
+import io
+import json
+import math
+from dataclasses import asdict, dataclass
+from html import escape
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from PIL import Image
+from torch import Tensor
+
+from .. import __version__
+from ..camera import Camera
+from ..display import track
+from ..exchange import spz
+from ..figures import to_bytes
+from ..files import write_bytes
+from ..gaussians import Gaussians
+from ..method import Method
+from ..paths import Surroundings, angle_of_view, camera_path, film_size
+from ..scene import Frame, Vector
+from .mesh import Mesh
+
+WEB = Path(__file__).parent / "web"
+NEAREST, FARTHEST = 0.1, 3.0  # times the first distance to what is looked at: how far zooming goes
+BELOW = 20.0  # degrees below the lowest photograph that the camera may go
+AHEAD = 0.02  # scene units: of what a camera turns about that looks outward from the middle
+FINE = 2, 4  # of 1/128: steps of the harmonics, a quarter of those that .spz files have by custom
+QUALITY = 90  # of the pictures, as WebP
+TURN = "drag to turn", "scroll to zoom", "right-drag to move"
+TOUCH = "drag to turn", "pinch to zoom", "two fingers to move"
+
+
+@dataclass(frozen=True)
+class Look:
+    """How a page begins: lengths in scene units, angles in degrees.
+
+    background: colour behind everything, sRGB in [0, 1]
+    position, target: where the camera stands, and what it looks at and turns about
+    angle:      of view, across the window's smaller side
+    near, far:  distances along the optical axis between which the scene is drawn
+    nearest, farthest: distances from the target that zooming keeps to
+    lowest:     largest angle between up and the direction from the target to the camera
+    inward:     whether the camera goes around the target; otherwise it turns on the spot
+    """
+
+    title: str
+    background: Vector
+    position: tuple[float, ...]
+    target: tuple[float, ...]
+    angle: float
+    near: float
+    far: float
+    nearest: float
+    farthest: float
+    lowest: float
+    inward: bool
+
+
+def look_at_scene(title: str, cameras: Camera, frame: Frame, background: Vector | None = None) -> Look:
+    """From where photographs were typically taken, looking at what they look at.
+
+    cameras:    of the photographs
+    background: instead of the frame's
+    """
+    around = Surroundings(cameras, frame)
+    pose = camera_path("orbit", cameras, frame, 1, (2, 2)).pose[0].double()
+    position, forward = pose[:, 3], pose[:, 2]
+    target = around.focus if around.inward else position + AHEAD * forward
+    distance = float((position - target).norm())
+    elevation = math.degrees(float(around.polar[:, 1].min()))
+    return Look(
+        title,
+        background or frame.background,
+        tuple(position.tolist()),
+        tuple(target.tolist()),
+        math.degrees(angle_of_view(cameras)),
+        frame.near,
+        100 * frame.reach,
+        NEAREST * distance,
+        FARTHEST * distance,
+        min(90 - elevation + BELOW, 175.0) if around.inward else 175.0,
+        around.inward,
+    )
+
+
+def splats_page(path: Path, gaussians: Gaussians, look: Look) -> None:
+    """A cloud in the scene's frame, drawn as splats with its harmonics. The page holds it as .spz, with that loss."""
+    settings = asdict(look) | {"webgl": True, "packed": False, "antialiased": gaussians.antialiased}
+    write_page(path, "splats", settings, spz.encode(gaussians, steps=FINE), TURN, TOUCH)
+
+
+def mesh_page(path: Path, mesh: Mesh, look: Look) -> None:
+    """A mesh in the scene's frame, unlit, for its colours were photographed. Positions are held in 16 bits an axis."""
+    low = mesh.vertices.min(0).astype(np.float64)
+    size = np.maximum(mesh.vertices.max(0) - low, 1e-12)
+    steps = np.rint((mesh.vertices - low) / size * 65535).astype("<u2")
+    data = mesh.faces.astype("<u4").tobytes() + steps.tobytes() + mesh.colours.tobytes()
+    held = {"vertices": len(steps), "faces": len(mesh.faces), "low": low.tolist(), "high": (low + size).tolist()}
+    settings = asdict(look) | {"webgl": True, "packed": True} | held
+    write_page(path, "mesh", settings, gzip.compress(data, 9, mtime=0), TURN, TOUCH)
+
+
+def views_page(path: Path, method: Method, cameras: Camera, look: Look, count: int, longest: int) -> None:
+    """Pictures rendered here, from all around or along the arc that photographs cover; dragging turns them over.
+
+    cameras: of the photographs
+    count:   pictures
+    longest: side of a picture in pixels
+    """
+    method.eval()
+    closed = Surroundings(cameras, method.frame).arc[1] == math.pi
+    seen_from = views(cameras, method.frame, count, longest, closed)
+    pictures, ends = [], [0]
+    for i in track(range(len(seen_from)), f"Rendering {path.name}", len(seen_from)):
+        pictures.append(webp(method.render(seen_from[i]).rgb))
+        ends.append(ends[-1] + len(pictures[-1]))
+    settings = asdict(look) | {
+        "webgl": False,
+        "packed": False,
+        "closed": closed,
+        "first": 0 if closed else len(seen_from) // 2,
+        "pictures": list(zip(ends[:-1], ends[1:], strict=True)),
+        "poses": seen_from.pose.tolist(),
+    }
+    hints = ("drag to turn", "scroll to zoom"), ("drag to turn", "pinch to zoom")
+    write_page(path, "views", settings, b"".join(pictures), *hints)
+
+
+def views(cameras: Camera, frame: Frame, count: int, longest: int, closed: bool) -> Camera:
+    """Once around; or from one end to the other of the arc that an orbit sways along, which is half of its way."""
+    size = film_size(cameras, longest)
+    if closed:
+        return camera_path("orbit", cameras, frame, count, size)
+    there_and_back = camera_path("orbit", cameras, frame, 2 * count, size)
+    return there_and_back[(torch.arange(count) + (3 * count) // 2) % (2 * count)]
+
+
+def webp(rgb: Float[Tensor, "height width 3"]) -> bytes:
+    held = io.BytesIO()
+    Image.fromarray(to_bytes(rgb.cpu()).numpy()).save(held, "WEBP", quality=QUALITY, method=4)
+    return held.getvalue()
+
+
+def write_page(
+    path: Path, program: str, settings: dict[str, Any], data: bytes, mouse: tuple[str, ...], touch: tuple[str, ...]
+) -> None:
+    """Put a program of web/, its settings and its data into the page.
+
+    mouse, touch: how to move, said in the caption
+    """
+    bright = float(np.dot(settings["background"], (0.299, 0.587, 0.114))) > 0.5
+    ink, edge = ("#16181c", "#ffffff") if bright else ("#ffffff", "#000000")
+    red, green, blue = (round(255 * value) for value in settings["background"])
+    source = (WEB / f"{program}.js").read_bytes()
+    parts = {
+        "version": escape(__version__),
+        "title": escape(settings["title"]),
+        "ground": f"rgb({red} {green} {blue})",
+        "ink": ink,
+        "edge": edge,
+        "mouse": " · ".join(mouse).capitalize(),
+        "touch": " · ".join(touch).capitalize(),
+        "settings": json.dumps(settings, allow_nan=False).replace("<", "\\u003c"),
+        "data": base64.b64encode(data).decode(),
+        "program": base64.b64encode(gzip.compress(source, 9, mtime=0)).decode(),
+    }
+    page = (WEB / "page.html").read_text("utf-8")
+    pieces = page.split("@@")  # text, name, text, name, ..., text
+    pieces[1::2] = [parts[name] for name in pieces[1::2]]
+    write_bytes(path, "".join(pieces).encode())

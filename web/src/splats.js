@@ -1,0 +1,53 @@
+// A cloud of Gaussians, drawn by Spark as Lumigraph draws it: blended in sRGB, cut where it adds less than 1/255.
+
+import { SparkRenderer, SplatFileType, SplatMesh } from "@sparkjsdev/spark";
+import { Stage } from "./stage.js";
+
+const FAINTEST = 1 / 255;
+const BLUR = 0.3; // square pixels by which a footprint is widened
+
+export async function start(settings, data) {
+  const stage = new Stage(settings, { antialias: false });
+  const widened = settings.antialiased ? { blurAmount: BLUR, preBlurAmount: 0 } : { blurAmount: 0, preBlurAmount: BLUR };
+  const spark = new SparkRenderer({
+    renderer: stage.renderer,
+    maxStdDev: Math.sqrt(2 * Math.log(1 / FAINTEST)),
+    minAlpha: FAINTEST,
+    maxPixelRadius: 4096,
+    clipXY: 3,
+    sortRadial: false,
+    accumExtSplats: true,
+    enableLod: false,
+    onDirty: () => stage.redraw(),
+    ...widened,
+  });
+  asOurs(spark.material);
+  const mesh = new SplatMesh({ fileBytes: data, fileType: SplatFileType.SPZ, extSplats: true, lod: false });
+  mesh.quaternion.set(1, 0, 0, 0); // .spz has y up and z back: half a turn around x
+  stage.scene.add(spark, mesh);
+  await mesh.initialized;
+  stage.arranged = async () => {
+    await spark.update({ scene: stage.scene, camera: stage.camera });
+    while (spark.sorting || spark.sortDirty) await new Promise((resolve) => setTimeout(resolve, 5));
+  };
+  stage.camera.updateMatrixWorld();
+  await stage.arranged();
+  stage.redraw();
+  return stage;
+}
+
+// Three differences between Spark's shaders and Kerbl's: colours are never taken for linear, no Gaussian hides more than
+// 0.99, and beyond the picture's edge the projection's slope stays that of its margin, 0.15 of the picture.
+function asOurs(material) {
+  const replace = (source, from, to) => {
+    if (!source.includes(from)) throw new Error(`Spark's shader has no ${from}`);
+    return source.replace(from, to);
+  };
+  material.fragmentShader = replace(material.fragmentShader, "if (encodeLinear) {", "rgba.a = min(rgba.a, 0.99); if (false) {");
+  material.vertexShader = replace(
+    material.vertexShader,
+    "vec2 J2 = -(J1 * viewCenter.xy) * invZ;",
+    `vec2 plane = viewCenter.xy * invZ, edge = 1.3 / vec2(projectionMatrix[0][0], projectionMatrix[1][1]);
+    vec2 J2 = -J1 * clamp(plane, -edge, edge);`,
+  );
+}

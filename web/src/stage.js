@@ -1,0 +1,125 @@
+// A canvas, a camera that a person turns around the scene, and a picture drawn only when something has changed.
+
+import { Color, ColorManagement, LinearSRGBColorSpace, MathUtils, Matrix4, PerspectiveCamera, Scene, Spherical, Vector3, WebGLRenderer } from "three";
+import { OrbitControls } from "three/addons/controls/OrbitControls.js";
+
+const DENSEST = 2; // physical pixels to a CSS pixel; more cost much and show little
+const TURN = 0.06; // radians for each press of a key
+const ZOOM = 1.08; // times, likewise
+
+// Colours are what the photographs hold, sRGB-encoded, and are blended as they are.
+ColorManagement.enabled = false;
+
+export class Stage {
+  constructor(settings, { antialias }) {
+    this.settings = settings;
+    this.renderer = new WebGLRenderer({ antialias, alpha: false, powerPreference: "high-performance" });
+    this.renderer.outputColorSpace = LinearSRGBColorSpace; // no second encoding
+    this.renderer.setClearColor(new Color(...settings.background), 1);
+    this.scene = new Scene();
+    this.camera = new PerspectiveCamera(50, 1, settings.near, settings.far);
+    this.camera.up.set(0, 0, 1);
+    this.paint = () => this.renderer.render(this.scene, this.camera);
+    this.arranged = async () => {}; // becomes a wait for what must be put in order before a picture is right
+
+    const canvas = this.renderer.domElement;
+    canvas.tabIndex = 0;
+    canvas.setAttribute("aria-label", settings.title);
+    document.getElementById("stage").append(canvas);
+
+    this.controls = new OrbitControls(this.camera, canvas);
+    Object.assign(this.controls, {
+      enableDamping: true,
+      dampingFactor: 0.08,
+      rotateSpeed: settings.inward ? 0.7 : -0.35, // looking outward, the scene is dragged along
+      minDistance: settings.nearest,
+      maxDistance: settings.farthest,
+      enableZoom: settings.inward,
+      maxPolarAngle: MathUtils.degToRad(settings.lowest),
+      minPolarAngle: MathUtils.degToRad(2),
+    });
+    this.controls.addEventListener("change", () => this.redraw());
+    canvas.addEventListener("keydown", (event) => this.press(event));
+    addEventListener("resize", () => this.resize());
+    this.angle = settings.angle;
+    this.reset();
+    this.resize();
+  }
+
+  // Where the page begins, looking at what the photographs look at.
+  reset() {
+    this.angle = this.settings.angle;
+    this.free = null;
+    this.controls.enabled = true;
+    this.controls.target.fromArray(this.settings.target);
+    this.camera.position.fromArray(this.settings.position);
+    this.lens();
+    this.controls.update();
+    this.redraw();
+  }
+
+  resize() {
+    this.renderer.setPixelRatio(Math.min(devicePixelRatio, DENSEST));
+    this.renderer.setSize(innerWidth, innerHeight);
+    this.lens();
+    this.redraw();
+  }
+
+  // The angle of view holds across the smaller side, so that a phone held upright sees as much as one held across.
+  lens() {
+    const aspect = innerWidth / innerHeight;
+    const across = Math.tan(MathUtils.degToRad(this.angle) / 2);
+    const upright = 2 * MathUtils.radToDeg(Math.atan(across / Math.min(aspect, 1)));
+    Object.assign(this.camera, { aspect, fov: this.free ?? upright });
+    this.camera.updateProjectionMatrix();
+  }
+
+  redraw() {
+    if (this.asked) return;
+    this.asked = requestAnimationFrame(() => {
+      this.asked = null;
+      if (this.controls.enabled) this.controls.update(); // goes on, by way of `change`, until damping has come to rest
+      this.paint();
+    });
+  }
+
+  press(event) {
+    if (event.ctrlKey || event.metaKey || event.altKey) return;
+    const turns = { ArrowLeft: [-TURN, 0], ArrowRight: [TURN, 0], ArrowUp: [0, -TURN], ArrowDown: [0, TURN] };
+    const zooms = { "+": 1 / ZOOM, "=": 1 / ZOOM, "-": ZOOM };
+    if (event.key in turns) this.orbit(...turns[event.key], 1);
+    else if (event.key in zooms) this.orbit(0, 0, zooms[event.key]);
+    else return;
+    event.preventDefault();
+  }
+
+  // Around the target by angles in radians, and away from it by a factor; the controls keep their limits.
+  orbit(azimuth, polar, factor) {
+    this.controls.enabled = true;
+    const turned = new Matrix4().makeRotationX(Math.PI / 2); // Spherical has y upwards
+    const offset = this.camera.position.clone().sub(this.controls.target).applyMatrix4(turned.clone().invert());
+    const place = new Spherical().setFromVector3(offset);
+    place.theta += azimuth;
+    place.phi = Math.min(Math.max(place.phi + polar, 0.01), Math.PI - 0.01);
+    if (this.settings.inward) place.radius *= factor;
+    offset.setFromSpherical(place).applyMatrix4(turned);
+    this.camera.position.copy(this.controls.target).add(offset);
+    this.controls.update();
+    this.redraw();
+  }
+
+  // Exactly this camera, until the page is reset: a 3x4 camera-to-world pose with x right, y down, z forward, and the
+  // vertical angle of view in degrees.
+  async setCamera(pose, fov) {
+    const [x, y, z, position] = [0, 1, 2, 3].map((k) => new Vector3(pose[0][k], pose[1][k], pose[2][k]));
+    this.controls.enabled = false;
+    this.free = fov;
+    this.camera.position.copy(position);
+    this.camera.quaternion.setFromRotationMatrix(new Matrix4().makeBasis(x, y.negate(), z.negate()));
+    this.camera.updateMatrixWorld();
+    this.lens();
+    await this.arranged();
+    this.paint();
+    await new Promise((resolve) => requestAnimationFrame(() => requestAnimationFrame(resolve)));
+  }
+}
