@@ -2,10 +2,35 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
-from jaxtyping import Float, Int, UInt8
+import torch
+from jaxtyping import Bool, Float, Int, UInt8
+from scipy import ndimage
+from torch import Tensor
+
+from ..camera import Camera
+from ..display import track
+from ..errors import LumigraphError
+from ..method import Method
+from .fusion import Fusion
+from .polygons import BLOCK, Grid, zero_level
+from .sightings import FAR, Sighting, colours, look_around, unseen
+from .surface import larger_pieces, simplified, smoothed, vertex_normals
+
+CELLS = 256  # along the longest side of the box of interest, if nobody asks for more
+FEWEST, MOST = 8, 2048  # cells along it that make sense
+PROBES = 160  # looks along it that tell where the surface may be
+SOFTNESS = 2.0  # logarithm of the density over its level at which it is as good as solid, or empty
+TRUNCATION = 5  # cells from the surface that depth pictures are fused over
+ONSET = 0.2  # share of a ray's light that is spent where the surface is said to be
+AT_ONCE = 1 << 18  # points
+
+Way = Literal["auto", "density", "depth"]
 
 
 @dataclass(frozen=True)
@@ -26,3 +51,180 @@ class Mesh:
         vertices = self.vertices @ matrix[:3, :3].T + matrix[:3, 3]
         faces = self.faces if np.linalg.det(matrix[:3, :3]) > 0 else self.faces[:, ::-1].copy()
         return replace(self, vertices=vertices, faces=faces)
+
+
+def extract_mesh(
+    method: Method,
+    cameras: Camera,
+    *,
+    cell: float | None = None,
+    level: float | None = None,
+    way: Way = "auto",
+    smooth: int = 10,
+    faces: int | None = None,
+    keep: float = 0.01,
+    closed: bool | None = None,
+    size: int = 400,
+    views: int = 64,
+) -> Mesh:
+    """The surface inside the box of interest, in the scene's frame.
+
+    cameras: the scene's own; what none of them sees is left out, or filled in
+    cell:    side of the cubes that are marched through, scene units; None for 1/256 of the box's longest side
+    level:   density of the surface, per scene unit; None for that where the cameras see surfaces
+    way:     "density", "depth", or "auto" for density where the method has one
+    smooth:  rounds of smoothing
+    faces:   number of triangles to come down to; None for all
+    keep:    pieces with less than this share of the largest one's area are dropped
+    closed:  whether the surface is closed around what no camera sees, or cut there; None closes objects alone
+    size:    longer side of the cameras' pictures at most, pixels
+    views:   cameras at most
+    Raises LumigraphError where nothing is solid, and for numbers that make no sense.
+    """
+    method.eval()
+    closed = method.frame.reach == 1 if closed is None else closed
+    box = torch.tensor(method.frame.bounds)
+    grid = make_grid(box, cell)
+    sightings = look_around(method, cameras, size, views)
+    if way == "depth" or (way == "auto" and type(method).density is Method.density):
+        value = from_depth(sightings, TRUNCATION * grid.cell, closed)
+    else:
+        value = from_density(method, surface_level(method, sightings, box) if level is None else level)
+    vertices, triangles = find_surface(grid, box, value, sightings, closed)
+    if len(triangles):
+        hidden = unseen(torch.from_numpy(vertices).float(), sightings, 2 * grid.cell).numpy()
+        if not closed:
+            triangles = triangles[~hidden[triangles].all(-1)]
+        vertices, triangles = larger_pieces(vertices, triangles, keep, ~hidden)
+    if not len(triangles):
+        raise LumigraphError(
+            "Nothing inside the box of interest is solid at this density, so there is no surface; train for longer, or "
+            "try a lower --level"
+        )
+    vertices = smoothed(vertices, triangles, smooth)
+    if faces is not None:
+        vertices, triangles = simplified(vertices, triangles, faces)
+    points, normals = (torch.from_numpy(x).float() for x in (vertices, vertex_normals(vertices, triangles)))
+    rgb = colours(points, normals, sightings, 3 * grid.cell)
+    return Mesh(vertices, triangles, (rgb * 255).round().to(torch.uint8).numpy())
+
+
+def make_grid(box: Float[Tensor, "2 3"], cell: float | None) -> Grid:
+    """Cubes over a box and a little around it. Raises LumigraphError for cubes too small or too large."""
+    longest = float((box[1] - box[0]).max())
+    if cell is None:
+        cell = longest / CELLS
+    if not longest / MOST <= cell <= longest / FEWEST:
+        raise LumigraphError(
+            f"Cells of {cell / longest:.3g} times the longest side of the box of interest make no mesh; give "
+            f"--cell-size something from 1/{MOST} to 1/{FEWEST} of it"
+        )
+    low, high = box.tolist()
+    return Grid.around(tuple(low), tuple(high), cell, 1.5)
+
+
+Value = Callable[[Float[Tensor, "point 3"]], Float[Tensor, " point"]]
+
+
+def from_density(method: Method, level: float) -> Value:
+    """Zero where the density is at its level, 1 well inside, -1 well outside.
+
+    Its logarithm, which changes evenly where the density itself grows by orders of magnitude within a cell.
+    """
+
+    def value(points: Float[Tensor, "point 3"]) -> Float[Tensor, " point"]:
+        density = method.density(points.to(method.device)).cpu().float()
+        return ((density.clamp_min(1e-30) / level).log() / SOFTNESS).clamp(-1, 1)
+
+    return value
+
+
+def from_depth(sightings: Sequence[Sighting], truncation: float, closed: bool) -> Value:
+    """Zero at the surface of the fused depth pictures, 1 well inside, -1 well outside.
+
+    closed: whether what is pictured but hidden from all cameras counts as solid, rather than as unknown (NaN)
+    """
+    fusion = Fusion(sightings, truncation)
+
+    def value(points: Float[Tensor, "point 3"]) -> Float[Tensor, " point"]:
+        distance, pictured = fusion(points)
+        return torch.where(distance.isnan() & closed, torch.where(pictured, 1.0, -1.0), distance)
+
+    return value
+
+
+def surface_level(method: Method, sightings: Sequence[Sighting], box: Float[Tensor, "2 3"]) -> float:
+    """The density where rays begin to end, found from the field itself, whatever its units and however sharp it is.
+
+    At the rendered depth half of a ray's light is spent; the median density there is known. But fields begin at the
+    surface and grow behind it, where nothing tells them not to. On a ramp that grows exponentially the optical
+    thickness so far is proportional to the density, so a share q is spent where it is log(1 - q) / log(1 / 2) as large.
+    """
+    points = []
+    for seen in sightings:
+        rays = seen.camera.rays(seen.camera.pixels())
+        good = (seen.opacity > 0.9) & (seen.depth < FAR) & (seen.facing > 0.3)
+        points.append(rays.at(seen.depth.reshape(-1))[good.reshape(-1)])
+    found = torch.cat(points)
+    found = found[((found > box[0]) & (found < box[1])).all(-1)]
+    if not len(found):
+        raise LumigraphError(
+            "No camera sees a surface inside the box of interest, so there is nothing to make a mesh of; train for "
+            "longer, or give the density at which it is solid as --level"
+        )
+    found = found[:: max(1, len(found) // AT_ONCE)]
+    with torch.no_grad():
+        at_depth = float(method.density(found.to(method.device)).median())
+    return at_depth * math.log(1 - ONSET) / math.log(0.5)
+
+
+@torch.no_grad()
+def find_surface(
+    grid: Grid, box: Float[Tensor, "2 3"], value: Value, sightings: Sequence[Sighting], closed: bool
+) -> tuple[Float[np.ndarray, "vertex 3"], Int[np.ndarray, "face 3"]]:
+    """From coarse to fine: probes tell which blocks the surface may pass through, and those are marched through."""
+    step = max(2, math.ceil(max(grid.shape) / PROBES))
+    corners = grid.every(step)
+    probes = grid.points(corners.reshape(-1, 3))
+    batches = probes.split(AT_ONCE)
+    known = torch.cat([value(x) for x in track(batches, "Looking for the surface", len(batches))])
+    probed = known.reshape(corners.shape[:3]).numpy()
+    solid = probed > 0
+    filled = np.zeros_like(solid)
+    if closed:
+        filled = voids(solid, probes, sightings, 2 * step * grid.cell)
+        probed[filled] = 1.0
+    near = ndimage.maximum_filter(np.abs(np.nan_to_num(probed, nan=1.0)) < 1, 3)
+    near |= ndimage.maximum_filter(probed > 0, 3) != ndimage.minimum_filter(probed > 0, 3)
+    shape = tuple(-(-n // BLOCK) for n in grid.shape)
+    active = np.zeros(shape, bool)
+    active[tuple((np.argwhere(near) * step // BLOCK).clip(max=np.array(shape) - 1).T)] = True
+    middle = ((np.stack(np.indices(shape), -1) + 0.5) * BLOCK / step).astype(int).clip(max=np.array(probed.shape) - 1)
+    elsewhere = np.where(probed[tuple(np.moveaxis(middle, -1, 0))] > 0, 1.0, -1.0)
+    patched = torch.from_numpy(ndimage.binary_dilation(filled) & ~solid | filled)
+    beyond = -1.0 if closed else torch.nan
+
+    def inside(points: Float[Tensor, "point 3"]) -> Float[Tensor, " point"]:
+        found = value(points)
+        if closed:
+            nearest = ((points - torch.tensor(grid.low)) / (step * grid.cell)).round().long()
+            found[patched[tuple(nearest.clamp_min(0).minimum(torch.tensor(probed.shape) - 1).T)]] = 1.0
+        found[((points < box[0]) | (points > box[1])).any(-1)] = beyond
+        return found
+
+    return zero_level(grid, inside, active, elsewhere)
+
+
+def voids(
+    solid: Bool[np.ndarray, "i j k"], points: Float[Tensor, "probe 3"], sightings: Sequence[Sighting], margin: float
+) -> Bool[np.ndarray, "i j k"]:
+    """Empty places that no camera sees into and that are shut in by what is solid or seen: the insides of things.
+
+    What is not seen but reaches the edge of the grid lies below or behind things, and stays empty.
+    """
+    hidden = np.zeros(solid.size, bool)
+    empty = np.flatnonzero(~solid.ravel())
+    hidden[empty] = unseen(points[torch.from_numpy(empty)], sightings, margin).numpy()
+    label, _ = ndimage.label(hidden.reshape(solid.shape))
+    faces = [np.take(label, (0, -1), axis).ravel() for axis in range(3)]
+    return (label > 0) & ~np.isin(label, np.concatenate(faces))

@@ -128,13 +128,15 @@ def with_neighbours(
     return cube
 
 
-STRIDES = np.array([1 << 44, 1 << 24, 1 << 4], np.int64)  # of a key: 20 bits for each axis, 4 for the kind of edge
+STRIDES = np.array(
+    [1 << 44, 1 << 24, 1 << 4], np.int64
+)  # of a key: 20 bits for each axis, 4 for its direction (3: in a cube's middle)
 
 
 def edges(
     vertices: Float[np.ndarray, "vertex 3"], known: Bool[np.ndarray, "side side side"]
 ) -> tuple[Int[np.ndarray, " vertex"], Bool[np.ndarray, " vertex"]]:
-    """A number for the grid's edge that each vertex lies on (3 in the middle of a cube), and whether its ends are known.
+    """A number for the grid's edge that each vertex lies on, and whether the function is known at its ends.
 
     Neighbouring blocks find the same vertex to the last bits but one; its edge is the same to the last.
     """

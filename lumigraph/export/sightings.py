@@ -135,9 +135,7 @@ def compare(sighting: Sighting, points: Float[Tensor, "point 3"], jump: float) -
     return Compared(torch.where(inside, ahead, torch.nan), smooth, pixels, away)
 
 
-def unseen(
-    points: Float[Tensor, "point 3"], sightings: Sequence[Sighting], margin: float
-) -> Bool[Tensor, " point"]:
+def unseen(points: Float[Tensor, "point 3"], sightings: Sequence[Sighting], margin: float) -> Bool[Tensor, " point"]:
     """Whether points lie hidden from every camera, or outside all pictures.
 
     margin: how far behind a surface a point still counts as seen, scene units

@@ -1,0 +1,43 @@
+"""Fusion of depth pictures into one signed distance (Curless and Levoy 1996)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from .sightings import Sighting, compare, look_up
+
+FREE = 0.3  # weight, beside the cosine of a surface, of a pixel that shows none: it says that there is nothing
+
+
+@dataclass(frozen=True)
+class Fusion:
+    """The weighted mean of what cameras say of the distance to the surface along their rays (eq. 1 and 2).
+
+    truncation: distance from the surface at which it no longer matters, scene units; hidden points deeper than that
+                are left to others
+    A camera counts with the cosine at which it sees the surface, over the area of its pixel there (section 4).
+    """
+
+    sightings: Sequence[Sighting]
+    truncation: float
+
+    def __call__(self, points: Float[Tensor, "point 3"]) -> tuple[Float[Tensor, " point"], Bool[Tensor, " point"]]:
+        """Signed distance over the truncation, in [-1, 1], positive inside, NaN where no camera sees; and whether any
+        picture holds the point at all."""
+        total, weight = torch.zeros(len(points)), torch.zeros(len(points))
+        pictured = torch.zeros(len(points), dtype=torch.bool)
+        for sighting in self.sightings:
+            seen = compare(sighting, points, self.truncation)
+            pictured |= ~seen.ahead.isnan()
+            # At an edge only what lies in front of both sides is known.
+            known = seen.ahead > torch.where(seen.smooth, -self.truncation, self.truncation)
+            share = look_up(sighting.facing, seen.pixels).clamp_min(FREE) / seen.away.square()
+            share = torch.where(known, share, 0.0)
+            total += share * (seen.ahead / self.truncation).nan_to_num().clamp(-1, 1)
+            weight += share
+        return torch.where(weight > 0, -total / weight, torch.nan), pictured
