@@ -95,12 +95,14 @@ class Camera:
         return replace(self, size=size, lens=self.lens.resized((size.double() / self.size).to(self.pose.dtype)))
 
     def transformed(self, similarity: Float[Tensor, "4 4"]) -> Camera:
-        """The cameras in another frame, x' = M x: positions scale, rotations stay rotations."""
+        """The cameras in another frame, x' = M x: positions and eyes' distances scale, rotations stay rotations."""
         similarity = similarity.to(self.pose)
         scale = torch.linalg.det(similarity[:3, :3]) ** (1 / 3)
         rotation = similarity[:3, :3] / scale @ self.pose[:, :, :3]
         position = self.position @ similarity[:3, :3].mT + similarity[:3, 3]
-        return replace(self, pose=torch.cat([rotation, position[:, :, None]], -1))
+        return replace(
+            self, pose=torch.cat([rotation, position[:, :, None]], -1), lens=self.lens.enlarged(float(scale))
+        )
 
     @staticmethod
     def cat(cameras: Sequence[Camera]) -> Camera:

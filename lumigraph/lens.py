@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from typing import Any, ClassVar
 
@@ -75,6 +75,10 @@ class Lens(ABC):
     def resized(self, scale: Float[Tensor, "#camera 2"]) -> Lens:
         """The same lens behind a picture with (x, y) scaled pixels."""
         return type(self)(**{k: v * scale if k in self.in_pixels else v for k, v in self._numbers().items()})
+
+    def enlarged(self, scale: float) -> Lens:
+        """The same lens in a world so many times as large."""
+        return self
 
     def __len__(self) -> int:
         return len(next(iter(self._numbers().values())))
@@ -272,30 +276,68 @@ class Fisheye(Lens):
 
 @dataclass(frozen=True)
 class Equirectangular(Lens):
-    """The whole sphere on one picture: longitude across, latitude down. The middle looks along +z, the top along -y.
+    """The whole sphere on one picture: longitude across, latitude down. The top looks along -y.
 
-    size: (width, height) of the picture in pixels, spanning 360 by 180 degrees
+    size:   (width, height) in pixels of 360 by 180 degrees
+    centre: the pixel that looks along +z; half the size where nothing is said. Another one shows a part of the sphere
     """
 
-    in_pixels: ClassVar[tuple[str, ...]] = ("size",)
+    in_pixels: ClassVar[tuple[str, ...]] = ("size", "centre")
     size: Float[Tensor, "camera 2"]
+    centre: Float[Tensor, "camera 2"] = None  # type: ignore[assignment]
+
+    def __post_init__(self) -> None:
+        if self.centre is None:
+            object.__setattr__(self, "centre", self.size / 2)  # type: ignore[unreachable]
 
     def unproject(self, pixels, index=None):
-        share = pixels / rows(self.size, index) - 0.5
+        share = (pixels - rows(self.centre, index)) / rows(self.size, index)
         longitude, latitude = 2 * math.pi * share[:, 0], math.pi * share[:, 1]
         level = latitude.cos()
         return torch.stack([level * longitude.sin(), latitude.sin(), level * longitude.cos()], -1)
 
     def project(self, points, index=None):
         x, y, z = points.unbind(-1)
-        longitude = torch.atan2(x, z) / (2 * math.pi)
-        latitude = torch.atan2(y, torch.hypot(x, z)) / math.pi
-        pixels = (torch.stack([longitude, latitude], -1) + 0.5) * rows(self.size, index)
+        pixels = self._at(torch.atan2(x, z), torch.atan2(y, torch.hypot(x, z)), index)
         return pixels, (points != 0).any(-1)
 
     def solid_angle(self, pixels, directions, index=None):
         level = (1 - directions[:, 1] ** 2).clamp_min(1e-12).sqrt()
         return 2 * math.pi**2 * level / area(self.size, index)
+
+    def _at(self, longitude: Tensor, latitude: Tensor, index: Tensor | None) -> Tensor:
+        """The pixel of each longitude and latitude, radians."""
+        share = torch.stack([longitude / (2 * math.pi), latitude / math.pi], -1)
+        return share * rows(self.size, index) + rows(self.centre, index)
+
+
+@dataclass(frozen=True)
+class OmnidirectionalStereo(Equirectangular):
+    """One eye's panorama whose rays leave a level circle, the viewing circle, along its tangents (Peleg 2001).
+
+    Whichever way one turns, the eyes are beside each other: a ray of longitude a begins at s (cos a, 0, -sin a). A
+    point at a distance R from the vertical axis appears turned by asin(s / R) against where the circle's centre sees it.
+
+    offset: s in scene units, from the middle between the eyes to this one, positive to the right
+    """
+
+    offset: Float[Tensor, "camera 1"] = field(kw_only=True)
+
+    def enlarged(self, scale):
+        return replace(self, offset=self.offset * scale)
+
+    def origins(self, pixels, index=None):
+        longitude = 2 * math.pi * ((pixels - rows(self.centre, index)) / rows(self.size, index))[:, 0]
+        right = torch.stack([longitude.cos(), torch.zeros_like(longitude), -longitude.sin()], -1)
+        return rows(self.offset, index) * right
+
+    def project(self, points, index=None):
+        x, y, z = points.unbind(-1)
+        (offset,) = columns(self.offset, index)
+        beyond = x * x + z * z - offset * offset
+        away = beyond.clamp_min(0).sqrt()  # level distance along the ray
+        longitude = torch.atan2(x * away - z * offset, z * away + x * offset)
+        return self._at(longitude, torch.atan2(y, away), index), (beyond > 0) | ((offset == 0) & (y != 0))
 
 
 @dataclass(frozen=True)
@@ -322,8 +364,21 @@ class Mixed(Lens):
         pixels, valid = self._by_part(lambda lens, row, points: lens.project(points, row), index, points)
         return pixels, valid
 
+    def origins(self, pixels, index=None):
+        if all(lens.origins(pixels[:0]) is None for lens in self.parts):
+            return None
+
+        def ask(lens: Lens, row: Tensor, pixels: Tensor) -> tuple[Tensor]:
+            begin = lens.origins(pixels, row)
+            return (pixels.new_zeros(len(pixels), 3) if begin is None else begin,)
+
+        return self._by_part(ask, index, pixels)[0]
+
     def solid_angle(self, pixels, directions, index=None):
         return self._by_part(lambda lens, row, *x: (lens.solid_angle(*x, row),), index, pixels, directions)[0]
+
+    def enlarged(self, scale):
+        return Mixed(tuple(lens.enlarged(scale) for lens in self.parts), self.part)
 
     def resized(self, scale):
         scale = scale.expand(len(self), 2)

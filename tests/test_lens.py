@@ -9,7 +9,8 @@ import pycolmap
 import pytest
 import torch
 
-from lumigraph.lens import Equirectangular, Fisheye, Lens, Mixed, OpenCV, Pinhole, stretch
+from lumigraph.camera import Camera
+from lumigraph.lens import Equirectangular, Fisheye, Lens, Mixed, OmnidirectionalStereo, OpenCV, Pinhole, stretch
 
 CAMERAS, RAYS = 64, 4096
 FOX = [0.0578421, -0.0805099, -0.000980296, 0.00015575, 0.0, 0.0, 0.0, 0.0]  # a telephone's, OpenCV's order
@@ -39,11 +40,16 @@ def random_lens(kind: str, generator: torch.Generator) -> tuple[Lens, torch.Tens
         coefficients = uniform(generator, -1, 1, CAMERAS, 4) * torch.tensor([0.02, 0.002, 5e-4, 5e-5])
         corner = (size.norm(dim=-1) / 2 + 40) / stretch(torch.tensor(math.radians(110)), coefficients.unbind(-1))[0]
         return Fisheye(corner[:, None].repeat(1, 2), centre, coefficients), size
-    assert kind == "equirectangular"
-    return Equirectangular(size), size
+    if kind == "equirectangular":
+        return Equirectangular(size), size
+    if kind == "part of a sphere":
+        return Equirectangular(size * 1.5, size * uniform(generator, 0.3, 0.7, CAMERAS, 2)), size
+    assert kind == "stereo"
+    return OmnidirectionalStereo(size, offset=uniform(generator, -0.04, 0.04, CAMERAS, 1)), size
 
 
-KINDS = ["pinhole", "opencv", "fox", "fisheye", "wide fisheye", "equirectangular"]
+SPHERES = ["equirectangular", "part of a sphere", "stereo"]
+KINDS = ["pinhole", "opencv", "fox", "fisheye", "wide fisheye", *SPHERES]
 
 
 def random_pixels(size, generator):
@@ -58,10 +64,12 @@ def test_project_inverts_unproject(kind, generator):
     pixels, index = random_pixels(size, generator)
     directions = lens.unproject(pixels, index)
     torch.testing.assert_close(directions.norm(dim=-1), torch.ones(RAYS), rtol=0, atol=1e-6)
-    found, valid = lens.project(directions * uniform(generator, 0.1, 100, RAYS, 1), index)
-    assert valid.all()
+    points = directions * uniform(generator, 0.1, 100, RAYS, 1)
+    begin = lens.origins(pixels, index)
+    found, valid = lens.project(points if begin is None else points + begin, index)
+    assert valid.all() and (begin is None) == (kind != "stereo")
     off = found - pixels
-    if kind == "equirectangular":  # columns meet at the poles: count pixels of the equator
+    if kind in SPHERES:  # columns meet at the poles: count pixels of the equator
         off[:, 0] *= directions[:, [0, 2]].norm(dim=-1)
     assert off.abs().max() < 1e-3
 
@@ -76,6 +84,7 @@ def test_one_camera_needs_no_index(kind, generator):
         lens.project(lens.unproject(pixels)), lens.project(lens.unproject(pixels), index), strict=True
     ):
         assert torch.equal(short, long)
+    assert lens.origins(pixels) is None or torch.equal(lens.origins(pixels), lens.origins(pixels, index))
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -162,6 +171,50 @@ def test_equirectangular_conventions():
     torch.testing.assert_close(lens.project(expected)[0], pixels, atol=1e-3, rtol=0)
 
 
+def eyes(half: float = 0.032, width: float = 4000.0) -> tuple[OmnidirectionalStereo, OmnidirectionalStereo]:
+    size = torch.tensor([[width, width / 2]])
+    return tuple(OmnidirectionalStereo(size, offset=torch.tensor([[side * half]])) for side in (-1, 1))
+
+
+def test_stereo_rays_are_tangents_of_the_viewing_circle(generator):
+    left, right = eyes()
+    pixels = uniform(generator, 0, 1, 500, 2) * torch.tensor([4000.0, 2000.0])
+    directions = left.unproject(pixels)
+    assert torch.equal(directions, right.unproject(pixels))
+    apart = right.origins(pixels) - left.origins(pixels)
+    torch.testing.assert_close(apart.norm(dim=-1), torch.full((500,), 0.064))
+    assert (apart * directions).sum(-1).abs().max() < 1e-6 and (apart[:, 1] == 0).all()  # level, across the gaze
+    ahead = torch.tensor([[2000.0, 1000.0], [3000.0, 1000.0]])  # forwards, to the right
+    torch.testing.assert_close(right.origins(ahead), torch.tensor([[0.032, 0, 0], [0, 0, -0.032]]), atol=1e-6, rtol=0)
+
+
+def test_stereo_disparity_is_the_known_formula(generator):
+    """sin(theta) = r / R to either side, the same row: Peleg 2001, section 3."""
+    left, right = eyes()
+    longitude, distance = uniform(generator, -3, 3, 200), uniform(generator, 0.1, 50, 200)
+    height = uniform(generator, -3, 3, 200)
+    points = torch.stack([distance * longitude.sin(), height, distance * longitude.cos()], -1)
+    (in_left, seen), (in_right, _) = left.project(points), right.project(points)
+    apart = in_left - in_right
+    expected = 2 * torch.asin(0.032 / distance) * 4000 / (2 * math.pi)
+    off = torch.remainder(apart[:, 0] - expected + 2000, 4000) - 2000
+    assert seen.all() and off.abs().max() < 0.01 and apart[:, 1].abs().max() < 1e-3
+    _, seen = left.project(torch.tensor([[0.01, 0.5, 0.02], [0.0, 0.0, 0.0]]))  # within the circle
+    assert not seen.any()
+
+
+def test_stereo_follows_its_world(generator):
+    """In a world three times as large the same camera, its eyes further apart, sees the same pixels."""
+    matrix = torch.diag(torch.tensor([3.0, 3.0, 3.0, 1.0]))
+    lens = Lens.cat([eyes()[0], Pinhole(torch.ones(1, 2), torch.zeros(1, 2))])
+    camera = Camera(torch.eye(3, 4).expand(2, 3, 4), lens, torch.tensor([[4000, 2000], [1, 1]]))
+    points = torch.randn(100, 3, generator=generator)
+    torch.testing.assert_close(camera.transformed(matrix).project(3 * points)[0], camera.project(points)[0])
+    index = torch.tensor([0, 1, 0])
+    begin = camera.rays(torch.tensor([[2000.0, 1000.0]] * 3), index).origins
+    torch.testing.assert_close(begin, torch.tensor([[-0.032, 0, 0], [0, 0, 0], [-0.032, 0, 0]]), atol=1e-7, rtol=0)
+
+
 @pytest.mark.parametrize("k1", [-0.1, -0.3, -0.6])
 def test_a_distortion_that_folds_over(k1):
     """With r (1 + k1 r^2), points beyond r = 1 / sqrt(-3 k1) come back towards the centre: not seen, not looked for."""
@@ -207,6 +260,8 @@ def test_json_keeps_every_bit(kind, generator):
     again = Lens.from_json(json.loads(json.dumps(lens.to_json())))
     assert type(again) is type(lens)
     assert torch.equal(again.unproject(pixels, index), lens.unproject(pixels, index))
+    if kind == "stereo":
+        assert torch.equal(again.origins(pixels, index), lens.origins(pixels, index))
 
 
 def test_no_rays_at_all(generator):
