@@ -7,13 +7,15 @@ from typing import Annotated
 
 from tyro.conf import OmitArgPrefixes, OmitSubcommandPrefixes, subcommand
 
+from .exports.mesh import Mesh
 from .exports.points import Points
 from .exports.splats import Splats
 from .exports.web import Web
 
 # One line for each thing that can be written; the files are in exports/.
 What = (
-    Annotated[Points, subcommand("points")]
+    Annotated[Mesh, subcommand("mesh")]
+    | Annotated[Points, subcommand("points")]
     | Annotated[Splats, subcommand("splats")]
     | Annotated[Web, subcommand("web")]
 )

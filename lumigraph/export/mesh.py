@@ -17,6 +17,7 @@ from ..camera import Camera
 from ..display import track
 from ..errors import LumigraphError
 from ..method import Method
+from ..scene import Frame
 from .fusion import Fusion
 from .polygons import BLOCK, Grid, zero_level
 from .sightings import FAR, Sighting, colours, look_around, unseen
@@ -51,6 +52,15 @@ class Mesh:
         vertices = self.vertices @ matrix[:3, :3].T + matrix[:3, 3]
         faces = self.faces if np.linalg.det(matrix[:3, :3]) > 0 else self.faces[:, ::-1].copy()
         return replace(self, vertices=vertices, faces=faces)
+
+    def in_source(self, frame: Frame) -> Mesh:
+        """From the scene's frame to that of the capture."""
+        return self.transformed(np.array(frame.source_from_scene))
+
+
+def scale_to_source(frame: Frame) -> float:
+    """Units of the capture's frame to one of the scene's."""
+    return float(abs(np.linalg.det(np.array(frame.source_from_scene)[:3, :3])) ** (1 / 3))
 
 
 def extract_mesh(

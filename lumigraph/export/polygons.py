@@ -130,7 +130,7 @@ def with_neighbours(
 
 STRIDES = np.array(
     [1 << 44, 1 << 24, 1 << 4], np.int64
-)  # of a key: 20 bits for each axis, 4 for its direction (3: in a cube's middle)
+)  # of a key: 20 bits an axis, 4 for the direction, 3 in a cube's middle
 
 
 def edges(

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import torch
@@ -15,8 +16,10 @@ from ..camera import Camera
 from ..display import track
 from ..errors import LumigraphError
 from ..method import Method
+from ..paths import look_at
 
 SOLID = 0.5  # opacity from which on a pixel shows a surface
+ELEVATIONS = (0.0, 30.0, 60.0)  # degrees, of cameras around what has none of its own
 FAR = 1e6  # scene units: the depth of pixels that show none
 
 
@@ -72,6 +75,19 @@ def look_around(method: Method, cameras: Camera, size: int = 400, most: int = 64
             "No camera sees anything solid here, so there is no surface to export; train for longer and try again"
         )
     return sightings
+
+
+def all_around(ring: Camera) -> Camera:
+    """Cameras over a whole dome, at the distances and azimuths of a ring around the origin."""
+    parts = []
+    for degrees in ELEVATIONS:
+        angle = torch.full((len(ring),), math.radians(degrees))
+        flat = torch.nn.functional.normalize(ring.position[:, :2], dim=-1)
+        outward = torch.cat([angle.cos()[:, None] * flat, angle.sin()[:, None]], -1)
+        position = ring.position.norm(dim=-1, keepdim=True) * outward
+        pose = look_at(position, -outward, torch.tensor([0.0, 0.0, 1.0]))
+        parts.append(replace(ring, pose=pose))
+    return Camera.cat(parts)
 
 
 def sighted(method: Method, camera: Camera) -> Sighting:

@@ -4,21 +4,73 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 from tyro.conf import Positional
 
-from ..common import needed
+from ...errors import LumigraphError
+from ..common import choose_device, needed, option, show
 
 
 @dataclass(frozen=True)
 class Points:
-    """A cloud of coloured points."""
+    """A cloud of coloured points with normals, spread evenly over the surfaces that the photographs show.
+
+    They lie in the frame of the photographs. Floaters are left out: several cameras must see each point.
+    """
 
     source: Annotated[Positional[Path], needed("RUN_OR_FILE")]
     """Folder of a run, or a splat file."""
     output: Annotated[Positional[Path], needed("FILE.ply")]
     """The new file."""
+    count: Annotated[int, option("N")] = 200_000
+    """Points at most."""
+    size: Annotated[int, option("PIXELS")] = 400
+    """Longer side of the pictures that the points come from; at most that of the photographs."""
+    views: Annotated[int, option("N")] = 64
+    """Number of these pictures at most."""
+    device: Annotated[str, option("NAME")] = "auto"
+    """auto, cpu, cuda, cuda:1."""
 
     def run(self) -> int:
-        raise NotImplementedError
+        if self.output.suffix.lower() != ".ply":
+            raise LumigraphError(f"{self.output} should end in .ply, the one kind of point cloud there is; rename it")
+        if self.count < 1:
+            raise LumigraphError(f"A cloud cannot have {self.count} points; give --count a number above 0")
+        check_pictures(self.size, self.views)
+        from ...export.points import extract_points, write_points
+
+        run, cameras = opened(self.source)
+        method = run.method(choose_device(self.device))
+        points = extract_points(method, cameras, self.count, self.size, self.views).in_source(run.frame)
+        write_points(self.output, points)
+        show(
+            {
+                "file": str(self.output),
+                "points": f"{len(points.positions):,}",
+                "size": f"{self.output.stat().st_size / 1e6:.1f} MB",
+            }
+        )
+        return 0
+
+
+def opened(source: Path) -> tuple[Any, Any]:
+    """A run or a splat file, and the cameras that its surfaces are looked at with."""
+    from ...exchange import is_splat_file
+    from ...export.sightings import all_around
+    from ...run import Run
+    from ...splat_file import SplatFile
+
+    if is_splat_file(source):
+        file = SplatFile(source)
+        return file, all_around(file.cameras()["train"])
+    run = Run(source)
+    return run, run.cameras()["train"]
+
+
+def check_pictures(size: int, views: int) -> None:
+    """Refuse pictures that cannot be, before anything is opened."""
+    if not 16 <= size <= 8192:
+        raise LumigraphError(f"Pictures cannot be {size} pixels large; give --size a number from 16 to 8192")
+    if views < 1:
+        raise LumigraphError(f"{views} views show nothing; give --views a number above 0")

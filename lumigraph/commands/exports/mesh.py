@@ -1,0 +1,97 @@
+"""`lumigraph export mesh`: the surfaces of a trained scene, for modellers, printers and game engines."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+from tyro.conf import Positional, arg
+
+from ...errors import LumigraphError
+from ..common import choose_device, needed, option, show
+from .points import check_pictures, opened
+
+
+@dataclass(frozen=True)
+class Mesh:
+    """Triangles with colours at their corners, in the frame of the photographs.
+
+    The ending says which format: .ply, .obj or .glb. Marching cubes on the density of methods that have one, fusion of
+    the depth that others render. Only the box of interest is meshed, and what no camera sees is closed up (objects) or
+    left out (rooms and the open).
+    """
+
+    source: Annotated[Positional[Path], needed("RUN_OR_FILE")]
+    """Folder of a run, or a splat file."""
+    output: Annotated[Positional[Path], needed("FILE")]
+    """The new file."""
+    cell_size: Annotated[float | None, option("LENGTH", "1/256 of the box of interest")] = None
+    """Side of the cubes marched through, in the units of the photographs' frame: details are twice as large."""
+    way: Annotated[
+        Literal["auto", "density", "depth"],
+        arg(name="from", help_behavior_hint="(default: density where the method has one)"),
+    ] = "auto"
+    """What the surface is found in."""
+    level: Annotated[float | None, option("DENSITY", "where rays begin to end")] = None
+    """Density of the surface, per unit of the scene's own frame."""
+    smooth: Annotated[int, option("N")] = 10
+    """Rounds of smoothing; 0 for none."""
+    faces: Annotated[int | None, option("N", "as many as there are")] = None
+    """Triangles to come down to."""
+    keep: Annotated[float, option("SHARE")] = 0.01
+    """Pieces smaller than this share of the largest one are dropped."""
+    unseen: Annotated[Literal["close", "cut"] | None, option("{close,cut}", "close objects, cut the rest")] = None
+    """What becomes of the surface where no camera looks."""
+    size: Annotated[int, option("PIXELS")] = 400
+    """Longer side of the pictures that tell colours, and depth where it is fused; at most that of the photographs."""
+    views: Annotated[int, option("N")] = 64
+    """Number of these pictures at most."""
+    device: Annotated[str, option("NAME")] = "auto"
+    """auto, cpu, cuda, cuda:1."""
+
+    def run(self) -> int:
+        self._check()
+        from ...export.mesh import extract_mesh, scale_to_source
+        from ...export.mesh_file import ending, write_mesh
+
+        ending(self.output)
+        run, cameras = opened(self.source)
+        mesh = extract_mesh(
+            run.method(choose_device(self.device)),
+            cameras,
+            cell=None if self.cell_size is None else self.cell_size / scale_to_source(run.frame),
+            level=self.level,
+            way=self.way,
+            smooth=self.smooth,
+            faces=self.faces,
+            keep=self.keep,
+            closed=None if self.unseen is None else self.unseen == "close",
+            size=self.size,
+            views=self.views,
+        ).in_source(run.frame)
+        write_mesh(self.output, mesh)
+        low, high = mesh.vertices.min(0), mesh.vertices.max(0)
+        show(
+            {
+                "file": str(self.output),
+                "triangles": f"{len(mesh.faces):,}, {len(mesh.vertices):,} vertices",
+                "extent": " x ".join(f"{x:.4g}" for x in high - low) + " in the frame of the photographs",
+                "size": f"{self.output.stat().st_size / 1e6:.1f} MB",
+            }
+        )
+        return 0
+
+    def _check(self) -> None:
+        """Raises LumigraphError for numbers that make no sense, before anything is opened."""
+        if self.cell_size is not None and not self.cell_size > 0:
+            raise LumigraphError(f"Cells cannot be {self.cell_size:g} large; give --cell-size a length above 0")
+        if self.level is not None and not self.level > 0:
+            raise LumigraphError(f"A density of {self.level:g} is nowhere a surface; give --level a number above 0")
+        if not 0 <= self.smooth <= 1000:
+            raise LumigraphError(f"Nothing can be smoothed {self.smooth} times; give --smooth something from 0 to 1000")
+        if self.faces is not None and self.faces < 4:
+            raise LumigraphError(f"No mesh has {self.faces} triangles; give --faces a number from 4 on")
+        if not 0 <= self.keep <= 1:
+            raise LumigraphError(f"{self.keep:g} is no share; give --keep a number from 0 to 1")
+        check_pictures(self.size, self.views)

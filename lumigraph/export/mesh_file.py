@@ -1,0 +1,105 @@
+"""Meshes as files: PLY, OBJ and GLB, each with its colours where most programs look for them."""
+
+from __future__ import annotations
+
+import json
+import struct
+from pathlib import Path
+
+import numpy as np
+import trimesh
+from jaxtyping import Float
+
+from ..errors import LumigraphError
+from ..files import write_bytes
+from .mesh import Mesh
+from .surface import vertex_normals
+
+FLOAT, UNSIGNED_INT = 5126, 5125  # glTF 2.0, 3.6.2.2
+VERTICES, INDICES = 34962, 34963  # glTF 2.0, 5.11.5
+
+
+def write_mesh(path: Path, mesh: Mesh) -> None:
+    """Write in the format that the ending names, whole or not at all, in the frame that the mesh is in.
+
+    .ply: binary, float32, sRGB-encoded bytes at each vertex
+    .obj: sRGB-encoded colours from 0 to 1 after each vertex, as MeshLab, Blender and others read them
+    .glb: linear colours, float32, and an unlit material, for the light is in the colours already
+    Raises LumigraphError for any other ending.
+    """
+    write_bytes(path, ENCODERS[ending(path)](mesh))
+
+
+def ending(path: Path) -> str:
+    """Of a file of a mesh. Raises LumigraphError for one that is none."""
+    if path.suffix.lower() not in ENCODERS:
+        raise LumigraphError(f"{path} does not end like a mesh; name one that ends in {', '.join(ENCODERS)}")
+    return path.suffix.lower()
+
+
+def ply(mesh: Mesh) -> bytes:
+    return bytes(as_trimesh(mesh).export(file_type="ply", vertex_normal=True))
+
+
+def obj(mesh: Mesh) -> bytes:
+    text = as_trimesh(mesh).export(file_type="obj", include_normals=True, digits=7, header="written by Lumigraph")
+    return str(text).encode()
+
+
+def glb(mesh: Mesh) -> bytes:
+    """A binary glTF 2.0 of one mesh."""
+    positions = mesh.vertices.astype("<f4")
+    parts = [
+        (positions, FLOAT, "VEC3", VERTICES),
+        (vertex_normals(mesh.vertices, mesh.faces).astype("<f4"), FLOAT, "VEC3", VERTICES),
+        (linear(mesh.colours / 255).astype("<f4"), FLOAT, "VEC3", VERTICES),
+        (mesh.faces.astype("<u4").reshape(-1), UNSIGNED_INT, "SCALAR", INDICES),
+    ]
+    starts = np.cumsum([0, *(data.nbytes for data, *_ in parts)]).tolist()
+    views = [
+        {"buffer": 0, "byteOffset": start, "byteLength": data.nbytes, "target": target}
+        for (data, _, _, target), start in zip(parts, starts, strict=False)
+    ]
+    accessors = [
+        {"bufferView": i, "componentType": kind, "type": shape, "count": len(data)}
+        for i, (data, kind, shape, _) in enumerate(parts)
+    ]
+    accessors[0] |= {"min": positions.min(0).tolist(), "max": positions.max(0).tolist()}
+    about = {
+        "asset": {"version": "2.0", "generator": "Lumigraph"},
+        "extensionsUsed": ["KHR_materials_unlit"],
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"mesh": 0, "name": "mesh"}],
+        "meshes": [
+            {"primitives": [{"attributes": {"POSITION": 0, "NORMAL": 1, "COLOR_0": 2}, "indices": 3, "material": 0}]}
+        ],
+        "materials": [
+            {
+                "extensions": {"KHR_materials_unlit": {}},
+                "pbrMetallicRoughness": {"metallicFactor": 0.0, "roughnessFactor": 1.0},
+            }
+        ],
+        "accessors": accessors,
+        "bufferViews": views,
+        "buffers": [{"byteLength": starts[-1]}],
+    }
+    text = json.dumps(about, separators=(",", ":")).encode()
+    text += b" " * (-len(text) % 4)
+    chunks = [(b"JSON", text), (b"BIN\0", b"".join(data.tobytes() for data, *_ in parts))]
+    body = b"".join(struct.pack("<I4s", len(data), name) + data for name, data in chunks)
+    return struct.pack("<4sII", b"glTF", 2, 12 + len(body)) + body
+
+
+def linear(encoded: Float[np.ndarray, "*shape"]) -> Float[np.ndarray, "*shape"]:
+    """sRGB-encoded values to linear light (IEC 61966-2-1), which is what COLOR_0 holds (glTF 2.0, 3.9.2)."""
+    return np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
+
+
+def as_trimesh(mesh: Mesh) -> trimesh.Trimesh:
+    """For trimesh, which leaves vertices and their order as they are."""
+    normals = vertex_normals(mesh.vertices, mesh.faces)
+    return trimesh.Trimesh(mesh.vertices, mesh.faces, vertex_normals=normals, vertex_colors=mesh.colours, process=False)
+
+
+ENCODERS = {".ply": ply, ".obj": obj, ".glb": glb}

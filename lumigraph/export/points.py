@@ -1,0 +1,122 @@
+"""Points where a scene is solid: what its cameras see, brought back into space and thinned evenly."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import plyfile
+import torch
+from jaxtyping import Bool, Float, Int, UInt8
+from torch import Tensor
+
+from ..camera import Camera
+from ..display import track
+from ..errors import LumigraphError
+from ..files import replacing
+from ..method import Method
+from ..scene import Frame
+from .sightings import FAR, Sighting, compare, look_around
+
+CANDIDATES = 4  # as many pixels are looked at as points are wanted, times this
+SQUARELY = 0.2  # cosine between a surface's normal and the ray from which on its depth is trusted
+TOLERANCE = 0.01  # of the distance from the camera: depths that agree
+WITNESSES = 2  # further cameras that must see a surface at the same place, where there are so many
+
+
+@dataclass(frozen=True)
+class Points:
+    """Points of surfaces, in the frame that whoever made them says.
+
+    normals: unit length, towards the cameras
+    colours: sRGB-encoded
+    """
+
+    positions: Float[np.ndarray, "point 3"]
+    normals: Float[np.ndarray, "point 3"]
+    colours: UInt8[np.ndarray, "point 3"]
+
+    def in_source(self, frame: Frame) -> Points:
+        """From the scene's frame to that of the capture."""
+        matrix = np.array(frame.source_from_scene)
+        normals = self.normals @ matrix[:3, :3].T
+        normals /= np.maximum(np.linalg.norm(normals, axis=-1, keepdims=True), 1e-30)
+        return Points(self.positions @ matrix[:3, :3].T + matrix[:3, 3], normals, self.colours)
+
+
+@torch.no_grad()
+def extract_points(method: Method, cameras: Camera, count: int = 200_000, size: int = 400, views: int = 64) -> Points:
+    """At most `count` points in the scene's frame, spread evenly over what the cameras see.
+
+    size:  longer side of the cameras' pictures at most, pixels
+    views: cameras at most
+    A point stays if other cameras see a surface there too, and at most half as many look through it. Raises
+    LumigraphError where nothing is solid.
+    """
+    method.eval()
+    sightings = look_around(method, cameras, size, views)
+    good = [(seen.depth < FAR) & (seen.facing > SQUARELY) for seen in sightings]
+    share = min(1.0, CANDIDATES * count / max(1, sum(int(x.sum()) for x in good)))
+    chance = torch.Generator().manual_seed(0)
+    found = []
+    for seen, mask in zip(sightings, good, strict=True):
+        some = mask & (torch.rand(mask.shape, generator=chance) < share)
+        positions = seen.camera.rays(seen.camera.pixels()).at(seen.depth.reshape(-1))[some.reshape(-1)]
+        found.append(torch.cat([positions, seen.normals[some], seen.rgb[some]], -1))
+    columns = torch.cat(found)
+    columns = columns[witnessed(columns[:, :3], sightings)].double().numpy()
+    if not len(columns):
+        raise LumigraphError(
+            "No two cameras agree on where anything solid is, so there are no points; train for longer and try again"
+        )
+    columns = thinned(columns, count)
+    normals = columns[:, 3:6] / np.maximum(np.linalg.norm(columns[:, 3:6], axis=-1, keepdims=True), 1e-30)
+    return Points(columns[:, :3], normals, (columns[:, 6:] * 255).round().astype(np.uint8))
+
+
+def witnessed(points: Float[Tensor, "point 3"], sightings: list[Sighting]) -> Bool[Tensor, " point"]:
+    """Which points enough cameras see as a surface, and not many see through."""
+    agree, through = torch.zeros(len(points), dtype=torch.int64), torch.zeros(len(points), dtype=torch.int64)
+    for sighting in track(sightings, "Comparing what cameras see", len(sightings)):
+        away = (points - sighting.camera.position).norm(dim=-1)
+        seen = compare(sighting, points, TOLERANCE * float(away.median()))
+        agree += seen.smooth & (seen.ahead.abs() < TOLERANCE * away)
+        through += seen.ahead > TOLERANCE * away
+    return (agree > min(WITNESSES, len(sightings) - 1)) & (through <= agree / 2)
+
+
+def thinned(columns: Float[np.ndarray, "point column"], count: int) -> Float[np.ndarray, "thinned column"]:
+    """The means within cells of space just large enough that there are at most `count`. The first three are places."""
+    if len(columns) <= count:
+        return columns
+    low, extent = columns[:, :3].min(0), float(np.ptp(columns[:, :3], axis=0).max())
+    small, large = extent / (1 << 20), 2 * extent
+    while large > 1.01 * small:
+        middle = float(np.sqrt(small * large))
+        if len(np.unique(cells(columns, low, middle))) > count:
+            small = middle
+        else:
+            large = middle
+    _, cell, filled = np.unique(cells(columns, low, large), return_inverse=True, return_counts=True)
+    sums = [np.bincount(cell, column, len(filled)) for column in columns.T]
+    return np.stack(sums, -1) / filled[:, None]
+
+
+def cells(
+    columns: Float[np.ndarray, "point column"], low: Float[np.ndarray, " 3"], size: float
+) -> Int[np.ndarray, " point"]:
+    """A number for the cell of space that each point lies in."""
+    return ((columns[:, :3] - low) / size).astype(np.int64) @ np.array([1 << 42, 1 << 21, 1])
+
+
+def write_points(path: Path, points: Points) -> None:
+    """A binary PLY file: x y z, nx ny nz (float32), red green blue (bytes). Raises LumigraphError where it cannot."""
+    floats = [(name, "<f4") for name in ("x", "y", "z", "nx", "ny", "nz")]
+    rows = np.empty(len(points.positions), [*floats, *((name, "u1") for name in ("red", "green", "blue"))])
+    values = np.concatenate([points.positions, points.normals, points.colours], -1)
+    for name, column in zip(rows.dtype.names, values.T, strict=True):
+        rows[name] = column
+    with replacing(path) as partial, open(partial, "wb") as file:
+        elements = [plyfile.PlyElement.describe(rows, "vertex")]
+        plyfile.PlyData(elements, byte_order="<", comments=["written by Lumigraph"]).write(file)
