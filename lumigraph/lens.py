@@ -315,8 +315,8 @@ class Equirectangular(Lens):
 class OmnidirectionalStereo(Equirectangular):
     """One eye's panorama whose rays leave a level circle, the viewing circle, along its tangents (Peleg 2001).
 
-    Whichever way one turns, the eyes are beside each other: a ray of longitude a begins at s (cos a, 0, -sin a). A
-    point at a distance R from the vertical axis appears turned by asin(s / R) against where the circle's centre sees it.
+    Whichever way one turns, the eyes are beside each other: a ray of longitude a begins at s (cos a, 0, -sin a).
+    A point at a distance R from the vertical axis appears turned by asin(s / R) against what the circle's middle sees.
 
     offset: s in scene units, from the middle between the eyes to this one, positive to the right
     """

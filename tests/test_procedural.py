@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -16,7 +17,7 @@ from lumigraph.capture.procedural.rendering import photograph, render, signed_di
 from lumigraph.capture.procedural.shapes import Arch, Box, Cone, Cylinder, Plane, Shape, Sphere, Torus
 from lumigraph.capture.procedural.textures import Bricks, Checker, Marble, Mottle, Plain, Rings, Sectors, Stripes, Wood
 from lumigraph.errors import LumigraphError
-from lumigraph.lens import Fisheye
+from lumigraph.lens import Equirectangular, Fisheye
 from lumigraph.rays import Rays
 
 SHAPES = [
@@ -321,6 +322,19 @@ def test_a_visible_sky_leaves_no_pixel_empty():
     assert signed_distance(stage.world, positions).min() > stage.near
 
 
+def test_the_room_is_closed_and_its_cameras_look_everywhere():
+    stage = scenes.stage("room", size=32, views=40)
+    sphere = Equirectangular(torch.tensor([[64.0, 32.0]]))
+    upright = torch.tensor([[[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0]]])
+    seen = render(stage.world, Camera(upright, sphere, torch.tensor([[64, 32]])))
+    assert (seen.extra["ids"] >= 0).all() and seen.depth.max() < 1.5 and (seen.opacity == 1).all()
+    assert seen.rgb.amax() < 0.999 and seen.rgb.reshape(-1, 3).std(0).min() > 0.1  # lit, nowhere too brightly
+    train = stage.cameras["train"]
+    assert signed_distance(stage.world, torch.cat([c.position for c in stage.cameras.values()])).min() > stage.near
+    everywhere = torch.nn.functional.normalize(torch.randn(500, 3, generator=torch.Generator().manual_seed(0)), dim=-1)
+    assert (everywhere @ train.forward.T).amax(-1).min() > math.cos(math.radians(38))  # in somebody's picture
+
+
 def test_worlds_are_data_nothing_is_compiled_for_a_new_one(still_life):
     from lumigraph.capture.procedural import tracer
 
@@ -355,7 +369,7 @@ def test_open_scene_makes_a_scene_in_the_worlds_own_frame():
 @pytest.mark.parametrize(
     ("request_", "sentence"),
     [
-        ("still-lif", "choose one of courtyard, still-life"),
+        ("still-lif", "choose one of courtyard, room, still-life"),
         ("still-life,colour=3", "no option 'colour'; there are size, views, seed"),
         ("still-life,size=big", "size must be a whole number, as in size=20; got 'big'"),
         ("still-life,views=0", "views must be a whole number"),
