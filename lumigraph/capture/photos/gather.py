@@ -13,6 +13,7 @@ from pathlib import Path
 from PIL import Image, UnidentifiedImageError
 
 from ...errors import LumigraphError
+from ...files import explained
 from ..pictures import describe, reductions
 from . import upright
 from .exif import read_facts
@@ -112,14 +113,15 @@ def list_photographs(sources: Sequence[Path], work: Path) -> list[Path]:
 
 def walk(folder: Path, work: Path | None = None) -> Iterator[Path]:
     """Photographs below a folder, sorted: no hidden ones, none that a program reduced or rendered."""
-    entries = sorted(folder.iterdir())
+    with explained(folder):
+        entries = sorted(folder.iterdir())
     folders = [entry for entry in entries if entry.is_dir()]
     reduced = {path for folder in folders for times, path in reductions(folder).items() if times > 1}
     for entry in entries:
         if entry.name.startswith(".") or entry in reduced or entry.resolve() == work:
             continue
         if entry.is_dir():
-            if not any((entry / name).exists() for name in MADE):
+            if not entry.is_symlink() and not any((entry / name).exists() for name in MADE):
                 yield from walk(entry, work)
         elif entry.suffix.lower() in PHOTOGRAPHS:
             yield entry
@@ -147,15 +149,17 @@ def take(name: str, path: Path, copies: Path) -> Seen | str:
 
     Raises LumigraphError where the disk refuses the copy.
     """
+    if path.suffix.lower() not in PHOTOGRAPHS:
+        return "its format is not read here; convert it to JPEG"
     try:
         with Image.open(path) as image:
             facts = read_facts(image.getexif(), image.size)
             upright_file = path
             if not upright.is_plain(image, path):
-                upright_file = copies / f"{name}{upright.suffix(image)}"
+                name = upright.name_of_copy(name, image)
+                upright_file = copies / name
                 if not upright.is_current(upright_file, path):
                     upright.copy(image, path, upright_file)
-                name = upright_file.relative_to(copies).as_posix()
         with Image.open(upright_file) as image:
             size, found = image.size, look(image)
     except LumigraphError:

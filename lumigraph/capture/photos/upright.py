@@ -12,6 +12,7 @@ from PIL import Image, ImageOps
 from ...files import replacing
 from ..pictures import EXIF_ORIENTATION, EXIF_UPRIGHT, eight_bits
 
+JPEG, PNG = (".jpg", ".jpeg"), (".png",)
 QUALITY = 95  # of JPEG, with colours at full size: no difference can be seen
 PNG_DEPTH = 24  # the byte of a PNG's header that says how many bits a channel has
 
@@ -36,9 +37,10 @@ def bits(png: Path) -> int:
         return file.read(PNG_DEPTH + 1)[-1]
 
 
-def suffix(image: Image.Image) -> str:
-    """Of a copy. Only PNG keeps alpha."""
-    return ".png" if image.has_transparency_data else ".jpg"
+def name_of_copy(name: str, image: Image.Image) -> str:
+    """PNG stays PNG, alpha becomes PNG, the rest JPEG; a name that says otherwise gets the right suffix added."""
+    suffixes = PNG if image.format == "PNG" or image.has_transparency_data else JPEG
+    return name if name.lower().endswith(suffixes) else name + suffixes[0]
 
 
 def copy(image: Image.Image, source: Path, path: Path) -> None:
@@ -56,7 +58,7 @@ def copy(image: Image.Image, source: Path, path: Path) -> None:
 
 def save(image: Image.Image, path: Path, profile: bytes | None = None) -> None:
     """As JPEG or PNG, by the suffix. profile: of the image's colours (ICC)."""
-    if path.suffix == ".jpg":
+    if path.suffix.lower() in JPEG:
         image.save(path, icc_profile=profile, quality=QUALITY, subsampling=0)
     else:
         image.save(path, icc_profile=profile)

@@ -3,8 +3,8 @@
 The film is watched twice. First every frame, or every second or fourth of a fast film, is judged small: how sharp it is
 and how far the picture has moved since the beginning. The film is then cut into as many stretches as frames are wanted,
 each with equal movement, so that a resting camera gives few frames and a quick turn many; a share of TIME goes by the
-clock, for what the eye does not see move. The sharpest frame of each stretch is written the second time, unless it
-shows what a frame before it shows.
+clock, for what the eye does not see move. The sharpest frame of each stretch, rather in its middle, is written the
+second time, unless it shows what a frame before it shows.
 """
 
 from __future__ import annotations
@@ -36,6 +36,8 @@ PER_SECOND, FEWEST, MOST = 2.5, 20, 150  # frames, where the user asks for no nu
 JUDGED = 15.0  # frames per second that are looked at, or
 CANDIDATES = 4  # for each frame that is wanted, if that is more
 TIME = 0.2  # share of the clock in what counts as even
+MIDDLE = 0.3  # how much sharper (log) than in the middle of its stretch a frame at its end must be, lest two ends meet
+WHOLE = 0.9  # share of its length that a film must have, else it has been cut short
 WATCHED = 192  # pixels, the longer side of what movement is seen in
 
 
@@ -73,17 +75,19 @@ def judge(
 ) -> tuple[list[int], Float[np.ndarray, " frame"], Float[np.ndarray, " frame"], Float[np.ndarray, " frame"]]:
     """Of the frames looked at: their numbers, seconds from the first on, sharpness, how far the picture had moved."""
     rows: list[tuple[int, float, float, float]] = []
-    odometer = Odometer()
+    odometer, end = Odometer(), 0.0
     with opened(path) as film:
-        total = length(film)
+        total = film.streams.video[0].frames or max(round(duration(film) * speed(film)), 1)
         step = max(int(min(speed(film) / JUDGED, total / (CANDIDATES * frames) if frames else math.inf)), 1)
-        for number, (frame, seconds) in enumerate(track(decoded(path, film), f"Watching {path.name}", total)):
+        for number, (frame, end) in enumerate(track(decoded(path, film), f"Watching {path.name}", total)):
             if number % step == 0:
                 luminance = grey(frame, WORKING)
-                travelled = odometer.show(grey(frame, WATCHED))
-                rows.append((number, seconds, sharpness(luminance), travelled))
-    if not rows:
-        raise LumigraphError(f"{path} has no frames; record it again or take it from its source")
+                rows.append((number, end, sharpness(luminance), odometer.show(grey(frame, WATCHED))))
+        if not rows:
+            raise LumigraphError(f"{path} has no frames; record it again or take it from its source")
+        if end - rows[0][1] < WHOLE * duration(film) - 1 / speed(film):
+            text = f"{path} breaks off after {end:.1f} of {duration(film):.1f} s; what comes before is used"
+            warnings.warn(LumigraphWarning(text), stacklevel=2)
     numbers = [number for number, *_ in rows]
     times, sharp, travelled = np.array([figures for _, *figures in rows]).T
     return numbers, times - times[0], sharp, travelled
@@ -96,17 +100,15 @@ def choose(
     travelled: Float[np.ndarray, " frame"],
     frames: int | None = None,
 ) -> list[int]:
-    """The numbers of the sharpest frames of equal stretches, ascending. All arguments are as `judge` gives them."""
-    duration = float(seconds[-1])
-    count = frames or min(max(round(PER_SECOND * duration), FEWEST), MOST)
-    clock = seconds / max(duration, 1e-9)
+    """The numbers of the sharpest frames of equal stretches, ascending. Other arguments are as `judge` gives them."""
+    length = float(seconds[-1])
+    count = frames or min(max(round(PER_SECOND * length), FEWEST), MOST)
+    clock = seconds / max(length, 1e-9)
     way = travelled / travelled[-1] if travelled[-1] > 0 else clock
-    stretch = np.minimum(((1 - TIME) * way + TIME * clock) * count, count - 1).astype(int)
-    best: dict[int, int] = {}
-    for i, s in enumerate(stretch.tolist()):
-        if s not in best or sharp[i] > sharp[best[s]]:
-            best[s] = i
-    return [numbers[i] for i in best.values()]
+    place = ((1 - TIME) * way + TIME * clock) * count
+    stretch = np.minimum(place, count - 1).astype(int)
+    worth = np.log(sharp) - MIDDLE * (2 * (place - stretch) - 1) ** 2
+    return [numbers[int(max(np.flatnonzero(stretch == s), key=worth.__getitem__))] for s in np.unique(stretch)]
 
 
 def write(path: Path, folder: Path, chosen: Sequence[int], track: Track) -> dict[str, float]:
@@ -152,22 +154,20 @@ def opened(path: Path) -> Iterator[InputContainer]:
 
 
 def decoded(path: Path, film: InputContainer) -> Iterator[tuple[VideoFrame, float]]:
-    """Frames in order, and when each is shown, in seconds. A film that is damaged ends there, with a warning."""
-    rate, count, seconds = speed(film), 0, 0.0
+    """Frames in order, and when each is shown, in seconds. What comes after damage is left out.
+
+    Raises LumigraphError where no frame can be decoded.
+    """
+    rate, count = speed(film), 0
     try:
         for frame in film.decode(video=0):
-            seconds = count / rate if frame.time is None else float(frame.time)
+            yield frame, count / rate if frame.time is None else float(frame.time)
             count += 1
-            yield frame, seconds
     except av.FFmpegError as fault:
         if count == 0:
             raise LumigraphError(
                 f"{path} cannot be decoded ({why(fault)}); take it from its source again, or convert it to MP4"
             ) from fault
-        warnings.warn(
-            LumigraphWarning(f"{path} is damaged after {seconds:.1f} s ({why(fault)}); what comes before is used"),
-            stacklevel=2,
-        )
 
 
 def speed(film: InputContainer) -> float:
@@ -176,10 +176,12 @@ def speed(film: InputContainer) -> float:
     return float(stream.average_rate or stream.guessed_rate or 30)
 
 
-def length(film: InputContainer) -> int:
-    """About how many frames there are; 1 where the file does not say."""
-    seconds = (film.duration or 0) / av.time_base
-    return film.streams.video[0].frames or max(round(seconds * speed(film)), 1)
+def duration(film: InputContainer) -> float:
+    """Seconds, as the file says; 0 where it does not."""
+    stream = film.streams.video[0]
+    if stream.duration is not None and stream.time_base is not None:
+        return float(stream.duration * stream.time_base)
+    return (film.duration or 0) / av.time_base
 
 
 def grey(frame: VideoFrame, longest: int) -> Float[np.ndarray, "height width"]:
