@@ -149,9 +149,12 @@ def test_files_that_are_no_pictures_are_named_and_the_rest_is_used(tmp_path):
     (tmp_path / "photos" / "bad.jpg").write_bytes(b"nonsense")
     whole = (tmp_path / "photos" / "0.jpg").read_bytes()
     (tmp_path / "photos" / "half.jpg").write_bytes(whole[: len(whole) // 2])
+    turned = store(tmp_path / "photos" / "turned.jpg", view(0), exif=tags(orientation=6))
+    turned.write_bytes(turned.read_bytes()[:9000])
     intake = gather([tmp_path / "photos"], tmp_path / "work")
     assert names(intake) == ["0.jpg", "1.jpg"]
-    assert list(intake.unreadable) == ["bad.jpg", "half.jpg"] and "truncated" in intake.unreadable["half.jpg"]
+    assert list(intake.unreadable) == ["bad.jpg", "half.jpg", "turned.jpg"]
+    assert all("truncated" in intake.unreadable[name] for name in ("half.jpg", "turned.jpg"))
 
 
 # Upright copies
@@ -395,8 +398,13 @@ def test_frames_are_kept_for_the_same_film_and_options_only(tmp_path):
     first = extract(path, tmp_path / "frames", 6)
     first[0][0].write_bytes(b"mark")
     assert extract(path, tmp_path / "frames", 6) == first and first[0][0].read_bytes() == b"mark"
+    with pytest.raises(LumigraphError, match="is damaged"):
+        shutil.copytree(tmp_path / "frames", tmp_path / "work" / "frames")
+        gather([path], tmp_path / "work", 6)
+    first[0][0].unlink()
+    extract(path, tmp_path / "frames", 6)
+    assert Image.open(first[0][0]).size == (192, 128), "taken anew"
     assert len(extract(path, tmp_path / "frames", 8)) == 8
-    assert b"mark" not in {file.read_bytes() for file in (tmp_path / "frames").glob("*.jpg")}
     film(path, [800 - 8 * i for i in range(24)])
     again = extract(path, tmp_path / "frames", 8)
     expected = np.asarray(view(800 - 8 * int(again[0][0].stem), size=(192, 128)), int)

@@ -57,8 +57,13 @@ def gather(sources: Sequence[Path], work: Path, frames: int | None = None, track
 def of_video(path: Path, source: str, work: Path, frames: int | None, track: Track) -> Intake:
     found = extract(path, work / "frames", frames, track)
     taken = examine({file.name: file for file, _ in found}, work / "upright", track)
-    seen = [one for one in taken.values() if isinstance(one, Seen)]
-    photos = [replace(one.photo, device=path.name, time=seconds) for one, (_, seconds) in zip(seen, found, strict=True)]
+    seen = []
+    for file, seconds in found:
+        one = taken[file.name]
+        if isinstance(one, str):
+            raise LumigraphError(f"{file} is damaged ({one}); delete {file.parent}, and frames will be taken anew")
+        seen.append(replace(one, photo=replace(one.photo, device=path.name, time=seconds)))
+    photos = [one.photo for one in seen]
     return assess(Intake(source, photos, in_order=True), seen)
 
 

@@ -58,7 +58,7 @@ class Look:
 def look(image: Image.Image) -> Look:
     """Judge a picture. A JPEG that nobody has read yet is decoded at a fraction of its size, which is quick.
 
-    Turning a picture upright changes none of the figures but the signature, so judge it upright or turned, but alike.
+    EXIF's orientation is not looked at: only pictures that stand the same way have comparable signatures.
     Raises whatever Pillow raises for damaged files.
     """
     image.draft("L", (WORKING, WORKING))

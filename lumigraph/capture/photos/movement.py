@@ -9,6 +9,7 @@ from scipy.fft import irfft2, rfft2
 TILE = 32  # pixels to a side
 STRIDE = 3  # pixels of movement after which a new reference is taken
 TEXTURED = 9.0  # variance (of values 0 to 255) that a tile needs to be followed
+FADED = (3 / 8) ** 2  # mean square of the window that fades a tile out
 
 
 class Odometer:
@@ -49,7 +50,7 @@ def moved(a: Float[np.ndarray, "tile row column"], b: Float[np.ndarray, "tile ro
 
     Tiles are followed one by one, so that walking forward or turning about the line of sight counts as well.
     """
-    textured = np.minimum(np.square(a).mean((1, 2)), np.square(b).mean((1, 2))) > TEXTURED * 0.14  # the window's mean
+    textured = np.minimum(np.square(a).mean((1, 2)), np.square(b).mean((1, 2))) > TEXTURED * FADED
     if not textured.any():
         return 0.0
     correlation = irfft2(np.conj(rfft2(a[textured])) * rfft2(b[textured]), s=(TILE, TILE))

@@ -60,7 +60,8 @@ def extract(path: Path, folder: Path, frames: int | None = None, track: Track = 
     identity = {"video": path.name, "modified": stat.st_mtime_ns, "bytes": stat.st_size, "asked": frames}
     index = folder / "frames.json"
     known = read_json(index) if index.is_file() else {}
-    if {key: known.get(key) for key in identity} != identity:
+    complete = all((folder / name).is_file() for name in known.get("frames", ()))
+    if not complete or {key: known.get(key) for key in identity} != identity:
         chosen = choose(*judge(path, frames, track), frames)
         with replacing(folder) as partial:
             partial.mkdir()
