@@ -10,7 +10,7 @@ import threading
 import time
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import torch
 from torch import Tensor
@@ -43,6 +43,7 @@ class Outcome:
     saving_seconds: float = 0.0
 
 
+@runtime_checkable
 class Watch(Protocol):
     """Somebody who looks on while a method learns, from other threads: the viewer. It may hold training up between
     steps, which does not count as training, and changes nothing of what is learnt."""
