@@ -212,7 +212,21 @@ def where_axes_meet(position: np.ndarray, forward: np.ndarray) -> tuple[np.ndarr
 
 
 def find_upright(cameras: Camera) -> Float[np.ndarray, "4 4"]:
-    """The rotation that brings the cameras' common up to +z; none if the source already has an axis there.
+    """The rotation that brings the cameras' common up to +z; none if the source already has an axis there."""
+    up = common_up(cameras)
+    if up is None:
+        return np.eye(4)
+    nearest = np.zeros(3)
+    nearest[np.abs(up).argmax()] = np.sign(up[np.abs(up).argmax()])
+    if up @ nearest > UPRIGHT:
+        up = nearest
+    matrix = np.eye(4)
+    matrix[:3, :3] = turn_onto_z(up)
+    return matrix
+
+
+def common_up(cameras: Camera) -> Float[np.ndarray, " 3"] | None:
+    """The direction that was up where the photographs were taken, unit length; None if cameras cannot tell.
 
     People hold cameras level rather than straight ahead: up is the direction most at right angles to all pictures'
     rows, on the side of the pictures' own up, or where all look straight down, on the side that they look from. Where
@@ -225,18 +239,8 @@ def find_upright(cameras: Camera) -> Float[np.ndarray, "4 4"]:
     if length > 0.2:
         own /= length
         level = level * np.sign(level @ own)
-        up = level if values[1] > 0.1 and level @ own > 0.7 else own
-    elif values[1] > 0.1:
-        up = level * np.sign(-level @ forwards.mean(0))
-    else:
-        return np.eye(4)
-    nearest = np.zeros(3)
-    nearest[np.abs(up).argmax()] = np.sign(up[np.abs(up).argmax()])
-    if up @ nearest > UPRIGHT:
-        up = nearest
-    matrix = np.eye(4)
-    matrix[:3, :3] = turn_onto_z(up)
-    return matrix
+        return level if values[1] > 0.1 and level @ own > 0.7 else own
+    return level * np.sign(-level @ forwards.mean(0)) if values[1] > 0.1 else None
 
 
 def turn_onto_z(up: Float[np.ndarray, " 3"]) -> Float[np.ndarray, "3 3"]:

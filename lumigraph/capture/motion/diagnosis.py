@@ -1,0 +1,317 @@
+"""What became of each photograph, and how far the result is to be trusted, in words that people act on."""
+
+from __future__ import annotations
+
+import statistics
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+from jaxtyping import Float
+from scipy.spatial import ConvexHull, QhullError
+
+from ..normalise import where_axes_meet
+from ..photos import Intake, Photo
+
+FEW_FEATURES = 100
+FEW_MATCHES = 15  # details that two photographs must share for COLMAP to believe them
+STOPS = 1.5  # of exposure that a photograph may differ from others
+WINDOW = 5  # neighbours on each side that a frame's exposure is compared with
+SMALL_ANGLE = 2.0  # degrees between the rays that meet at a point, in the middle: less says little of depth
+ROTATIONS = 0.6  # share of the pairs that a turn of the camera explains alone
+JUMP = 10.0  # times the usual distance between neighbours
+STEADY = 0.5  # distance of neighbours, as a share of that of any two, up to which names tell the order of exposure
+GAP = 30.0  # degrees between neighbouring directions from which on nobody looked from between
+INACCURATE = 2.0  # pixels of reprojection error
+SEEN_ANGLES = 2000  # points whose angles are measured
+NAMED = 8  # photographs that a warning lists
+
+
+@dataclass(frozen=True)
+class Matches:
+    """Which photographs share details: for each pair of names how many one motion explains, and COLMAP's verdict."""
+
+    features: dict[str, int]
+    shared: dict[tuple[str, str], int]
+    turned: int  # pairs that a turn of the camera alone explains
+    flat: int  # pairs that a turn or a plane explains
+
+    def best(self, name: str) -> tuple[str, int]:
+        """The photograph that shares most with this one, and how many details; 0 and no name if none does."""
+        found = [(n, b if a == name else a) for (a, b), n in self.shared.items() if name in (a, b)]
+        most = max(found, default=(0, ""))
+        return most[1], most[0]
+
+    def groups(self) -> list[set[str]]:
+        """Photographs that hang together, the largest group first."""
+        parent = {name: name for name in self.features}
+
+        def root(name: str) -> str:
+            while parent[name] != name:
+                parent[name] = name = parent[parent[name]]
+            return name
+
+        for a, b in self.shared:
+            parent[root(a)] = root(b)
+        found: dict[str, set[str]] = {}
+        for name in parent:
+            found.setdefault(root(name), set()).add(name)
+        return sorted(found.values(), key=len, reverse=True)
+
+
+def read_matches(database: Path) -> Matches:
+    opened = pycolmap.Database.open(database)
+    try:
+        names = {image.image_id: image.name for image in opened.read_all_images()}
+        features = {name: opened.num_keypoints_for_image(number) for number, name in names.items()}
+        shared, turned, flat = {}, 0, 0
+        kinds = pycolmap.TwoViewGeometryConfiguration
+        for number, pair in zip(*opened.read_two_view_geometries(), strict=True):
+            if len(pair.inlier_matches) >= FEW_MATCHES:
+                a, b = pycolmap.pair_id_to_image_pair(number)
+                shared[names[a], names[b]] = len(pair.inlier_matches)
+                turned += pair.config == kinds.PANORAMIC
+                flat += pair.config in (kinds.PANORAMIC, kinds.PLANAR_OR_PANORAMIC)
+    finally:
+        opened.close()
+    return Matches(features, shared, turned, flat)
+
+
+@dataclass(frozen=True)
+class Gap:
+    """Directions that nobody looked from: so many degrees, between two photographs."""
+
+    degrees: float
+    between: tuple[str, str]
+
+
+@dataclass(frozen=True)
+class Coverage:
+    """How far around their subject photographs were taken; gaps only where they go more than half around."""
+
+    degrees: float
+    gaps: list[Gap] = field(default_factory=list)
+
+
+@dataclass(frozen=True)
+class Diagnosis:
+    """All that a capture found out about itself.
+
+    given:        how many files there were;  used: those that cameras were looked for
+    registered:   names of the photographs whose cameras were found
+    left_out:     name and reason of each that was not used or not found
+    blurred:      name and reason, of those that are used all the same
+    duplicates:   name, and the name of the one it repeats
+    other_models: photographs that hang together but not with the rest
+    error:        mean distance between details and where the model has them, pixels
+    points, track_length: how many points, and how many photographs show each on average
+    angle:        between the outermost rays to a point, in the middle, degrees
+    filled:       share of a picture that its points span, on average
+    coverage:     None where cameras do not look at one subject
+    warnings:     sentences on what may spoil the result, and what to do
+    """
+
+    given: int
+    used: int
+    registered: list[str]
+    left_out: dict[str, str]
+    blurred: dict[str, str]
+    duplicates: dict[str, str]
+    other_models: list[list[str]]
+    error: float
+    points: int
+    track_length: float
+    angle: float
+    filled: float
+    coverage: Coverage | None
+    warnings: list[str]
+
+
+def diagnose(
+    intake: Intake, used: Sequence[Photo], model: pycolmap.Reconstruction, others: list[list[str]], matches: Matches
+) -> Diagnosis:
+    """used: the photographs that cameras were looked for; others: names in other models; the model stands upright."""
+    by_name = {image.name: image for image in model.images.values() if image.has_pose}
+    registered = [photo.name for photo in used if photo.name in by_name]
+    poses = np.stack([by_name[name].cam_from_world().inverse().matrix() for name in registered])
+    left_out = intake.unreadable | {
+        photo.name: why_not(photo.name, registered, others, matches) for photo in used if photo.name not in by_name
+    }
+    angle = triangulation_angle(model)
+    names_tell = intake.in_order or in_steps(poses[:, :, 3])
+    error = float(model.compute_mean_reprojection_error())
+    warnings = [
+        *about_left_out(left_out, len(used)),
+        *about_blur(intake.blurred),
+        *about_exposure([photo for photo in used if photo.name in by_name], intake.in_order),
+        *about_rotation(angle, matches),
+        *(about_jumps(registered, poses[:, :, 3]) if names_tell else []),
+    ]
+    if error > INACCURATE:
+        warnings.append(
+            f"details are {error:.1f} pixels from where the model has them, on average: photographs may be blurred, or "
+            f"the subject moved"
+        )
+    return Diagnosis(
+        given=len(intake.photos) + len(intake.unreadable),
+        used=len(used),
+        registered=registered,
+        left_out=dict(sorted(left_out.items())),
+        blurred=dict(intake.blurred),
+        duplicates=dict(intake.duplicates),
+        other_models=others,
+        error=error,
+        points=len(model.points3D),
+        track_length=float(model.compute_mean_track_length()),
+        angle=angle,
+        filled=filled(model),
+        coverage=coverage(registered, poses),
+        warnings=warnings,
+    )
+
+
+def why_not(name: str, registered: Sequence[str], others: Sequence[Sequence[str]], matches: Matches) -> str:
+    """Why no camera was found for a photograph, in a few words."""
+    features = matches.features.get(name, 0)
+    if features < FEW_FEATURES:
+        return f"too few details ({features} found): blank, dark or out of focus"
+    for model in others:
+        if name in model:
+            return f"in another group of {len(model)}, which shares too little with the rest"
+    neighbour, most = matches.best(name)
+    if not most:
+        return "shares too few details with any other photograph"
+    group = next(group for group in matches.groups() if name in group)
+    if group.isdisjoint(registered):
+        return f"in another group of {len(group)}, which shares too little with the rest"
+    return f"matches {neighbour} ({most} details), but its place could not be told"
+
+
+def triangulation_angle(model: pycolmap.Reconstruction, seed: int = 0) -> float:
+    """Median over points of the angle between the outermost rays that meet there, degrees."""
+    centres = {number: image.projection_center() for number, image in model.images.items() if image.has_pose}
+    numbers = np.array(sorted(model.points3D.keys()))
+    chosen = np.random.default_rng(seed).permutation(len(numbers))[:SEEN_ANGLES]
+    angles = []
+    for number in numbers[chosen].tolist():
+        point = model.points3D[number]
+        rays = np.stack([centres[e.image_id] for e in point.track.elements]) - point.xyz
+        rays /= np.linalg.norm(rays, axis=-1, keepdims=True).clip(1e-12)
+        angles.append(np.degrees(np.arccos(np.clip((rays @ rays.T).min(), -1, 1))))
+    return float(np.median(angles)) if angles else 0.0
+
+
+def filled(model: pycolmap.Reconstruction) -> float:
+    """Share of a picture inside the convex hull of its points, mean over pictures."""
+    shares = []
+    for image in model.images.values():
+        if not image.has_pose:
+            continue
+        found = np.array([point.xy for point in image.points2D if point.has_point3D()]).reshape(-1, 2)
+        camera = model.cameras[image.camera_id]
+        try:
+            shares.append(ConvexHull(found).volume / (camera.width * camera.height) if len(found) > 2 else 0.0)
+        except QhullError:  # all on a line
+            shares.append(0.0)
+    return float(np.mean(shares))
+
+
+def coverage(names: Sequence[str], poses: Float[np.ndarray, "photo 3 4"]) -> Coverage | None:
+    """Around the vertical through what the cameras look at; None where they look at no one thing.
+
+    Directions nearer to each other than 30 degrees cover what lies between them.
+    """
+    subject, converging = where_axes_meet(poses[:, :, 3], poses[:, :, 2])
+    if not converging:
+        return None
+    away = poses[:, :2, 3] - subject[:2]
+    azimuth = np.degrees(np.arctan2(away[:, 1], away[:, 0]))
+    order = np.argsort(azimuth)
+    steps = np.diff(azimuth[order], append=azimuth[order[0]] + 360)
+    wide = [i for i in range(len(order)) if steps[i] > GAP]
+    degrees = float(360 - steps[wide].sum())
+    gaps = [Gap(float(steps[i]), (names[order[i]], names[order[(i + 1) % len(order)]])) for i in wide]
+    return Coverage(degrees, sorted(gaps, key=lambda gap: -gap.degrees) if degrees > 180 else [])
+
+
+def jumps(positions: Float[np.ndarray, "photo 3"]) -> list[tuple[int, float]]:
+    """Where cameras in order leap: the number of the one before, and how many times the usual step it is.
+
+    A model that is folded, with parts of the place in it twice, leaps where the fold is.
+    """
+    steps = np.linalg.norm(np.diff(positions, axis=0), axis=-1)
+    usual = float(np.median(steps)) if len(steps) else 0.0
+    return [(i, float(step / usual)) for i, step in enumerate(steps) if usual > 0 and step > JUMP * usual]
+
+
+def in_steps(positions: Float[np.ndarray, "photo 3"]) -> bool:
+    """Whether neighbours in the list were taken near each other, as one walks."""
+    if len(positions) < 8:
+        return False
+    steps = np.linalg.norm(np.diff(positions, axis=0), axis=-1)
+    apart = np.linalg.norm(positions[:, None] - positions, axis=-1)
+    return bool(np.median(steps) < STEADY * np.median(apart[np.triu_indices(len(positions), 1)]))
+
+
+def about_left_out(left_out: Mapping[str, str], used: int) -> list[str]:
+    if len(left_out) <= used / 3:
+        return []
+    return [
+        f"{len(left_out)} photographs have no place: take more between them and the rest, each overlapping the next "
+        f"by two thirds"
+    ]
+
+
+def about_blur(blurred: Mapping[str, str]) -> list[str]:
+    if not blurred:
+        return []
+    return [f"{counted(len(blurred), 'blurred photograph')}: {listed(blurred)}; remove or retake what is not needed"]
+
+
+def about_exposure(photos: Sequence[Photo], in_order: bool) -> list[str]:
+    """Photographs more than 1.5 stops from their neighbours, or where there is no order, from the median of all."""
+    found = []
+    for i, photo in enumerate(photos):
+        others = photos[max(0, i - WINDOW) : i + WINDOW + 1] if in_order else photos
+        if abs(photo.brightness - statistics.median(p.brightness for p in others)) > STOPS:
+            found.append(photo.name)
+    if not found:
+        return []
+    return [
+        f"exposure jumps by more than {STOPS:g} stops at {listed(found)}; lock the exposure, or leave these out, for "
+        f"colours will not agree"
+    ]
+
+
+def about_rotation(angle: float, matches: Matches) -> list[str]:
+    turned = matches.turned > ROTATIONS * max(len(matches.shared), 1)
+    if angle >= SMALL_ANGLE and not turned:
+        return []
+    return [
+        f"the photographs were taken from nearly one place (rays to a point differ by {angle:.1f} degrees), so depth "
+        f"is uncertain; walk sideways instead of turning on the spot"
+    ]
+
+
+def about_jumps(names: Sequence[str], positions: Float[np.ndarray, "photo 3"]) -> list[str]:
+    found = sorted(jumps(positions), key=lambda jump: -jump[1])
+    if not found:
+        return []
+    i, times = found[0]
+    more = f", and there are {len(found) - 1} more such places" if len(found) > 1 else ""
+    return [
+        f"{names[i]} and {names[i + 1]} follow each other but stand {times:.0f} times as far apart as is usual{more}: "
+        f"the model may be folded there; look at capture.png, and try --mapper global or --matching exhaustive"
+    ]
+
+
+def listed(names: Mapping[str, str] | Sequence[str]) -> str:
+    found = list(names)
+    rest = f" and {len(found) - NAMED} more" if len(found) > NAMED else ""
+    return ", ".join(found[:NAMED]) + rest
+
+
+def counted(count: int, noun: str) -> str:
+    return f"{count} {noun}{'' if count == 1 else 's'}"

@@ -1,0 +1,218 @@
+"""Two pictures of a capture: cameras and points from above and from the side, and all photographs with their fate."""
+
+from __future__ import annotations
+
+import textwrap
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+from jaxtyping import Float, UInt8
+from PIL import Image, ImageDraw, ImageFont
+
+from ...figures import RAMP, fit_into, save_picture
+from ..photos import Intake
+from .diagnosis import Diagnosis
+
+INK, FAINT, PAPER = "#1b1d22", "#6d717a", "#fbfaf8"
+LEFT_OUT, BLURRED, DUPLICATE = "#c0392b", "#d98200", "#3f6fb0"
+PANEL, MARGIN, LINE = 720, 28, 20
+FINE = 2  # times larger than shown, so that lines and dots come out smooth
+SHADE = 0.85  # of points' colours, so that white ones show on paper
+RELIABLE = 3  # photographs that show a point worth drawing
+OUTLYING = 0.04  # share of the points on each side that do not decide what is shown
+FARTHEST = 2.0  # times the distance from cameras to points that is shown around the cameras
+FRUSTUM = 0.05  # depth of a camera's pyramid, as a share of what is shown
+
+
+@dataclass(frozen=True)
+class Sketch:
+    """What is drawn, in a frame with +z up: corners are each camera's eye and the four of its picture."""
+
+    eyes: Float[np.ndarray, "photo 3"]
+    corners: Float[np.ndarray, "photo 4 3"]
+    points: Float[np.ndarray, "point 3"]
+    colours: UInt8[np.ndarray, "point 3"]
+
+    def seen_along(self, axis: int) -> tuple[int, int]:
+        """The axes that go right and up in a view from above (2) or from the side (1)."""
+        return (0, 1) if axis == 2 else (0, 2)
+
+
+def draw_capture(path: Path, model: pycolmap.Reconstruction, diagnosis: Diagnosis, keep_axes: bool = False) -> None:
+    """Write a picture of an upright model. keep_axes: whether x goes right in it, as where x is east."""
+    sketch = sketch_of(model, diagnosis.registered, keep_axes)
+    low, high = interesting(sketch)
+    top, side = high - low, high - low
+    height = [round(PANEL * min(max(s[k] / s[0], 0.35), 1.25)) for s, k in ((top, 1), (side, 2))]
+    sheet = Image.new("RGB", (2 * PANEL + 3 * MARGIN, max(height) + 3 * MARGIN + 2 * LINE), PAPER)
+    draw = ImageDraw.Draw(sheet)
+    draw.text((MARGIN, MARGIN - 8), heading(diagnosis), INK, ImageFont.load_default(18))
+    for i, (name, axis) in enumerate((("from above", 2), ("from the side", 1))):
+        corner = MARGIN + i * (PANEL + MARGIN), 2 * MARGIN + LINE
+        draw.text((corner[0], corner[1] - LINE), name, FAINT, ImageFont.load_default(14))
+        sheet.paste(draw_view(sketch, axis, low, high, (PANEL, height[i])), corner)
+    foot = "cameras from first (dark) to last (bright); points in their own colours"
+    draw.text((MARGIN, sheet.height - MARGIN), foot, FAINT, ImageFont.load_default(14))
+    save_picture(path, sheet)
+
+
+def heading(diagnosis: Diagnosis) -> str:
+    return (
+        f"{len(diagnosis.registered)} of {diagnosis.given} photographs placed · {diagnosis.points:,} points · "
+        f"{diagnosis.error:.2f} pixels of error"
+    )
+
+
+def sketch_of(model: pycolmap.Reconstruction, names: list[str], keep_axes: bool) -> Sketch:
+    by_name = {image.name: image for image in model.images.values() if image.has_pose}
+    eyes, corners = [], []
+    for name in names:
+        image = by_name[name]
+        camera, pose = model.cameras[image.camera_id], image.cam_from_world().inverse().matrix()
+        half = np.array([camera.width, camera.height]) / (2 * camera.mean_focal_length())
+        directions = np.array([[x * half[0], y * half[1], 1.0] for x, y in ((-1, -1), (1, -1), (1, 1), (-1, 1))])
+        eyes.append(pose[:, 3])
+        corners.append(directions @ pose[:, :3].T)
+    found = [point for point in model.points3D.values() if point.track.length() >= RELIABLE]
+    found = found or list(model.points3D.values())
+    turn = np.eye(3) if keep_axes else longest_first(np.array(eyes))
+    return Sketch(
+        np.array(eyes) @ turn.T,
+        np.array(corners) @ turn.T,
+        np.array([point.xyz for point in found]).reshape(-1, 3) @ turn.T,
+        np.array([point.color for point in found], np.uint8).reshape(-1, 3),
+    )
+
+
+def longest_first(eyes: Float[np.ndarray, "photo 3"]) -> Float[np.ndarray, "3 3"]:
+    """A turn about +z that brings the horizontal direction in which cameras spread most to x."""
+    flat = eyes[:, :2] - eyes[:, :2].mean(0)
+    _, vectors = np.linalg.eigh(flat.T @ flat)
+    x, y = vectors[:, 1]
+    return np.array([[x, y, 0], [-y, x, 0], [0, 0, 1.0]])
+
+
+def interesting(sketch: Sketch) -> tuple[Float[np.ndarray, " 3"], Float[np.ndarray, " 3"]]:
+    """The box to show: all cameras, and most points, unless those are far off."""
+    low, high = sketch.eyes.min(0), sketch.eyes.max(0)
+    if len(sketch.points):
+        middle = np.median(sketch.points, axis=0)
+        away = FARTHEST * np.median(np.linalg.norm(sketch.eyes - middle, axis=-1))
+        inner, outer = np.quantile(sketch.points, [OUTLYING, 1 - OUTLYING], axis=0)
+        low, high = np.minimum(low, np.maximum(inner, low - away)), np.maximum(high, np.minimum(outer, high + away))
+    margin = 0.06 * (high - low).max()
+    return low - margin, high + margin
+
+
+def draw_view(sketch: Sketch, axis: int, low: np.ndarray, high: np.ndarray, size: tuple[int, int]) -> Image.Image:
+    """One view along an axis, with equal scales to the right and upwards."""
+    width, height = FINE * size[0], FINE * size[1]
+    right, up = sketch.seen_along(axis)
+    scale = min(width / (high[right] - low[right]), height / (high[up] - low[up]))
+
+    def place(points: np.ndarray) -> np.ndarray:
+        x = width / 2 + scale * (points[..., right] - (low + high)[right] / 2)
+        y = height / 2 - scale * (points[..., up] - (low + high)[up] / 2)
+        return np.stack([x, y], -1)
+
+    canvas = np.full((height, width, 3), tuple(bytes.fromhex("ffffff")), np.uint8)
+    order = np.argsort(sketch.points[:, axis] * (1 if axis == 2 else -1), kind="stable")
+    at = place(sketch.points[order]).round().astype(int)
+    dot = range(-1, 2) if len(at) > 4000 else range(-2, 3)
+    colours = (SHADE * sketch.colours[order]).astype(np.uint8)
+    for dx in dot:
+        for dy in dot:
+            x, y = at[:, 0] + dx, at[:, 1] + dy
+            inside = (x >= 0) & (x < width) & (y >= 0) & (y < height)
+            canvas[y[inside], x[inside]] = colours[inside]
+    image = Image.fromarray(canvas)
+    draw = ImageDraw.Draw(image)
+    depth = min(FRUSTUM * float((high - low).max()), 0.8 * typical_gap(sketch.eyes))
+    for i in range(len(sketch.eyes)):
+        colour = ramp_at(i / max(len(sketch.eyes) - 1, 1))
+        eye = place(sketch.eyes[i])
+        tips = place(sketch.eyes[i] + depth * sketch.corners[i])
+        for j in range(4):
+            draw.line([tuple(eye), tuple(tips[j])], colour, FINE)
+            draw.line([tuple(tips[j]), tuple(tips[(j + 1) % 4])], colour, FINE)
+        draw.ellipse([*(eye - 2.5 * FINE), *(eye + 2.5 * FINE)], colour)
+    return image.resize(size, Image.Resampling.BOX)
+
+
+def typical_gap(eyes: Float[np.ndarray, "photo 3"]) -> float:
+    """Distance to the nearest other camera, in the middle, at least a fiftieth of their spread."""
+    apart = np.linalg.norm(eyes[:, None] - eyes, axis=-1)
+    np.fill_diagonal(apart, np.inf)
+    return float(max(2 * np.median(apart.min(1)), 0.02 * np.ptp(eyes, axis=0).max()))
+
+
+def ramp_at(share: float) -> str:
+    """Dark and cool for the first, bright and warm for the last; paler ends of the ramp do not show on paper."""
+    colours = [np.array(list(bytes.fromhex(c)), float) for c in reversed(RAMP[1:])]
+    position = share * (len(colours) - 1)
+    below = min(int(position), len(colours) - 2)
+    mixed = colours[below] + (position - below) * (colours[below + 1] - colours[below])
+    return f"#{bytes(mixed.round().astype(np.uint8)).hex()}"
+
+
+def draw_photographs(path: Path, intake: Intake, diagnosis: Diagnosis) -> None:
+    """Write a contact sheet: all photographs by name, those with something to say of them framed, and why."""
+    files = {photo.name: photo.path for photo in intake.photos}
+    names = [*files, *sorted(intake.unreadable)]
+    cell = 220 if len(names) <= 60 else 150 if len(names) <= 200 else 110
+    columns = min(max(round((1.4 * len(names)) ** 0.5), 4), 1720 // cell)
+    letters = cell // 6
+    notes = {name: textwrap.wrap(note, letters)[:3] for name in names if (note := remark(name, diagnosis)[0])}
+    gap, text = 12, 15
+    sheet = Image.new("RGB", (1, 1), PAPER)
+    rows, y = [], 2 * MARGIN + LINE
+    for start in range(0, len(names), columns):
+        row = [(name, thumbnail(files.get(name), cell)) for name in names[start : start + columns]]
+        height = max(image.height for _, image in row)
+        rows.append((y, height, row))
+        y += height + text * (1 + max(len(notes.get(name, ())) for name, _ in row)) + gap
+    sheet = Image.new("RGB", (2 * MARGIN + columns * (cell + gap) - gap, y + MARGIN - gap), PAPER)
+    draw, small = ImageDraw.Draw(sheet), ImageFont.load_default(12)
+    draw.text((MARGIN, MARGIN - 8), heading(diagnosis), INK, ImageFont.load_default(18))
+    x = MARGIN
+    for colour, name in ((LEFT_OUT, "left out"), (BLURRED, "blurred"), (DUPLICATE, "duplicate")):
+        draw.rectangle([x, MARGIN + LINE + 2, x + 12, MARGIN + LINE + 14], colour)
+        draw.text((x + 18, MARGIN + LINE), name, FAINT, small)
+        x += 90
+    for y, height, row in rows:
+        for i, (name, image) in enumerate(row):
+            x, mark = MARGIN + i * (cell + gap), remark(name, diagnosis)[1]
+            left = x + (cell - image.width) // 2
+            sheet.paste(image if mark != LEFT_OUT else Image.blend(image, Image.new("RGB", image.size, PAPER), 0.35),
+                        (left, y))  # fmt: skip
+            if mark:
+                draw.rectangle([left - 3, y - 3, left + image.width + 2, y + image.height + 2], None, mark, 4)
+            draw.text((x, y + height + 3), shortened(name, letters), INK, small)
+            for k, line in enumerate(notes.get(name, ())):
+                draw.text((x, y + height + 3 + text * (k + 1)), line, mark, small)
+    save_picture(path, sheet)
+
+
+def remark(name: str, diagnosis: Diagnosis) -> tuple[str, str | None]:
+    """What to say of a photograph, and in which colour."""
+    if name in diagnosis.left_out:
+        return diagnosis.left_out[name], LEFT_OUT
+    if name in diagnosis.duplicates:
+        return f"shows what {diagnosis.duplicates[name]} shows", DUPLICATE
+    if name in diagnosis.blurred:
+        return f"blurred: {diagnosis.blurred[name]}", BLURRED
+    return "", None
+
+
+def thumbnail(path: Path | None, cell: int) -> Image.Image:
+    if path is None:
+        return Image.new("RGB", (cell, cell * 2 // 3), "#e4e1dc")
+    with Image.open(path) as image:
+        image.draft("RGB", (2 * cell, 2 * cell))
+        return fit_into(image.convert("RGB"), cell, cell)
+
+
+def shortened(name: str, letters: int) -> str:
+    return name if len(name) <= letters else f"…{name[1 - letters :]}"

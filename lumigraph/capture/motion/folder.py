@@ -1,0 +1,115 @@
+"""A scene's folder: photographs, COLMAP's model and transforms.json, as other programs expect them."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import plyfile
+import pycolmap
+
+from ...errors import LumigraphError
+from ...files import PARTIAL, read_json, remove, replacing, write_json
+from ..photos import Photo
+from ..photos.track import Track
+from ..pictures import list_images
+from ..transforms import OPENCV_FROM_OPENGL
+
+WORK = "work"
+RESULT = "capture.json"
+OWNER = "sources.json"  # inside WORK: what the folder was made of
+POINTS = "points.ply"
+
+# COLMAP's parameters by the names that transforms.json has for them.
+NAMES = {
+    "SIMPLE_RADIAL": ("fl_x", "cx", "cy", "k1"),
+    "OPENCV": ("fl_x", "fl_y", "cx", "cy", "k1", "k2", "p1", "p2"),
+}
+
+
+def claim(folder: Path, sources: Sequence[Path]) -> Path:
+    """Make or recognise the folder of these photographs' scene; gives the folder to work in.
+
+    Raises LumigraphError for a folder that holds something else.
+    """
+    work, wanted = folder / WORK, [str(path.resolve()) for path in sources]
+    if any(path.resolve() == folder.resolve() for path in sources):
+        raise LumigraphError(f"{folder} holds the photographs themselves; name another folder by --output")
+    if folder.is_dir() and any(folder.iterdir()):
+        owner, result = work / OWNER, folder / RESULT
+        if owner.is_file():
+            made_of = read_json(owner)
+        elif result.is_file():
+            made_of = read_json(result).get("sources")
+        else:
+            raise LumigraphError(f"{folder} exists and is no capture; name another folder by --output")
+        if made_of != wanted:
+            raise LumigraphError(
+                f"{folder} was made from other photographs ({', '.join(made_of or ['unknown'])}); delete it, or name "
+                f"another folder by --output"
+            )
+    # Beside a folder called sparse lie no bare photographs: so those of a scene that lies among them are passed over.
+    (folder / "sparse").mkdir(parents=True, exist_ok=True)
+    write_json(work / OWNER, wanted)
+    return work
+
+
+def copy_photographs(photos: Sequence[Photo], images: Path, track: Track) -> None:
+    """Copies with their sources' dates; those that are there already stay, what else lies there goes."""
+    kept = {photo.name for photo in photos}
+    for name in list_images(images):
+        if name not in kept or PARTIAL in name:
+            remove(images / name)
+    for photo in track(photos, "Copying photographs", len(photos)):
+        target = images / photo.name
+        if not target.is_file() or stamp(target) != stamp(photo.path):
+            with replacing(target) as partial:
+                shutil.copy2(photo.path, partial)
+
+
+def stamp(path: Path) -> tuple[int, int]:
+    """What changes when a file does: nanoseconds and bytes."""
+    about = path.stat()
+    return about.st_mtime_ns, about.st_size
+
+
+def write_model(folder: Path, model: pycolmap.Reconstruction, photos: Sequence[Photo]) -> None:
+    """sparse/0, points.ply and transforms.json, all in the model's frame; frames in the order of `photos`."""
+    with replacing(folder / "sparse") as partial:
+        (partial / "0").mkdir(parents=True)
+        model.write(partial / "0")
+    write_points(folder / POINTS, model)
+    by_name = {image.name: image for image in model.images.values() if image.has_pose}
+    write_json(folder / "transforms.json", transforms(model, [by_name[p.name] for p in photos if p.name in by_name]))
+
+
+def transforms(model: pycolmap.Reconstruction, images: Sequence[pycolmap.Image]) -> dict[str, Any]:
+    """What transforms.json says: the lens once if all share it, otherwise with each frame."""
+    shared = len({image.camera_id for image in images}) == 1
+    frames = []
+    for image in images:
+        pose = np.eye(4)
+        pose[:3] = image.cam_from_world().inverse().matrix()
+        pose[:3, :3] *= OPENCV_FROM_OPENGL
+        own = {} if shared else lens(model.cameras[image.camera_id])
+        frames.append({"file_path": f"images/{image.name}", **own, "transform_matrix": pose.tolist()})
+    common = lens(model.cameras[images[0].camera_id]) if shared else {"camera_model": "OPENCV"}
+    return {**common, "ply_file_path": POINTS, "frames": frames}
+
+
+def lens(camera: pycolmap.Camera) -> dict[str, Any]:
+    numbers = dict(zip(NAMES[camera.model.name], camera.params.tolist(), strict=True))
+    numbers.setdefault("fl_y", numbers["fl_x"])
+    return {"camera_model": "OPENCV", "w": camera.width, "h": camera.height, **numbers}
+
+
+def write_points(path: Path, model: pycolmap.Reconstruction) -> None:
+    """Positions, colours, and how many photographs show each point."""
+    points = list(model.points3D.values())
+    kinds = [(k, "f4") for k in "xyz"] + [(k, "u1") for k in ("red", "green", "blue")] + [("sightings", "i4")]
+    rows = np.array([(*p.xyz, *p.color, p.track.length()) for p in points], kinds)
+    with replacing(path) as partial:
+        plyfile.PlyData([plyfile.PlyElement.describe(rows, "vertex")]).write(partial)

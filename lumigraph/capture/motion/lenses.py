@@ -1,0 +1,82 @@
+"""Which photographs share a lens, and COLMAP's database with what is known of each before anything is measured."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Literal
+
+import pycolmap
+
+from ...errors import LumigraphError
+from ..photos import Photo
+
+Sharing = Literal["auto", "single", "per-device", "per-image"]
+
+GUESSED_FOCAL = 1.2  # longer sides of the picture: 43 mm before a full frame
+ENOUGH = 12  # photographs of one lens from which on two focal lengths and four numbers of distortion can be told
+MOST = (
+    0.5  # share of the photographs of unknown origin that have one size, from which on they are taken to share a lens
+)
+
+
+def group_by_lens(photos: Sequence[Photo], in_order: bool, sharing: Sharing = "auto") -> list[list[Photo]]:
+    """Photographs in groups that share a lens.
+
+    auto: those of one device and size do. Where files name no device, a video's frames do, and photographs if most have
+    one size; pictures out of many hands seldom do.
+    Raises LumigraphError where one lens is asked for and sizes differ.
+    """
+    if sharing == "single" and len({p.size for p in photos}) > 1:
+        raise LumigraphError(
+            "--camera single needs photographs of one size, and these have several; use --camera per-device"
+        )
+    unknown = Counter(p.size for p in photos if p.device is None)
+    shared = {size for size, n in unknown.items() if in_order or sharing == "per-device" or n > MOST * unknown.total()}
+
+    def lens(photo: Photo) -> tuple:
+        if sharing == "single":
+            return ()
+        if sharing == "per-image" or (photo.device is None and photo.size not in shared):
+            return (photo.name,)
+        return photo.device, photo.size
+
+    groups: dict[tuple, list[Photo]] = {}
+    for photo in photos:
+        groups.setdefault(lens(photo), []).append(photo)
+    return list(groups.values())
+
+
+def prior(group: Sequence[Photo]) -> tuple[float, bool]:
+    """The focal length in pixels to begin with, and whether it is more than a guess: the median of what files say."""
+    known = sorted(p.focal for p in group if p.focal)
+    return (known[len(known) // 2], True) if known else (GUESSED_FOCAL * max(group[0].size), False)
+
+
+def model_for(group: Sequence[Photo]) -> str:
+    """COLMAP's name of a lens with as many unknowns as so many photographs can tell."""
+    return "OPENCV" if len(group) >= ENOUGH else "SIMPLE_RADIAL"
+
+
+def write_database(path: Path, groups: Sequence[Sequence[Photo]]) -> None:
+    """A new database with a camera for each group and an image for each photograph."""
+    database = pycolmap.Database.open(path)
+    try:
+        for group in groups:
+            focal, known = prior(group)
+            camera = pycolmap.Camera.create_from_model_name(1, model_for(group), focal, *group[0].size)
+            camera.has_prior_focal_length = known
+            camera_id = database.write_camera(camera)
+            rig = pycolmap.Rig()
+            rig.add_ref_sensor(pycolmap.sensor_t(pycolmap.SensorType.CAMERA, camera_id))
+            rig_id = database.write_rig(rig)
+            for photo in group:
+                image = pycolmap.Image(name=photo.name, camera_id=camera_id)
+                image.image_id = database.write_image(image)
+                frame = pycolmap.Frame()
+                frame.rig_id = rig_id
+                frame.add_data_id(image.data_id)
+                database.write_frame(frame)
+    finally:
+        database.close()

@@ -1,0 +1,292 @@
+"""reconstruct(): bare photographs or a video become a folder with poses, stage by stage."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import pycolmap
+
+from ...errors import LumigraphError
+from ...files import read_json, remove, replacing, write_bytes, write_json
+from ..photos import Intake, Photo, gather
+from ..photos.track import Track, untracked
+from .diagnosis import FEW_FEATURES, Diagnosis, Matches, counted, diagnose, read_matches
+from .drawings import draw_capture, draw_photographs
+from .folder import RESULT, claim, copy_photographs, stamp, write_model
+from .georeference import Georeference, georeference, gps_positions, upright
+from .lenses import Sharing, group_by_lens, model_for, prior, write_database
+from .pairs import Matching, choose_matching, choose_pairs
+from .stages import Stages, key_of
+
+FEWEST = 3  # photographs that make a model
+MAX_SIZE = 1600  # pixels of the longer side at which details are looked for
+FEATURES = ((12, 8192), (60, 4096))  # up to so many photographs so many features each; comparing goes by their square
+FEWEST_FEATURES = 2048
+UNSAFE = re.compile(r"[\s#]")  # COLMAP's lists of pairs end names at spaces
+SPECIFICATION = 1  # of what is written; another number has everything written again
+
+
+@dataclass(frozen=True)
+class Options:
+    """How cameras are looked for.
+
+    frames:   how many to take of a video; None: by its length
+    mapper:   one photograph after the other, or all at once
+    matching: which photographs are compared; auto: neighbours for a video, all up to 80 photographs, else those alike
+    camera:   which photographs share a lens
+    max_size: longer side in pixels to which photographs are reduced when details are looked for
+    """
+
+    frames: int | None = None
+    mapper: Literal["incremental", "global"] = "incremental"
+    matching: Matching = "auto"
+    camera: Sharing = "auto"
+    max_size: int = MAX_SIZE
+
+
+def reconstruct(
+    sources: Sequence[Path], folder: Path, options: Options | None = None, track: Track = untracked
+) -> dict[str, Any]:
+    """Find the cameras of bare photographs and write a scene's folder; gives what its capture.json holds.
+
+    sources: a folder, a list of image files, or one video; they are only read
+    folder:  where the scene goes: images, sparse/0, transforms.json, points.ply, capture.json, two pictures, and a
+             folder `work` that nobody needs afterwards. What lies there of an earlier call for the same sources is used
+    Raises LumigraphError if there are too few photographs, if none fit together, and for a folder of something else.
+    """
+    options = options or Options()
+    check(options)
+    for source in sources:
+        if not source.exists():
+            raise LumigraphError(f"{source} does not exist; check the path")
+    work = claim(folder, sources)
+    intake = with_safe_names(gather(sources, work, options.frames, track))
+    photos = [photo for photo in intake.photos if photo.name not in intake.duplicates]
+    if len(photos) < FEWEST:
+        raise LumigraphError(
+            f"{intake.source} has {counted(len(photos), 'photograph')} that can be used, and {FEWEST} are the least; "
+            f"take some from other places"
+        )
+    key = key_of(SPECIFICATION, pycolmap.__version__, intake_identity(intake), asdict(options))
+    if (known := finished(folder, key)) is not None:
+        return known
+    return Reconstruction(sources, folder, work, options, intake, photos, track).run(key)
+
+
+def check(options: Options) -> None:
+    if options.max_size < 200:
+        raise LumigraphError(f"--max-size {options.max_size} leaves no details to find; give at least 200 pixels")
+    if options.frames is not None and options.frames < FEWEST:
+        raise LumigraphError(f"--frames {options.frames} are too few to tell depth from; give at least {FEWEST}")
+
+
+def with_safe_names(intake: Intake) -> Intake:
+    """The same with names that COLMAP can hold in its lists."""
+    new: dict[str, str] = {}
+    for photo in intake.photos:
+        name = UNSAFE.sub("_", photo.name)
+        while name in new.values():
+            name = f"_{name}"
+        new[photo.name] = name
+    return replace(
+        intake,
+        photos=[replace(photo, name=new[photo.name]) for photo in intake.photos],
+        blurred={new[name]: why for name, why in intake.blurred.items()},
+        duplicates={new[name]: new[other] for name, other in intake.duplicates.items()},
+    )
+
+
+def intake_identity(intake: Intake) -> list[Any]:
+    """All of the intake that the result depends on, as JSON."""
+    photos = [[p.name, *stamp(p.path), p.device, p.focal, p.gps, round(p.brightness, 3)] for p in intake.photos]
+    return [photos, intake.in_order, intake.blurred, intake.duplicates, intake.unreadable]
+
+
+def finished(folder: Path, key: str) -> dict[str, Any] | None:
+    """What an earlier call found, if it came to its end for the same things."""
+    needed = ("transforms.json", "sparse/0/images.bin", "images", RESULT)
+    if not all((folder / name).exists() for name in needed):
+        return None
+    known = read_json(folder / RESULT)
+    return known if isinstance(known, dict) and known.get("key") == key else None
+
+
+@dataclass
+class Reconstruction:
+    """One run through the stages: copies, features, matching, mapping, writing."""
+
+    sources: Sequence[Path]
+    folder: Path
+    work: Path
+    options: Options
+    intake: Intake
+    photos: list[Photo]
+    track: Track
+
+    def __post_init__(self) -> None:
+        self.stages = Stages(self.work)
+        self.images, self.database, self.models = (
+            self.folder / "images",
+            self.work / "database.db",
+            self.work / "models",
+        )
+        self.names = [photo.name for photo in self.photos]
+        self.groups = group_by_lens(self.photos, self.intake.in_order, self.options.camera)
+        chosen = choose_matching(len(self.photos), self.intake.in_order)
+        self.matching: Matching = chosen if self.options.matching == "auto" else self.options.matching
+
+    def run(self, key: str) -> dict[str, Any]:
+        copy_photographs(self.photos, self.images, self.track)
+        features = key_of(
+            pycolmap.__version__,
+            [[p.name, *stamp(p.path)] for p in self.photos],
+            [[prior(group), model_for(group), [p.name for p in group]] for group in self.groups],
+            self.options.max_size,
+            self.count_features(),
+        )
+        matching = key_of(features, self.matching, [p.gps for p in self.photos])
+        mapping = key_of(matching, self.options.mapper)
+        self.find_features(features)
+        self.compare(matching)
+        self.place(mapping)
+        return self.write(key)
+
+    def count_features(self) -> int:
+        return next((features for most, features in FEATURES if len(self.photos) <= most), FEWEST_FEATURES)
+
+    def find_features(self, key: str) -> None:
+        if self.stages.is_done("features", key) and self.database.is_file():
+            return
+        if not self.stages.was_begun("features", key) or not self.database.is_file():
+            for file in self.work.glob(f"{self.database.name}*"):
+                remove(file)
+            with replacing(self.database) as partial:
+                write_database(partial, self.groups)
+        with self.stages.working("features", key):
+            self.colmap(
+                "Finding details", len(self.names), stage="features", names=self.names, images=str(self.images),
+                max_size=self.options.max_size, features=self.count_features(),
+            )  # fmt: skip
+
+    def compare(self, key: str) -> None:
+        if self.stages.is_done("matching", key):
+            return
+        if not self.stages.was_begun("matching", key):
+            opened = pycolmap.Database.open(self.database)
+            opened.clear_matches()
+            opened.clear_two_view_geometries()
+            opened.close()
+        with self.stages.working("matching", key):
+            pairs = choose_pairs(self.matching, self.names, self.database, gps_positions(self.photos))
+            listed = self.work / "pairs.txt"
+            write_bytes(listed, "".join(f"{self.names[i]} {self.names[j]}\n" for i, j in pairs).encode())
+            self.colmap("Comparing pairs", len(pairs), stage="matching", pairs=str(listed))
+
+    def place(self, key: str) -> None:
+        if self.stages.is_done("mapping", key) and self.models.is_dir():
+            return
+        with self.stages.working("mapping", key), replacing(self.models) as partial:
+            partial.mkdir()
+            self.colmap(
+                "Placing cameras", len(self.names), stage=self.options.mapper, images=str(self.images),
+                models=str(partial), calibrate=not all(prior(group)[1] for group in self.groups),
+            )  # fmt: skip
+
+    def colmap(self, description: str, total: int, **job: Any) -> None:
+        done = self.stages.colmap(total, database=str(self.database), **job)
+        try:
+            for _ in self.track(done, description, total):
+                pass
+        finally:
+            done.close()
+
+    def write(self, key: str) -> dict[str, Any]:
+        """The largest model becomes the scene. capture.json comes last: where it is, the rest is whole."""
+        matches = read_matches(self.database)
+        found = [pycolmap.Reconstruction(place) for place in sorted(self.models.iterdir()) if place.is_dir()]
+        found.sort(key=lambda model: (model.num_reg_images(), model.num_points3D()), reverse=True)
+        if not found or found[0].num_reg_images() < FEWEST:
+            raise LumigraphError(nothing_fits(self.intake.source, self.photos, matches))
+        for name in (RESULT, "transforms.json"):
+            remove(self.folder / name)
+        model = found[0]
+        place = self.turn_upright(model)
+        others = [sorted(image.name for image in other.images.values() if image.has_pose) for other in found[1:]]
+        taken = {image.name for image in model.images.values() if image.has_pose}
+        others = [left for names in others if len(left := [name for name in names if name not in taken]) > 1]
+        diagnosis = diagnose(self.intake, self.photos, model, others, matches)
+        if place is not None and place.new_from_old is None:
+            diagnosis = replace(diagnosis, warnings=[*diagnosis.warnings, place.say])
+        write_model(self.folder, model, self.photos)
+        draw_capture(
+            self.folder / "capture.png", model, diagnosis, place is not None and place.new_from_old is not None
+        )
+        draw_photographs(self.folder / "photographs.png", self.intake, diagnosis)
+        result = self.summary(key, model, place, diagnosis)
+        write_json(self.folder / RESULT, result)
+        return result
+
+    def turn_upright(self, model: pycolmap.Reconstruction) -> Georeference | None:
+        """Turn a model so that +z is up; by GPS, which also gives metres and the origin, where that can tell."""
+        poses = {i.name: i.cam_from_world().inverse().matrix() for i in model.images.values() if i.has_pose}
+        photos = [photo for photo in self.photos if photo.name in poses]
+        stacked = np.stack([poses[photo.name] for photo in photos])
+        place = georeference(stacked[:, :, 3], photos)
+        known = place is not None and place.new_from_old is not None
+        model.transform(place.new_from_old if place is not None and known else upright(stacked))
+        return place
+
+    def summary(
+        self, key: str, model: pycolmap.Reconstruction, place: Georeference | None, diagnosis: Diagnosis
+    ) -> dict[str, Any]:
+        cameras = [
+            {
+                "model": camera.model.name,
+                "size": [camera.width, camera.height],
+                "parameters": camera.params.tolist(),
+                "photographs": sum(image.camera_id == number and image.has_pose for image in model.images.values()),
+                "focal length from EXIF": camera.has_prior_focal_length,
+            }
+            for number, camera in sorted(model.cameras.items())
+        ]
+        gps = None
+        if place is not None:
+            gps = {
+                "used": place.new_from_old is not None,
+                "say": place.say,
+                "origin": place.origin,
+                "error": place.error,
+            }
+        return {
+            "key": key,
+            "source": self.intake.source,
+            "sources": [str(path.resolve()) for path in self.sources],
+            "options": asdict(self.options) | {"matching": self.matching, "features": self.count_features()},
+            **asdict(diagnosis),
+            "cameras": cameras,
+            "gps": gps,
+            "seconds": self.stages.seconds(),
+        }
+
+
+def nothing_fits(source: str, photos: Sequence[Photo], matches: Matches) -> str:
+    """Why no model came about, in a sentence."""
+    poor = sum(matches.features.get(photo.name, 0) < FEW_FEATURES for photo in photos)
+    if poor > len(photos) / 2:
+        why = f"{poor} of {len(photos)} show too few details, being blank, dark or out of focus"
+    elif not matches.shared:
+        why = f"no two of {len(photos)} show the same things"
+    elif matches.turned > len(matches.shared) / 2:
+        why = "they were taken from one place, which tells nothing of depth"
+    else:
+        largest = len(matches.groups()[0])
+        why = f"at most {largest} of {len(photos)} show the same things, and not from places that tell depth"
+    return (
+        f"{source}: the photographs' cameras could not be found, for {why}; take 20 or more of one thing from places "
+        f"a step apart, so that neighbours overlap by two thirds"
+    )

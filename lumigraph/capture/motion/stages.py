@@ -1,0 +1,94 @@
+"""What is done stays done: stages of work in a folder, each known by everything that it was made from."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import subprocess
+import sys
+import time
+from collections.abc import Generator, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from ...errors import LumigraphError
+from ...files import read_json, write_json
+
+WORKER = Path(__file__).with_name("worker.py")
+
+
+def key_of(*parts: Any) -> str:
+    """A short name for values of JSON: the same values give the same name, others another one."""
+    return hashlib.blake2b(json.dumps(parts, sort_keys=True).encode(), digest_size=12).hexdigest()
+
+
+class Stages:
+    """Marks in a folder's stages.json: which stages were begun and done, from what, and in how many seconds."""
+
+    def __init__(self, folder: Path):
+        self.path = folder / "stages.json"
+        self.log = folder / "colmap.log"
+        self.marks: dict[str, Any] = read_json(self.path) if self.path.is_file() else {}
+
+    def is_done(self, stage: str, key: str) -> bool:
+        mark = self.marks.get(stage, {})
+        return mark.get("key") == key and mark["done"]
+
+    def was_begun(self, stage: str, key: str) -> bool:
+        """Whether work that is not done may go on: it was begun with the same things."""
+        return self.marks.get(stage, {}).get("key") == key
+
+    def seconds(self) -> dict[str, float]:
+        """How long each stage took, interruptions left out."""
+        return {stage: mark["seconds"] for stage, mark in self.marks.items()}
+
+    @contextmanager
+    def working(self, stage: str, key: str) -> Iterator[None]:
+        """Mark a stage as begun, and once the block ends well, as done."""
+        spent = self.marks[stage]["seconds"] if self.was_begun(stage, key) else 0.0
+        self.mark(stage, key, False, spent)
+        begun = time.perf_counter()
+        try:
+            yield
+        except BaseException:
+            self.mark(stage, key, False, spent + time.perf_counter() - begun)
+            raise
+        self.mark(stage, key, True, spent + time.perf_counter() - begun)
+
+    def mark(self, stage: str, key: str, done: bool, seconds: float) -> None:
+        self.marks[stage] = {"key": key, "done": done, "seconds": round(seconds, 2)}
+        write_json(self.path, self.marks)
+
+    def colmap(self, total: int, **job: Any) -> Generator[int, None, None]:
+        """Do a job of `worker.py`; gives a number for each of `total` things that becomes ready, as it does.
+
+        Leaving the iterator early ends the work. Raises LumigraphError if COLMAP gives up.
+        """
+        command = [sys.executable, "-P", str(WORKER), json.dumps(job)]
+        with open(self.log, "ab") as log:
+            process = subprocess.Popen(
+                command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=log, start_new_session=True, text=True
+            )
+        assert process.stdin and process.stdout
+        told = 0
+        try:
+            for line in process.stdout:
+                for told in range(told + 1, min(int(line), total) + 1):  # noqa: B020
+                    yield told
+            if process.wait():
+                raise LumigraphError(
+                    f"COLMAP gave up while {job['stage']} was under way ({last_words(self.log)}); {self.log} has all "
+                    f"that it said"
+                )
+            yield from range(told + 1, total + 1)
+        finally:
+            process.kill()
+            process.wait()
+            process.stdin.close()
+            process.stdout.close()
+
+
+def last_words(log: Path) -> str:
+    lines = log.read_text("utf-8", errors="replace").split("\n")
+    return next((line.strip() for line in reversed(lines) if line.strip()), "without a word")
