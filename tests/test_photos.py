@@ -6,6 +6,8 @@ import io
 import math
 import os
 import shutil
+import struct
+import zlib
 from fractions import Fraction
 from pathlib import Path
 
@@ -213,6 +215,25 @@ def test_rare_formats_become_plain_ones(tmp_path):
                 assert error < 4, photo.name
     with Image.open(intake.photos[5].path) as copy:  # bit-exact
         assert (np.asarray(copy) == np.asarray(see_through)[::-1, ::-1]).all()
+
+
+def test_sixteen_bits_of_colour_become_eight(tmp_path):
+    """Pillow reads such files and cannot write them, so here is one byte by byte."""
+
+    def chunk(kind: bytes, data: bytes) -> bytes:
+        return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+
+    pixels = np.asarray(view(0), ">u2") * 257
+    rows = b"".join(b"\0" + row.tobytes() for row in pixels.astype(">u2"))
+    header = struct.pack(">IIBBBBB", *SIZE, 16, 2, 0, 0, 0)
+    path = tmp_path / "photos" / "deep.png"
+    path.parent.mkdir()
+    parts = (chunk(b"IHDR", header), chunk(b"IDAT", zlib.compress(rows)), chunk(b"IEND", b""))
+    path.write_bytes(b"\x89PNG\r\n\x1a\n" + b"".join(parts))
+    photo = gather([path], tmp_path / "work").photos[0]
+    assert photo.path != path
+    assert photo.path.read_bytes()[24] == 8
+    assert np.abs(np.asarray(Image.open(photo.path), int) - np.asarray(view(0), int)).max() <= 1
 
 
 # What EXIF says
@@ -492,15 +513,15 @@ def test_choice_is_even_where_all_are_alike():
     assert 17 in choose(numbers, seconds, sharp, 3 * seconds, 10)
 
 
-def test_the_odometer_counts_pixels_but_no_noise():
+def test_the_odometer_counts_pixels_but_neither_noise_nor_trembling():
     rng = np.random.default_rng(0)
     rests, moves = Odometer(), Odometer()
     wall = gaussian_filter(WALL[..., 0].astype(np.float32), 1)
     for i in range(30):
         noise = rng.normal(0, 3, (100, 180)).astype(np.float32)
-        at_rest = rests.show(wall[:100, :180] + noise)
+        at_rest = rests.show(wall[i % 2 : i % 2 + 100, :180] + noise)  # in a hand that trembles
         moving = moves.show(wall[2 * i : 2 * i + 100, :180] + noise)
-    assert at_rest < 1
+    assert at_rest <= 1
     assert moving == pytest.approx(58, rel=0.25)
 
 
