@@ -15,7 +15,7 @@ from ..photos import Photo
 Sharing = Literal["auto", "single", "per-device", "per-image"]
 
 GUESSED_FOCAL = 1.2  # longer sides of the picture: 43 mm before a full frame
-ENOUGH = 12  # photographs of one lens from which on two focal lengths and four numbers of distortion can be told
+ENOUGH = 30  # photographs of one lens from which on two focal lengths and four numbers of distortion can be told
 MOST = (
     0.5  # share of the photographs of unknown origin that have one size, from which on they are taken to share a lens
 )

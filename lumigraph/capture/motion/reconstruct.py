@@ -25,7 +25,7 @@ from .stages import Stages, key_of
 
 FEWEST = 3  # photographs that make a model
 MAX_SIZE = 1600  # pixels of the longer side at which details are looked for
-FEATURES = ((12, 8192), (60, 4096))  # up to so many photographs so many features each; comparing goes by their square
+FEATURES = ((20, 8192), (60, 4096))  # up to so many photographs so many features each; comparing goes by their square
 FEWEST_FEATURES = 2048
 UNSAFE = re.compile(r"[\s#]")  # COLMAP's lists of pairs end names at spaces
 SPECIFICATION = 1  # of what is written; another number has everything written again
@@ -72,10 +72,8 @@ def reconstruct(
             f"{intake.source} has {counted(len(photos), 'photograph')} that can be used, and {FEWEST} are the least; "
             f"take some from other places"
         )
-    key = key_of(SPECIFICATION, pycolmap.__version__, intake_identity(intake), asdict(options))
-    if (known := finished(folder, key)) is not None:
-        return known
-    return Reconstruction(sources, folder, work, options, intake, photos, track).run(key)
+    work_to_do = Reconstruction(sources, folder, work, options, intake, photos, track)
+    return finished(folder, work_to_do.keys["result"]) or work_to_do.run()
 
 
 def check(options: Options) -> None:
@@ -140,8 +138,10 @@ class Reconstruction:
         chosen = choose_matching(len(self.photos), self.intake.in_order)
         self.matching: Matching = chosen if self.options.matching == "auto" else self.options.matching
 
-    def run(self, key: str) -> dict[str, Any]:
-        copy_photographs(self.photos, self.images, self.track)
+        self.keys = self.make_keys()
+
+    def make_keys(self) -> dict[str, str]:
+        """For each stage a name of everything that its result depends on."""
         features = key_of(
             pycolmap.__version__,
             [[p.name, *stamp(p.path)] for p in self.photos],
@@ -151,10 +151,15 @@ class Reconstruction:
         )
         matching = key_of(features, self.matching, [p.gps for p in self.photos])
         mapping = key_of(matching, self.options.mapper)
-        self.find_features(features)
-        self.compare(matching)
-        self.place(mapping)
-        return self.write(key)
+        result = key_of(SPECIFICATION, mapping, intake_identity(self.intake))
+        return {"features": features, "matching": matching, "mapping": mapping, "result": result}
+
+    def run(self) -> dict[str, Any]:
+        copy_photographs(self.photos, self.images, self.track)
+        self.find_features(self.keys["features"])
+        self.compare(self.keys["matching"])
+        self.place(self.keys["mapping"])
+        return self.write(self.keys["result"])
 
     def count_features(self) -> int:
         return next((features for most, features in FEATURES if len(self.photos) <= most), FEWEST_FEATURES)
@@ -244,13 +249,15 @@ class Reconstruction:
     def summary(
         self, key: str, model: pycolmap.Reconstruction, place: Georeference | None, diagnosis: Diagnosis
     ) -> dict[str, Any]:
+        priors = {photo.name: prior(group)[1] for group in self.groups for photo in group}
+        known = {image.camera_id: priors[image.name] for image in model.images.values()}
         cameras = [
             {
                 "model": camera.model.name,
                 "size": [camera.width, camera.height],
                 "parameters": camera.params.tolist(),
                 "photographs": sum(image.camera_id == number and image.has_pose for image in model.images.values()),
-                "focal length from EXIF": camera.has_prior_focal_length,
+                "focal length from EXIF": known[number],
             }
             for number, camera in sorted(model.cameras.items())
         ]
