@@ -17,6 +17,7 @@ import tyro
 
 from . import __version__, methods
 from .commands.bench import Bench
+from .commands.capture import Capture
 from .commands.common import say
 from .commands.demo import Demo
 from .commands.eval import Eval
@@ -33,6 +34,7 @@ from .files import refusal
 
 COMMANDS: dict[str, type] = {
     "demo": Demo,
+    "capture": Capture,
     "train": Train,
     "resume": Resume,
     "eval": Eval,
@@ -47,7 +49,8 @@ COMMANDS: dict[str, type] = {
 DESCRIPTION = """Photographs become radiance fields, and radiance fields become new views.
 
   lumigraph demo                        everything once, in a few minutes
-  lumigraph train instant-ngp PHOTOS    learn a scene from a folder of posed photographs
+  lumigraph capture PHOTOS_OR_VIDEO     find where photographs were taken from
+  lumigraph train instant-ngp PHOTOS    learn a scene from a folder of photographs or a video
   lumigraph eval runs/PHOTOS-instant-ngp-1"""
 
 

@@ -48,7 +48,10 @@ def choose_reader(folder: Path, name: str | None = None) -> ModuleType:
     if not folder.exists():
         raise LumigraphError(f"{folder} does not exist; check the path")
     if not folder.is_dir():
-        raise LumigraphError(f"{folder} is a file; name the folder that holds the photographs and their poses")
+        raise LumigraphError(
+            f"{folder} is a file; name the folder that holds the photographs and their poses, "
+            f"or find those of a video or of photographs first: lumigraph capture {folder}"
+        )
     if not any(folder.iterdir()):
         raise LumigraphError(f"{folder} is empty; name a folder that holds photographs and their poses")
     if name is not None and name not in READERS:
@@ -60,5 +63,5 @@ def choose_reader(folder: Path, name: str | None = None) -> ModuleType:
     pictures = len(list_images(folder))
     raise LumigraphError(
         f"{folder} holds no camera poses ({pictures} images were found): looked for "
-        f"{'; '.join(reader.LOOKED_FOR for reader in asked.values())}; find the poses first, with COLMAP for instance"
+        f"{'; '.join(reader.LOOKED_FOR for reader in asked.values())}; find the poses first: lumigraph capture {folder}"
     )

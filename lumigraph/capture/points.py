@@ -25,7 +25,7 @@ class Points:
 
 
 def read_ply(path: Path) -> Points:
-    """Vertices with x, y, z and, where they have them, red, green, blue."""
+    """Vertices with x, y, z and, where they have them, red, green, blue, and sightings (in how many photographs)."""
     try:
         vertex = plyfile.PlyData.read(path)["vertex"]
         positions = np.stack([np.asarray(vertex[k], np.float64) for k in "xyz"], -1)
@@ -36,9 +36,10 @@ def read_ply(path: Path) -> Points:
                 colours = (colours * 255).round().clip(0, 255).astype(np.uint8)
         else:
             colours = np.full(positions.shape, 128, np.uint8)
+        sightings = np.array(vertex["sightings"]) if "sightings" in names else np.full(len(positions), 2)
     except Exception as fault:
         raise LumigraphError(f"{path} cannot be read as a point cloud ({fault}); restore or remove it") from fault
-    return Points(positions, colours, np.full(len(positions), 2))
+    return Points(positions, colours, sightings)
 
 
 def read_points3d(path: Path) -> Points:

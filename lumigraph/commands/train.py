@@ -9,6 +9,7 @@ from typing import Annotated, Any, Literal
 from tyro.conf import Fixed, OmitArgPrefixes, Positional, Suppress
 
 from .. import methods
+from .capture import posed
 from .common import (
     Reader,
     budget_of,
@@ -29,8 +30,9 @@ DEFAULT_SECONDS = 60.0
 class Train:
     """Learn a scene from its photographs.
 
-    The scene is a folder of posed photographs, or procedural:NAME. `lumigraph train METHOD --help` adds the method's
-    own options, `lumigraph methods` lists the methods. Ctrl-C saves; `lumigraph resume` goes on.
+    The scene is a folder of photographs, a video, or procedural:NAME. Where photographs have no poses, `lumigraph
+    capture` finds them first. `lumigraph train METHOD --help` adds the method's own options, `lumigraph methods` lists
+    the methods. Ctrl-C saves; `lumigraph resume` goes on.
     """
 
     method: Annotated[Positional[str], needed("METHOD")]
@@ -70,10 +72,11 @@ class Train:
 
         budget = budget_of(self.steps, self.seconds) or {"seconds": DEFAULT_SECONDS}
         kind, device = methods.find(self.method), choose_device(self.device)
-        output = self.output or next_free(f"runs/{scene_name(self.scene)}-{methods.check(self.method)}")
+        source = posed(self.scene)
+        output = self.output or next_free(f"runs/{scene_name(source)}-{methods.check(self.method)}")
         check_new(output)
         options: dict[str, Any] = {"downscale": self.downscale, "reader": self.reader}
-        scene = open_scene(self.scene, **options)
+        scene = open_scene(source, **options)
         config = self.method_config(kind)
         seed = getattr(config, "seed", self.seed)
         method = build(kind, scene.frame, config, device, seed)

@@ -36,6 +36,12 @@ def claim(folder: Path, sources: Sequence[Path]) -> Path:
     Raises LumigraphError for a folder that holds something else.
     """
     work, wanted = folder / WORK, [str(path.resolve()) for path in sources]
+    for path in sources:
+        if (path / WORK / OWNER).is_file():
+            began = " ".join(read_json(path / WORK / OWNER))
+            raise LumigraphError(
+                f"{path} is an unfinished capture; go on with: lumigraph capture {began} --output {path}"
+            )
     if any(path.resolve() == folder.resolve() for path in sources):
         raise LumigraphError(f"{folder} holds the photographs themselves; name another folder by --output")
     if folder.is_dir() and any(folder.iterdir()):

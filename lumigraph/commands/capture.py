@@ -1,0 +1,127 @@
+"""`lumigraph capture`: bare photographs or a video become a folder with poses."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from tyro.conf import Positional
+
+from ..errors import LumigraphError
+from .common import needed, option, say, scene_name, show
+
+NAMELESS = ("images", "photos", "photographs", "pictures", "input", "frames")  # folders named after what is in them
+NAMED = 12  # photographs at most that a list names; all are in capture.json and photographs.png
+INDENT = " " * 14
+
+
+@dataclass(frozen=True)
+class Capture:
+    """Find where photographs were taken from: a folder, a list of files, or a video.
+
+    The result is a folder that this and other programs open: images, sparse/0 (COLMAP), transforms.json, and two
+    pictures of how it went. Ctrl-C stops; the same command goes on.
+    """
+
+    what: Annotated[Positional[tuple[Path, ...]], needed("PHOTOS_OR_VIDEO")]
+    """A folder of photographs, several image files, or one video."""
+    output: Annotated[Path | None, option("SCENE", "scenes/NAME")] = None
+    """Folder for the scene."""
+    frames: Annotated[int | None, option("N", "by the video's length")] = None
+    """How many frames of a video to use."""
+    mapper: Literal["incremental", "global"] = "incremental"
+    """One photograph after the other, or all at once, which is quicker for hundreds."""
+    matching: Literal["auto", "sequential", "exhaustive", "retrieval"] = "auto"
+    """What is compared: neighbours in order, all pairs, or those that look alike; auto goes by kind and number."""
+    camera: Literal["auto", "single", "per-device", "per-image"] = "auto"
+    """Which photographs share a lens; auto goes by what the files say."""
+    max_size: Annotated[int, option("PIXELS")] = 1600
+    """Longer side to which photographs are reduced when details are looked for."""
+
+    def run(self) -> int:
+        from ..capture.motion import Options
+
+        if not self.what:
+            raise LumigraphError("Nothing to capture; name a folder of photographs, image files or a video")
+        options = Options(self.frames, self.mapper, self.matching, self.camera, self.max_size)
+        folder = self.output or scene_folder(self.what)
+        tell(folder, find_cameras(self.what, folder, options))
+        show({"next": f"lumigraph train gaussian-splatting {folder}"})
+        return 0
+
+
+def posed(scene: str) -> str:
+    """The scene itself, or for bare photographs and videos the folder with their poses, which are found first."""
+    from ..capture import PROCEDURAL
+    from ..capture.photos import is_bare
+
+    path = Path(scene).expanduser()
+    if scene.startswith(PROCEDURAL) or not is_bare(path):
+        return scene
+    folder = scene_folder((path,))
+    say(f"{scene} holds no poses; finding them, to {folder}")
+    tell(folder, find_cameras((path,), folder))
+    return str(folder)
+
+
+def scene_folder(what: tuple[Path, ...]) -> Path:
+    """scenes/NAME, called after the folder or the video, or for a list of files after the folder that all are in."""
+    first = what[0].expanduser().resolve()
+    if len(what) > 1 or first.suffix.lower() in (".jpg", ".jpeg", ".png"):
+        first = Path(os.path.commonpath([path.expanduser().resolve().parent for path in what]))
+    if first.name.lower() in NAMELESS and first.parent.name:
+        first = first.parent
+    return Path("scenes") / scene_name(str(first.with_suffix("") if first.is_file() else first))
+
+
+def find_cameras(what: tuple[Path, ...], folder: Path, options: Any = None) -> dict[str, Any]:
+    """reconstruct(), with bars; Ctrl-C says how to go on."""
+    from ..capture.motion import reconstruct
+    from ..display import track
+
+    try:
+        return reconstruct([path.expanduser() for path in what], folder, options, track)
+    except KeyboardInterrupt:
+        say(f"What is done is kept in {folder}; the same command goes on from there")
+        raise
+
+
+def tell(folder: Path, result: dict[str, Any]) -> None:
+    """What became of the photographs: results to stdout, warnings to stderr."""
+    show(rows(folder, result))
+    for sentence in result["warnings"]:
+        say(f"warning: {sentence}")
+
+
+def rows(folder: Path, result: dict[str, Any]) -> dict[str, str]:
+    placed, others = len(result["registered"]), result["other_models"]
+    found = {"photographs": f"{placed} of {result['given']} placed"}
+    if others:
+        found["photographs"] += f", and apart from them {' and '.join(str(len(names)) for names in others)}"
+    for title, what in (("left out", result["left_out"]), ("blurred", result["blurred"])):
+        if what:
+            found[title] = lines([f"{name}: {why}" for name, why in what.items()])
+    if result["duplicates"]:
+        found["duplicates"] = lines([f"{name} of {other}" for name, other in result["duplicates"].items()])
+    found["error"] = f"{result['error']:.2f} pixels"
+    found["points"] = f"{result['points']:,}, each in {result['track_length']:.1f} photographs on average"
+    found["seen"] = (
+        f"points fill {100 * result['filled']:.0f} % of a picture; rays to one differ by {result['angle']:.0f} degrees"
+    )
+    if coverage := result["coverage"]:
+        found["around"] = f"{coverage['degrees']:.0f} of 360 degrees"
+        gaps = [f"{g['degrees']:.0f} degrees between {' and '.join(g['between'])}" for g in coverage["gaps"]]
+        found["around"] += f"; nobody looked from {', '.join(gaps)}" if gaps else ""
+    if result["gps"] and result["gps"]["used"]:
+        found["place"] = result["gps"]["say"]
+    found["time"] = ", ".join(f"{stage} {seconds:.0f} s" for stage, seconds in result["seconds"].items())
+    found["pictures"] = f"{folder / 'capture.png'}, {folder / 'photographs.png'}"
+    return found | {"scene": str(folder)}
+
+
+def lines(items: list[str]) -> str:
+    """One below the other, beside the names of the rows."""
+    more = [f"and {len(items) - NAMED} more, in photographs.png and capture.json"] if len(items) > NAMED else []
+    return f"\n{INDENT[:13]}".join(items[:NAMED] + more)
