@@ -1,0 +1,52 @@
+"""`lumigraph export panorama`: the whole sphere around a place, on one picture."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+from tyro.conf import Positional, arg
+
+from ..common import choose_device, needed, option, show
+from .points import opened
+
+Place = Annotated[
+    tuple[float, float, float] | None,
+    arg(
+        name="from",
+        metavar="X Y Z",
+        help_behavior_hint="(default: where the camera in the middle of all stood)",
+    ),
+]
+
+
+@dataclass(frozen=True)
+class Panorama:
+    """All that is seen from one place, as an equirectangular picture that viewers and headsets show as a sphere.
+
+    The horizon is level, the photographs' main direction in the middle. The ending says which format: .png or .jpg.
+    """
+
+    source: Annotated[Positional[Path], needed("RUN_OR_FILE")]
+    """Folder of a run, or a splat file."""
+    output: Annotated[Positional[Path], needed("FILE")]
+    """The new picture."""
+    place: Place = None
+    """Where to stand, in the frame of the photographs."""
+    size: Annotated[int, option("PIXELS")] = 2048
+    """Width; the height is half of it."""
+    device: Annotated[str, option("NAME")] = "auto"
+    """auto, cpu, cuda, cuda:1."""
+
+    def run(self) -> int:
+        from ...export.panorama import panorama, picture_format, save_sphere, sphere_size, standpoint
+
+        picture_format(self.output)
+        sphere_size(self.size)
+        run, _ = opened(self.source)
+        place, heading, where = standpoint(run.cameras()["train"], run.frame, self.place)
+        method = run.method(choose_device(self.device))
+        save_sphere(self.output, panorama(method, place, heading, self.size).rgb, whole=True)
+        show({"panorama": str(self.output), "size": f"{self.size}x{self.size // 2}", "from": where})
+        return 0

@@ -1,0 +1,71 @@
+"""`lumigraph export stereo`: a panorama for each eye, for headsets."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+from tyro.conf import Positional
+
+from ...errors import LumigraphError
+from ..common import choose_device, needed, option, show
+from .panorama import Place
+from .points import opened
+
+
+@dataclass(frozen=True)
+class Stereo:
+    """An omnidirectional stereo pair on one square picture, the left eye on top.
+
+    The horizon is level, the photographs' main direction in the middle. The ending says which format: .png or .jpg.
+    Photographs seldom tell how large a scene is; where yours do (GPS, a measured model), give --interpupillary 0.064 in
+    metres, and sizes will feel real.
+    """
+
+    source: Annotated[Positional[Path], needed("RUN_OR_FILE")]
+    """Folder of a run, or a splat file."""
+    output: Annotated[Positional[Path], needed("FILE")]
+    """The new picture."""
+    place: Place = None
+    """Where the middle between the eyes is, in the frame of the photographs."""
+    interpupillary: Annotated[float | None, option("LENGTH", "1/50 of the median distance to what is around")] = None
+    """Distance between the eyes, in the units of the photographs' frame."""
+    size: Annotated[int, option("PIXELS")] = 2048
+    """Width, and height of both halves together."""
+    device: Annotated[str, option("NAME")] = "auto"
+    """auto, cpu, cuda, cuda:1."""
+
+    def run(self) -> int:
+        from ...export.mesh import scale_to_source
+        from ...export.panorama import picture_format, save_sphere, sphere_size, standpoint
+        from ...export.stereo import SHARE, stereo_pair, surrounding_distances, top_bottom
+
+        picture_format(self.output)
+        sphere_size(self.size)
+        if self.interpupillary is not None and not 0 < self.interpupillary < float("inf"):
+            raise LumigraphError(
+                f"Eyes cannot be {self.interpupillary:g} apart; give --interpupillary a length above 0"
+            )
+        run, _ = opened(self.source)
+        place, heading, where = standpoint(run.cameras()["train"], run.frame, self.place)
+        method = run.method(choose_device(self.device))
+        unit = scale_to_source(run.frame)
+        near, middle = surrounding_distances(method, place, heading)
+        apart = SHARE * middle if self.interpupillary is None else self.interpupillary / unit
+        if apart > near:
+            raise LumigraphError(
+                f"Eyes {apart * unit:.4g} apart do not fit where things are {near * unit:.4g} away; "
+                "give a smaller --interpupillary or another --from"
+            )
+        pair = stereo_pair(method, place, heading, self.size, apart, near)
+        save_sphere(self.output, top_bottom(*pair), whole=False)
+        show(
+            {
+                "stereo pair": f"{self.output}, the left eye on top",
+                "size": f"{self.size}x{self.size}",
+                "from": where,
+                "eyes": f"{apart * unit:.4g} apart; half of all is nearer than {middle * unit:.4g}",
+            }
+        )
+        return 0

@@ -1,0 +1,222 @@
+"""Panoramas: the whole sphere around a place, from any method, on one equirectangular picture.
+
+Methods that follow every lens render it as it is, ray by ray. Gaussians are seen on flat pictures only, so the sphere
+is put together from many small ones, each rendered for a few columns and a band of rows and read between its pixels.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from PIL.PngImagePlugin import PngInfo
+from torch import Tensor
+
+from ..camera import Camera
+from ..display import track
+from ..errors import LumigraphError
+from ..figures import to_image
+from ..files import replacing
+from ..lens import Equirectangular, Pinhole
+from ..method import Method
+from ..paths import Surroundings, unit
+from ..rays import Rendering
+from ..scene import Frame
+
+AT_ONCE = 1 << 18  # pixels rendered between two looks at the progress
+BANDS = 3  # of rows, each seen by flat pictures that are pitched towards it
+COLUMNS = 8  # flat pictures around the horizon, where one place sees all
+FINENESS = 1.25  # pixels of a flat picture's middle for one of the panorama's equator
+BORDER = 2  # pixels around what is read of a flat picture
+JPEG_QUALITY = 95
+NARROWEST, WIDEST = 64, 16_384  # pixels
+
+Vector = tuple[float, float, float]
+
+
+def panorama(method: Method, place: Float[Tensor, " 3"], heading: Float[Tensor, " 3"], width: int) -> Rendering:
+    """What is seen from a place in the scene's frame, (width / 2, width) pixels; up is +z.
+
+    heading: what lies in the middle, once it is made level
+    """
+    return sphere(method, level_camera(place, heading, Equirectangular(sphere_size(width))), "Panorama")
+
+
+def sphere(method: Method, camera: Camera, name: str, columns: int | None = None) -> Rendering:
+    """What an upright camera behind an `Equirectangular` lens, or a kind of it, sees.
+
+    columns: of the flat pictures that others than ray methods need; None for an eighth of the sphere
+    """
+    method.eval()
+    width, height = camera.size[0].tolist()
+    if method.any_lens:
+        step = max(1, AT_ONCE // width)
+        tops = range(0, height, step)
+        parts = [method.render(rows_of(camera, top, min(step, height - top))) for top in track(tops, name, len(tops))]
+        return Rendering.cat([Rendering(x.rgb.cpu(), x.depth.cpu(), x.opacity.cpu()) for x in parts])
+    return by_flat_pictures(method, camera, columns or -(-width // COLUMNS), name)
+
+
+def by_flat_pictures(method: Method, camera: Camera, columns: int, name: str) -> Rendering:
+    """The sphere from flat pictures; each is exact where all of its columns see from one place."""
+    width, height = camera.size[0].tolist()
+    rgb, depth, opacity = torch.empty(height, width, 3), torch.empty(height, width), torch.empty(height, width)
+    patches = list(cut(width, height, columns))
+    for rows, some in track(patches, name, len(patches)):
+        y, x = torch.meshgrid(torch.arange(rows.start, rows.stop), torch.arange(some.start, some.stop), indexing="ij")
+        pixels = torch.stack([x, y], -1).reshape(-1, 2) + 0.5
+        flat, at = flat_camera(camera, pixels)
+        seen = method.render(flat).cpu()
+        rgb[rows, some] = read(seen.rgb, at).view(*x.shape, 3)
+        opacity[rows, some] = read(seen.opacity[..., None], at).view(x.shape)
+        depth[rows, some] = read(seen.depth[..., None], at, "nearest").view(x.shape)  # infinity has no mean
+    return Rendering(rgb, depth, opacity)
+
+
+def cut(width: int, height: int, columns: int) -> Iterator[tuple[slice, slice]]:
+    """Rows and columns of patches that cover a picture."""
+    edges = [round(height * i / BANDS) for i in range(BANDS + 1)]
+    for left in range(0, width, columns):
+        for top, bottom in zip(edges, edges[1:], strict=False):
+            yield slice(top, bottom), slice(left, min(left + columns, width))
+
+
+def flat_camera(camera: Camera, pixels: Float[Tensor, "pixel 2"]) -> tuple[Camera, Float[Tensor, "pixel 2"]]:
+    """A pinhole camera that looks where some neighbouring pixels of a sphere look, and where on its picture they are.
+
+    It stands where the ray in the middle of them begins.
+    """
+    assert isinstance(camera.lens, Equirectangular)
+    middle = (pixels.amin(0) + pixels.amax(0))[None] / 2
+    z = camera.lens.unproject(middle)[0]
+    x = unit(torch.stack([z[2], torch.zeros_like(z[0]), -z[0]]))  # level
+    turn = torch.stack([x, torch.linalg.cross(z, x), z], -1)
+    directions = camera.lens.unproject(pixels) @ turn
+    focal = FINENESS * camera.lens.size[0, 0] / (2 * math.pi)
+    at = focal * directions[:, :2] / directions[:, 2:]
+    low, high = at.amin(0), at.amax(0)
+    corner = BORDER + 0.5 - low.floor()  # the axis goes through a pixel's centre
+    size = (high.ceil() - low.floor()).long() + 1 + 2 * BORDER
+    rotation = camera.pose[0, :, :3] @ turn
+    begin = camera.rays(middle).origins[0]
+    pose = torch.cat([rotation, begin[:, None]], -1)[None]
+    return Camera(pose, Pinhole(focal.expand(1, 2), corner[None]), size[None]), at + corner
+
+
+def read(
+    picture: Float[Tensor, "height width channel"], at: Float[Tensor, "pixel 2"], how: str = "bilinear"
+) -> Float[Tensor, "pixel channel"]:
+    """Values of a picture at places (x, y) of it."""
+    height, width = picture.shape[:2]
+    share = 2 * at / torch.tensor([width, height]) - 1
+    found = torch.nn.functional.grid_sample(
+        picture.permute(2, 0, 1)[None], share[None, None], how, "border", align_corners=False
+    )
+    return found[0, :, 0].T
+
+
+def rows_of(camera: Camera, top: int, count: int) -> Camera:
+    """The same camera for some rows of its picture."""
+    assert isinstance(camera.lens, Equirectangular)
+    lens = replace(camera.lens, centre=camera.lens.centre - camera.lens.centre.new_tensor([[0, top]]))
+    return replace(camera, lens=lens, size=torch.tensor([[int(camera.size[0, 0]), count]]))
+
+
+def sphere_size(width: int) -> Float[Tensor, "1 2"]:
+    """Pixels of a panorama. Raises LumigraphError for a width that none has."""
+    if width % 2 or not NARROWEST <= width <= WIDEST:
+        raise LumigraphError(
+            f"A panorama cannot be {width} pixels wide; give --size an even number from {NARROWEST} to {WIDEST}"
+        )
+    return torch.tensor([[width, width / 2]])
+
+
+def level_camera(place: Float[Tensor, " 3"], heading: Float[Tensor, " 3"], lens: Equirectangular) -> Camera:
+    """A camera that stands upright and faces a heading."""
+    z = unit(torch.stack([heading[0], heading[1], torch.zeros_like(heading[0])]))
+    down = torch.tensor([0.0, 0.0, -1.0])
+    pose = torch.stack([torch.linalg.cross(down, z), down, z, place], -1)[None]
+    return Camera(pose, lens, lens.size.long())
+
+
+def standpoint(cameras: Camera, frame: Frame, source: Vector | None = None) -> tuple[Tensor, Tensor, str]:
+    """Where to stand and what to face, in the scene's frame, and where that is in words.
+
+    source: the place in the source's frame. Without one it is where the camera nearest to the middle of all stood: a
+            place that is free for certain, and that photographs tell about.
+    """
+    around = Surroundings(cameras, frame)
+    source_from_scene = torch.tensor(frame.source_from_scene, dtype=torch.double)
+    if source is None:
+        away = (around.position - around.position.median(0).values).norm(dim=-1)
+        place = around.position[int(away.argmin())]
+        given = source_from_scene[:3, :3] @ place + source_from_scene[:3, 3]
+        words = "where the camera in the middle of all stood"
+    else:
+        given = torch.tensor(source, dtype=torch.double)
+        if not given.isfinite().all():
+            raise LumigraphError("Nobody can stand at a place that is not finite; give --from three numbers")
+        place = torch.linalg.solve(source_from_scene[:3, :3], given - source_from_scene[:3, 3])
+        words = "as asked"
+    heading = around.axes[0] if not around.inward else around.focus - place - 1e-6 * around.axes[0]
+    return place.float(), heading.float(), f"{' '.join(f'{x:.4g}' for x in given.tolist())}, {words}"
+
+
+def save_sphere(path: Path, rgb: Float[Tensor, "height width 3"], whole: bool) -> None:
+    """Write a PNG or a JPEG, whole or not at all.
+
+    whole: whether this is one panorama, which then says so in its metadata (Google's GPano), so that viewers show it
+           as a sphere
+    Raises LumigraphError for another ending.
+    """
+    picture_format(path)
+    image, height, width = to_image(rgb), *rgb.shape[:2]
+    about: dict[str, Any] = {}
+    if whole and path.suffix.lower() == ".png":
+        about["pnginfo"] = PngInfo()
+        about["pnginfo"].add_itxt("XML:com.adobe.xmp", gpano(width, height))
+    elif whole:
+        about["xmp"] = gpano(width, height).encode()
+    if path.suffix.lower() != ".png":
+        about |= {"quality": JPEG_QUALITY, "subsampling": 0}
+    with replacing(path) as partial:
+        image.save(partial, picture_format(path), **about)
+
+
+def picture_format(path: Path) -> str:
+    """Pillow's name for what an ending stands for."""
+    found = {".png": "PNG", ".jpg": "JPEG", ".jpeg": "JPEG"}.get(path.suffix.lower())
+    if found is None:
+        raise LumigraphError(f"{path} should end in .png or .jpg, the kinds of picture there are; rename it")
+    return found
+
+
+def gpano(width: int, height: int) -> str:
+    """XMP that declares a full sphere, upright (Google's Photo Sphere schema)."""
+    numbers = {
+        "ProjectionType": "equirectangular",
+        "UsePanoramaViewer": "True",
+        "FullPanoWidthPixels": width,
+        "FullPanoHeightPixels": height,
+        "CroppedAreaImageWidthPixels": width,
+        "CroppedAreaImageHeightPixels": height,
+        "CroppedAreaLeftPixels": 0,
+        "CroppedAreaTopPixels": 0,
+        "PosePitchDegrees": 0,
+        "PoseRollDegrees": 0,
+    }
+    said = "\n".join(f"   <GPano:{name}>{value}</GPano:{name}>" for name, value in numbers.items())
+    return (
+        '<?xpacket begin="\ufeff" id="W5M0MpCehiHzreSzNTczkc9d"?>\n'
+        '<x:xmpmeta xmlns:x="adobe:ns:meta/">\n'
+        ' <rdf:RDF xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#">\n'
+        '  <rdf:Description rdf:about="" xmlns:GPano="http://ns.google.com/photos/1.0/panorama/">\n'
+        f"{said}\n"
+        "  </rdf:Description>\n </rdf:RDF>\n</x:xmpmeta>\n"
+        '<?xpacket end="r"?>'
+    )

@@ -1,0 +1,80 @@
+"""Omnidirectional stereo: a panorama for each eye, the pair that headsets show as a sphere in depth.
+
+All around, the two eyes' rays leave a level circle along its tangents (`lens.OmnidirectionalStereo`; Peleg 2001), so
+whichever way one turns, the eyes are beside each other. Looking at the poles there is no such thing, and depth fades.
+"""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from ..errors import LumigraphError
+from ..lens import OmnidirectionalStereo
+from ..method import Method
+from ..rays import Rendering
+from .panorama import level_camera, panorama, sphere, sphere_size
+
+SHARE = 1 / 50  # of the distance to what is around: 64 mm in a room of some three metres
+PROBE = 256  # pixels of the small panorama that tells distances
+SHIFT = 0.1  # pixels by which a flat picture may be off at its edge, at what is near
+MOST_COLUMNS = 32
+SOLID = 0.5  # opacity from which on something is there
+
+
+def stereo_pair(
+    method: Method,
+    place: Float[Tensor, " 3"],
+    heading: Float[Tensor, " 3"],
+    width: int,
+    interpupillary: float,
+    nearest: float,
+) -> tuple[Rendering, Rendering]:
+    """What the left and the right eye see, (width / 2, width) pixels each; up is +z.
+
+    place:          the middle between the eyes, in the scene's frame
+    interpupillary: the distance between them, scene units
+    nearest:        distance to what is near, scene units: the nearer, the more flat pictures it takes to be exact
+    """
+    columns = columns_at_once(interpupillary / 2, nearest)
+    eyes = []
+    for name, side in (("Left eye", -0.5), ("Right eye", 0.5)):
+        offset = torch.tensor([[side * interpupillary]])
+        camera = level_camera(place, heading, OmnidirectionalStereo(sphere_size(width), offset=offset))
+        eyes.append(sphere(method, camera, name, columns))
+    return eyes[0], eyes[1]
+
+
+def top_bottom(left: Rendering, right: Rendering) -> Float[Tensor, "height width 3"]:
+    """The pair as one square picture, the left eye on top."""
+    return torch.cat([left.rgb, right.rgb])
+
+
+def surrounding_distances(
+    method: Method, place: Float[Tensor, " 3"], heading: Float[Tensor, " 3"]
+) -> tuple[float, float]:
+    """How far away things are from a place: near ones (the 2nd percentile) and half of all, scene units.
+
+    Each direction counts by its share of the sphere. Raises LumigraphError where nothing is around.
+    """
+    seen = panorama(method, place, heading, PROBE)
+    rows = torch.arange(PROBE // 2) + 0.5
+    weight = torch.sin(torch.pi * rows / len(rows))[:, None].expand_as(seen.depth)
+    solid = (seen.opacity > SOLID) & seen.depth.isfinite()
+    if not solid.any():
+        raise LumigraphError("Nothing is around that place; give --from another one, or --interpupillary")
+    depth, order = seen.depth[solid].sort()
+    share = weight[solid][order].cumsum(0)
+    near, middle = (depth[int(torch.searchsorted(share, q * share[-1]))].item() for q in (0.02, 0.5))
+    return near, middle
+
+
+def columns_at_once(radius: float, nearest: float) -> int:
+    """How many columns one flat picture may serve.
+
+    Its camera stands where the middle column's rays begin. Those of a column k / 2 away begin k / 2 pixels' angle
+    further along the circle, which is ahead or behind by r k / 2 pixels' angle: things at a distance d and high up are
+    off by up to r k / (2 d) pixels.
+    """
+    return max(1, min(MOST_COLUMNS, int(2 * SHIFT * nearest / max(radius, 1e-9))))
