@@ -7,6 +7,7 @@ meshes, neither for pictures). They are compressed into the page, and so is what
 from __future__ import annotations
 
 import base64
+import dataclasses
 import gzip
 import io
 import json
@@ -37,6 +38,7 @@ from .mesh import Mesh
 WEB = Path(__file__).parent / "web"
 NEAREST, FARTHEST = 0.1, 3.0  # times the first distance to what is looked at: how far zooming goes
 BELOW = 20.0  # degrees below the lowest photograph that the camera may go
+ARC = 0.8  # of the arc that photographs cover is shown
 AHEAD = 0.02  # scene units: of what a camera turns about that looks outward from the middle
 FINE = 2, 4  # of 1/128: steps of the harmonics, a quarter of those that .spz files have by custom
 QUALITY = 90  # of the pictures, as WebP
@@ -122,8 +124,9 @@ def views_page(path: Path, method: Method, cameras: Camera, look: Look, count: i
     longest: side of a picture in pixels
     """
     method.eval()
-    closed = Surroundings(cameras, method.frame).arc[1] == math.pi
-    seen_from = views(cameras, method.frame, count, longest, closed)
+    around = Surroundings(cameras, method.frame)
+    closed = around.arc[1] == math.pi
+    seen_from = views(around, count, film_size(cameras, longest))
     pictures, ends = [], [0]
     for i in track(range(len(seen_from)), f"Rendering {path.name}", len(seen_from)):
         pictures.append(webp(method.render(seen_from[i]).rgb))
@@ -140,13 +143,14 @@ def views_page(path: Path, method: Method, cameras: Camera, look: Look, count: i
     write_page(path, "views", settings, b"".join(pictures), *hints)
 
 
-def views(cameras: Camera, frame: Frame, count: int, longest: int, closed: bool) -> Camera:
-    """Once around; or from one end to the other of the arc that an orbit sways along, which is half of its way."""
-    size = film_size(cameras, longest)
-    if closed:
-        return camera_path("orbit", cameras, frame, count, size)
-    there_and_back = camera_path("orbit", cameras, frame, 2 * count, size)
-    return there_and_back[(torch.arange(count) + (3 * count) // 2) % (2 * count)]
+def views(around: Surroundings, count: int, size: tuple[int, int]) -> Camera:
+    """Once around; or evenly along the arc that photographs cover. size: (width, height)."""
+    path = camera_path("orbit", around.cameras, around.frame, count, size)
+    middle, half = around.arc
+    if half == math.pi:
+        return path
+    azimuth = torch.linspace(middle - ARC * half, middle + ARC * half, count, dtype=torch.double)
+    return dataclasses.replace(path, pose=around.poses(azimuth, *around.typical(azimuth)).float())
 
 
 def webp(rgb: Float[Tensor, "height width 3"]) -> bytes:

@@ -1,6 +1,7 @@
 // A cloud of Gaussians, drawn by Spark as Lumigraph draws it: blended in sRGB, cut where it adds less than 1/255.
 
-import { SparkRenderer, SplatFileType, SplatMesh } from "@sparkjsdev/spark";
+import { ExtSplats, SparkRenderer, SplatFileType, SplatMesh } from "@sparkjsdev/spark";
+import { packAgain } from "./harmonics.js";
 import { Stage } from "./stage.js";
 
 const FAINTEST = 1 / 255;
@@ -22,13 +23,21 @@ export async function start(settings, data) {
     ...widened,
   });
   asOurs(spark.material);
-  const mesh = new SplatMesh({ fileBytes: data, fileType: SplatFileType.SPZ, extSplats: true, lod: false });
+  const unpacked = await new Response(new Blob([data]).stream().pipeThrough(new DecompressionStream("gzip"))).arrayBuffer();
+  const cloud = new ExtSplats({ fileBytes: data, fileType: SplatFileType.SPZ });
+  await cloud.initialized;
+  packAgain(unpacked, cloud.extra);
+  const mesh = new SplatMesh({ extSplats: cloud });
   mesh.quaternion.set(1, 0, 0, 0); // .spz has y up and z back: half a turn around x
   stage.scene.add(spark, mesh);
   await mesh.initialized;
-  stage.arranged = async () => {
-    await spark.update({ scene: stage.scene, camera: stage.camera });
+  stage.sorted = async () => {
     while (spark.sorting || spark.sortDirty) await new Promise((resolve) => setTimeout(resolve, 5));
+  };
+  stage.arranged = async () => {
+    await stage.sorted(); // for another camera, perhaps
+    await spark.update({ scene: stage.scene, camera: stage.camera });
+    await stage.sorted();
   };
   stage.camera.updateMatrixWorld();
   await stage.arranged();

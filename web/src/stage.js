@@ -20,7 +20,8 @@ export class Stage {
     this.camera = new PerspectiveCamera(50, 1, settings.near, settings.far);
     this.camera.up.set(0, 0, 1);
     this.paint = () => this.renderer.render(this.scene, this.camera);
-    this.arranged = async () => {}; // becomes a wait for what must be put in order before a picture is right
+    this.arranged = async () => {}; // to await: what must be put in order before a camera's picture is right
+    this.sorted = async () => {}; // and what of that is under way
 
     const canvas = this.renderer.domElement;
     canvas.tabIndex = 0;
@@ -29,7 +30,7 @@ export class Stage {
 
     this.controls = new OrbitControls(this.camera, canvas);
     Object.assign(this.controls, {
-      enableDamping: true,
+      enableDamping: !matchMedia("(prefers-reduced-motion: reduce)").matches,
       dampingFactor: 0.08,
       rotateSpeed: settings.inward ? 0.7 : -0.35, // looking outward, the scene is dragged along
       minDistance: settings.nearest,
@@ -120,6 +121,19 @@ export class Stage {
     this.lens();
     await this.arranged();
     this.paint();
-    await new Promise((resolve) => requestAnimationFrame(() => requestAnimationFrame(resolve)));
+    await shown();
   }
+
+  // Until the picture no longer changes.
+  async rest() {
+    do {
+      await this.sorted();
+      await shown();
+    } while (this.asked);
+  }
+}
+
+// Until what was painted is on the screen.
+export function shown() {
+  return new Promise((resolve) => requestAnimationFrame(() => requestAnimationFrame(resolve)));
 }

@@ -5,6 +5,8 @@ const SWEEP = 0.8; // of all pictures, turned over by a drag across a window up 
 const LARGE = 900;
 const CROP = 1.45; // times larger than the largest that fits, at most, to fill the window
 
+const STILL = matchMedia("(prefers-reduced-motion: reduce)").matches;
+
 export async function start(settings, data) {
   const pictures = await Promise.all(settings.pictures.map(([begin, end]) => decode(data.slice(begin, end))));
   const canvas = document.createElement("canvas");
@@ -94,7 +96,7 @@ class Views {
     this.asked = requestAnimationFrame(() => {
       this.asked = null;
       this.paint();
-      if (this.fingers.size || Math.abs(this.speed) < 0.02) return;
+      if (STILL || this.fingers.size || Math.abs(this.speed) < 0.02) return;
       this.speed *= FRICTION;
       this.turn(this.speed);
     });
@@ -122,6 +124,17 @@ class Views {
     this.speed = 0;
     this.at = away.indexOf(Math.min(...away));
     this.paint();
-    await new Promise((resolve) => requestAnimationFrame(() => requestAnimationFrame(resolve)));
+    await shown();
   }
+
+  // Until the picture no longer changes.
+  async rest() {
+    do await shown();
+    while (this.asked);
+  }
+}
+
+// Until what was painted is on the screen.
+function shown() {
+  return new Promise((resolve) => requestAnimationFrame(() => requestAnimationFrame(resolve)));
 }

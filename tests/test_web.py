@@ -1,0 +1,286 @@
+"""Pages to share: they open from disk in a real browser, with no network, and show what we render ourselves."""
+
+from __future__ import annotations
+
+import dataclasses
+import io
+import json
+import math
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from browser import listen
+from PIL import Image
+from tiny import method as tiny_method
+from tiny import new_run, poses, scene
+
+from lumigraph.camera import Camera
+from lumigraph.cli import main
+from lumigraph.export.mesh import Mesh
+from lumigraph.export.page import WEB, Look, look_at_scene, mesh_page, splats_page, views, views_page
+from lumigraph.gaussians import Gaussians
+from lumigraph.lens import Pinhole
+from lumigraph.paths import Surroundings
+from lumigraph.run import State
+from lumigraph.splatting import render
+
+SIZE = 256
+PACKAGES = Path(__file__).parent.parent / "web" / "package.json"
+LOOK = Look("A <test> & more", (0.9, 0.8, 0.6), (0.0, -3.0, 1.0), (0.0, 0.0, 0.0), 50.0, 0.05, 100, 0.3, 9, 110, True)
+
+
+def cloud(count: int = 400, antialiased: bool = False) -> Gaussians:
+    """Gaussians of many shapes and sizes in a ball, with strong harmonics, all inside what .spz can hold."""
+    g = torch.Generator().manual_seed(3)
+    harmonics = 0.25 * torch.randn(count, 16, 3, generator=g).clamp(-3, 3)
+    harmonics[:, 0] = 1.2 * torch.randn(count, 3, generator=g).clamp(-2, 2)
+    return Gaussians(
+        0.35 * torch.randn(count, 3, generator=g),
+        torch.randn(count, 4, generator=g),
+        -3 + 0.8 * torch.randn(count, 3, generator=g),
+        2 * torch.randn(count, generator=g),
+        harmonics,
+        antialiased,
+    )
+
+
+def some_camera(index: int = 1, angle: float = 45.0) -> Camera:
+    focal = SIZE / 2 / math.tan(math.radians(angle) / 2)
+    lens = Pinhole(torch.tensor([[focal, focal]]), torch.tensor([[SIZE / 2, SIZE / 2]]))
+    return Camera(poses()[index : index + 1], lens, torch.tensor([[SIZE, SIZE]]))
+
+
+def psnr(a: np.ndarray, b: np.ndarray) -> float:
+    return -10 * math.log10(max(float(np.square(a - b).mean()), 1e-10))
+
+
+class Window:
+    """A browser's window on a page from disk, with the network cut and everything it asks for written down."""
+
+    def __init__(self, chromium, path: Path, **context):
+        context = {"viewport": {"width": SIZE, "height": SIZE}} | context
+        self.context = chromium.new_context(offline=True, reduced_motion="reduce", **context)  # no swinging out
+        self.page = self.context.new_page()
+        self.faults = listen(self.page)
+        self.requests: list[str] = []
+        self.page.on("request", lambda request: self.requests.append(request.url))
+        self.page.goto(path.as_uri())
+        self.page.evaluate("lumigraph.ready")
+        self.page.wait_for_function("document.body.classList.contains('open')")
+        self.page.add_style_tag(
+            content="#caption, #buttons, #wait { display: none !important } * { transition: none !important }"
+        )
+
+    def look(self, camera: Camera, angle: float = 45.0) -> np.ndarray:
+        self.page.evaluate("([pose, angle]) => lumigraph.setCamera(pose, angle)", [camera.pose[0].tolist(), angle])
+        return self.picture()
+
+    def picture(self) -> np.ndarray:
+        return np.asarray(Image.open(io.BytesIO(self.page.screenshot())).convert("RGB")) / 255
+
+    def settled(self) -> np.ndarray:
+        """The picture once it has stopped moving."""
+        self.page.evaluate("lumigraph.rest()")
+        return self.picture()
+
+    def drag(self, by: float) -> None:
+        """From the middle to the right, by a share of the window's width."""
+        width, height = (self.page.viewport_size[side] for side in ("width", "height"))
+        self.page.mouse.move(width / 2, height / 2)
+        self.page.mouse.down()
+        self.page.mouse.move((0.5 + by) * width, height / 2, steps=3)
+        self.page.mouse.up()
+
+    def close(self) -> None:
+        """At the end nothing was complained of, and nothing asked of a network."""
+        self.context.close()
+        assert self.faults == []
+        assert {url.partition(":")[0] for url in self.requests} <= {"file", "blob", "data"}
+
+
+@pytest.fixture
+def window(chromium):
+    opened: list[Window] = []
+
+    def open_(path: Path, **context) -> Window:
+        opened.append(Window(chromium, path, **context))
+        return opened[-1]
+
+    yield open_
+    for each in opened:
+        each.close()
+
+
+@pytest.mark.parametrize("antialiased", [False, True])
+def test_splats_are_drawn_as_we_draw_them(tmp_path, window, antialiased):
+    made = cloud(antialiased=antialiased)
+    splats_page(tmp_path / "page.html", made, LOOK)
+    assert (tmp_path / "page.html").stat().st_size < 2e6
+    opened = window(tmp_path / "page.html")
+    for index in (1, 4):
+        camera = some_camera(index)
+        shown = opened.look(camera)
+        ours = render(made, camera, LOOK.background, LOOK.near).rgb.clamp(0, 1).numpy()
+        assert psnr(shown, ours) > 42
+        without = render(
+            dataclasses.replace(made, harmonics=made.harmonics[:, :1]), camera, LOOK.background, LOOK.near
+        ).rgb.clamp(0, 1)
+        assert psnr(shown, without.numpy()) < 30  # the harmonics are seen
+
+
+def test_turning_and_going_back(tmp_path, window):
+    splats_page(tmp_path / "page.html", cloud(), LOOK)
+    opened = window(tmp_path / "page.html")
+    assert opened.page.title() == LOOK.title
+    first = opened.settled()
+    assert psnr(first, np.broadcast_to(LOOK.background, first.shape)) < 20  # something is there from the start
+    opened.drag(0.25)
+    turned = opened.settled()
+    assert psnr(turned, first) < 25
+    opened.page.keyboard.press("ArrowLeft")
+    assert psnr(opened.settled(), turned) < 35
+    opened.page.mouse.wheel(0, -300)
+    assert psnr(opened.settled(), turned) < 30
+    opened.page.keyboard.press("r")
+    assert psnr(opened.settled(), first) > 45
+
+
+def test_a_phone(tmp_path, window):
+    splats_page(tmp_path / "page.html", cloud(), LOOK)
+    phone = {"viewport": {"width": 130, "height": 280}, "device_scale_factor": 2, "has_touch": True, "is_mobile": True}
+    opened = window(tmp_path / "page.html", **phone)
+    first = opened.settled()
+    assert first.shape == (560, 260, 3)
+    touch = opened.context.new_cdp_session(opened.page)
+
+    def finger(kind: str, *at: tuple[int, int]) -> None:
+        points = [{"x": x, "y": y, "id": i} for i, (x, y) in enumerate(at)]
+        touch.send("Input.dispatchTouchEvent", {"type": kind, "touchPoints": points})
+
+    finger("touchStart", (60, 140))
+    finger("touchMove", (90, 140))
+    finger("touchEnd")
+    turned = opened.settled()
+    assert psnr(turned, first) < 25
+    finger("touchStart", (50, 140), (80, 140))
+    finger("touchMove", (20, 140), (110, 140))
+    finger("touchEnd")
+    assert psnr(opened.settled(), turned) < 25  # pinched
+
+
+def cube() -> Mesh:
+    corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], np.float64)
+    sides = [[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]]
+    faces = np.array([[a, b, c] for s in sides for a, b, c in ((s[0], s[1], s[2]), (s[0], s[2], s[3]))])
+    return Mesh(0.6 * corners, faces, ((corners + 1) * 100 + 30).astype(np.uint8))
+
+
+def traced(mesh: Mesh, camera: Camera) -> np.ndarray:
+    """The mesh as rays meet it (Moeller and Trumbore 1997), colours interpolated across each triangle."""
+    rays = camera.rays(camera.pixels())
+    o, d = rays.origins.double().numpy(), rays.directions.double().numpy()
+    rgb, nearest = np.tile(np.array(LOOK.background), (len(o), 1)), np.full(len(o), np.inf)
+    for face in mesh.faces:
+        a, b, c = mesh.vertices[face]
+        p = np.cross(d, c - a)
+        det = p @ (b - a)
+        u = ((o - a) * p).sum(-1) / det
+        q = np.cross(o - a, b - a)
+        v, t = (q * d).sum(-1) / det, q @ (c - a) / det
+        hit = (u >= 0) & (v >= 0) & (u + v <= 1) & (t > 0) & (t < nearest)
+        weights = np.stack([1 - u - v, u, v], -1)
+        rgb[hit], nearest[hit] = (weights @ mesh.colours[face] / 255)[hit], t[hit]
+    return rgb.reshape(SIZE, SIZE, 3)
+
+
+def test_a_mesh_is_drawn_where_it_is(tmp_path, window):
+    mesh_page(tmp_path / "page.html", cube(), LOOK)
+    assert (tmp_path / "page.html").stat().st_size < 4e5
+    opened = window(tmp_path / "page.html")
+    camera = some_camera(2)
+    assert psnr(opened.look(camera), traced(cube(), camera)) > 35  # all but the edges, which the page smooths
+    opened.page.keyboard.press("r")
+    first = opened.settled()
+    opened.drag(0.25)
+    assert psnr(opened.settled(), first) < 25
+
+
+def test_pictures_are_turned_over(tmp_path, window):
+    made, cameras = tiny_method(), scene().cameras
+    views_page(tmp_path / "page.html", made, cameras, look_at_scene("ball", cameras, made.frame), 8, 96)
+    assert (tmp_path / "page.html").stat().st_size < 1e5
+    opened = window(tmp_path / "page.html", viewport={"width": 96, "height": 96})
+    seen_from = views(Surroundings(cameras, made.frame), 8, (96, 96))
+    for i in (3, 6):
+        assert psnr(opened.look(seen_from[i]), made.render(seen_from[i]).rgb.numpy()) > 35
+    opened.page.keyboard.press("r")
+    first = opened.settled()
+    opened.drag(0.3)
+    assert psnr(opened.settled(), first) < 30
+
+
+def test_an_arc_has_two_ends():
+    made = scene()
+    arc = made.cameras[torch.tensor([0, 1, 2])]
+    seen_from = views(Surroundings(arc, made.frame), 9, (32, 32))
+    azimuth = torch.atan2(seen_from.position[:, 1], seen_from.position[:, 0])
+    assert torch.allclose(azimuth.diff(), azimuth.diff()[0].expand(8), rtol=0.2)
+    assert 0 < float(azimuth[0]) < 0.3 and math.pi / 3 - 0.3 < float(azimuth[-1]) < math.pi / 3
+
+
+@pytest.fixture
+def run(tmp_path):
+    made = new_run(tmp_path / "run")
+    method = tiny_method()
+    made.save(State(), method, method.optimizers(), torch.Generator())
+    return made
+
+
+def test_the_command(run, tmp_path, capsys):
+    assert main(["export", "web", str(run.folder), str(tmp_path / "a.html"), "--views", "3", "--size", "32"]) == 0
+    assert "3 views" in capsys.readouterr().out
+    page = (tmp_path / "a.html").read_text("utf-8")
+    settings = json.loads(re.search(r'<script id="settings" type="application/json">(.*?)</script>', page)[1])
+    assert len(settings["pictures"]) == 3
+
+
+@pytest.mark.parametrize(
+    ("arguments", "told"),
+    [
+        (["page.txt"], ".html"),
+        (["page.html", "--views", "1"], "--views"),
+        (["page.html", "--size", "3"], "--size"),
+        (["page.html", "--as", "splats"], "no Gaussians"),
+        (["page.html", "--background", "red"], "--background"),
+    ],
+)
+def test_what_cannot_be_is_refused(run, tmp_path, capsys, arguments, told):
+    assert main(["export", "web", str(run.folder), str(tmp_path / arguments[0]), *arguments[1:]]) == 2
+    assert told in capsys.readouterr().err
+    assert not (tmp_path / arguments[0]).exists()
+
+
+def test_titles_cannot_break_a_page(tmp_path):
+    look = dataclasses.replace(LOOK, title="</script><b>@@data@@")
+    mesh_page(tmp_path / "page.html", cube(), look)
+    page = (tmp_path / "page.html").read_text("utf-8")
+    assert "</script><b>" not in page
+    assert "<title>&lt;/script&gt;&lt;b&gt;@@data@@</title>" in page
+
+
+def test_programs_name_the_versions_that_are_pinned():
+    pinned = json.loads(PACKAGES.read_text("utf-8"))["dependencies"]
+    assert all(re.fullmatch(r"\d+\.\d+\.\d+", version) for version in pinned.values())
+    for program, names in {"splats": ["three", "@sparkjsdev/spark"], "mesh": ["three"], "views": []}.items():
+        heading = (WEB / f"{program}.js").read_text("utf-8")[:20_000]
+        for name in names:
+            assert f"{name} {pinned[name]}" in heading
+        assert heading.count("Permission is hereby granted") >= len(names)
+
+
+def test_the_lock_names_no_registry():
+    text = PACKAGES.with_name("package-lock.json").read_text("utf-8")
+    assert '"resolved"' not in text and "http" not in re.sub(r'"url": "[^"]*"', "", text)
