@@ -40,7 +40,8 @@ class View:
         run = SplatFile(self.source) if is_file else Run(self.source)
         method = run.method(device)
         subject = subject_of_file(run) if isinstance(run, SplatFile) else subject_of_run(run)
-        with Viewer(method, subject, choose_address(self.host, self.port)) as viewer:
+        address = choose_address(self.host, self.port)
+        with contextlib.suppress(KeyboardInterrupt), Viewer(method, subject, address) as viewer:
             tell(viewer)
             viewer.serve()
         return 0
@@ -83,7 +84,8 @@ def keep_showing(viewer: Any, signal: int | None) -> None:
     """After training: go on until Ctrl-C, unless that is what ended it."""
     if viewer is not None and signal is None:
         viewer.end_training()
-        viewer.serve()
+        with contextlib.suppress(KeyboardInterrupt):
+            viewer.serve()
 
 
 def tell(viewer: Any) -> None:

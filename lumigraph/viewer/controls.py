@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable
 from typing import Any, cast
 
 import numpy as np
+from jaxtyping import Float
 
 from ..scene import Frame, Vector
 from .crop import Box
@@ -121,14 +123,17 @@ class Controls:
             self._box = None
         box = self.box
         if box is not None:
-            lower, upper = np.array(box.lower), np.array(box.upper)
-            self._box = self._client.scene.add_box(
-                "/crop",
-                color=(240, 190, 80),
-                dimensions=tuple(np.maximum(upper - lower, 1e-4)),
-                position=(lower + upper) / 2,
-                wireframe=True,
+            self._box = self._client.scene.add_line_segments(
+                "/crop", edges(box), (240, 190, 80), thickness=2.0, thickness_units="screen"
             )
+
+
+def edges(box: Box) -> Float[np.ndarray, "12 2 3"]:
+    """The ends of a box's twelve edges."""
+    corners = np.array(list(itertools.product((0, 1), repeat=3)))
+    ends = [(a, b) for a, b in itertools.combinations(corners, 2) if abs(a - b).sum() == 1]
+    lower, upper = np.array(box.lower), np.array(box.upper)
+    return lower + np.array(ends) * (upper - lower)
 
 
 def to_bytes(colour: Vector) -> tuple[int, int, int]:

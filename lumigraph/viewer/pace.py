@@ -4,30 +4,47 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
+
 SMALLEST = 80  # pixels along the longer side
-MEMORY = 0.5  # share of the known cost that one picture keeps
+MEMORY = 0.7  # share of its weight that a picture keeps when the next has come
 
 
 class Pace:
-    """What a pixel has cost of late, all waiting included, and what size that makes."""
+    """Seconds of a picture as a + b pixels, fitted to what pictures have cost of late."""
 
     def __init__(self) -> None:
-        self.seconds_per_pixel: float | None = None
+        self._sums = np.zeros(5)  # of 1, n, n^2, t, n t over pictures of n pixels and t seconds, older ones fading
+        self._noted = False
 
     def note(self, pixels: int, seconds: float) -> None:
-        """A picture took so long."""
-        cost = seconds / max(pixels, 1)
-        known = self.seconds_per_pixel
-        self.seconds_per_pixel = cost if known is None else MEMORY * known + (1 - MEMORY) * cost
+        """A picture took so long. The first is passed over: something may have been compiled for it."""
+        if self._noted:
+            n, t = float(pixels), seconds
+            self._sums = MEMORY * self._sums + np.array([1, n, n * n, t, n * t])
+        self._noted = True
+
+    @property
+    def costs(self) -> tuple[float, float] | None:
+        """(a, b), neither below zero; None while nothing is known."""
+        one, n, nn, t, nt = self._sums
+        if one == 0:
+            return None
+        spread = one * nn - n * n
+        b = (one * nt - n * t) / spread if spread > 1e-3 * one * nn else 0.0
+        a = (t - b * n) / one
+        return (a, b) if a >= 0 and b > 0 else (0.0, t / n)
+
+    def pixels(self, seconds: float) -> float:
+        """How many pixels can be drawn in this time. Where a picture's fixed cost is most of it, half as much again is
+        allowed: a smaller picture would hardly be quicker."""
+        if self.costs is None:
+            return 0.0
+        a, b = self.costs
+        return max(seconds - a, 0.5 * a) / max(b, 1e-12)
 
     def size(self, full: tuple[int, int], seconds: float) -> tuple[int, int]:
         """(width, height) in the shape of `full` that should take so many seconds; small while nothing is known."""
-        smallest = min(1.0, SMALLEST / max(full))
-        if self.seconds_per_pixel is None:
-            return scaled(full, smallest)
-        affordable = seconds / max(self.seconds_per_pixel, 1e-12)
-        return scaled(full, min(1.0, max(smallest, math.sqrt(affordable / (full[0] * full[1])))))
-
-
-def scaled(size: tuple[int, int], share: float) -> tuple[int, int]:
-    return max(1, round(size[0] * share)), max(1, round(size[1] * share))
+        share = math.sqrt(self.pixels(seconds) / (full[0] * full[1]))
+        share = min(1.0, max(share, SMALLEST / max(full)))
+        return max(1, round(full[0] * share)), max(1, round(full[1] * share))

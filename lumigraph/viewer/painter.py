@@ -48,7 +48,7 @@ class Painter:
         self._wake.set()
 
     def _work(self) -> None:
-        drawn, best, stage = 0, True, -1
+        drawn, best, stage = 0, True, self._stage()
         while not self._stopped:
             asked, now = self._asked, time.perf_counter()
             if asked != drawn:

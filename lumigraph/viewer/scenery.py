@@ -21,7 +21,7 @@ MOST_CAMERAS, MOST_POINTS = 250, 200_000  # more only fill the browser
 THUMBNAIL = 96  # pixels along the longer side
 TRAIN, TEST = (86, 134, 214), (232, 140, 60)
 SHARE = 0.4  # of the distance between neighbouring cameras, as the size of a frustum
-NARROWEST, WIDEST = 0.01, 0.1  # of the distance to the middle of all cameras
+NARROWEST, WIDEST = 0.03, 0.07  # of the distance to the middle of all cameras
 
 
 class Scenery:
@@ -35,7 +35,7 @@ class Scenery:
     def __init__(self, server: Any, cameras: dict[str, Camera], clicked: Callable[[Any, Camera], None]):
         self._server = server
         self._frusta: dict[int, Any] = {}  # by image number
-        self.has_points = False
+        self.has_points, self._stopped = False, False
         server.scene.add_frame(CAMERAS, show_axes=False)
         server.scene.add_frame(POINTS, show_axes=False)
         everyone = Camera.cat(list(cameras.values()))
@@ -78,10 +78,17 @@ class Scenery:
                 self.show(open_scene())
             except LumigraphError as error:
                 done(str(error))
+            except RuntimeError:
+                if not self._stopped:  # otherwise it only says that Python is about to end
+                    raise
             else:
                 done(None)
 
         threading.Thread(target=work, name="photographs", daemon=True).start()
+
+    def stop(self) -> None:
+        """Nobody wants what is still being opened."""
+        self._stopped = True
 
     def show(self, scene: Scene) -> None:
         """Thumbnails and points of a scene."""

@@ -22,10 +22,10 @@ class TrainingPanel:
     def __init__(self, server: Any, turns: Turns, rows: list[dict[str, Any]]):
         self._gui, self._turns = server.gui, turns
         self._rows = [(row["seconds"], row["psnr"]) for row in rows if "psnr" in row]
-        self._next = 0.0
+        self._next, self._last = 0.0, ""
         last = rows[-1] if rows else None
         self._status = self._gui.add_markdown(
-            "About to begin" if turns.training or not last else describe(last["step"], last, None)
+            "About to begin" if turns.training or not last else describe(last["step"], last)
         )
         self._plot = self._gui.add_uplot(
             curve(self._rows),
@@ -43,14 +43,16 @@ class TrainingPanel:
         if not row:
             return
         self._rows.append((row["seconds"], row["psnr"]))
+        self._last = describe(step, row)
         if (now := time.perf_counter()) >= self._next:
             self._next = now + EVERY
-            self._status.content = describe(step, row, progress)
+            self._status.content = f"{100 * progress:.0f} % · {self._last}"
             self._draw()
 
     def end(self) -> None:
         """There will be no more steps."""
         self._button.visible = False
+        self._status.content = f"Done · {self._last}" if self._last else "Done"
         self._draw()
 
     def _draw(self) -> None:
@@ -62,9 +64,8 @@ class TrainingPanel:
         self._button.label = "Resume" if self._turns.paused else "Pause"
 
 
-def describe(step: int, row: dict[str, Any], progress: float | None) -> str:
-    share = "" if progress is None else f"{100 * progress:.0f} % · "
-    return f"{share}step {step} · {row['psnr']:.2f} dB · {clock(row['seconds'])} trained"
+def describe(step: int, row: dict[str, Any]) -> str:
+    return f"step {step} · {row['psnr']:.2f} dB · {clock(row['seconds'])} trained"
 
 
 def curve(rows: list[tuple[float, float]]) -> tuple[Float[np.ndarray, " point"], Float[np.ndarray, " point"]]:

@@ -56,6 +56,7 @@ class Turns:
             end = time.perf_counter()
             with self._condition:
                 self._busy, self._served = False, self._served + 1
+                self._open = self._open and self.paused  # the next one has to wait until training gives way again
                 self._own_until = end + (end - begin) * (1 / SHARE - 1)
                 self._condition.notify_all()
 

@@ -70,7 +70,9 @@ class Viewer:
         self.method, self.subject, self.address = method, subject, address
         self.turns, self.stage = Turns(training), 0
         self._visitors: dict[int, Visitor] = {}
-        self._lock = threading.Lock()
+        self._stopped = False
+        self._lock = threading.Lock()  # around the visitors
+        self._welcoming = threading.Lock()  # one at a time fills the tabs
         self.is_cloud = has_gaussians(method)
         self._server = start_server(address, subject.title)
         self._arrange()
@@ -112,7 +114,7 @@ class Viewer:
 
     def knows(self, client: Any) -> bool:
         """Whether a client is still there."""
-        return client.client_id in self._server.get_clients()
+        return not self._stopped and client.client_id in self._server.get_clients()
 
     # What fit() calls
 
@@ -142,17 +144,16 @@ class Viewer:
     # Coming and going
 
     def serve(self) -> None:
-        """Wait until somebody presses Ctrl-C."""
-        try:
-            while True:
-                time.sleep(3600)
-        except KeyboardInterrupt:
-            return
+        """Wait for Ctrl-C, which raises KeyboardInterrupt."""
+        while True:
+            time.sleep(3600)
 
     def stop(self) -> None:
         """Send everybody away."""
+        self._stopped = True
         for visitor in self._everyone():
             visitor.stop()
+        self.scenery.stop()
         with quiet():
             self._server.stop()
 
@@ -167,7 +168,8 @@ class Viewer:
             return list(self._visitors.values())
 
     def _welcome(self, client: Any) -> None:
-        visitor = Visitor(self, client)
+        with self._welcoming:
+            visitor = Visitor(self, client)
         with self._lock:
             self._visitors[client.client_id] = visitor
         if not self.knows(client):  # it left while its panel was being made

@@ -33,6 +33,7 @@ if TYPE_CHECKING:
 
 DEPTH_SIZE = 320  # pixels along the longer side of the depth that goes with a picture
 DEPTH_STEP = 256e-5  # scene units, to which that depth is rounded so that it packs well
+FEWEST_ROWS = 16  # of a band
 QUALITY, QUALITY_MOVING = 90, 70  # of JPEG
 MOST_RECOLOURED = 500_000  # Gaussians; more are too many to send again whenever the camera rests
 TURNED = 0.03  # how far the eye must move, as a share of its distance to the middle, for colours to change
@@ -44,7 +45,7 @@ class Visitor:
 
     def __init__(self, viewer: Viewer, client: Any):
         self._viewer, self._client = viewer, client
-        self._pace, self._said = Pace(), ""
+        self._pace, self._bands, self._said = Pace(), Pace(), ""  # whole pictures, all waiting included; bands of them
         self._splats: Any = None
         self._sent: tuple[Any, ...] = ()  # which splats the client has
         self._eye = torch.zeros(3)  # towards which their colours are
@@ -122,15 +123,18 @@ class Visitor:
 
     def _render(self, look: Look, size: tuple[int, int], wanted: Wanted) -> tuple[Rendering, Camera]:
         """A picture in bands short enough for others to have their turn, and to stop soon if nobody wants it."""
-        camera, height = look.camera(size), size[1]
-        band = self._pace.size((size[0] * height, 1), MOVING)[0] // size[0]  # rows
-        band = height if band >= 0.7 * height else max(8, band)
+        camera, (width, height) = look.camera(size), size
+        band = max(FEWEST_ROWS, int(self._bands.pixels(MOVING)) // width)
+        band = height if band >= 0.7 * height else band
         parts = []
         for first in range(0, height, band):
             if not wanted():
                 raise NotWantedError
+            some = rows(camera, first, min(first + band, height))
             with self._viewer.turns.turn(wanted):
-                parts.append(self._viewer.render(rows(camera, first, min(first + band, height)), look.box))
+                begin = time.perf_counter()
+                parts.append(self._viewer.render(some, look.box))
+                self._bands.note(width * len(parts[-1].rgb), time.perf_counter() - begin)
         return Rendering.cat(parts), camera
 
     def _show(self, rendering: Rendering, camera: Camera, look: Look, quality: int) -> None:
@@ -166,7 +170,6 @@ class Visitor:
 
     def _send_splats(self, look: Look, eye: torch.Tensor, wanted: Wanted) -> None:
         with self._viewer.turns.turn(wanted):
-            begin = time.perf_counter()
             cloud = self._viewer.cloud(look.box)
             made = splats(cloud, eye)
         if not self._here:
@@ -176,7 +179,7 @@ class Visitor:
             self._splats = self._client.scene.add_gaussian_splats("/gaussians", *arrays, scale=1 / ENLARGED)
         else:
             self._splats.set_gaussians(*arrays)
-        self._say(f"{len(cloud)} Gaussians, prepared in {1000 * (time.perf_counter() - begin):.0f} ms")
+        self._say(f"{len(cloud)} Gaussians, drawn by the browser")
 
     def _recolour(self, look: Look, eye: torch.Tensor, wanted: Wanted) -> None:
         """Colours towards where the eye rests now."""

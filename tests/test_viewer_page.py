@@ -1,0 +1,195 @@
+"""The viewer in a real browser."""
+
+from __future__ import annotations
+
+import io
+import json
+import time
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import tiny
+import torch
+from PIL import Image
+from test_viewer import some_cloud, subject
+
+import lumigraph.methods
+from lumigraph.keyframes import CameraPath
+from lumigraph.scene import Frame
+from lumigraph.train import fit
+from lumigraph.viewer import Viewer, choose_address
+
+SIZE = (800, 600)
+LEFT = slice(0, 430)  # columns beside the panel
+HARMLESS = "computeBoundingSphere"  # viser's own complaint about its splats
+
+
+@pytest.fixture(scope="module")
+def viewer(tmp_path_factory):
+    """Of the tiny scene, with its photographs."""
+    scene = tiny.scene()
+    method = tiny.method(scene.frame)
+    fit(method, scene, steps=80, show=False)
+    about = subject(scene, tmp_path_factory.mktemp("run"), open_scene=lambda: scene)
+    with Viewer(method, about, choose_address(port=0)) as made:
+        yield made
+
+
+def visit(viewer, page):
+    """Open the page; gives the visitor that the viewer has made of it, at rest."""
+    known = set(map(id, viewer._everyone()))
+    page.goto(viewer.address.url)
+    visitor = wait(lambda: next((v for v in viewer._everyone() if id(v) not in known), None))
+    settle(visitor)
+    return visitor
+
+
+def wait(told, seconds: float = 30.0):
+    """What a function gives as soon as it gives anything."""
+    end = time.monotonic() + seconds
+    while not (found := told()):
+        assert time.monotonic() < end, "it never came"
+        time.sleep(0.02)
+    return found
+
+
+def settle(visitor) -> None:
+    assert visitor.painter.settled.wait(30)
+
+
+def shot(page) -> np.ndarray:
+    """The left of the page, in [0, 1]."""
+    image = Image.open(io.BytesIO(page.screenshot())).convert("RGB")
+    return np.asarray(image)[160:, LEFT] / 255
+
+
+def expected(viewer, visitor) -> np.ndarray:
+    """What our own renderer sees in that place."""
+    return viewer.method.render(visitor.look().camera(SIZE)).rgb.clamp(0, 1).numpy()[160:, LEFT]
+
+
+def psnr(a: np.ndarray, b: np.ndarray) -> float:
+    return float(-10 * np.log10(np.square(a - b).mean()))
+
+
+def shows(page, wanted, decibels: float, seconds: float = 30.0) -> float:
+    """Wait until the page looks like a picture; browsers decode when they like. Gives the PSNR."""
+    reached = 0.0
+
+    def alike() -> bool:
+        nonlocal reached
+        reached = psnr(shot(page), wanted())
+        return reached > decibels
+
+    end = time.monotonic() + seconds
+    while not alike():
+        assert time.monotonic() < end, f"only {reached:.1f} dB"
+        time.sleep(0.2)
+    return reached
+
+
+def choose(page, label: str, option: str) -> None:
+    page.get_by_label(label, exact=True).first.click()
+    page.get_by_role("option", name=option, exact=True).click()
+
+
+def test_the_scene_appears_turns_and_changes_modes(viewer, page, faults):
+    visitor = visit(viewer, page)
+    page.get_by_role("checkbox", name="Cameras").click()  # so that nothing but the scene is to be seen
+    before = expected(viewer, visitor)
+    assert before.std() > 0.1
+    assert shows(page, lambda: expected(viewer, visitor), 28) > 28
+
+    place = visitor.look().pose
+    page.mouse.move(200, 400)
+    page.mouse.down()
+    page.mouse.move(320, 430, steps=4)
+    page.mouse.up()
+    wait(lambda: visitor.look().pose != place)
+    wait(visitor.painter.settled.is_set)
+    assert psnr(expected(viewer, visitor), before) < 25
+    shows(page, lambda: expected(viewer, visitor), 28)
+
+    seen = shot(page)
+    for mode in ("Depth", "Opacity", "Normals"):
+        choose(page, "Show", mode)
+        wait(lambda mode=mode: visitor.look().mode == mode.lower() and visitor.painter.settled.is_set())
+        wait(lambda seen=seen: psnr(shot(page), seen) < 20)
+        seen = shot(page)
+    assert faults == []
+
+
+def test_a_click_on_a_camera_flies_there(viewer, page):
+    visitor = visit(viewer, page)
+    camera = viewer.subject.cameras["train"][1]
+    away = camera.position[0] - 0.9 * camera.forward[0]
+    visitor.flight.place(
+        torch.cat([camera.pose[0, :, :3], away[:, None]], 1).double().numpy(), 3.9, 0.9
+    )  # behind it, so that it is in the middle
+    wait(lambda: abs(visitor.look().pose[0][3] - float(away[0])) < 1e-3)
+    time.sleep(0.5)
+    for _ in range(20):  # software draws slowly: until the frustum is there to be clicked
+        page.mouse.click(400, 300)
+        try:
+            wait(lambda: np.abs(np.array(visitor.look().pose) - camera.pose[0].numpy()).max() < 2e-3, 1.5)
+            break
+        except AssertionError:
+            continue
+    assert np.abs(np.array(visitor.look().pose) - camera.pose[0].numpy()).max() < 2e-3
+
+
+def test_a_path_is_set_saved_and_opened(viewer, page):
+    visitor = visit(viewer, page)
+    page.get_by_role("tab", name="Path").click()
+    add = page.get_by_role("button", name="Add keyframe here")
+    add.click()
+    wait(lambda: len(visitor.path._stops) == 1)
+    first = np.array(visitor.look().pose)
+    visitor.flight.place(viewer.subject.cameras["train"].pose[4].double().numpy(), 3.0, 0.9)
+    wait(lambda: np.abs(np.array(visitor.look().pose) - first).max() > 0.1)
+    add.click()
+    wait(lambda: len(visitor.path._stops) == 2)
+    page.get_by_role("button", name="Save").click()
+    file = viewer.subject.paths / "path-1.json"
+    wait(file.exists)
+    path = CameraPath.load(file)
+    assert [key.seconds for key in path.keyframes] == [0.0, 2.0]
+    assert np.allclose(path.keyframes[0].pose, first, atol=1e-5)
+    assert path.keyframes[1].fov == pytest.approx(np.degrees(0.9), abs=0.01)
+    page.get_by_text(f"lumigraph render RUN --path {file}").wait_for()
+
+    about = json.loads(file.read_text())
+    about["keyframes"][0]["pose"][0][0] = "left"
+    (viewer.subject.paths / "nonsense.json").write_text(json.dumps(about))
+    visitor.path._saved.options = visitor.path._names()
+    visitor.path._saved.value = "nonsense"
+    page.get_by_role("button", name="Open").click()
+    page.get_by_text("nonsense.json").first.wait_for()  # in a sentence that says what is wrong
+    assert len(visitor.path._stops) == 2
+
+    visitor.path._saved.value = "path-1"
+    page.get_by_role("button", name="✕").click()
+    wait(lambda: len(visitor.path._stops) == 1)
+    page.get_by_role("button", name="Open").click()
+    wait(lambda: len(visitor.path._stops) == 2)
+    page.get_by_role("button", name="Play").click()
+    last = np.array(path.keyframes[1].pose)
+    wait(lambda: np.abs(np.array(visitor.look().pose) - last).max() < 1e-3)
+
+
+def test_gaussians_are_drawn_by_the_browser(page, faults, tmp_path):
+    cloud = replace(some_cloud(300), harmonics=0.4 * some_cloud(300).harmonics)
+    frame = Frame(near=0.05, background=(0.1, 0.2, 0.3))
+    kind = lumigraph.methods.find("gaussian-splatting")
+    method = kind(frame, kind.Config(degree=3))
+    method.cloud.replace(cloud)
+    with Viewer(method.eval(), subject(replace(tiny.scene(), frame=frame), tmp_path), choose_address(port=0)) as viewer:
+        visitor = visit(viewer, page)
+        page.get_by_role("checkbox", name="Cameras").click()
+        shows(page, lambda: expected(viewer, visitor), 26)  # the browser's sums are half as exact
+        assert visitor.controls.status.content == "300 Gaussians, drawn by the browser"
+        page.get_by_role("checkbox", name="Draw exactly").click()
+        wait(lambda: visitor.look().here and visitor.painter.settled.is_set())
+        shows(page, lambda: expected(viewer, visitor), 33)
+    assert [fault for fault in faults if HARMLESS not in fault and "WebSocket" not in fault] == []

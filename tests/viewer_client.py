@@ -1,0 +1,88 @@
+"""A client of the viewer without a browser: it has a camera, and reads what it is sent. For tests."""
+
+from __future__ import annotations
+
+import io
+import time
+
+import msgspec
+import numpy as np
+import viser
+import zstandard
+from PIL import Image
+from websockets.sync.client import connect
+
+
+class Client:
+    """Connected from the moment it is made. size: of its window."""
+
+    def __init__(self, url: str, position=(3.0, 0.0, 0.5), size=(120, 90)):
+        self.size = size
+        self.socket = connect(
+            url.replace("http", "ws"),
+            subprotocols=[f"viser-v{viser.__version__}"],
+            max_size=None,
+            compression=None,
+            close_timeout=1,
+        )
+        self.look_from(position)
+
+    def look_from(self, position) -> None:
+        """Look at the origin from there."""
+        forward = -np.array(position) / np.linalg.norm(position)
+        right = np.cross(forward, [0.0, 0.0, 1.0])
+        right /= np.linalg.norm(right)
+        rotation = np.stack([right, np.cross(forward, right), forward], 1)
+        message = {
+            "type": "ViewerCameraMessage",
+            "wxyz": viser.transforms.SO3.from_matrix(rotation).wxyz.tolist(),
+            "position": [float(x) for x in position],
+            "fov": 0.8,
+            "near": 0.01,
+            "far": 1000.0,
+            "image_height": self.size[1],
+            "image_width": self.size[0],
+            "look_at": [0.0, 0.0, 0.0],
+            "up_direction": [0.0, 0.0, 1.0],
+        }
+        self.socket.send(msgspec.msgpack.encode(message))
+
+    def messages(self, seconds: float):
+        """What comes within so many seconds, each a dict."""
+        end = time.monotonic() + seconds
+        while (left := end - time.monotonic()) > 0:
+            try:
+                data = self.socket.recv(timeout=left)
+            except TimeoutError:
+                return
+            packed = int.from_bytes(data[8:16], "little")
+            inner = msgspec.msgpack.decode(zstandard.ZstdDecompressor().decompress(data[16 : 16 + packed]))
+            begins = 16 + packed
+            buffers = []
+            for length in inner["binaryBufferLengths"]:
+                begins += -begins % 8
+                buffers.append(data[begins : begins + length])
+                begins += length
+            for message in inner["messages"]:
+                yield message | {"buffers": buffers}
+
+    def picture(self, seconds: float = 20.0, width: int | None = None) -> np.ndarray:
+        """The next picture that is streamed, bytes (height, width, 3); only one of a certain width, if that is told."""
+        for message in self.messages(seconds):
+            if message["type"] == "BackgroundImageMessage" and message["rgb_data"]:
+                image = Image.open(io.BytesIO(whole(message["rgb_data"], message))).convert("RGB")
+                if width is None or image.width == width:
+                    return np.asarray(image)
+        raise AssertionError(f"no picture came within {seconds} s")
+
+    def close(self) -> None:
+        self.socket.close()
+
+    def vanish(self) -> None:
+        """Without a farewell, as when a cable is pulled."""
+        self.socket.socket.close()
+
+
+def whole(value, message) -> bytes:
+    """Bytes, wherever in the message they lie."""
+    return bytes(message["buffers"][value["__binary_index"]]) if isinstance(value, dict) else bytes(value)
