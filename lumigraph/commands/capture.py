@@ -100,7 +100,8 @@ def rows(folder: Path, result: dict[str, Any]) -> dict[str, str]:
     found = {"photographs": f"{placed} of {result['given']} placed"}
     if others:
         found["photographs"] += f", and apart from them {' and '.join(str(len(names)) for names in others)}"
-    for title, what in (("left out", result["left_out"]), ("blurred", result["blurred"])):
+    blurred = {name: why for name, why in result["blurred"].items() if name not in result["left_out"]}
+    for title, what in (("left out", result["left_out"]), ("blurred", blurred)):
         if what:
             found[title] = lines([f"{name}: {why}" for name, why in what.items()])
     if result["duplicates"]:

@@ -1,5 +1,5 @@
 """Structure from motion: where bare photographs were taken from."""
 
-from .reconstruct import Options, reconstruct
+from .reconstruction import Options, reconstruct
 
 __all__ = ["Options", "reconstruct"]

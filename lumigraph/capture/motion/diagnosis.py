@@ -137,7 +137,9 @@ def diagnose(
     registered = [photo.name for photo in used if photo.name in by_name]
     poses = np.stack([by_name[name].cam_from_world().inverse().matrix() for name in registered])
     left_out = intake.unreadable | {
-        photo.name: why_not(photo.name, registered, others, matches) for photo in used if photo.name not in by_name
+        photo.name: why_not(photo.name, registered, others, matches, photo.name in intake.blurred)
+        for photo in used
+        if photo.name not in by_name
     }
     angle = triangulation_angle(model)
     names_tell = intake.in_order or in_steps(poses[:, :, 3])
@@ -172,11 +174,13 @@ def diagnose(
     )
 
 
-def why_not(name: str, registered: Sequence[str], others: Sequence[Sequence[str]], matches: Matches) -> str:
+def why_not(
+    name: str, registered: Sequence[str], others: Sequence[Sequence[str]], matches: Matches, blurred: bool
+) -> str:
     """Why no camera was found for a photograph, in a few words."""
     features = matches.features.get(name, 0)
     if features < FEW_FEATURES:
-        return f"too few details ({features} found): blank, dark or out of focus"
+        return f"too few details ({features} found): {'blurred' if blurred else 'blank, dark or out of focus'}"
     for model in others:
         if name in model:
             return f"in another group of {len(model)}, which shares too little with the rest"

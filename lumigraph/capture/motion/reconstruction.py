@@ -149,7 +149,8 @@ class Reconstruction:
             self.options.max_size,
             self.count_features(),
         )
-        matching = key_of(features, self.matching, [p.gps for p in self.photos])
+        places = [p.gps for p in self.photos] if self.matching == "retrieval" else None
+        matching = key_of(features, self.matching, places)
         mapping = key_of(matching, self.options.mapper)
         result = key_of(SPECIFICATION, mapping, intake_identity(self.intake))
         return {"features": features, "matching": matching, "mapping": mapping, "result": result}

@@ -1,0 +1,408 @@
+"""Structure from motion, on drawn photographs whose cameras are known."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from dataclasses import replace
+from hashlib import sha256
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+import pytest
+import torch
+from PIL import Image
+from scipy.spatial import KDTree
+from views import draw, look_at, pattern, spoil, write_views
+
+from lumigraph import cli
+from lumigraph.capture import open_scene
+from lumigraph.capture.colmap import read as read_colmap
+from lumigraph.capture.motion import diagnosis, reconstruct, reconstruction
+from lumigraph.capture.motion.diagnosis import Matches, coverage, jumps, why_not
+from lumigraph.capture.motion.georeference import georeference, upright
+from lumigraph.capture.motion.lenses import group_by_lens, prior
+from lumigraph.capture.motion.pairs import alike, choose_matching, exhaustive, likeness, sequential
+from lumigraph.capture.motion.stages import WORKER, Stages, key_of
+from lumigraph.capture.photos import Intake, Photo
+from lumigraph.capture.transforms import read as read_transforms
+from lumigraph.commands import capture as command
+from lumigraph.errors import LumigraphError
+
+
+class Told:
+    """Progress that remembers what was told of, and stops at some point if asked."""
+
+    def __init__(self, stop_in: str | None = None, after: int = 0):
+        self.counts: dict[str, int] = {}
+        self.stop_in, self.after = stop_in, after
+
+    def __call__(self, items, description, total):
+        for i, item in enumerate(items):
+            if description == self.stop_in and i >= self.after:
+                raise KeyboardInterrupt
+            self.counts[description] = i + 1
+            yield item
+
+
+@pytest.fixture(scope="module")
+def captured(tmp_path_factory):
+    """Twelve good photographs and six bad ones: sources, true poses, what is bad, the scene, its report, progress."""
+    base = tmp_path_factory.mktemp("capture")
+    photos = base / "photos"
+    poses = write_views(photos)
+    bad = spoil(photos)
+    before = digests(photos)
+    told = Told()
+    result = reconstruct([photos], base / "scene", track=told)
+    assert digests(photos) == before, "the user's files were changed"
+    return photos, poses, bad, base / "scene", result, told
+
+
+def digests(folder: Path) -> dict[str, str]:
+    return {path.name: sha256(path.read_bytes()).hexdigest() for path in sorted(folder.iterdir())}
+
+
+def aligned_error(scene: Path, poses: dict[str, np.ndarray]) -> np.ndarray:
+    """Distances between found and true cameras after the best similarity, as a share of the true extent."""
+    shots = {shot.name: shot.pose for shot in read_colmap(scene).shots if shot.name in poses}
+    a = np.stack([shots[name][:, 3] for name in shots])
+    b = np.stack([poses[name][:, 3] for name in shots])
+    options = pycolmap.RANSACOptions()
+    options.random_seed, extent = 0, np.linalg.norm(np.ptp(b, axis=0))
+    similarity = pycolmap.estimate_sim3d_robust(a, b, options)["tgt_from_src"].matrix()
+    return np.linalg.norm(a @ similarity[:, :3].T + similarity[:, 3] - b, axis=-1) / extent
+
+
+def test_all_good_photographs_are_placed_where_they_were_taken(captured):
+    _, poses, bad, scene, result, _ = captured
+    assert set(poses) <= set(result["registered"]) <= set(poses) | set(bad["blurred"])
+    assert np.median(aligned_error(scene, poses)) < 0.003
+    assert result["error"] < 0.5
+    focal = result["cameras"][0]["parameters"][0]
+    assert focal == pytest.approx(300, rel=0.03)
+    assert not any("one place" in sentence or "folded" in sentence for sentence in result["warnings"])
+
+
+def test_exactly_the_bad_ones_are_named(captured):
+    _, _, bad, _, result, _ = captured
+    named = set(result["left_out"]) | set(result["blurred"]) | set(result["duplicates"])
+    assert named == {name for names in bad.values() for name in names}
+    assert result["duplicates"] == {"again.jpg": "view03.jpg"}
+    assert "blurred.jpg" in result["blurred"]
+    assert set(bad["left_out"]) <= set(result["left_out"])
+    assert "too few details (0 found)" in result["left_out"]["blank.jpg"]
+    assert result["left_out"]["stranger0.jpg"] == "shares too few details with any other photograph"
+
+
+def test_progress_counts_what_there_is(captured):
+    told = captured[-1].counts
+    assert told["Looking at photographs"] == 18
+    assert told["Finding details"] == 16 and told["Comparing pairs"] == 16 * 15 / 2 and told["Placing cameras"] == 16
+
+
+def test_both_readers_see_the_same_cameras_and_points(captured):
+    scene = captured[3]
+    ours, colmap = read_transforms(scene), read_colmap(scene)
+    assert [Path(shot.name).name for shot in ours.shots] == [shot.name for shot in colmap.shots]
+    for a, b in zip(ours.shots, colmap.shots, strict=True):
+        assert np.allclose(a.pose, b.pose, atol=1e-9) and a.size == b.size and a.image[1] == b.image[1]
+        pixels = torch.tensor([[10.0, 20.0], [300.0, 200.0]])
+        assert torch.allclose(a.lens.unproject(pixels), b.lens.unproject(pixels), atol=1e-6)
+    assert len(ours.points) == len(colmap.points)
+    assert KDTree(ours.points).query(colmap.points)[0].max() < 1e-4
+    assert sorted(ours.sightings) == sorted(colmap.sightings) and max(ours.sightings) > 4
+
+
+def test_the_scene_opens_with_points_and_held_out_views(captured):
+    scene = open_scene(captured[3])
+    assert len(scene) == len(captured[4]["registered"]) and len(scene.points) == captured[4]["points"]
+    assert len(scene.splits["test"]) == 2 and not scene.warnings
+
+
+def test_the_scene_stands_upright(captured):
+    """+z of the drawn room is up, and the cameras were held level."""
+    _, poses, _, scene, _, _ = captured
+    for shot in read_colmap(scene).shots:
+        if shot.name in poses:
+            found_up, true_up = shot.pose[2, :3], poses[shot.name][2, :3]  # the world's up in the camera's axes
+            assert found_up @ true_up > np.cos(np.radians(3))
+
+
+def colours_of(image: Image.Image) -> set[tuple[int, ...]]:
+    return {tuple(colour) for colour in np.unique(np.asarray(image.convert("RGB")).reshape(-1, 3), axis=0).tolist()}
+
+
+def test_pictures_are_drawn(captured):
+    _, _, _, scene, _, _ = captured
+    with Image.open(scene / "capture.png") as image:
+        assert image.width > 1000 and len(colours_of(image)) > 500
+    with Image.open(scene / "photographs.png") as image:
+        colours = colours_of(image)
+    for colour in ("c0392b", "3f6fb0"):  # frames of those left out and of duplicates
+        assert tuple(bytes.fromhex(colour)) in colours
+
+
+def test_a_second_call_does_nothing_again(captured, monkeypatch):
+    photos, _, _, scene, result, _ = captured
+    monkeypatch.setattr(Stages, "colmap", None)
+    before = {
+        path: path.stat().st_mtime_ns for path in scene.rglob("*") if path.is_file() and path.name != "sources.json"
+    }
+    assert reconstruct([photos], scene) == json.loads((scene / "capture.json").read_text()) == result
+    assert before == {path: path.stat().st_mtime_ns for path in before}
+
+
+def test_gps_turns_and_scales(captured, monkeypatch, tmp_path):
+    """The same photographs with positions: no stage is done again, and the scene is in metres east, north and up."""
+    photos, poses, _, scene, _, _ = captured
+    metres, turn = 40.0, np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
+    chance = np.random.default_rng(0)
+    east_north_up = {name: metres * turn @ pose[:, 3] + chance.normal(0, 1.0, 3) for name, pose in poses.items()}
+    there = pycolmap.GPSTransform().enu_to_ellipsoid(np.array(list(east_north_up.values())), 47.0, 8.0, 400.0)
+    gps = {name: tuple(place.tolist()) for name, place in zip(east_north_up, there, strict=True)}
+    plain = reconstruction.gather
+
+    def with_gps(*arguments):
+        intake = plain(*arguments)
+        return replace(intake, photos=[replace(photo, gps=gps.get(photo.name)) for photo in intake.photos])
+
+    copied = tmp_path / "scene"
+    subprocess.run(["cp", "-a", str(scene), str(copied)], check=True)
+    monkeypatch.setattr(reconstruction, "gather", with_gps)
+    monkeypatch.setattr(Stages, "colmap", None)
+    result = reconstruct([photos], copied)
+    assert result["gps"]["used"] and result["gps"]["error"] < 3
+    shots = {shot.name: shot.pose for shot in read_colmap(copied).shots}
+    first, last = "view00.jpg", "view11.jpg"
+    found = shots[last][:, 3] - shots[first][:, 3]
+    true = metres * turn @ (poses[last] - poses[first])[:, 3]
+    assert np.linalg.norm(found - true) < 0.05 * np.linalg.norm(true)
+    axes = [shots[name][:, :3] for name in (first, last)]
+    assert all(a[:, 2] @ (turn @ poses[n][:, 2]) > 0.995 for a, n in zip(axes, (first, last), strict=True))
+
+
+def test_stopped_and_gone_on(tmp_path):
+    photos, scene = tmp_path / "a folder", tmp_path / "scene"
+    poses = write_views(photos, 12)
+    for i, name in enumerate(list(poses)):
+        (photos / name).rename(photos / f"my {name}") if 3 <= i < 9 else (photos / name).unlink()
+    with pytest.raises(KeyboardInterrupt):
+        reconstruct([photos], scene, track=Told("Comparing pairs", after=3))
+    marks = json.loads((scene / "work" / "stages.json").read_text())
+    assert marks["features"]["done"] and not marks["matching"]["done"] and "mapping" not in marks
+    assert not (scene / "capture.json").exists() and not (scene / "transforms.json").exists()
+    told = Told()
+    result = reconstruct([photos], scene, track=told)
+    assert "Finding details" not in told.counts and told.counts["Placing cameras"] == 6
+    assert result["registered"] == [f"my_view{i:02d}.jpg" for i in range(3, 9)]  # COLMAP's lists know no spaces
+    other = tmp_path / "other"
+    other.mkdir()
+    with pytest.raises(LumigraphError, match="made from other photographs"):
+        reconstruct([other], scene)
+
+
+def test_the_worker_ends_when_nobody_listens(tmp_path):
+    """As after a kill of the process that started it."""
+    write_views(tmp_path / "images", 3)
+    job = {"stage": "matching", "database": str(tmp_path / "none.db"), "pairs": "/dev/stdin"}
+    process = subprocess.Popen(
+        [sys.executable, "-P", str(WORKER), json.dumps(job)],
+        stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
+    )  # fmt: skip
+    process.stdin.close()
+    assert process.wait(timeout=20) == 1
+
+
+def test_nothing_fits_together(tmp_path, capsys, monkeypatch):
+    photos = tmp_path / "photos"
+    photos.mkdir()
+    for i in range(3):
+        Image.fromarray(pattern(50 + i, 160).astype(np.uint8)).save(photos / f"{i}.jpg", quality=95)
+    monkeypatch.chdir(tmp_path)
+    assert cli.main(["capture", str(photos)]) == 2
+    said = [line for line in capsys.readouterr().err.splitlines() if line.startswith("lumigraph: ")]
+    assert len(said) == 1 and "no two of 3 show the same things" in said[0] and "overlap" in said[0]
+    assert not list(tmp_path.rglob("transforms.json")) and not list(tmp_path.rglob("capture.json"))
+
+
+@pytest.mark.parametrize(
+    ("what", "sentence"),
+    [
+        (["nowhere"], "does not exist"),
+        (["two"], "3 are the least"),
+        (["two", "--output", "two"], "holds the photographs themselves"),
+        (["two", "--output", "taken"], "is no capture"),
+        (["two", "--max-size", "50"], "at least 200"),
+        (["two", "--frames", "1"], "at least 3"),
+    ],
+)
+def test_bad_input_gets_one_sentence(tmp_path, capsys, monkeypatch, what, sentence):
+    monkeypatch.chdir(tmp_path)
+    walls = [pattern(seed) for seed in range(3)]
+    for folder in ("two", "taken"):
+        Path(folder).mkdir()
+    for i in range(2):
+        draw(look_at(np.array([3.0, 1.0 + i, 1.0])), walls).save(f"two/{i}.jpg")
+    Path("taken/notes.txt").write_text("mine")
+    assert cli.main(["capture", *what]) == 2
+    assert sentence in capsys.readouterr().err
+
+
+def test_train_captures_what_has_no_poses(tmp_path, monkeypatch, captured, capsys):
+    monkeypatch.chdir(tmp_path)
+    calls = []
+
+    def found(what, folder, options=None):
+        calls.append((what, folder))
+        return captured[4]
+
+    monkeypatch.setattr(command, "find_cameras", found)
+    assert command.posed("procedural:still-life") == "procedural:still-life"
+    assert command.posed(str(captured[3])) == str(captured[3]) and not calls
+    assert command.posed(str(captured[0])) == "scenes/" + captured[0].parent.name  # "photos" names nothing
+    assert calls == [((captured[0],), Path("scenes") / captured[0].parent.name)]
+    assert "left out" in capsys.readouterr().out
+
+
+def test_bare_photographs_are_told_to_be_captured(captured):
+    with pytest.raises(LumigraphError, match="lumigraph capture"):
+        open_scene(captured[0])
+
+
+# Parts by themselves
+
+
+def test_stages_remember(tmp_path):
+    stages = Stages(tmp_path)
+    key = key_of({"b": 1, "a": [1, 2]})
+    assert key == key_of({"a": [1, 2], "b": 1}) != key_of({"a": [2, 1], "b": 1})
+    with pytest.raises(ValueError), stages.working("features", key):
+        raise ValueError
+    assert not Stages(tmp_path).is_done("features", key) and Stages(tmp_path).was_begun("features", key)
+    with stages.working("features", key):
+        pass
+    assert Stages(tmp_path).is_done("features", key) and not Stages(tmp_path).is_done("features", key_of(1))
+
+
+def photo(name: str, **facts) -> Photo:
+    return Photo(name, Path(name), **{"size": (100, 80), **facts})
+
+
+def test_who_shares_a_lens():
+    phone = [photo(f"p{i}", device="phone", focal=90.0 + i) for i in range(3)]
+    tourists = [photo("t0", size=(90, 60)), photo("t1", size=(91, 60)), photo("t2", size=(60, 90))]
+    scan = [photo(f"s{i}") for i in range(4)]
+    names = lambda groups: [[p.name for p in group] for group in groups]  # noqa: E731
+    assert names(group_by_lens(phone + tourists, False)) == [["p0", "p1", "p2"], ["t0"], ["t1"], ["t2"]]
+    assert names(group_by_lens(scan, False)) == [["s0", "s1", "s2", "s3"]]
+    assert len(group_by_lens(scan, False, "per-image")) == 4
+    assert len(group_by_lens(phone + scan, False, "single")) == 1
+    with pytest.raises(LumigraphError, match="one size"):
+        group_by_lens(tourists, False, "single")
+    assert prior(phone) == (91.0, True) and prior(scan) == (120.0, False)
+
+
+def test_which_pairs_are_compared():
+    assert len(exhaustive(5)) == 10
+    pairs = sequential(100, 10)
+    assert (0, 10) in pairs and (0, 11) not in pairs and (0, 16) in pairs and (0, 64) in pairs
+    assert [choose_matching(n, ordered) for n, ordered in ((20, False), (200, False), (20, True))] == [
+        "exhaustive", "retrieval", "sequential",
+    ]  # fmt: skip
+
+
+def test_photographs_of_one_place_are_alike():
+    """Three places, four photographs of each: with one neighbour less than there are, all are of the same place."""
+    chance = np.random.default_rng(0)
+    places = [chance.integers(0, 120, (300, 128)) for _ in range(3)]
+    photos = [
+        np.clip(places[i % 3][chance.permutation(300)[:200]] + chance.normal(0, 4, (200, 128)), 0, 255).astype(np.uint8)
+        for i in range(12)
+    ]
+    similar = likeness(photos)
+    assert all((i - j) % 3 == 0 for i, j in alike(similar, 3))
+    assert all(abs(i - j) >= 6 for i, j in alike(similar, 3, apart=6))
+    assert np.isfinite(likeness([np.zeros((0, 128), np.uint8), *photos])).all()
+
+
+def test_a_fold_is_a_jump():
+    walk = np.stack([np.linspace(0, 5, 50), np.zeros(50), np.zeros(50)], -1)
+    assert jumps(walk) == []
+    folded = walk.copy()
+    folded[30:] += [0, 4, 0]
+    assert [i for i, _ in jumps(folded)] == [29]
+
+
+def test_gaps_around_a_subject():
+    def ring(degrees):
+        eyes = [np.array([np.cos(a), np.sin(a), 0.4]) * 3 for a in np.radians(degrees)]
+        return np.stack([look_at(eye, np.zeros(3)) for eye in eyes])
+
+    names = [f"{i}" for i in range(24)]
+    assert coverage(names, ring(np.arange(0, 360, 15))).degrees == pytest.approx(360)
+    some = coverage(names[:18], ring(np.arange(0, 270, 15)))
+    assert some.degrees == pytest.approx(255, abs=1)
+    assert [round(gap.degrees) for gap in some.gaps] == [105] and set(some.gaps[0].between) == {"17", "0"}
+    ahead = np.stack([look_at(np.array([x, 0, 0.0]), np.array([x, 5, 0])) for x in range(3)])
+    assert coverage(names[:3], ahead) is None
+
+
+def test_exposure_rotation_and_reasons():
+    usual = [photo(f"{i}", brightness=-3 + 0.1 * i) for i in range(9)]
+    assert diagnosis.about_exposure(usual, False) == []
+    dark = [*usual, photo("dark", brightness=-5.0)]
+    assert "dark;" in diagnosis.about_exposure(dark, False)[0]
+    dusk = [photo(f"{i}", brightness=-0.3 * i) for i in range(30)]  # slowly, so that neighbours agree
+    assert diagnosis.about_exposure(dusk, True) == [] and diagnosis.about_exposure(dusk, False)
+    matches = Matches(
+        {name: 500 for name in "abcdef"} | {"g": 3},
+        {("a", "b"): 90, ("b", "c"): 60, ("e", "d"): 30, ("a", "f"): 20},
+        3,
+        3,
+    )
+    assert "one place" in diagnosis.about_rotation(10.0, matches)[0]
+    assert diagnosis.about_rotation(10.0, replace(matches, turned=1)) == []
+    assert "one place" in diagnosis.about_rotation(0.5, replace(matches, turned=0))[0]
+    placed = ["a", "b", "c"]
+    assert why_not("d", placed, [], matches, False) == "in another group of 2, which shares too little with the rest"
+    assert why_not("f", placed, [], matches, False).startswith("matches a (20 details)")
+    assert "too few details (3 found): blurred" == why_not("g", placed, [], matches, True)
+    assert "another group of 3" in why_not("f", placed, [["f", "x", "y"]], matches, False)
+
+
+def located(places: np.ndarray) -> list[Photo]:
+    there = pycolmap.GPSTransform().enu_to_ellipsoid(places, 47.0, 8.0, 400.0)
+    return [photo(f"{i}", gps=tuple(place.tolist())) for i, place in enumerate(there)]
+
+
+def test_when_gps_is_trusted():
+    chance = np.random.default_rng(1)
+    centres = chance.normal(0, 1, (20, 3))
+    places = 30 * centres + chance.normal(0, 1, (20, 3))
+    places[4] += [300, 0, 0]  # a receiver that was lost
+    found = georeference(centres, located(places))
+    assert found.new_from_old.scale == pytest.approx(30, rel=0.03) and found.error < 3
+    assert found.origin[0] == pytest.approx(47.0, abs=1e-3)
+    line = centres * [1, 0, 0]
+    assert "GPS is not used" in georeference(line, located(30 * line + chance.normal(0, 1, (20, 3)))).say
+    table = georeference(centres, located(0.5 * centres + chance.normal(0, 4, (20, 3))))
+    assert table.new_from_old is None and "too large" in table.say
+    assert georeference(centres[:2], located(places[:2])).new_from_old is None
+    assert georeference(centres, [photo(f"{i}") for i in range(20)]) is None
+
+
+def test_level_cameras_tell_up():
+    tilt = pycolmap.Rotation3d(np.array([0.2, -0.1, 0.05, 0.97])).matrix()
+    eyes = [np.array([2 * np.cos(a), 2 * np.sin(a), 1.0]) for a in np.linspace(0, 2, 9)]
+    poses = np.stack([tilt @ look_at(eye, np.zeros(3)) for eye in eyes])
+    assert upright(poses).rotation.matrix() @ tilt @ [0, 0, 1] == pytest.approx([0, 0, 1], abs=1e-3)
+
+
+def test_one_photograph_is_an_intake_too():
+    """Names that COLMAP cannot hold are changed, and stay unique."""
+    intake = Intake("x", [photo("a b.jpg"), photo("a_b.jpg")], duplicates={"a b.jpg": "a_b.jpg"})
+    safe = reconstruction.with_safe_names(intake)
+    assert [p.name for p in safe.photos] == ["a_b.jpg", "_a_b.jpg"] and safe.duplicates == {"a_b.jpg": "_a_b.jpg"}
