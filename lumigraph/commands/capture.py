@@ -14,7 +14,7 @@ from .common import needed, option, say, scene_name, show
 
 NAMELESS = ("images", "photos", "photographs", "pictures", "input", "frames")  # folders named after what is in them
 NAMED = 12  # photographs at most that a list names; all are in capture.json and photographs.png
-INDENT = " " * 14
+INDENT = " " * 13
 
 
 @dataclass(frozen=True)
@@ -47,8 +47,7 @@ class Capture:
             raise LumigraphError("Nothing to capture; name a folder of photographs, image files or a video")
         options = Options(self.frames, self.mapper, self.matching, self.camera, self.max_size)
         folder = self.output or scene_folder(self.what)
-        tell(folder, find_cameras(self.what, folder, options))
-        show({"next": f"lumigraph train gaussian-splatting {folder}"})
+        tell(folder, find_cameras(self.what, folder, options), f"lumigraph train gaussian-splatting {folder}")
         return 0
 
 
@@ -88,9 +87,9 @@ def find_cameras(what: tuple[Path, ...], folder: Path, options: Any = None) -> d
         raise
 
 
-def tell(folder: Path, result: dict[str, Any]) -> None:
-    """What became of the photographs: results to stdout, warnings to stderr."""
-    show(rows(folder, result))
+def tell(folder: Path, result: dict[str, Any], onward: str | None = None) -> None:
+    """What became of the photographs, and what to do next: results to stdout, warnings to stderr."""
+    show(rows(folder, result) | ({"next": onward} if onward else {}))
     for sentence in result["warnings"]:
         say(f"warning: {sentence}")
 
@@ -125,4 +124,4 @@ def rows(folder: Path, result: dict[str, Any]) -> dict[str, str]:
 def lines(items: list[str]) -> str:
     """One below the other, beside the names of the rows."""
     more = [f"and {len(items) - NAMED} more, in photographs.png and capture.json"] if len(items) > NAMED else []
-    return f"\n{INDENT[:13]}".join(items[:NAMED] + more)
+    return f"\n{INDENT}".join(items[:NAMED] + more)

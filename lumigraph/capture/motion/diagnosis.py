@@ -146,7 +146,7 @@ def diagnose(
     error = float(model.compute_mean_reprojection_error())
     warnings = [
         *about_left_out(left_out, len(used)),
-        *about_blur(intake.blurred),
+        *about_blur({name: why for name, why in intake.blurred.items() if name in by_name}),
         *about_exposure([photo for photo in used if photo.name in by_name], intake.in_order),
         *about_rotation(angle, matches),
         *(about_jumps(registered, poses[:, :, 3]) if names_tell else []),
@@ -180,7 +180,7 @@ def why_not(
     """Why no camera was found for a photograph, in a few words."""
     features = matches.features.get(name, 0)
     if features < FEW_FEATURES:
-        return f"too few details ({features} found): {'blurred' if blurred else 'blank, dark or out of focus'}"
+        return f"too few details ({features} found): {'blurred' if blurred and features else 'blank, dark or out of focus'}"
     for model in others:
         if name in model:
             return f"in another group of {len(model)}, which shares too little with the rest"
