@@ -43,13 +43,20 @@ class Stop:
 class PathPanel:
     """The keyframes of one client.
 
+    size: of a frustum, in scene units
     tell: says a title and a text to the client
     """
 
     def __init__(
-        self, client: Any, tab: Any, subject: Subject, flight: Flight, tell: Callable[[str, str], None]
-    ) -> None:
-        self._client, self._subject, self._flight, self._tell = client, subject, flight, tell
+        self,
+        client: Any,
+        tab: Any,
+        subject: Subject,
+        flight: Flight,
+        size: float,
+        tell: Callable[[str, str], None],
+    ):
+        self._client, self._subject, self._flight, self._size, self._tell = client, subject, flight, size, tell
         self._stops: list[Stop] = []
         self._nodes: list[Any] = []
         self._filling = False  # while what the panel shows is set from here
@@ -57,7 +64,7 @@ class PathPanel:
         with tab:
             gui.add_button("Add keyframe here").on_click(lambda _: self._add())
             self._chosen = gui.add_dropdown("Keyframe", [NONE])
-            self._actions = gui.add_button_group("Keyframe", ("Go", "Set", "◀", "▶", "✕"))
+            self._actions = gui.add_button_group("This one", ("Go", "Set", "◀", "▶", "✕"))
             self._leg = gui.add_number("Seconds to next", LEG, min=0.05, max=600.0, step=0.05)
             self._loop = gui.add_checkbox("Loop", False)
             self._fps = gui.add_slider("Frames per second", 1, 120, 1, 30)
@@ -194,7 +201,7 @@ class PathPanel:
                 f"/path/{i}",
                 fov=math.radians(self._stops[i].key.fov),
                 aspect=1.5,
-                scale=0.06 * self._distance,
+                scale=1.3 * self._size,
                 thickness=2.0,
                 thickness_units="screen",
                 color=COLOUR,
@@ -227,9 +234,7 @@ class PathPanel:
             return
         self._saved.options = self._names()
         self._saved.value = name
-        self._about.content = (
-            f"Saved. This makes a film of it:\n\n```\n{self._subject.render_command} --path {file}\n```"
-        )
+        self._about.content = f"Saved. A film of it: `{self._subject.render_command} --path {file}`"
 
     def _open(self) -> None:
         self._saved.options, name = self._names(), self._saved.value

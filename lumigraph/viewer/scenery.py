@@ -21,6 +21,7 @@ MOST_CAMERAS, MOST_POINTS = 250, 200_000  # more only fill the browser
 THUMBNAIL = 96  # pixels along the longer side
 TRAIN, TEST = (86, 134, 214), (232, 140, 60)
 SHARE = 0.4  # of the distance between neighbouring cameras, as the size of a frustum
+NEARBY = 4.0  # frustum sizes
 NARROWEST, WIDEST = 0.03, 0.07  # of the distance to the middle of all cameras
 
 
@@ -39,18 +40,17 @@ class Scenery:
         server.scene.add_frame(CAMERAS, show_axes=False)
         server.scene.add_frame(POINTS, show_axes=False)
         everyone = Camera.cat(list(cameras.values()))
-        self._size, step = frustum_size(everyone), -(-len(everyone) // MOST_CAMERAS)
+        self.size, step = frustum_size(everyone), -(-len(everyone) // MOST_CAMERAS)
         self._names: list[str] = []
         for split, group in cameras.items():
             for i in range(0, len(group), step):
                 self._add(split, group[i], f"{CAMERAS}/{split}/{i}", clicked)
         self._positions = Camera.cat([group[::step] for group in cameras.values()]).position.cpu().double()
 
-    def around(self, place: tuple[float, ...]) -> str | None:
-        """The name of the frustum that holds a place or nearly does, and so would hide everything from there."""
+    def around(self, place: tuple[float, ...]) -> set[str]:
+        """The names of the frusta that hold a place or nearly do, and so would hide everything from there."""
         distance = (self._positions - torch.tensor(place, dtype=torch.double)).norm(dim=-1)
-        nearest = int(distance.argmin())
-        return self._names[nearest] if distance[nearest] < 1.5 * self._size else None
+        return {self._names[i] for i in (distance < NEARBY * self.size).nonzero()[:, 0].tolist()}
 
     def _add(self, split: str, camera: Camera, name: str, clicked: Callable[[Any, Camera], None]) -> None:
         across, down = angles(camera)
@@ -59,7 +59,7 @@ class Scenery:
             name,
             fov=down,
             aspect=float(torch.tensor(across / 2).tan() / torch.tensor(down / 2).tan()),
-            scale=self._size,
+            scale=self.size,
             thickness=1.5,
             thickness_units="screen",
             color=TRAIN if split == "train" else TEST,

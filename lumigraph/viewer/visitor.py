@@ -50,11 +50,11 @@ class Visitor:
         self._sent: tuple[Any, ...] = ()  # which splats the client has
         self._eye = torch.zeros(3)  # towards which their colours are
         self._flat: Vector | None = None  # the background behind splats
-        self._inside: tuple[str | None, Any] = None, None  # the frustum that the eye is in, and what hides it
+        self._hidden: dict[str, Any] = {}  # frusta that are too near to the eye, and what hides each
         self.painter = Painter(self._draw, viewer.turns, self._tell_fault, lambda: viewer.stage)
         self.flight = Flight(client)
         self.controls = Controls(client, viewer.view_tab, viewer.subject.frame, viewer.is_cloud, self.painter.ask)
-        self.path = PathPanel(client, viewer.path_tab, viewer.subject, self.flight, self.tell)
+        self.path = PathPanel(client, viewer.path_tab, viewer.subject, self.flight, viewer.scenery.size, self.tell)
         self._seen: tuple[Any, ...] = ()
         client.camera.on_update(self._moved)
         self.controls.tell_angle(client.camera.fov)
@@ -196,13 +196,12 @@ class Visitor:
         return float((eye - self._eye).norm()) > TURNED * max(float((self._eye - middle).norm()), 0.1)
 
     def _step_out(self, eye: tuple[float, ...]) -> None:
-        """Hide the frustum that the eye is in, from this client alone, by a node of its own in the same place."""
-        name, (hidden, node) = self._viewer.scenery.around(eye), self._inside
-        if name == hidden or not self._here:
-            return
-        if node is not None:
-            node.remove()
-        self._inside = name, name and self._client.scene.add_frame(name, show_axes=False, visible=False)
+        """Hide frusta that the eye is in, from this client alone, by nodes of its own in the same places."""
+        near = self._viewer.scenery.around(eye) if self._here else set(self._hidden)
+        for name in self._hidden.keys() - near:
+            self._hidden.pop(name).remove()
+        for name in near - self._hidden.keys():
+            self._hidden[name] = self._client.scene.add_frame(name, show_axes=False, visible=False)
 
     def _say(self, text: str) -> None:
         """In the panel, unless it says so already."""
