@@ -171,6 +171,26 @@ def test_a_phone(tmp_path, window):
     assert psnr(opened.settled(), turned) < 25  # pinched
 
 
+def test_looking_around_from_the_middle(tmp_path, window):
+    look = dataclasses.replace(LOOK, position=(0.0, 0.0, 0.0), target=(0.0, 0.02, 0.0), nearest=0.002, farthest=0.06)
+    mesh_page(tmp_path / "page.html", cube(), dataclasses.replace(look, inward=False))
+    opened = window(tmp_path / "page.html")
+    first = opened.settled()
+    opened.drag(0.25)
+    turned = opened.settled()
+    assert psnr(turned, first) < 30
+    assert psnr(turned, np.broadcast_to(LOOK.background, first.shape)) < 20  # still inside
+
+
+def test_without_webgl_a_sentence(tmp_path, page, faults):
+    mesh_page(tmp_path / "page.html", cube(), LOOK)
+    page.add_init_script("HTMLCanvasElement.prototype.getContext = () => null")
+    page.goto((tmp_path / "page.html").as_uri())
+    page.wait_for_selector("body.failed")
+    assert "WebGL 2" in page.inner_text("#wait") and "another" in page.inner_text("#wait")
+    assert len(faults) == 1
+
+
 def cube() -> Mesh:
     corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], np.float64)
     sides = [[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]]

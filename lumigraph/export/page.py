@@ -41,9 +41,11 @@ BELOW = 20.0  # degrees below the lowest photograph that the camera may go
 ARC = 0.8  # of the arc that photographs cover is shown
 AHEAD = 0.02  # scene units: of what a camera turns about that looks outward from the middle
 FINE = 2, 4  # of 1/128: steps of the harmonics, a quarter of those that .spz files have by custom
+CROP = 1.45  # times larger than fits, at most, is a picture without a plain background, to fill the window
 QUALITY = 90  # of the pictures, as WebP
-TURN = "drag to turn", "scroll to zoom", "right-drag to move"
-TOUCH = "drag to turn", "pinch to zoom", "two fingers to move"
+# How to move, with a mouse and with fingers.
+AROUND = "Drag to turn · scroll to zoom · right-drag to move", "Drag to turn · pinch to zoom"
+ON_THE_SPOT = "Drag to look around", "Drag to look around"
 
 
 @dataclass(frozen=True)
@@ -102,7 +104,7 @@ def look_at_scene(title: str, cameras: Camera, frame: Frame, background: Vector 
 def splats_page(path: Path, gaussians: Gaussians, look: Look) -> None:
     """A cloud in the scene's frame, drawn as splats with its harmonics. The page holds it as .spz, with that loss."""
     settings = asdict(look) | {"webgl": True, "packed": False, "antialiased": gaussians.antialiased}
-    write_page(path, "splats", settings, spz.encode(gaussians, steps=FINE), TURN, TOUCH)
+    write_page(path, "splats", settings, spz.encode(gaussians, steps=FINE))
 
 
 def mesh_page(path: Path, mesh: Mesh, look: Look) -> None:
@@ -113,7 +115,7 @@ def mesh_page(path: Path, mesh: Mesh, look: Look) -> None:
     data = mesh.faces.astype("<u4").tobytes() + steps.tobytes() + mesh.colours.tobytes()
     held = {"vertices": len(steps), "faces": len(mesh.faces), "low": low.tolist(), "high": (low + size).tolist()}
     settings = asdict(look) | {"webgl": True, "packed": True} | held
-    write_page(path, "mesh", settings, gzip.compress(data, 9, mtime=0), TURN, TOUCH)
+    write_page(path, "mesh", settings, gzip.compress(data, 9, mtime=0))
 
 
 def views_page(path: Path, method: Method, cameras: Camera, look: Look, count: int, longest: int) -> None:
@@ -135,12 +137,12 @@ def views_page(path: Path, method: Method, cameras: Camera, look: Look, count: i
         "webgl": False,
         "packed": False,
         "closed": closed,
+        "crop": 1.0 if method.frame.has_alpha else CROP,
         "first": 0 if closed else len(seen_from) // 2,
         "pictures": list(zip(ends[:-1], ends[1:], strict=True)),
         "poses": seen_from.pose.tolist(),
     }
-    hints = ("drag to turn", "scroll to zoom"), ("drag to turn", "pinch to zoom")
-    write_page(path, "views", settings, b"".join(pictures), *hints)
+    write_page(path, "views", settings, b"".join(pictures))
 
 
 def views(around: Surroundings, count: int, size: tuple[int, int]) -> Camera:
@@ -159,13 +161,9 @@ def webp(rgb: Float[Tensor, "height width 3"]) -> bytes:
     return held.getvalue()
 
 
-def write_page(
-    path: Path, program: str, settings: dict[str, Any], data: bytes, mouse: tuple[str, ...], touch: tuple[str, ...]
-) -> None:
-    """Put a program of web/, its settings and its data into the page.
-
-    mouse, touch: how to move, said in the caption
-    """
+def write_page(path: Path, program: str, settings: dict[str, Any], data: bytes) -> None:
+    """Put a program of web/, its settings and its data into the page."""
+    mouse, touch = AROUND if settings["inward"] else ON_THE_SPOT
     bright = float(np.dot(settings["background"], (0.299, 0.587, 0.114))) > 0.5
     ink, edge = ("#16181c", "#ffffff") if bright else ("#ffffff", "#000000")
     red, green, blue = (round(255 * value) for value in settings["background"])
@@ -176,8 +174,8 @@ def write_page(
         "ground": f"rgb({red} {green} {blue})",
         "ink": ink,
         "edge": edge,
-        "mouse": " · ".join(mouse).capitalize(),
-        "touch": " · ".join(touch).capitalize(),
+        "mouse": mouse,
+        "touch": touch,
         "settings": json.dumps(settings, allow_nan=False).replace("<", "\\u003c"),
         "data": base64.b64encode(data).decode(),
         "program": base64.b64encode(gzip.compress(source, 9, mtime=0)).decode(),

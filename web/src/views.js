@@ -3,7 +3,6 @@
 const FRICTION = 0.93; // of the speed that is left after a sixtieth of a second
 const SWEEP = 0.8; // of all pictures, turned over by a drag across a window up to LARGE CSS pixels wide
 const LARGE = 900;
-const CROP = 1.45; // times larger than the largest that fits, at most, to fill the window
 
 const STILL = matchMedia("(prefers-reduced-motion: reduce)").matches;
 
@@ -106,7 +105,7 @@ class Views {
     const { canvas, pictures } = this;
     const shown = pictures[Math.round(this.at) % pictures.length];
     const [x, y] = [canvas.width / shown.width, canvas.height / shown.height];
-    const scale = this.zoom * Math.min(Math.max(x, y), CROP * Math.min(x, y));
+    const scale = this.zoom * Math.min(Math.max(x, y), this.settings.crop * Math.min(x, y));
     const [width, height] = [scale * shown.width, scale * shown.height];
     const context = canvas.getContext("2d");
     context.imageSmoothingQuality = "high";
