@@ -9,7 +9,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from .sightings import Sighting, compare, look_up
+from . import depths
+from .sightings import Sighting, located
 
 FREE = 0.3  # weight, beside the cosine of a surface, of a pixel that shows none: it says that there is nothing
 
@@ -32,12 +33,8 @@ class Fusion:
         total, weight = torch.zeros(len(points)), torch.zeros(len(points))
         pictured = torch.zeros(len(points), dtype=torch.bool)
         for sighting in self.sightings:
-            seen = compare(sighting, points, self.truncation)
-            pictured |= ~seen.ahead.isnan()
-            # At an edge only what lies in front of both sides is known.
-            known = seen.ahead > torch.where(seen.smooth, -self.truncation, self.truncation)
-            share = look_up(sighting.facing, seen.pixels).clamp_min(FREE) / seen.away.square()
-            share = torch.where(known, share, 0.0)
-            total += share * (seen.ahead / self.truncation).nan_to_num().clamp(-1, 1)
-            weight += share
+            pixels, valid, away = located(sighting, points)
+            given = pixels, valid, away, sighting.depth, sighting.facing
+            sums = total, weight, pictured
+            depths.fuse(*(x.numpy() for x in given), FREE, self.truncation, *(x.numpy() for x in sums))
         return torch.where(weight > 0, -total / weight, torch.nan), pictured

@@ -9,9 +9,10 @@ from typing import Literal
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int, UInt8
+from jaxtyping import Float, Int, UInt8
 from scipy import ndimage
 from torch import Tensor
+from torch.nn.functional import grid_sample
 
 from ..camera import Camera
 from ..display import track
@@ -28,6 +29,7 @@ FEWEST, MOST = 8, 2048  # cells along it that make sense
 PROBES = 160  # looks along it that tell where the surface may be
 SOFTNESS = 2.0  # logarithm of the density over its level at which it is as good as solid, or empty
 TRUNCATION = 5  # cells from the surface that depth pictures are fused over
+INWARD, OUTWARD = 1, 2  # cells from the fused surface within which the density decides
 ONSET = 0.2  # share of a ray's light that is spent where the surface is said to be
 AT_ONCE = 1 << 18  # points
 
@@ -63,6 +65,7 @@ def scale_to_source(frame: Frame) -> float:
     return float(abs(np.linalg.det(np.array(frame.source_from_scene)[:3, :3])) ** (1 / 3))
 
 
+@torch.no_grad()
 def extract_mesh(
     method: Method,
     cameras: Camera,
@@ -96,11 +99,14 @@ def extract_mesh(
     box = torch.tensor(method.frame.bounds)
     grid = make_grid(box, cell)
     sightings = look_around(method, cameras, size, views)
+    step = max(2, math.ceil(max(grid.shape) / PROBES))
+    seen = from_depth(sightings, grid.cell, closed)
     if way == "depth" or (way == "auto" and type(method).density is Method.density):
-        value = from_depth(sightings, TRUNCATION * grid.cell, closed)
+        value = seen
     else:
-        value = from_density(method, surface_level(method, sightings, box) if level is None else level)
-    vertices, triangles = find_surface(grid, box, value, sightings, closed)
+        level = surface_level(method, sightings, box) if level is None else level
+        value = from_density(method, level, interpolated(seen, grid, step))
+    vertices, triangles = find_surface(grid, step, box, value, -1.0 if closed else math.nan)
     if len(triangles):
         hidden = unseen(torch.from_numpy(vertices).float(), sightings, 2 * grid.cell).numpy()
         if not closed:
@@ -136,29 +142,33 @@ def make_grid(box: Float[Tensor, "2 3"], cell: float | None) -> Grid:
 Value = Callable[[Float[Tensor, "point 3"]], Float[Tensor, " point"]]
 
 
-def from_density(method: Method, level: float) -> Value:
-    """Zero where the density is at its level, 1 well inside, -1 well outside.
-
-    Its logarithm, which changes evenly where the density itself grows by orders of magnitude within a cell.
-    """
-
-    def value(points: Float[Tensor, "point 3"]) -> Float[Tensor, " point"]:
-        density = method.density(points.to(method.device)).cpu().float()
-        return ((density.clamp_min(1e-30) / level).log() / SOFTNESS).clamp(-1, 1)
-
-    return value
-
-
-def from_depth(sightings: Sequence[Sighting], truncation: float, closed: bool) -> Value:
+def from_depth(sightings: Sequence[Sighting], cell: float, closed: bool) -> Value:
     """Zero at the surface of the fused depth pictures, 1 well inside, -1 well outside.
 
     closed: whether what is pictured but hidden from all cameras counts as solid, rather than as unknown (NaN)
     """
-    fusion = Fusion(sightings, truncation)
+    fusion = Fusion(sightings, TRUNCATION * cell)
 
     def value(points: Float[Tensor, "point 3"]) -> Float[Tensor, " point"]:
         distance, pictured = fusion(points)
         return torch.where(distance.isnan() & closed, torch.where(pictured, 1.0, -1.0), distance)
+
+    return value
+
+
+def from_density(method: Method, level: float, depth: Value) -> Value:
+    """Zero where the density is at its level, 1 well inside, -1 well outside.
+
+    It is the logarithm that counts, for it changes evenly where the density itself grows by orders of magnitude within
+    a cell. Farther from the surface that the cameras see than a few cells their word counts: so there are no caves
+    inside of things, where nothing taught the field to be solid, and no mist that all see through.
+    """
+    inward, outward = INWARD / TRUNCATION, OUTWARD / TRUNCATION
+
+    def value(points: Float[Tensor, "point 3"]) -> Float[Tensor, " point"]:
+        density = method.density(points.to(method.device)).cpu().float()
+        own, seen = ((density.clamp_min(1e-30) / level).log() / SOFTNESS).clamp(-1, 1), depth(points)
+        return own.maximum(seen - inward).minimum(seen + outward)
 
     return value
 
@@ -183,58 +193,48 @@ def surface_level(method: Method, sightings: Sequence[Sighting], box: Float[Tens
             "longer, or give the density at which it is solid as --level"
         )
     found = found[:: max(1, len(found) // AT_ONCE)]
-    with torch.no_grad():
-        at_depth = float(method.density(found.to(method.device)).median())
+    at_depth = float(method.density(found.to(method.device)).median())
     return at_depth * math.log(1 - ONSET) / math.log(0.5)
 
 
-@torch.no_grad()
-def find_surface(
-    grid: Grid, box: Float[Tensor, "2 3"], value: Value, sightings: Sequence[Sighting], closed: bool
-) -> tuple[Float[np.ndarray, "vertex 3"], Int[np.ndarray, "face 3"]]:
-    """From coarse to fine: probes tell which blocks the surface may pass through, and those are marched through."""
-    step = max(2, math.ceil(max(grid.shape) / PROBES))
+def at_probes(value: Value, grid: Grid, step: int) -> Float[Tensor, "i j k"]:
+    """A function at each step-th corner along each axis."""
     corners = grid.every(step)
-    probes = grid.points(corners.reshape(-1, 3))
-    batches = probes.split(AT_ONCE)
-    known = torch.cat([value(x) for x in track(batches, "Looking for the surface", len(batches))])
-    probed = known.reshape(corners.shape[:3]).numpy()
-    solid = probed > 0
-    filled = np.zeros_like(solid)
-    if closed:
-        filled = voids(solid, probes, sightings, 2 * step * grid.cell)
-        probed[filled] = 1.0
-    near = ndimage.maximum_filter(np.abs(np.nan_to_num(probed, nan=1.0)) < 1, 3)
-    near |= ndimage.maximum_filter(probed > 0, 3) != ndimage.minimum_filter(probed > 0, 3)
+    batches = grid.points(corners.reshape(-1, 3)).split(AT_ONCE)
+    found = [value(x) for x in track(batches, "Looking for the surface", len(batches))]
+    return torch.cat(found).reshape(corners.shape[:3])
+
+
+def interpolated(value: Value, grid: Grid, step: int) -> Value:
+    """A function that is asked at probes alone, and interpolated between them."""
+    probed = at_probes(value, grid, step)
+    low, span = torch.tensor(grid.low), step * grid.cell * (torch.tensor(probed.shape) - 1)
+
+    def between(points: Float[Tensor, "point 3"]) -> Float[Tensor, " point"]:
+        place = (2 * (points - low) / span - 1).flip(-1)[None, None, None]
+        return grid_sample(probed[None, None], place, padding_mode="border", align_corners=True).flatten()
+
+    return between
+
+
+def find_surface(
+    grid: Grid, step: int, box: Float[Tensor, "2 3"], value: Value, beyond: float
+) -> tuple[Float[np.ndarray, "vertex 3"], Int[np.ndarray, "face 3"]]:
+    """From coarse to fine: probes tell which blocks the surface may pass through, and those are marched through.
+
+    step:   corners of the grid from one probe to the next
+    beyond: value outside the box: -1 closes the surface there, NaN leaves it open
+    """
+
+    def inside(points: Float[Tensor, "point 3"]) -> Float[Tensor, " point"]:
+        return torch.where(((points < box[0]) | (points > box[1])).any(-1), beyond, value(points))
+
+    probed = at_probes(inside, grid, step).nan_to_num(nan=-1.0).numpy()
+    near = ndimage.maximum_filter(np.abs(probed) < 1, 3)
+    near |= ndimage.maximum_filter(probed, 3) * ndimage.minimum_filter(probed, 3) < 0
     shape = tuple(-(-n // BLOCK) for n in grid.shape)
     active = np.zeros(shape, bool)
     active[tuple((np.argwhere(near) * step // BLOCK).clip(max=np.array(shape) - 1).T)] = True
     middle = ((np.stack(np.indices(shape), -1) + 0.5) * BLOCK / step).astype(int).clip(max=np.array(probed.shape) - 1)
     elsewhere = np.where(probed[tuple(np.moveaxis(middle, -1, 0))] > 0, 1.0, -1.0)
-    patched = torch.from_numpy(ndimage.binary_dilation(filled) & ~solid | filled)
-    beyond = -1.0 if closed else torch.nan
-
-    def inside(points: Float[Tensor, "point 3"]) -> Float[Tensor, " point"]:
-        found = value(points)
-        if closed:
-            nearest = ((points - torch.tensor(grid.low)) / (step * grid.cell)).round().long()
-            found[patched[tuple(nearest.clamp_min(0).minimum(torch.tensor(probed.shape) - 1).T)]] = 1.0
-        found[((points < box[0]) | (points > box[1])).any(-1)] = beyond
-        return found
-
     return zero_level(grid, inside, active, elsewhere)
-
-
-def voids(
-    solid: Bool[np.ndarray, "i j k"], points: Float[Tensor, "probe 3"], sightings: Sequence[Sighting], margin: float
-) -> Bool[np.ndarray, "i j k"]:
-    """Empty places that no camera sees into and that are shut in by what is solid or seen: the insides of things.
-
-    What is not seen but reaches the edge of the grid lies below or behind things, and stays empty.
-    """
-    hidden = np.zeros(solid.size, bool)
-    empty = np.flatnonzero(~solid.ravel())
-    hidden[empty] = unseen(points[torch.from_numpy(empty)], sightings, margin).numpy()
-    label, _ = ndimage.label(hidden.reshape(solid.shape))
-    faces = [np.take(label, (0, -1), axis).ravel() for axis in range(3)]
-    return (label > 0) & ~np.isin(label, np.concatenate(faces))

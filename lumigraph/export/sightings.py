@@ -17,9 +17,11 @@ from ..display import track
 from ..errors import LumigraphError
 from ..method import Method
 from ..paths import look_at
+from . import depths
 
 SOLID = 0.5  # opacity from which on a pixel shows a surface
 ELEVATIONS = (0.0, 30.0, 60.0)  # degrees, of cameras around what has none of its own
+SEERS = 16  # cameras of which one must see a point for it to count as seen
 FAR = 1e6  # scene units: the depth of pixels that show none
 
 
@@ -133,36 +135,33 @@ def compare(sighting: Sighting, points: Float[Tensor, "point 3"], jump: float) -
     jump: difference in depth between neighbouring pixels from which on there is an edge, scene units. There a point
           counts as seen only if it lies in front of both sides.
     """
-    camera, (height, width) = sighting.camera, sighting.depth.shape
-    pixels, valid = camera.project(points)
-    inside = valid & (pixels >= 0).all(-1) & (pixels < torch.tensor([width, height])).all(-1)
-    corner = (torch.where(inside[:, None], pixels, 0.5) - 0.5).clamp_min(0)
-    corner = torch.minimum(corner, torch.tensor([width - 1.0, height - 1.0]))
-    x, y = corner.long().unbind(-1)
-    dx, dy = (corner - corner.floor()).unbind(-1)
-    right, below = (x + 1).clamp(max=width - 1), (y + 1).clamp(max=height - 1)
-    depth = sighting.depth.reshape(-1)
-    taps = torch.stack([depth[v * width + u] for v in (y, below) for u in (x, right)])
-    nearest = taps.amin(0)
-    smooth = inside & (taps.amax(0) - nearest < jump)
-    top, bottom = torch.lerp(taps[0], taps[1], dx), torch.lerp(taps[2], taps[3], dx)
-    away = (points - camera.position).norm(dim=-1)
-    ahead = torch.where(smooth, torch.lerp(top, bottom, dy), nearest) - away
-    return Compared(torch.where(inside, ahead, torch.nan), smooth, pixels, away)
+    pixels, valid, away = located(sighting, points)
+    ahead, smooth = torch.empty_like(away), torch.empty_like(valid)
+    given = pixels, valid, away, sighting.depth
+    depths.against(*(x.numpy() for x in given), jump, ahead.numpy(), smooth.numpy())
+    return Compared(ahead, smooth, pixels, away)
+
+
+def located(
+    sighting: Sighting, points: Float[Tensor, "point 3"]
+) -> tuple[Float[Tensor, "point 2"], Bool[Tensor, " point"], Float[Tensor, " point"]]:
+    """Where points lie in a camera's picture, whether its lens sees them, and how far away they are."""
+    pixels, valid = sighting.camera.project(points)
+    return pixels, valid, (points - sighting.camera.position).norm(dim=-1)
 
 
 def unseen(points: Float[Tensor, "point 3"], sightings: Sequence[Sighting], margin: float) -> Bool[Tensor, " point"]:
-    """Whether points lie hidden from every camera, or outside all pictures.
+    """Whether points lie hidden from all cameras but a few, or outside all pictures.
 
     margin: how far behind a surface a point still counts as seen, scene units
+    One camera in SEERS must see a point, and at least one: single depths err, at edges and beneath what shines.
     """
-    left = torch.arange(len(points))
+    needed = 1 + len(sightings) // SEERS
+    left, count = torch.arange(len(points)), torch.zeros(len(points), dtype=torch.int64)
     for sighting in sightings:
-        seen = compare(sighting, points[left], margin).ahead >= -margin
-        left = left[~seen]
-    hidden = torch.zeros(len(points), dtype=torch.bool)
-    hidden[left] = True
-    return hidden
+        count[left] += compare(sighting, points[left], margin).ahead >= -margin
+        left = left[count[left] < needed]
+    return count < needed
 
 
 def look_up(values: Float[Tensor, "height width *channels"], pixels: Float[Tensor, "point 2"]) -> Tensor:
