@@ -11,10 +11,10 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ..errors import LumigraphError
-from ..lens import OmnidirectionalStereo
+from ..lens import Equirectangular, OmnidirectionalStereo
 from ..method import Method
 from ..rays import Rendering
-from .panorama import level_camera, panorama, sphere, sphere_size
+from .panorama import level_camera, sphere, sphere_size
 
 SHARE = 1 / 50  # of the distance to what is around: 64 mm in a room of some three metres
 PROBE = 256  # pixels of the small panorama that tells distances
@@ -58,7 +58,7 @@ def surrounding_distances(
 
     Each direction counts by its share of the sphere. Raises LumigraphError where nothing is around.
     """
-    seen = panorama(method, place, heading, PROBE)
+    seen = sphere(method, level_camera(place, heading, Equirectangular(sphere_size(PROBE))), "Looking around")
     rows = torch.arange(PROBE // 2) + 0.5
     weight = torch.sin(torch.pi * rows / len(rows))[:, None].expand_as(seen.depth)
     solid = (seen.opacity > SOLID) & seen.depth.isfinite()
