@@ -329,11 +329,15 @@ def test_photographs_of_one_place_are_alike():
 
 
 def test_a_fold_is_a_jump():
-    walk = np.stack([np.linspace(0, 5, 50), np.zeros(50), np.zeros(50)], -1)
+    """Neighbours far apart that look the same way; a camera carried elsewhere looks another way."""
+    walk = np.stack([look_at(np.array([x, 0, 0.0]), np.array([x, 5, 0])) for x in np.linspace(0, 5, 50)])
     assert jumps(walk) == []
     folded = walk.copy()
-    folded[30:] += [0, 4, 0]
-    assert [i for i, _ in jumps(folded)] == [29]
+    folded[30:, 1, 3] += 4
+    assert [i for i, _ in jumps(folded)] == [29] and jumps(folded)[0][1] > 30
+    carried = folded.copy()
+    carried[30:, :, :3] = look_at(np.zeros(3), np.array([1.0, -1, 0]))[:, :3]
+    assert jumps(carried) == []
 
 
 def test_gaps_around_a_subject():

@@ -22,6 +22,7 @@ WINDOW = 5  # neighbours on each side that a frame's exposure is compared with
 SMALL_ANGLE = 2.0  # degrees between the rays that meet at a point, in the middle: less says little of depth
 ROTATIONS = 0.6  # share of the pairs that a turn of the camera explains alone
 JUMP = 10.0  # times the usual distance between neighbours
+SAME_WAY = 45.0  # degrees between views; who walks far off and films on seldom looks the same way there
 STEADY = 0.5  # distance of neighbours, as a share of that of any two, up to which names tell the order of exposure
 GAP = 30.0  # degrees between neighbouring directions from which on nobody looked from between
 INACCURATE = 2.0  # pixels of reprojection error
@@ -149,7 +150,7 @@ def diagnose(
         *about_blur({name: why for name, why in intake.blurred.items() if name in by_name}),
         *about_exposure([photo for photo in used if photo.name in by_name], intake.in_order),
         *about_rotation(angle, matches),
-        *(about_jumps(registered, poses[:, :, 3]) if names_tell else []),
+        *(about_jumps(registered, poses) if names_tell else []),
     ]
     if error > INACCURATE:
         warnings.append(
@@ -180,7 +181,8 @@ def why_not(
     """Why no camera was found for a photograph, in a few words."""
     features = matches.features.get(name, 0)
     if features < FEW_FEATURES:
-        return f"too few details ({features} found): {'blurred' if blurred and features else 'blank, dark or out of focus'}"
+        fault = "blurred" if blurred and features else "blank, dark or out of focus"
+        return f"too few details ({features} found): {fault}"
     for model in others:
         if name in model:
             return f"in another group of {len(model)}, which shares too little with the rest"
@@ -240,14 +242,16 @@ def coverage(names: Sequence[str], poses: Float[np.ndarray, "photo 3 4"]) -> Cov
     return Coverage(degrees, sorted(gaps, key=lambda gap: -gap.degrees) if degrees > 180 else [])
 
 
-def jumps(positions: Float[np.ndarray, "photo 3"]) -> list[tuple[int, float]]:
-    """Where cameras in order leap: the number of the one before, and how many times the usual step it is.
+def jumps(poses: Float[np.ndarray, "photo 3 4"]) -> list[tuple[int, float]]:
+    """Where cameras in order leap but look on the same way: the one before, and how many times the usual step it is.
 
-    A model that is folded, with parts of the place in it twice, leaps where the fold is.
+    A model that is folded, with parts of the place in it twice, leaps where the fold is. poses: camera-to-world
     """
-    steps = np.linalg.norm(np.diff(positions, axis=0), axis=-1)
+    steps = np.linalg.norm(np.diff(poses[:, :, 3], axis=0), axis=-1)
+    same_way = (poses[1:, :, 2] * poses[:-1, :, 2]).sum(-1) > np.cos(np.radians(SAME_WAY))
     usual = float(np.median(steps)) if len(steps) else 0.0
-    return [(i, float(step / usual)) for i, step in enumerate(steps) if usual > 0 and step > JUMP * usual]
+    leaps = np.flatnonzero((steps > JUMP * usual) & same_way) if usual > 0 else []
+    return [(int(i), float(steps[i] / usual)) for i in leaps]
 
 
 def in_steps(positions: Float[np.ndarray, "photo 3"]) -> bool:
@@ -299,15 +303,16 @@ def about_rotation(angle: float, matches: Matches) -> list[str]:
     ]
 
 
-def about_jumps(names: Sequence[str], positions: Float[np.ndarray, "photo 3"]) -> list[str]:
-    found = sorted(jumps(positions), key=lambda jump: -jump[1])
+def about_jumps(names: Sequence[str], poses: Float[np.ndarray, "photo 3 4"]) -> list[str]:
+    found = sorted(jumps(poses), key=lambda jump: -jump[1])
     if not found:
         return []
     i, times = found[0]
     more = f", and there are {len(found) - 1} more such places" if len(found) > 1 else ""
     return [
-        f"{names[i]} and {names[i + 1]} follow each other but stand {times:.0f} times as far apart as is usual{more}: "
-        f"the model may be folded there; look at capture.png, and try --mapper global or --matching exhaustive"
+        f"{names[i]} and {names[i + 1]} follow each other and look the same way, but stand {times:.0f} times as far "
+        f"apart as is usual{more}: the model may be folded there; look at capture.png, and try --mapper global or "
+        f"--matching exhaustive"
     ]
 
 

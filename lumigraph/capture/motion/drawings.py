@@ -23,6 +23,7 @@ SHADE = 0.85  # of points' colours, so that white ones show on paper
 RELIABLE = 3  # photographs that show a point worth drawing
 OUTLYING = 0.04  # share of the points on each side that do not decide what is shown
 FARTHEST = 2.0  # times the distance from cameras to points that is shown around the cameras
+NARROWEST, WIDEST = 110, 1720  # pixels of a column and of the columns together, on the sheet of photographs
 FRUSTUM = 0.05  # depth of a camera's pyramid, as a share of what is shown
 
 
@@ -44,8 +45,8 @@ def draw_capture(path: Path, model: pycolmap.Reconstruction, diagnosis: Diagnosi
     """Write a picture of an upright model. keep_axes: whether x goes right in it, as where x is east."""
     sketch = sketch_of(model, diagnosis.registered, keep_axes)
     low, high = interesting(sketch)
-    top, side = high - low, high - low
-    height = [round(PANEL * min(max(s[k] / s[0], 0.35), 1.25)) for s, k in ((top, 1), (side, 2))]
+    extent = high - low
+    height = [round(PANEL * min(max(extent[k] / extent[0], 0.35), 1.25)) for k in (1, 2)]
     sheet = Image.new("RGB", (2 * PANEL + 3 * MARGIN, max(height) + 3 * MARGIN + 2 * LINE), PAPER)
     draw = ImageDraw.Draw(sheet)
     draw.text((MARGIN, MARGIN - 8), heading(diagnosis), INK, ImageFont.load_default(18))
@@ -117,7 +118,7 @@ def draw_view(sketch: Sketch, axis: int, low: np.ndarray, high: np.ndarray, size
         y = height / 2 - scale * (points[..., up] - (low + high)[up] / 2)
         return np.stack([x, y], -1)
 
-    canvas = np.full((height, width, 3), tuple(bytes.fromhex("ffffff")), np.uint8)
+    canvas = np.full((height, width, 3), 255, np.uint8)
     order = np.argsort(sketch.points[:, axis] * (1 if axis == 2 else -1), kind="stable")
     at = place(sketch.points[order]).round().astype(int)
     dot = range(-1, 2) if len(at) > 4000 else range(-2, 3)
@@ -162,14 +163,15 @@ def draw_photographs(path: Path, intake: Intake, diagnosis: Diagnosis) -> None:
     files = {photo.name: photo.path for photo in intake.photos}
     names = [*files, *sorted(intake.unreadable)]
     cell = 220 if len(names) <= 60 else 150 if len(names) <= 200 else 110
-    columns = min(max(round((1.4 * len(names)) ** 0.5), 4), 1720 // cell)
+    pictures = {name: thumbnail(files.get(name), cell) for name in names}
+    cell = max(NARROWEST, *(picture.width for picture in pictures.values()))
+    columns = min(max(round((1.4 * len(names)) ** 0.5), 4), WIDEST // cell)
     letters = cell // 6
     notes = {name: textwrap.wrap(note, letters)[:3] for name in names if (note := remark(name, diagnosis)[0])}
     gap, text = 12, 15
-    sheet = Image.new("RGB", (1, 1), PAPER)
     rows, y = [], 2 * MARGIN + LINE
     for start in range(0, len(names), columns):
-        row = [(name, thumbnail(files.get(name), cell)) for name in names[start : start + columns]]
+        row = [(name, pictures[name]) for name in names[start : start + columns]]
         height = max(image.height for _, image in row)
         rows.append((y, height, row))
         y += height + text * (1 + max(len(notes.get(name, ())) for name, _ in row)) + gap
@@ -185,8 +187,8 @@ def draw_photographs(path: Path, intake: Intake, diagnosis: Diagnosis) -> None:
         for i, (name, image) in enumerate(row):
             x, mark = MARGIN + i * (cell + gap), remark(name, diagnosis)[1]
             left = x + (cell - image.width) // 2
-            sheet.paste(image if mark != LEFT_OUT else Image.blend(image, Image.new("RGB", image.size, PAPER), 0.35),
-                        (left, y))  # fmt: skip
+            faded = Image.blend(image, Image.new("RGB", image.size, PAPER), 0.35) if mark == LEFT_OUT else image
+            sheet.paste(faded, (left, y))
             if mark:
                 draw.rectangle([left - 3, y - 3, left + image.width + 2, y + image.height + 2], None, mark, 4)
             draw.text((x, y + height + 3), shortened(name, letters), INK, small)
