@@ -75,9 +75,15 @@ def angles(camera: Camera) -> tuple[float, float]:
     """Radians across and down the picture of one camera, whatever its lens; not more than a flat picture can show."""
     width, height = camera.size[0].tolist()
     x, y = width / 2, height / 2
-    left, right, top, bottom = camera.lens.unproject(torch.tensor([[0.0, y], [width, y], [x, 0.0], [x, height]]))
-    across, down = (math.acos(max(-1.0, min(1.0, float(a @ b)))) for a, b in ((left, right), (top, bottom)))
+    edges = torch.tensor([[x, y], [0.0, y], [width, y], [x, 0.0], [x, height]])
+    middle, left, right, top, bottom = camera.to("cpu").lens.unproject(edges)
+    across, down = (angle(middle, a) + angle(middle, b) for a, b in ((left, right), (top, bottom)))
     return min(across, WIDEST), min(down, WIDEST)
+
+
+def angle(a: Float[Tensor, " 3"], b: Float[Tensor, " 3"]) -> float:
+    """Radians between unit vectors."""
+    return math.acos(max(-1.0, min(1.0, float(a @ b))))
 
 
 def angle_for(camera: Camera, aspect: float) -> float:

@@ -211,7 +211,7 @@ def start_server(address: Address, title: str) -> Any:
         with quiet():
             server.stop()
         raise LumigraphError(f"Port {address.port} has just been taken; start the viewer again")
-    server.scene.set_up_direction("+z")
+    server.request_share_url = lambda *_, **__: None  # viser would connect to the outside if a client asked it to
     return server
 
 
