@@ -38,7 +38,7 @@ class Web:
     """Colour behind splats or the mesh."""
     views: Annotated[int, option("N")] = 72
     """Pictures in a page of views."""
-    size: Annotated[int, option("PIXELS")] = 720
+    size: Annotated[int, option("PIXELS")] = 640
     """Longer side of these pictures."""
     device: Annotated[str, option("NAME")] = "auto"
     """auto, cpu, cuda, cuda:1."""
