@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import subprocess
 import sys
 from dataclasses import replace
@@ -20,11 +21,12 @@ from views import draw, look_at, pattern, spoil, write_views
 from lumigraph import cli
 from lumigraph.capture import open_scene
 from lumigraph.capture.colmap import read as read_colmap
-from lumigraph.capture.motion import diagnosis, reconstruct, reconstruction
-from lumigraph.capture.motion.diagnosis import Matches, coverage, jumps, why_not
+from lumigraph.capture.motion import Options, diagnosis, reconstruct, reconstruction
+from lumigraph.capture.motion.diagnosis import Matches, coverage, folds, jumps, read_matches, why_not
 from lumigraph.capture.motion.georeference import georeference, upright
 from lumigraph.capture.motion.lenses import group_by_lens, prior
 from lumigraph.capture.motion.pairs import alike, choose_matching, exhaustive, likeness, sequential
+from lumigraph.capture.motion.reconstruction import Reconstruction
 from lumigraph.capture.motion.stages import WORKER, Stages, key_of
 from lumigraph.capture.photos import Intake, Photo
 from lumigraph.capture.transforms import read as read_transforms
@@ -132,7 +134,9 @@ def test_the_scene_stands_upright(captured):
 
 
 def colours_of(image: Image.Image) -> set[tuple[int, ...]]:
-    return {tuple(colour) for colour in np.unique(np.asarray(image.convert("RGB")).reshape(-1, 3), axis=0).tolist()}
+    red, green, blue = np.asarray(image.convert("RGB")).astype(int).reshape(-1, 3).T
+    numbers = np.unique(red << 16 | green << 8 | blue)
+    return {(n >> 16, n >> 8 & 255, n & 255) for n in numbers.tolist()}
 
 
 def test_pictures_are_drawn(captured):
@@ -169,8 +173,7 @@ def test_gps_turns_and_scales(captured, monkeypatch, tmp_path):
         intake = plain(*arguments)
         return replace(intake, photos=[replace(photo, gps=gps.get(photo.name)) for photo in intake.photos])
 
-    copied = tmp_path / "scene"
-    subprocess.run(["cp", "-a", str(scene), str(copied)], check=True)
+    copied = copy_of(scene, tmp_path)
     monkeypatch.setattr(reconstruction, "gather", with_gps)
     monkeypatch.setattr(Stages, "colmap", None)
     result = reconstruct([photos], copied)
@@ -182,6 +185,43 @@ def test_gps_turns_and_scales(captured, monkeypatch, tmp_path):
     assert np.linalg.norm(found - true) < 0.05 * np.linalg.norm(true)
     axes = [shots[name][:, :3] for name in (first, last)]
     assert all(a[:, 2] @ (turn @ poses[n][:, 2]) > 0.995 for a, n in zip(axes, (first, last), strict=True))
+
+
+def test_all_at_once_with_chosen_pairs(captured, tmp_path):
+    """The other mapper, or the usual one should it give up for guessed focal lengths, and pairs by likeness."""
+    photos, poses, _, scene, _, _ = captured
+    copied, told = copy_of(scene, tmp_path), Told()
+    result = reconstruct([photos], copied, Options(mapper="global", matching="retrieval"), told)
+    assert "Finding details" not in told.counts and told.counts["Comparing pairs"] <= 120
+    assert set(poses) <= set(result["registered"])
+    assert np.median(aligned_error(copied, poses)) < 0.005
+
+
+def test_a_folded_model_is_made_again_from_near_neighbours(captured, monkeypatch, tmp_path):
+    photos, poses, _, scene, _, _ = captured
+    copied = copy_of(scene, tmp_path)
+    (copied / "capture.json").unlink()
+    stages = Stages(copied / "work")
+    stages.mark("unfolding", "other", False, 0)
+    answers = iter([1, 0, 1])  # the first model leaps; the second, asked of before the first again, does not
+    monkeypatch.setattr(Reconstruction, "leaps", lambda *_: next(answers))
+    monkeypatch.setattr(reconstruction, "NEIGHBOURS", 4)
+    told = Told()
+    result = reconstruct([photos], copied, track=told)
+    assert list(told.counts)[-1] == "Placing cameras" and "Comparing pairs" not in told.counts
+    assert any("folded, so it was made again" in sentence for sentence in result["warnings"])
+    assert len(result["registered"]) >= 0.8 * len(poses) and np.median(aligned_error(copied, poses)) < 0.01
+    names = sorted(read_matches(copied / "work" / "database.db").features)
+    far = {True: 0, False: 0}
+    for near in far:
+        for a, b in read_matches(copied / "work" / ("near.db" if near else "database.db")).shared:
+            far[near] += abs(names.index(a) - names.index(b)) > 4
+    assert far[True] == 0 < far[False]
+
+
+def copy_of(scene: Path, folder: Path) -> Path:
+    """With dates, by which photographs are known again."""
+    return Path(shutil.copytree(scene, folder / "scene"))
 
 
 def test_stopped_and_gone_on(tmp_path):
@@ -329,7 +369,7 @@ def test_photographs_of_one_place_are_alike():
 
 
 def test_a_fold_is_a_jump():
-    """Neighbours far apart that look the same way; a camera carried elsewhere looks another way."""
+    """Neighbours far apart that look the same way or share details; a camera carried elsewhere does neither."""
     walk = np.stack([look_at(np.array([x, 0, 0.0]), np.array([x, 5, 0])) for x in np.linspace(0, 5, 50)])
     assert jumps(walk) == []
     folded = walk.copy()
@@ -337,7 +377,10 @@ def test_a_fold_is_a_jump():
     assert [i for i, _ in jumps(folded)] == [29] and jumps(folded)[0][1] > 30
     carried = folded.copy()
     carried[30:, :, :3] = look_at(np.zeros(3), np.array([1.0, -1, 0]))[:, :3]
-    assert jumps(carried) == []
+    assert jumps(carried) == [] and [i for i, _ in jumps(carried, [29])] == [29]
+    names = [f"{i}" for i in range(50)]
+    shared = Matches(dict.fromkeys(names, 500), {("30", "29"): 80}, 0, 0)
+    assert folds(names, carried, shared, True) and not folds(names, carried, replace(shared, shared={}), True)
 
 
 def test_gaps_around_a_subject():

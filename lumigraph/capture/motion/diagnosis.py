@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import statistics
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -22,7 +22,8 @@ WINDOW = 5  # neighbours on each side that a frame's exposure is compared with
 SMALL_ANGLE = 2.0  # degrees between the rays that meet at a point, in the middle: less says little of depth
 ROTATIONS = 0.6  # share of the pairs that a turn of the camera explains alone
 JUMP = 10.0  # times the usual distance between neighbours
-SAME_WAY = 45.0  # degrees between views; who walks far off and films on seldom looks the same way there
+SAME_WAY = 45.0  # degrees between views; who walks far off seldom looks the same way there
+OVERLAPPING = 30  # details that neighbours share, from which on they cannot be far apart
 STEADY = 0.5  # distance of neighbours, as a share of that of any two, up to which names tell the order of exposure
 GAP = 30.0  # degrees between neighbouring directions from which on nobody looked from between
 INACCURATE = 2.0  # pixels of reprojection error
@@ -44,6 +45,9 @@ class Matches:
         found = [(n, b if a == name else a) for (a, b), n in self.shared.items() if name in (a, b)]
         most = max(found, default=(0, ""))
         return most[1], most[0]
+
+    def between(self, a: str, b: str) -> int:
+        return self.shared.get((a, b)) or self.shared.get((b, a)) or 0
 
     def groups(self) -> list[set[str]]:
         """Photographs that hang together, the largest group first."""
@@ -143,14 +147,13 @@ def diagnose(
         if photo.name not in by_name
     }
     angle = triangulation_angle(model)
-    names_tell = intake.in_order or in_steps(poses[:, :, 3])
     error = float(model.compute_mean_reprojection_error())
     warnings = [
         *about_left_out(left_out, len(used)),
         *about_blur({name: why for name, why in intake.blurred.items() if name in by_name}),
         *about_exposure([photo for photo in used if photo.name in by_name], intake.in_order),
         *about_rotation(angle, matches),
-        *(about_jumps(registered, poses) if names_tell else []),
+        *about_jumps(registered, folds(registered, poses, matches, intake.in_order)),
     ]
     if error > INACCURATE:
         warnings.append(
@@ -242,16 +245,30 @@ def coverage(names: Sequence[str], poses: Float[np.ndarray, "photo 3 4"]) -> Cov
     return Coverage(degrees, sorted(gaps, key=lambda gap: -gap.degrees) if degrees > 180 else [])
 
 
-def jumps(poses: Float[np.ndarray, "photo 3 4"]) -> list[tuple[int, float]]:
-    """Where cameras in order leap but look on the same way: the one before, and how many times the usual step it is.
+def jumps(poses: Float[np.ndarray, "photo 3 4"], overlapping: Collection[int] = ()) -> list[tuple[int, float]]:
+    """Where cameras in order leap, though they see the same: the one before, and how many times the usual step it is.
 
-    A model that is folded, with parts of the place in it twice, leaps where the fold is. poses: camera-to-world
+    A model that is folded, with parts of the place in it twice or two parts in one place, leaps where the fold is.
+    poses:       camera-to-world
+    overlapping: photographs that are known to share details with the next; others count where both look the same way
     """
     steps = np.linalg.norm(np.diff(poses[:, :, 3], axis=0), axis=-1)
     same_way = (poses[1:, :, 2] * poses[:-1, :, 2]).sum(-1) > np.cos(np.radians(SAME_WAY))
     usual = float(np.median(steps)) if len(steps) else 0.0
-    leaps = np.flatnonzero((steps > JUMP * usual) & same_way) if usual > 0 else []
-    return [(int(i), float(steps[i] / usual)) for i in leaps]
+    return [
+        (i, float(step / usual))
+        for i, step in enumerate(steps)
+        if step > JUMP * usual > 0 and (same_way[i] or i in overlapping)
+    ]
+
+
+def folds(
+    names: Sequence[str], poses: Float[np.ndarray, "photo 3 4"], matches: Matches, in_order: bool
+) -> list[tuple[int, float]]:
+    """The jumps of a capture, where its order tells anything."""
+    if not (in_order or in_steps(poses[:, :, 3])):
+        return []
+    return jumps(poses, [i for i in range(len(names) - 1) if matches.between(names[i], names[i + 1]) >= OVERLAPPING])
 
 
 def in_steps(positions: Float[np.ndarray, "photo 3"]) -> bool:
@@ -303,14 +320,14 @@ def about_rotation(angle: float, matches: Matches) -> list[str]:
     ]
 
 
-def about_jumps(names: Sequence[str], poses: Float[np.ndarray, "photo 3 4"]) -> list[str]:
-    found = sorted(jumps(poses), key=lambda jump: -jump[1])
-    if not found:
+def about_jumps(names: Sequence[str], leaps: Sequence[tuple[int, float]]) -> list[str]:
+    if not leaps:
         return []
+    found = sorted(leaps, key=lambda leap: -leap[1])
     i, times = found[0]
     more = f", and there are {len(found) - 1} more such places" if len(found) > 1 else ""
     return [
-        f"{names[i]} and {names[i + 1]} follow each other and look the same way, but stand {times:.0f} times as far "
+        f"{names[i]} and {names[i + 1]} follow each other and show the same, but stand {times:.0f} times as far "
         f"apart as is usual{more}: the model may be folded there; look at capture.png, and try --mapper global or "
         f"--matching exhaustive"
     ]

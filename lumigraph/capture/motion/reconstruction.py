@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import re
+import sqlite3
 from collections.abc import Sequence
+from contextlib import closing
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -15,20 +17,22 @@ from ...errors import LumigraphError
 from ...files import read_json, remove, replacing, write_bytes, write_json
 from ..photos import Intake, Photo, gather
 from ..photos.track import Track, untracked
-from .diagnosis import FEW_FEATURES, Diagnosis, Matches, counted, diagnose, read_matches
+from .diagnosis import FEW_FEATURES, Diagnosis, Matches, counted, diagnose, folds, read_matches
 from .drawings import draw_capture, draw_photographs
 from .folder import RESULT, claim, copy_photographs, stamp, write_model
 from .georeference import Georeference, georeference, gps_positions, upright
 from .lenses import Sharing, group_by_lens, model_for, prior, write_database
-from .pairs import Matching, choose_matching, choose_pairs
+from .pairs import NEIGHBOURS, Matching, choose_matching, choose_pairs
 from .stages import Stages, key_of
 
 FEWEST = 3  # photographs that make a model
 MAX_SIZE = 1600  # pixels of the longer side at which details are looked for
 FEATURES = ((20, 8192), (60, 4096))  # up to so many photographs so many features each; comparing goes by their square
 FEWEST_FEATURES = 2048
+KEPT = 0.8  # share of the photographs that a model must keep to be preferred for being free of folds
+INSTEAD = "incremental"  # a file among the models: they were not made by the mapper that was asked for
 UNSAFE = re.compile(r"[\s#]")  # COLMAP's lists of pairs end names at spaces
-SPECIFICATION = 1  # of what is written; another number has everything written again
+SPECIFICATION = 2  # of what is written; another number has everything written again
 
 
 @dataclass(frozen=True)
@@ -133,6 +137,7 @@ class Reconstruction:
             self.work / "database.db",
             self.work / "models",
         )
+        self.unfolded = self.work / "unfolded"
         self.names = [photo.name for photo in self.photos]
         self.groups = group_by_lens(self.photos, self.intake.in_order, self.options.camera)
         chosen = choose_matching(len(self.photos), self.intake.in_order)
@@ -160,6 +165,7 @@ class Reconstruction:
         self.find_features(self.keys["features"])
         self.compare(self.keys["matching"])
         self.place(self.keys["mapping"])
+        self.unfold(self.keys["mapping"])
         return self.write(self.keys["result"])
 
     def count_features(self) -> int:
@@ -175,9 +181,15 @@ class Reconstruction:
                 write_database(partial, self.groups)
         with self.stages.working("features", key):
             self.colmap(
-                "Finding details", len(self.names), stage="features", names=self.names, images=str(self.images),
-                max_size=self.options.max_size, features=self.count_features(),
-            )  # fmt: skip
+                "Finding details",
+                len(self.names),
+                self.database,
+                stage="features",
+                names=self.names,
+                images=str(self.images),
+                max_size=self.options.max_size,
+                features=self.count_features(),
+            )
 
     def compare(self, key: str) -> None:
         if self.stages.is_done("matching", key):
@@ -191,20 +203,66 @@ class Reconstruction:
             pairs = choose_pairs(self.matching, self.names, self.database, gps_positions(self.photos))
             listed = self.work / "pairs.txt"
             write_bytes(listed, "".join(f"{self.names[i]} {self.names[j]}\n" for i, j in pairs).encode())
-            self.colmap("Comparing pairs", len(pairs), stage="matching", pairs=str(listed))
+            self.colmap("Comparing pairs", len(pairs), self.database, stage="matching", pairs=str(listed))
 
     def place(self, key: str) -> None:
         if self.stages.is_done("mapping", key) and self.models.is_dir():
             return
         with self.stages.working("mapping", key), replacing(self.models) as partial:
             partial.mkdir()
-            self.colmap(
-                "Placing cameras", len(self.names), stage=self.options.mapper, images=str(self.images),
-                models=str(partial), calibrate=not all(prior(group)[1] for group in self.groups),
-            )  # fmt: skip
+            self.map(self.database, partial, self.options.mapper)
+            if self.options.mapper == "global" and not any(partial.iterdir()):
+                self.map(self.database, partial, "incremental")
+                (partial / INSTEAD).touch()
 
-    def colmap(self, description: str, total: int, **job: Any) -> None:
-        done = self.stages.colmap(total, database=str(self.database), **job)
+    def unfold(self, key: str) -> None:
+        """If the model leaps between neighbours, make another from what near neighbours share alone.
+
+        Far ones that merely look alike, as the two sides of a can do, fold a model.
+        """
+        if self.stages.is_done("unfolding", key):
+            return
+        with self.stages.working("unfolding", key):
+            remove(self.unfolded)
+            found, matches = read_models(self.models), read_matches(self.database)
+            if found and self.leaps(found[0], matches):
+                near = self.work / "near.db"
+                copy_database(self.database, near)
+                keep_near(near, self.names, NEIGHBOURS)
+                with replacing(self.unfolded) as partial:
+                    partial.mkdir()
+                    self.map(near, partial, "incremental")
+
+    def leaps(self, model: pycolmap.Reconstruction, matches: Matches) -> int:
+        poses = {i.name: i.cam_from_world().inverse().matrix() for i in model.images.values() if i.has_pose}
+        names = [name for name in self.names if name in poses]
+        return len(folds(names, np.stack([poses[name] for name in names]), matches, self.intake.in_order))
+
+    def map(self, database: Path, models: Path, mapper: str) -> None:
+        if mapper == "global":  # it changes what it finds in the database
+            copy_database(database, database := self.work / "global.db")
+        self.colmap(
+            "Placing cameras", len(self.names), database, stage=mapper, images=str(self.images), models=str(models),
+            calibrate=not all(prior(group)[1] for group in self.groups),
+        )  # fmt: skip
+
+    def choose(self, matches: Matches) -> tuple[list[pycolmap.Reconstruction], list[str]]:
+        """The models, largest first, and what to say of how they came about."""
+        found, told = read_models(self.models), []
+        if (self.models / INSTEAD).exists():
+            told.append("--mapper global found no model, so photographs were placed one by one")
+        if self.unfolded.is_dir() and (unfolded := read_models(self.unfolded)):
+            enough = unfolded[0].num_reg_images() >= KEPT * found[0].num_reg_images()
+            if enough and self.leaps(unfolded[0], matches) < self.leaps(found[0], matches):
+                found = unfolded
+                told.append(
+                    f"parts of the place look alike and the model folded, so it was made again from the nearest "
+                    f"{NEIGHBOURS} neighbours of each photograph alone; look at capture.png"
+                )
+        return found, told
+
+    def colmap(self, description: str, total: int, database: Path, **job: Any) -> None:
+        done = self.stages.colmap(total, database=str(database), **job)
         try:
             for _ in self.track(done, description, total):
                 pass
@@ -214,8 +272,7 @@ class Reconstruction:
     def write(self, key: str) -> dict[str, Any]:
         """The largest model becomes the scene. capture.json comes last: where it is, the rest is whole."""
         matches = read_matches(self.database)
-        found = [pycolmap.Reconstruction(place) for place in sorted(self.models.iterdir()) if place.is_dir()]
-        found.sort(key=lambda model: (model.num_reg_images(), model.num_points3D()), reverse=True)
+        found, told = self.choose(matches)
         if not found or found[0].num_reg_images() < FEWEST:
             raise LumigraphError(nothing_fits(self.intake.source, self.photos, matches))
         for name in (RESULT, "transforms.json"):
@@ -227,7 +284,8 @@ class Reconstruction:
         others = [left for names in others if len(left := [name for name in names if name not in taken]) > 1]
         diagnosis = diagnose(self.intake, self.photos, model, others, matches)
         if place is not None and place.new_from_old is None:
-            diagnosis = replace(diagnosis, warnings=[*diagnosis.warnings, place.say])
+            told.append(place.say)
+        diagnosis = replace(diagnosis, warnings=[*diagnosis.warnings, *told])
         write_model(self.folder, model, self.photos)
         draw_capture(
             self.folder / "capture.png", model, diagnosis, place is not None and place.new_from_old is not None
@@ -280,6 +338,30 @@ class Reconstruction:
             "gps": gps,
             "seconds": self.stages.seconds(),
         }
+
+
+def read_models(folder: Path) -> list[pycolmap.Reconstruction]:
+    """The largest first."""
+    found = [pycolmap.Reconstruction(place) for place in sorted(folder.iterdir()) if place.is_dir()]
+    return sorted(found, key=lambda model: (model.num_reg_images(), model.num_points3D()), reverse=True)
+
+
+def copy_database(source: Path, target: Path) -> None:
+    for file in target.parent.glob(f"{target.name}*"):
+        remove(file)
+    with closing(sqlite3.connect(source)) as old, closing(sqlite3.connect(target)) as new:
+        old.backup(new)
+
+
+def keep_near(path: Path, names: Sequence[str], reach: int) -> None:
+    """Forget what photographs share that are more than so many places apart."""
+    place = {name: i for i, name in enumerate(names)}
+    shared = read_matches(path).shared
+    with closing(pycolmap.Database.open(path)) as database:
+        number = {image.name: image.image_id for image in database.read_all_images()}
+        for a, b in shared:
+            if abs(place[a] - place[b]) > reach:
+                database.delete_two_view_geometry(number[a], number[b])
 
 
 def nothing_fits(source: str, photos: Sequence[Photo], matches: Matches) -> str:
