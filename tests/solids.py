@@ -62,7 +62,7 @@ class Seen(RayMethod):
 
     def render_rays(self, rays, background):
         t = torch.zeros(len(rays))
-        for _ in range(60):
+        for _ in range(40):
             t = t + self.distance(rays.at(t))
         hit = self.distance(rays.at(t)).abs() < 1e-3
         rgb = torch.where(hit[:, None], painted(rays.at(t)), background)
@@ -76,7 +76,7 @@ class Solid(Seen):
         return SOLID * torch.sigmoid(-SHARPNESS * self.distance(points))
 
 
-def around(count: int = 32, size: int = 96, lowest: float = -90.0, distance: float = 3.0) -> Camera:
+def around(count: int = 24, size: int = 80, lowest: float = -90.0, distance: float = 3.0) -> Camera:
     """Cameras evenly over a sphere, above a latitude in degrees, that look at the origin."""
     k = torch.arange(count) + 0.5
     low = math.sin(math.radians(lowest))

@@ -24,7 +24,8 @@ from .polygons import BLOCK, Grid, zero_level
 from .sightings import FAR, Sighting, colours, look_around, unseen
 from .surface import larger_pieces, simplified, smoothed, vertex_normals
 
-CELLS = 256  # along the longest side of the box of interest, if nobody asks for more
+CELLS = 256  # along the longest side of what is meshed, if nobody asks for more
+OPEN_BOX = 1.5  # times the box of interest, which holds the middle of what is looked at in a room or the open
 FEWEST, MOST = 8, 2048  # cells along it that make sense
 PROBES = 160  # looks along it that tell where the surface may be
 SOFTNESS = 2.0  # logarithm of the density over its level at which it is as good as solid, or empty
@@ -70,6 +71,7 @@ def extract_mesh(
     method: Method,
     cameras: Camera,
     *,
+    box: float | None = None,
     cell: float | None = None,
     level: float | None = None,
     way: Way = "auto",
@@ -80,9 +82,10 @@ def extract_mesh(
     size: int = 400,
     views: int = 64,
 ) -> Mesh:
-    """The surface inside the box of interest, in the scene's frame.
+    """The surface in the middle of a scene, in the scene's frame.
 
     cameras: the scene's own; what none of them sees is left out, or filled in
+    box:     size of what is meshed, times the frame's box of interest; None for 1 around an object, 1.5 in the open
     cell:    side of the cubes that are marched through, scene units; None for 1/256 of the box's longest side
     level:   density of the surface, per scene unit; None for that where the cameras see surfaces
     way:     "density", "depth", or "auto" for density where the method has one
@@ -96,17 +99,17 @@ def extract_mesh(
     """
     method.eval()
     closed = method.frame.reach == 1 if closed is None else closed
-    box = torch.tensor(method.frame.bounds)
-    grid = make_grid(box, cell)
+    limits = meshed_box(method.frame, box)
+    grid = make_grid(limits, cell)
     sightings = look_around(method, cameras, size, views)
     step = max(2, math.ceil(max(grid.shape) / PROBES))
     seen = from_depth(sightings, grid.cell, closed)
     if way == "depth" or (way == "auto" and type(method).density is Method.density):
         value = seen
     else:
-        level = surface_level(method, sightings, box) if level is None else level
+        level = surface_level(method, sightings, limits) if level is None else level
         value = from_density(method, level, interpolated(seen, grid, step))
-    vertices, triangles = find_surface(grid, step, box, value, -1.0 if closed else math.nan)
+    vertices, triangles = find_surface(grid, step, limits, value, -1.0 if closed else math.nan)
     if len(triangles):
         hidden = unseen(torch.from_numpy(vertices).float(), sightings, 2 * grid.cell).numpy()
         if not closed:
@@ -114,7 +117,7 @@ def extract_mesh(
         vertices, triangles = larger_pieces(vertices, triangles, keep, ~hidden)
     if not len(triangles):
         raise LumigraphError(
-            "Nothing inside the box of interest is solid at this density, so there is no surface; train for longer, or "
+            "Nothing inside the box is solid at this density, so there is no surface; train for longer, or "
             "try a lower --level"
         )
     vertices = smoothed(vertices, triangles, smooth)
@@ -125,6 +128,14 @@ def extract_mesh(
     return Mesh(vertices, triangles, (rgb * 255).round().to(torch.uint8).numpy())
 
 
+def meshed_box(frame: Frame, times: float | None) -> Float[Tensor, "2 3"]:
+    """The frame's box of interest, larger or smaller about its middle, within the cube that holds everything."""
+    low, high = torch.tensor(frame.bounds)
+    half = 0.5 * (high - low) * ((1.0 if frame.reach == 1 else OPEN_BOX) if times is None else times)
+    middle = 0.5 * (low + high)
+    return torch.stack([middle - half, middle + half]).clamp(-frame.reach, frame.reach)
+
+
 def make_grid(box: Float[Tensor, "2 3"], cell: float | None) -> Grid:
     """Cubes over a box and a little around it. Raises LumigraphError for cubes too small or too large."""
     longest = float((box[1] - box[0]).max())
@@ -132,7 +143,7 @@ def make_grid(box: Float[Tensor, "2 3"], cell: float | None) -> Grid:
         cell = longest / CELLS
     if not longest / MOST <= cell <= longest / FEWEST:
         raise LumigraphError(
-            f"Cells of {cell / longest:.3g} times the longest side of the box of interest make no mesh; give "
+            f"Cells of {cell / longest:.3g} times the longest side of the box make no mesh; give "
             f"--cell-size something from 1/{MOST} to 1/{FEWEST} of it"
         )
     low, high = box.tolist()
@@ -189,7 +200,7 @@ def surface_level(method: Method, sightings: Sequence[Sighting], box: Float[Tens
     found = found[((found > box[0]) & (found < box[1])).all(-1)]
     if not len(found):
         raise LumigraphError(
-            "No camera sees a surface inside the box of interest, so there is nothing to make a mesh of; train for "
+            "No camera sees a surface inside the box, so there is nothing to make a mesh of; train for "
             "longer, or give the density at which it is solid as --level"
         )
     found = found[:: max(1, len(found) // AT_ONCE)]
@@ -235,6 +246,7 @@ def find_surface(
     shape = tuple(-(-n // BLOCK) for n in grid.shape)
     active = np.zeros(shape, bool)
     active[tuple((np.argwhere(near) * step // BLOCK).clip(max=np.array(shape) - 1).T)] = True
-    middle = ((np.stack(np.indices(shape), -1) + 0.5) * BLOCK / step).astype(int).clip(max=np.array(probed.shape) - 1)
-    elsewhere = np.where(probed[tuple(np.moveaxis(middle, -1, 0))] > 0, 1.0, -1.0)
+    middles = [((np.arange(n) + 0.5) * BLOCK / step).astype(int) for n in shape]
+    middles = [middle.clip(max=n - 1) for middle, n in zip(middles, probed.shape, strict=True)]
+    elsewhere = np.where(probed[np.ix_(*middles)] > 0, 1.0, -1.0)
     return zero_level(grid, inside, active, elsewhere)

@@ -64,13 +64,13 @@ def extract_points(method: Method, cameras: Camera, count: int = 200_000, size: 
         some = mask & (torch.rand(mask.shape, generator=chance) < share)
         positions = seen.camera.rays(seen.camera.pixels()).at(seen.depth.reshape(-1))[some.reshape(-1)]
         found.append(torch.cat([positions, seen.normals[some], seen.rgb[some]], -1))
-    columns = torch.cat(found)
-    columns = columns[witnessed(columns[:, :3], sightings)].double().numpy()
-    if not len(columns):
+    all_found = torch.cat(found)
+    kept = all_found[witnessed(all_found[:, :3], sightings)].double().numpy()
+    if not len(kept):
         raise LumigraphError(
             "No two cameras agree on where anything solid is, so there are no points; train for longer and try again"
         )
-    columns = thinned(columns, count)
+    columns = thinned(kept, count)
     normals = columns[:, 3:6] / np.maximum(np.linalg.norm(columns[:, 3:6], axis=-1, keepdims=True), 1e-30)
     return Points(columns[:, :3], normals, (columns[:, 6:] * 255).round().astype(np.uint8))
 
@@ -112,10 +112,10 @@ def cells(
 
 def write_points(path: Path, points: Points) -> None:
     """A binary PLY file: x y z, nx ny nz (float32), red green blue (bytes). Raises LumigraphError where it cannot."""
-    floats = [(name, "<f4") for name in ("x", "y", "z", "nx", "ny", "nz")]
-    rows = np.empty(len(points.positions), [*floats, *((name, "u1") for name in ("red", "green", "blue"))])
+    floats, bytes_ = ("x", "y", "z", "nx", "ny", "nz"), ("red", "green", "blue")
+    rows = np.empty(len(points.positions), [*((name, "<f4") for name in floats), *((name, "u1") for name in bytes_)])
     values = np.concatenate([points.positions, points.normals, points.colours], -1)
-    for name, column in zip(rows.dtype.names, values.T, strict=True):
+    for name, column in zip((*floats, *bytes_), values.T, strict=True):
         rows[name] = column
     with replacing(path) as partial, open(partial, "wb") as file:
         elements = [plyfile.PlyElement.describe(rows, "vertex")]

@@ -153,7 +153,7 @@ def edges(
 
 def compact(
     vertices: Float[np.ndarray, "vertex 3"], faces: Int[np.ndarray, "face 3"]
-) -> tuple[Float[np.ndarray, "vertex 3"], Int[np.ndarray, "face 3"]]:
+) -> tuple[Float[np.ndarray, "used 3"], Int[np.ndarray, "face 3"]]:
     """Without vertices that no face has."""
     used, faces = np.unique(faces, return_inverse=True)
     return vertices[used], faces.reshape(-1, 3)

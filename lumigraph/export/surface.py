@@ -12,7 +12,7 @@ from .polygons import compact
 
 LAMBDA, MU = 0.5, -0.53  # of Taubin's two steps: the second undoes the first one's shrinking
 
-Triangles = tuple[Float[np.ndarray, "vertex 3"], Int[np.ndarray, "face 3"]]
+Triangles = tuple[Float[np.ndarray, "some 3"], Int[np.ndarray, "few 3"]]
 
 
 def larger_pieces(

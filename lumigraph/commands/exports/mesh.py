@@ -18,7 +18,7 @@ class Mesh:
     """Triangles with colours at their corners, in the frame of the photographs.
 
     The ending says which format: .ply, .obj or .glb. Marching cubes on the density of methods that have one, fusion of
-    the depth that others render. Only the box of interest is meshed, and what no camera sees is closed up (objects) or
+    the depth that others render. Only the middle of a scene is meshed. What no camera sees is closed up (objects) or
     left out (rooms and the open).
     """
 
@@ -26,7 +26,9 @@ class Mesh:
     """Folder of a run, or a splat file."""
     output: Annotated[Positional[Path], needed("FILE")]
     """The new file."""
-    cell_size: Annotated[float | None, option("LENGTH", "1/256 of the box of interest")] = None
+    box: Annotated[float | None, option("TIMES", "1 for objects, 1.5 for the rest")] = None
+    """Size of what is meshed, times the box of interest that `lumigraph info` tells."""
+    cell_size: Annotated[float | None, option("LENGTH", "1/256 of the box")] = None
     """Side of the cubes marched through, in the units of the photographs' frame: details are twice as large."""
     way: Annotated[
         Literal["auto", "density", "depth"],
@@ -60,6 +62,7 @@ class Mesh:
         mesh = extract_mesh(
             run.method(choose_device(self.device)),
             cameras,
+            box=self.box,
             cell=None if self.cell_size is None else self.cell_size / scale_to_source(run.frame),
             level=self.level,
             way=self.way,
@@ -86,6 +89,8 @@ class Mesh:
         """Raises LumigraphError for numbers that make no sense, before anything is opened."""
         if self.cell_size is not None and not self.cell_size > 0:
             raise LumigraphError(f"Cells cannot be {self.cell_size:g} large; give --cell-size a length above 0")
+        if self.box is not None and not self.box > 0:
+            raise LumigraphError(f"A box cannot be {self.box:g} times as large; give --box a number above 0")
         if self.level is not None and not self.level > 0:
             raise LumigraphError(f"A density of {self.level:g} is nowhere a surface; give --level a number above 0")
         if not 0 <= self.smooth <= 1000:

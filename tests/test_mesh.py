@@ -1,0 +1,358 @@
+"""Meshes and points of exact solids: shape, closedness, colours, pieces, files, the source's frame, faults."""
+
+from __future__ import annotations
+
+import json
+import math
+import struct
+from dataclasses import replace
+
+import numpy as np
+import plyfile
+import pytest
+import tiny
+import torch
+import trimesh
+from scipy.spatial import cKDTree
+from solids import SOLID, Seen, Solid, around, ball, painted, shell, together, torus
+
+from lumigraph.camera import Camera
+from lumigraph.cli import main
+from lumigraph.errors import LumigraphError
+from lumigraph.export.mesh import Mesh, extract_mesh, meshed_box
+from lumigraph.export.mesh_file import write_mesh
+from lumigraph.export.points import extract_points, thinned, write_points
+from lumigraph.export.polygons import BLOCK, Grid, zero_level
+from lumigraph.export.sightings import compare, look_around
+from lumigraph.export.surface import simplified, smoothed
+from lumigraph.rays import Rendering
+from lumigraph.run import Run
+from lumigraph.scene import Frame
+from lumigraph.train import fit
+
+CELL = 1 / 24
+# A scene that was shrunk to half, turned a quarter about z and moved.
+MOVED = ((0.0, -2.0, 0.0, 5.0), (2.0, 0.0, 0.0, -1.0), (0.0, 0.0, 2.0, 0.5), (0.0, 0.0, 0.0, 1.0))
+
+
+def as_trimesh(mesh: Mesh) -> trimesh.Trimesh:
+    return trimesh.Trimesh(mesh.vertices, mesh.faces, vertex_colors=mesh.colours, process=False)
+
+
+@pytest.fixture(scope="module")
+def solid_ball() -> Mesh:
+    return extract_mesh(Solid(ball()), around(), cell=CELL, level=SOLID / 2)
+
+
+@pytest.mark.parametrize("kind", [Solid, Seen], ids=["density", "depth"])
+@pytest.mark.parametrize("name", ["ball", "torus"])
+def test_a_mesh_is_closed_and_lies_on_the_surface(kind, name):
+    distance = {"ball": ball(), "torus": torus()}[name]
+    volume = {"ball": 4 / 3 * math.pi * 0.6**3, "torus": 2 * math.pi**2 * 0.55 * 0.2**2}[name]
+    mesh = extract_mesh(kind(distance), around(), cell=CELL)
+    solid = as_trimesh(mesh)
+    assert solid.is_watertight and solid.is_winding_consistent
+    assert solid.euler_number == {"ball": 2, "torus": 0}[name]
+    # The density's own ramp is a third of a cell wide, and its surface is said to be where it begins.
+    assert solid.volume == pytest.approx(volume, rel=0.12 if kind is Solid else 0.03)
+    away = distance(torch.from_numpy(mesh.vertices).float()).abs()
+    assert away.mean() < (0.35 if kind is Solid else 0.1) * CELL and away.max() < CELL
+    diagonal = np.linalg.norm(solid.extents)
+    assert away.mean() < 0.01 * diagonal
+
+
+def test_a_level_is_met_to_a_small_part_of_a_cell(solid_ball):
+    assert as_trimesh(solid_ball).volume == pytest.approx(4 / 3 * math.pi * 0.6**3, rel=0.02)
+    away = np.abs(np.linalg.norm(solid_ball.vertices, axis=-1) - 0.6)
+    assert away.mean() < 0.1 * CELL and away.max() < 0.4 * CELL
+
+
+def test_the_chamfer_distance_is_far_below_a_hundredth_of_the_diagonal(solid_ball):
+    """Mean distance from samples of the mesh to the solid, and back from the solid to the samples; half their sum."""
+    exact = np.random.default_rng(0).normal(size=(2000, 3))
+    exact *= 0.6 / np.linalg.norm(exact, axis=-1, keepdims=True)
+    samples, _ = trimesh.sample.sample_surface(as_trimesh(solid_ball), 20_000, seed=0)
+    there = np.abs(np.linalg.norm(samples, axis=-1) - 0.6).mean()
+    back = cKDTree(samples).query(exact)[0]
+    assert back.max() < CELL and 0.5 * (there + back.mean()) < 0.003 * 1.2 * math.sqrt(3)
+
+
+@pytest.mark.parametrize("kind", [Solid, Seen], ids=["density", "depth"])
+def test_colours_are_those_of_the_field(kind):
+    mesh = extract_mesh(kind(ball()), around(), cell=CELL)
+    expected = 255 * painted(torch.from_numpy(mesh.vertices).float()).numpy()
+    assert np.abs(mesh.colours - expected).mean() < 1.5 and np.abs(mesh.colours - expected).max() < 6
+
+
+def test_faces_look_outward(solid_ball):
+    normals = as_trimesh(solid_ball).face_normals
+    centres = solid_ball.vertices[solid_ball.faces].mean(1)
+    assert ((normals * centres).sum(-1) > 0.5).all()
+
+
+@pytest.mark.parametrize(("keep", "pieces"), [(0.01, 2), (0.05, 1)])
+def test_small_pieces_are_dropped(keep, pieces):
+    method = Solid(together(ball(), ball(0.1, (0.0, 0.0, 0.85))))  # a share of 0.028 of the area
+    mesh = extract_mesh(method, around(), cell=CELL, keep=keep, smooth=0)
+    assert as_trimesh(mesh).body_count == pieces
+
+
+def test_there_are_no_caves_inside():
+    mesh = as_trimesh(extract_mesh(Solid(shell()), around(), cell=CELL, level=SOLID / 2))
+    assert mesh.body_count == 1 and mesh.volume == pytest.approx(4 / 3 * math.pi * 0.6**3, rel=0.02)
+
+
+@pytest.mark.parametrize("kind", [Solid, Seen], ids=["density", "depth"])
+def test_what_no_camera_sees_is_closed_or_cut(kind):
+    above = around(lowest=20)
+    closed = as_trimesh(extract_mesh(kind(ball()), above, cell=CELL, closed=True))
+    cut = as_trimesh(extract_mesh(kind(ball()), above, cell=CELL, closed=False))
+    assert closed.is_watertight and closed.vertices[:, 2].min() < -0.55
+    assert not cut.is_watertight and -0.5 < cut.vertices[:, 2].min() < -0.1
+    assert np.abs(np.linalg.norm(cut.vertices, axis=-1) - 0.6).max() < CELL
+
+
+def test_a_surface_that_leaves_the_box_is_closed_there_or_open():
+    wide = Solid(ball(), Frame(bounds=((-1.0, -1.0, -0.3), (1.0, 1.0, 1.0)), near=0.1))
+    closed, cut = (extract_mesh(wide, around(), cell=CELL, closed=x) for x in (True, False))
+    assert as_trimesh(closed).is_watertight and not as_trimesh(cut).is_watertight
+    assert all(abs(x.vertices[:, 2].min() + 0.3) < 1.5 * CELL for x in (closed, cut))
+
+
+def test_the_box_may_be_larger_or_smaller_and_grows_in_the_open():
+    frame = Frame(bounds=((-0.4,) * 3, (0.4,) * 3), near=0.1, reach=4.0)
+    assert meshed_box(frame, None).tolist() == [[pytest.approx(-0.6)] * 3, [pytest.approx(0.6)] * 3]
+    assert meshed_box(frame, 100.0).tolist() == [[-4.0] * 3, [4.0] * 3]
+    assert meshed_box(replace(frame, reach=1.0), None)[1].tolist() == [pytest.approx(0.4)] * 3
+    mesh = extract_mesh(Seen(ball(), frame), around(), cell=CELL, box=2.0)
+    assert as_trimesh(mesh).is_watertight and as_trimesh(mesh).extents.min() > 1.1
+
+
+def test_smoothing_takes_noise_and_leaves_the_volume():
+    solid = trimesh.creation.icosphere(4)
+    noise = 0.01 * np.random.default_rng(0).normal(size=len(solid.vertices))
+    rough = np.asarray(solid.vertices) * (1 + noise[:, None])
+    smooth = smoothed(rough, np.asarray(solid.faces), 20)
+    before, after = (trimesh.Trimesh(v, solid.faces, process=False) for v in (rough, smooth))
+    assert after.volume == pytest.approx(before.volume, rel=0.01)
+    assert np.linalg.norm(smooth, axis=-1).std() < 0.5 * np.linalg.norm(rough, axis=-1).std()
+    half = np.asarray(solid.faces)[solid.triangles_center[:, 2] > 0]
+    edge = trimesh.Trimesh(rough, half, process=False).outline().referenced_vertices
+    assert len(edge) and (smoothed(rough, half, 5)[edge] == rough[edge]).all()
+
+
+def test_fewer_faces_keep_shape_and_colours():
+    mesh = extract_mesh(Seen(ball()), around(), cell=CELL, faces=1000)
+    solid = as_trimesh(mesh)
+    assert 900 < len(mesh.faces) <= 1000 and solid.is_watertight
+    assert solid.volume == pytest.approx(4 / 3 * math.pi * 0.6**3, rel=0.02)
+    expected = 255 * painted(torch.from_numpy(mesh.vertices).float()).numpy()
+    assert np.abs(mesh.colours - expected).mean() < 2
+    assert simplified(mesh.vertices, mesh.faces, 5000)[1] is mesh.faces
+
+
+def test_blocks_fit_together_and_unknown_places_are_left_open():
+    grid = Grid.around((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0), 0.05, 1.5)
+    blocks = np.array([-(-n // BLOCK) for n in grid.shape])
+    centres = np.array(grid.low) + grid.cell * BLOCK * (np.stack(np.indices(blocks), -1) + 0.5)
+    radius = np.linalg.norm(centres, axis=-1)
+    near = np.abs(radius - 0.7) < 0.87 * BLOCK * grid.cell
+    assert 0.2 < near.mean() < 0.9
+
+    def value(points):
+        return (5 * (0.7 - points.norm(dim=-1))).clamp(-1, 1)
+
+    vertices, faces = zero_level(grid, value, near, np.where(radius < 0.7, 1.0, -1.0))
+    solid = trimesh.Trimesh(vertices, faces, process=False)
+    assert solid.is_watertight and solid.volume == pytest.approx(4 / 3 * math.pi * 0.7**3, rel=0.01)
+    whole = zero_level(grid, value, np.ones(blocks, bool), np.zeros(blocks))
+    assert len(whole[0]) == len(vertices) and len(whole[1]) == len(faces)
+    torch.manual_seed(0)
+    noise = torch.randn(1, 1, 20, 20, 20)
+
+    def jumble(points):
+        found = torch.nn.functional.grid_sample(noise, points[None, None, None], align_corners=True)[0, 0, 0, 0]
+        return torch.where((points.abs() < 1).all(-1), found.clamp(-1, 1), -1.0)
+
+    vertices, faces = zero_level(grid, jumble, np.ones(blocks, bool), -np.ones(blocks))
+    edges = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), 1)
+    assert (np.unique(edges, axis=0, return_counts=True)[1] % 2 == 0).all()  # closed, however wild
+
+    def half(points):
+        return torch.where(points[:, 0] < 0.2, value(points), torch.nan)
+
+    vertices, _ = zero_level(grid, half, np.ones(blocks, bool), -np.ones(blocks))
+    assert 0.1 < vertices[:, 0].max() < 0.21 and np.isfinite(vertices).all()
+
+
+def test_normals_and_depths_of_a_view():
+    seen = look_around(Seen(ball()), around(4), 96)[0]
+    rays = seen.camera.rays(seen.camera.pixels())
+    points = rays.at(seen.depth.reshape(-1)).reshape(*seen.depth.shape, 3)
+    squarely = seen.facing > 0.4
+    assert squarely.sum() > 300
+    normals, outward = seen.normals[squarely], torch.nn.functional.normalize(points[squarely], dim=-1)
+    assert (normals * outward).sum(-1).min() > 0.98
+    moved = points[squarely] - 0.1 * rays.directions.reshape(points.shape)[squarely]
+    compared = compare(seen, moved, 0.1)
+    assert (compared.ahead - 0.1).abs().median() < 1e-4
+    behind = compare(seen, seen.camera.position - seen.camera.forward, 0.1)
+    assert behind.ahead.isnan().all()
+
+
+# Files
+
+
+@pytest.mark.parametrize("ending", [".ply", ".obj", ".glb"])
+def test_files_open_elsewhere_with_their_colours(solid_ball, tmp_path, ending):
+    path = tmp_path / f"ball{ending}"
+    write_mesh(path, solid_ball)
+    scene = trimesh.load_scene(path, process=False)
+    (found,) = scene.geometry.values()
+    np.testing.assert_allclose(found.vertices, solid_ball.vertices, atol=1e-6)
+    np.testing.assert_array_equal(found.faces, solid_ball.faces)
+    assert found.is_watertight and found.volume > 0
+    if ending != ".glb":
+        np.testing.assert_array_equal(found.visual.vertex_colors[:, :3], solid_ball.colours)
+    else:
+        linear = np.asarray(found.visual.vertex_attributes["color"], np.float64)
+        encoded = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
+        np.testing.assert_allclose(255 * encoded, solid_ball.colours, atol=0.01)
+    assert [x.name for x in tmp_path.iterdir()] == [path.name]
+
+
+def test_a_glb_is_unlit_and_well_formed(solid_ball, tmp_path):
+    write_mesh(tmp_path / "ball.glb", solid_ball)
+    data = (tmp_path / "ball.glb").read_bytes()
+    magic, version, length, size = struct.unpack("<4sIII", data[:16])
+    assert (magic, version, length) == (b"glTF", 2, len(data)) and size % 4 == 0
+    about = json.loads(data[20 : 20 + size])
+    assert "KHR_materials_unlit" in about["materials"][0]["extensions"]
+    assert all(view["byteOffset"] % 4 == 0 for view in about["bufferViews"])
+    assert about["buffers"][0]["byteLength"] == struct.unpack("<I", data[20 + size : 24 + size])[0]
+
+
+def test_another_frame_moves_scales_and_keeps_the_outside_outside(solid_ball):
+    moved = solid_ball.in_source(Frame(source_from_scene=MOVED))
+    np.testing.assert_allclose(moved.vertices.mean(0), (5, -1, 0.5), atol=0.05)
+    assert as_trimesh(moved).volume == pytest.approx(8 * as_trimesh(solid_ball).volume, rel=1e-6)
+    mirrored = solid_ball.transformed(np.diag([-1.0, 1.0, 1.0, 1.0]))
+    assert as_trimesh(mirrored).volume == pytest.approx(as_trimesh(solid_ball).volume, rel=1e-6)
+
+
+# Points
+
+
+def test_points_lie_on_the_surface_evenly():
+    points = extract_points(Seen(torus()), around(), 3000)
+    away = torus()(torch.from_numpy(points.positions).float()).abs()
+    assert 2700 < len(points.positions) <= 3000 and away.mean() < 0.005 and away.max() < 0.05
+    expected = 255 * painted(torch.from_numpy(points.positions).float()).numpy()
+    assert np.abs(points.colours - expected).mean() < 2
+    ring = points.positions * [1, 1, 0]
+    ring *= 0.55 / np.linalg.norm(ring, axis=-1, keepdims=True)
+    outward = (points.positions - ring) / np.linalg.norm(points.positions - ring, axis=-1, keepdims=True)
+    assert (points.normals * outward).sum(-1).mean() > 0.98
+    upper = (points.positions[:, 2] > 0).mean()
+    assert 0.45 < upper < 0.55
+
+
+class Floater(Seen):
+    """A ball; and to the first camera alone, something in front of it."""
+
+    def render(self, camera: Camera) -> Rendering:
+        seen = super().render(camera)
+        if torch.allclose(camera.position[0], around().position[0], atol=1e-4):
+            seen.depth[40:56, 40:56] = 1.0
+        return seen
+
+
+def test_what_one_camera_alone_sees_is_no_point():
+    points = extract_points(Floater(ball()), around(), 3000)
+    assert np.abs(np.linalg.norm(points.positions, axis=-1) - 0.6).max() < 0.05
+
+
+def test_thinning_gives_at_most_so_many_of_equal_spacing():
+    some = np.random.default_rng(0).random((20_000, 4))
+    few = thinned(some, 500)
+    assert 400 < len(few) <= 500 and thinned(some[:100], 500) is not some and len(thinned(some[:100], 500)) == 100
+    np.testing.assert_allclose(few.mean(0), 0.5, atol=0.05)
+
+
+def test_a_file_of_points(tmp_path):
+    frame = Frame(source_from_scene=MOVED)
+    points = extract_points(Seen(ball()), around(), 500)
+    write_points(tmp_path / "points.ply", points.in_source(frame))
+    vertex = plyfile.PlyData.read(tmp_path / "points.ply")["vertex"]
+    position, normal = (np.stack([vertex[x] for x in names], -1) for names in (("x", "y", "z"), ("nx", "ny", "nz")))
+    np.testing.assert_allclose(np.linalg.norm(position - [5, -1, 0.5], axis=-1), 1.2, atol=0.05)
+    np.testing.assert_allclose(normal, (position - [5, -1, 0.5]) / 1.2, atol=0.25)
+    assert vertex["red"].dtype == np.uint8 and len(vertex.data) == len(points.positions)
+
+
+# Commands and faults
+
+
+def test_commands_write_in_the_frame_of_the_photographs(tmp_path, capsys):
+    plain = tiny.scene()
+    made = replace(plain, frame=replace(plain.frame, source_from_scene=MOVED))
+    run = Run.create(tmp_path / "run", method := tiny.method(made.frame), made)
+    fit(method, made, run, steps=80, show=False)
+    options = ["--device", "cpu", "--views", "9"]
+    mesh, points = tmp_path / "ball.glb", tmp_path / "ball.ply"
+    assert main(["export", "mesh", str(run.folder), str(mesh), "--cell-size", "0.15", *options]) == 0
+    assert main(["export", "points", str(run.folder), str(points), "--count", "300", *options]) == 0
+    assert "triangles" in capsys.readouterr().out
+    found = trimesh.load_mesh(mesh, process=False)
+    assert found.is_watertight
+    np.testing.assert_allclose(found.bounds.mean(0), (5, -1, 0.5), atol=0.3)
+    assert found.volume == pytest.approx(4 / 3 * math.pi * 1.2**3, rel=0.35)
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ({"cell": 1e-4}, "--cell-size"),
+        ({"cell": 1.5}, "--cell-size"),
+        ({"way": "density"}, "holds no density"),
+    ],
+)
+def test_nothing_to_make_a_mesh_of(options, said):
+    method = Seen(ball()) if options.get("way") == "density" else Solid(ball())
+    with pytest.raises(LumigraphError, match=said):
+        extract_mesh(method, around(8, 32), **{"cell": CELL} | options)
+
+
+@pytest.mark.parametrize("options", [{}, {"level": SOLID / 2}, {"way": "depth"}])
+def test_a_box_without_a_surface(options):
+    frame = Frame(bounds=((0.5, 0.5, 0.5), (1.0, 1.0, 1.0)), near=0.1)
+    with pytest.raises(LumigraphError, match="inside the box"):
+        extract_mesh(Solid(ball(), frame), around(8, 32), **options)
+
+
+@pytest.mark.parametrize("make", [extract_mesh, extract_points])
+def test_an_empty_scene(make):
+    with pytest.raises(LumigraphError, match="anything solid"):
+        make(Seen(ball(0.1, (0.0, 0.0, 50.0))), around(8, 32))
+
+
+BAD = {
+    "ending": ["mesh", "RUN", "ball.stl"],
+    "cell size": ["mesh", "RUN", "ball.ply", "--cell-size", "-1"],
+    "box": ["mesh", "RUN", "ball.ply", "--box", "0"],
+    "faces": ["mesh", "RUN", "ball.ply", "--faces", "0"],
+    "share": ["mesh", "RUN", "ball.ply", "--keep", "2"],
+    "no run": ["mesh", "RUN", "ball.ply"],
+    "points' ending": ["points", "RUN", "ball.obj"],
+    "no points": ["points", "RUN", "ball.ply", "--count", "0"],
+    "no views": ["points", "RUN", "ball.ply", "--views", "0"],
+}
+
+
+@pytest.mark.parametrize("arguments", BAD.values(), ids=BAD.keys())
+def test_bad_input_gets_one_sentence(arguments, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert main(["export", *arguments]) == 2
+    told = capsys.readouterr()
+    assert told.out == "" and len(told.err.splitlines()) == 1 and told.err.startswith("lumigraph: ")
+    assert list(tmp_path.iterdir()) == []
