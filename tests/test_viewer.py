@@ -40,6 +40,8 @@ from lumigraph.viewer.splats import ENLARGED, splats
 from lumigraph.viewer.turns import IDLE_SHARE, SHARE, NotWantedError, Turns
 
 WHITE = (1.0, 1.0, 1.0)
+# A client may leave at any moment; viser warns of what was still on its way.
+pytestmark = pytest.mark.filterwarnings("ignore:Queued a .* on a closed connection")
 
 
 @pytest.fixture(scope="module")

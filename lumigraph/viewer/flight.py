@@ -22,13 +22,11 @@ class Flight:
     def stop(self) -> None:
         self._number += 1
 
-    def place(
-        self, pose: Float[np.ndarray, "3 4"], distance: float, angle: float, up: Float[np.ndarray, " 3"] | None = None
-    ) -> None:
+    def place(self, pose: Float[np.ndarray, "3 4"], distance: float, angle: float) -> None:
         """Put it at a pose, turning about a point so far ahead, with a vertical angle of view in radians."""
         camera = self._client.camera
         with self._client.atomic():
-            camera.up_direction = upwards(pose) if up is None else up
+            camera.up_direction = upwards(pose)
             camera.position = pose[:, 3]
             camera.look_at = pose[:, 3] + distance * pose[:, 2]
             camera.fov = angle
