@@ -134,7 +134,7 @@ def fit(
                 watch.note(step, progress, row)
             if run and logged:
                 run.log(row | {"learning_rate": [g["lr"] for o in optimizers for g in o.param_groups if "lr" in g]})
-            if clock.seconds >= next_save:
+            if clock.seconds >= next_save and budget.progress(step, clock.seconds) < 1:  # the last save comes after
                 save()
                 next_save = clock.seconds + save_every
             elif previews.due(progress):
