@@ -301,7 +301,11 @@ def test_train_captures_what_has_no_poses(tmp_path, monkeypatch, captured, capsy
 
     monkeypatch.setattr(command, "find_cameras", found)
     assert command.posed("procedural:still-life") == "procedural:still-life"
-    assert command.posed(str(captured[3])) == str(captured[3]) and not calls
+    run = tmp_path / "run"
+    (run / "checkpoints").mkdir(parents=True)
+    shutil.copy(captured[0] / "view00.jpg", run / "preview.jpg")
+    for known in (str(captured[3]), str(run)):
+        assert command.posed(known) == known and not calls
     assert command.posed(str(captured[0])) == "scenes/" + captured[0].parent.name  # "photos" names nothing
     assert calls == [((captured[0],), Path("scenes") / captured[0].parent.name)]
     assert "left out" in capsys.readouterr().out

@@ -72,6 +72,8 @@ class Train:
 
         budget = budget_of(self.steps, self.seconds) or {"seconds": DEFAULT_SECONDS}
         kind, device = methods.find(self.method), choose_device(self.device)
+        if self.output is not None:
+            check_new(self.output)
         source = posed(self.scene)
         output = self.output or next_free(f"runs/{scene_name(source)}-{methods.check(self.method)}")
         check_new(output)

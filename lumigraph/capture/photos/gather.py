@@ -103,7 +103,9 @@ def is_bare(path: Path) -> bool:
 
     if not path.is_dir():
         return is_video(path)
-    return not any(r.recognises(path) for r in READERS.values()) and next(walk(path), None) is not None
+    if any((path / name).exists() for name in MADE) or any(r.recognises(path) for r in READERS.values()):
+        return False
+    return next(walk(path), None) is not None
 
 
 def list_photographs(sources: Sequence[Path], work: Path) -> list[Path]:
