@@ -69,12 +69,14 @@ def main(options: Options) -> None:
     distances = level_distance(world, eyes[0], points)
     rows = []
     for name, method in trained(options):
+        scene_from_world = torch.linalg.inv(torch.tensor(method.frame.source_from_scene))
+        place, scale = scene_from_world[:3, 3], float(scene_from_world[:3, 0].norm())  # of PLACE, the world's origin
         began = time.perf_counter()
-        seen = panorama(method, PLACE, HEADING, options.size)
+        seen = panorama(method, place, HEADING, options.size)
         seconds = time.perf_counter() - began
-        near, _ = surrounding_distances(method, PLACE, HEADING)
+        near, _ = surrounding_distances(method, place, HEADING)
         began = time.perf_counter()
-        pair = stereo_pair(method, PLACE, HEADING, options.stereo_size, EYES, near)
+        pair = stereo_pair(method, place, HEADING, options.stereo_size, scale * EYES, near)
         stereo_seconds = time.perf_counter() - began
         off = measured(pair[0].rgb, pair[1].rgb, points) / distances - 1
         save_sphere(options.output / f"{name}.png", seen.rgb, whole=True)

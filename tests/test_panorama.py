@@ -157,6 +157,19 @@ def test_flat_pictures_make_the_same_sphere(width, one_thread):
     assert torch.isinf(nothing.depth).all() and (nothing.opacity == 0).all()
 
 
+def test_flat_pictures_that_disagree_fade_into_each_other(one_thread):
+    """As Gaussians do that are drawn in another order from picture to picture."""
+
+    class Moody(Hall):
+        def render(self, camera):
+            seen = super().render(camera)
+            return Rendering(torch.full_like(seen.rgb, len(self.cameras) % 2), seen.depth, seen.opacity)
+
+    seen = panorama(Moody(True), HERE, NORTH, 256).rgb[..., 0]
+    steps = torch.cat([seen.diff(dim=0).abs().flatten(), (seen - seen.roll(1, 1)).abs().flatten()])
+    assert seen.min() == 0 and seen.max() == 1 and steps.max() < 0.1
+
+
 def test_flat_pictures_make_the_same_stereo_pair(one_thread):
     r, near = 0.05, 0.8
     for side in (-1, 1):

@@ -7,13 +7,13 @@ is put together from many small ones, each rendered for a few columns and a band
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from PIL.PngImagePlugin import PngInfo
 from torch import Tensor
 
@@ -50,7 +50,8 @@ def panorama(method: Method, place: Float[Tensor, " 3"], heading: Float[Tensor, 
 def sphere(method: Method, camera: Camera, name: str, columns: int | None = None) -> Rendering:
     """What an upright camera behind an `Equirectangular` lens, or a kind of it, sees.
 
-    columns: of the flat pictures that others than ray methods need; None for an eighth of the sphere
+    columns: of the flat pictures that others than ray methods need; None where all rays begin at one place, which
+             gives eight pictures around, fading into each other
     """
     method.eval()
     width, height = camera.size[0].tolist()
@@ -59,31 +60,44 @@ def sphere(method: Method, camera: Camera, name: str, columns: int | None = None
         tops = range(0, height, step)
         parts = [method.render(rows_of(camera, top, min(step, height - top))) for top in track(tops, name, len(tops))]
         return Rendering.cat([Rendering(x.rgb.cpu(), x.depth.cpu(), x.opacity.cpu()) for x in parts])
-    return by_flat_pictures(method, camera, columns or -(-width // COLUMNS), name)
+    if columns is not None:
+        return by_flat_pictures(method, camera, columns, 0, name)
+    return by_flat_pictures(method, camera, -(-width // COLUMNS), width // (4 * COLUMNS), name)
 
 
-def by_flat_pictures(method: Method, camera: Camera, columns: int, name: str) -> Rendering:
-    """The sphere from flat pictures; each is exact where all of its columns see from one place."""
+def by_flat_pictures(method: Method, camera: Camera, columns: int, lap: int, name: str) -> Rendering:
+    """The sphere from flat pictures of a few columns and a band of rows; exact where these see from one place.
+
+    lap: pixels by which each reaches beyond its edges, where it fades into its neighbours: Gaussians are drawn in
+         another order in each
+    """
     width, height = camera.size[0].tolist()
-    rgb, depth, opacity = torch.empty(height, width, 3), torch.empty(height, width), torch.empty(height, width)
-    patches = list(cut(width, height, columns))
-    for rows, some in track(patches, name, len(patches)):
-        y, x = torch.meshgrid(torch.arange(rows.start, rows.stop), torch.arange(some.start, some.stop), indexing="ij")
-        pixels = torch.stack([x, y], -1).reshape(-1, 2) + 0.5
-        flat, at = flat_camera(camera, pixels)
+    rgb, opacity, total = torch.zeros(height, width, 3), torch.zeros(height, width), torch.zeros(height, width)
+    depth = torch.empty(height, width)
+    edges = [-math.inf, *(round(height * i / BANDS) for i in range(1, BANDS)), math.inf]  # nothing fades at the poles
+    bands = [fading(top, bottom, lap, 0, height) for top, bottom in pairwise(edges)]
+    strips = [fading(x, min(x + columns, width), lap, -lap, width + lap) for x in range(0, width, columns)]
+    patches = [(band, strip) for strip in strips for band in bands]
+    for (rows, low), (some, across) in track(patches, name, len(patches)):
+        y, x = torch.meshgrid(rows, some, indexing="ij")
+        flat, at = flat_camera(camera, torch.stack([x, y], -1).reshape(-1, 2) + 0.5)
         seen = method.render(flat).cpu()
-        rgb[rows, some] = read(seen.rgb, at).view(*x.shape, 3)
-        opacity[rows, some] = read(seen.opacity[..., None], at).view(x.shape)
-        depth[rows, some] = read(seen.depth[..., None], at, "nearest").view(x.shape)  # infinity has no mean
-    return Rendering(rgb, depth, opacity)
+        weight, place = low[:, None] * across, (rows[:, None], some % width)
+        rgb[place] += weight[..., None] * read(seen.rgb, at).view(*x.shape, 3)
+        opacity[place] += weight * read(seen.opacity[..., None], at).view(x.shape)
+        total[place] += weight
+        nearest = read(seen.depth[..., None], at, "nearest").view(x.shape)  # infinity has no mean
+        depth[place] = torch.where((low > 0.5)[:, None] & (across > 0.5), nearest, depth[place])
+    return Rendering(rgb / total[..., None], depth, opacity / total)
 
 
-def cut(width: int, height: int, columns: int) -> Iterator[tuple[slice, slice]]:
-    """Rows and columns of patches that cover a picture."""
-    edges = [round(height * i / BANDS) for i in range(BANDS + 1)]
-    for left in range(0, width, columns):
-        for top, bottom in zip(edges, edges[1:], strict=False):
-            yield slice(top, bottom), slice(left, min(left + columns, width))
+def fading(
+    begin: float, end: float, lap: int, first: int, last: int
+) -> tuple[Int[Tensor, " pixel"], Float[Tensor, " pixel"]]:
+    """The pixels among [first, last) that a patch reaches, and how much each counts: half at the patch's edges."""
+    pixels = torch.arange(max(first, begin - lap), min(last, end + lap)).long()
+    inside = torch.minimum(pixels + 0.5 - begin, end - pixels - 0.5)  # pixels from the nearer edge
+    return pixels, (0.5 + inside / max(2 * lap, 1e-6)).clamp(0, 1)
 
 
 def flat_camera(camera: Camera, pixels: Float[Tensor, "pixel 2"]) -> tuple[Camera, Float[Tensor, "pixel 2"]]:
