@@ -19,12 +19,15 @@ from solids import SOLID, Seen, Solid, around, ball, painted, shell, together, t
 from lumigraph.camera import Camera
 from lumigraph.cli import main
 from lumigraph.errors import LumigraphError
+from lumigraph.exchange import write_gaussians
 from lumigraph.export.mesh import Mesh, extract_mesh, meshed_box
 from lumigraph.export.mesh_file import write_mesh
 from lumigraph.export.points import extract_points, thinned, write_points
 from lumigraph.export.polygons import BLOCK, Grid, zero_level
 from lumigraph.export.sightings import compare, look_around
 from lumigraph.export.surface import simplified, smoothed
+from lumigraph.gaussians import Gaussians
+from lumigraph.kernels.spherical_harmonics import K00
 from lumigraph.rays import Rendering
 from lumigraph.run import Run
 from lumigraph.scene import Frame
@@ -307,6 +310,27 @@ def test_commands_write_in_the_frame_of_the_photographs(tmp_path, capsys):
     assert found.is_watertight
     np.testing.assert_allclose(found.bounds.mean(0), (5, -1, 0.5), atol=0.3)
     assert found.volume == pytest.approx(4 / 3 * math.pi * 1.2**3, rel=0.35)
+
+
+def test_a_splat_file_is_looked_at_from_a_dome(tmp_path):
+    """A ball of flat Gaussians; splat files have y pointing down."""
+    generator = torch.Generator().manual_seed(0)
+    means = torch.nn.functional.normalize(torch.randn(4000, 3, generator=generator), dim=-1)
+    quaternions = torch.tensor([[1.0, 0.0, 0.0, 0.0]]).expand(4000, 4)
+    harmonics = (means / 2 / K00)[:, None] * torch.tensor([0.8, 0.8, 0.8])
+    cloud = Gaussians(means, quaternions, torch.full((4000, 3), -3.2), torch.full((4000,), 4.0), harmonics)
+    write_gaussians(tmp_path / "ball.ply", cloud)
+    options = ["--size", "100", "--views", "24", "--device", "cpu"]
+    assert main(["export", "points", str(tmp_path / "ball.ply"), str(tmp_path / "points.ply"), *options]) == 0
+    options += ["--cell-size", "0.06"]
+    assert main(["export", "mesh", str(tmp_path / "ball.ply"), str(tmp_path / "mesh.ply"), *options]) == 0
+    found = trimesh.load(tmp_path / "points.ply")
+    assert np.linalg.norm(found.vertices, axis=-1).mean() == pytest.approx(1, abs=0.05)
+    assert np.abs(found.colors[:, :3] / 255 - (0.5 + 0.4 * found.vertices)).mean() < 0.08
+    mesh = trimesh.load_mesh(tmp_path / "mesh.ply", process=False)
+    height = -mesh.vertices[:, 1]  # y points down
+    assert (height < -0.5).sum() < 0.9 * (height > 0.5).sum() and height.max() > 0.95
+    assert np.linalg.norm(mesh.vertices, axis=-1).mean() == pytest.approx(1, abs=0.05)
 
 
 @pytest.mark.parametrize(
