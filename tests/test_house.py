@@ -14,7 +14,7 @@ import lumigraph
 # Each floor may know the floors above it in this list, and a room on it knows no other room of its own floor.
 # A new room is a new name here, on the floor where it belongs.
 FLOORS: list[set[str]] = [
-    {"errors", "loops"},
+    {"errors", "loops", "srgb"},
     {"files", "plain", "lens", "rays"},
     {"camera", "images", "kernels", "charts", "figures", "metrics"},
     {"volume", "gaussians", "scene"},

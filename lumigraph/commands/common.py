@@ -42,6 +42,15 @@ def choose_device(name: str) -> Any:
     return device
 
 
+def open_run(source: Path) -> Any:
+    """A Run, or a SplatFile, which offers the same to whoever only looks."""
+    from ..exchange import is_splat_file
+    from ..run import Run
+    from ..splat_file import SplatFile
+
+    return SplatFile(source) if is_splat_file(source) else Run(source)
+
+
 def budget_of(steps: int | None, seconds: float | None) -> dict[str, Any]:
     """What --steps and --seconds say, as fit() takes it; empty if they say nothing."""
     from ..train import Budget

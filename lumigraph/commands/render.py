@@ -9,7 +9,7 @@ from typing import Annotated, Any
 from tyro.conf import Positional
 
 from ..errors import LumigraphError
-from .common import check_film, choose_device, needed, option, show
+from .common import check_film, choose_device, needed, open_run, option, show
 
 LONGEST = 480  # pixels of a film, if nobody asks for more
 PATHS = ("orbit", "spiral", "interpolate", "held-out")
@@ -40,16 +40,13 @@ class Render:
     """auto, cpu, cuda, cuda:1."""
 
     def run(self) -> int:
-        from ..exchange import is_splat_file
         from ..export.film import film
         from ..export.video import kind_of
-        from ..run import Run
-        from ..splat_file import SplatFile
 
         check_film(self.frames, 30.0 if self.fps is None else self.fps, self.size)
         flight = None if self.path in PATHS else read_path(self.path, self.fps)
         fps = self.fps or (flight.fps if flight else 30.0)
-        run = SplatFile(self.source) if is_splat_file(self.source) else Run(self.source)
+        run = open_run(self.source)
         output = self.output or run.renders / f"{Path(self.path).stem}.mp4"
         kind_of(output, fps)
         if flight and output.with_suffix(".json").resolve() == Path(self.path).resolve():

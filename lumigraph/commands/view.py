@@ -10,7 +10,7 @@ from typing import Annotated, Any
 
 from tyro.conf import Positional
 
-from .common import choose_device, needed, option, show
+from .common import choose_device, needed, open_run, option, show
 
 
 @dataclass(frozen=True)
@@ -31,13 +31,11 @@ class View:
     """auto, cpu, cuda, cuda:1."""
 
     def run(self) -> int:
-        from ..exchange import is_splat_file
-        from ..run import Run
         from ..splat_file import SplatFile
         from ..viewer import Viewer, choose_address
 
-        device, is_file = choose_device(self.device), is_splat_file(self.source)
-        run = SplatFile(self.source) if is_file else Run(self.source)
+        device = choose_device(self.device)
+        run = open_run(self.source)
         method = run.method(device)
         subject = subject_of_file(run) if isinstance(run, SplatFile) else subject_of_run(run)
         address = choose_address(self.host, self.port)

@@ -8,10 +8,10 @@ from pathlib import Path
 
 import numpy as np
 import trimesh
-from jaxtyping import Float
 
 from ..errors import LumigraphError
 from ..files import write_bytes
+from ..srgb import linear_from_srgb
 from .mesh import Mesh
 from .surface import vertex_normals
 
@@ -52,7 +52,7 @@ def glb(mesh: Mesh) -> bytes:
     parts = [
         (positions, FLOAT, "VEC3", VERTICES),
         (vertex_normals(mesh.vertices, mesh.faces).astype("<f4"), FLOAT, "VEC3", VERTICES),
-        (linear(mesh.colours / 255).astype("<f4"), FLOAT, "VEC3", VERTICES),
+        (linear_from_srgb(mesh.colours / 255).astype("<f4"), FLOAT, "VEC3", VERTICES),
         (mesh.faces.astype("<u4").reshape(-1), UNSIGNED_INT, "SCALAR", INDICES),
     ]
     starts = np.cumsum([0, *(data.nbytes for data, *_ in parts)]).tolist()
@@ -89,11 +89,6 @@ def glb(mesh: Mesh) -> bytes:
     chunks = [(b"JSON", text), (b"BIN\0", b"".join(data.tobytes() for data, *_ in parts))]
     body = b"".join(struct.pack("<I4s", len(data), name) + data for name, data in chunks)
     return struct.pack("<4sII", b"glTF", 2, 12 + len(body)) + body
-
-
-def linear(encoded: Float[np.ndarray, "*shape"]) -> Float[np.ndarray, "*shape"]:
-    """sRGB-encoded values to linear light (IEC 61966-2-1), which is what COLOR_0 holds (glTF 2.0, 3.9.2)."""
-    return np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
 
 
 def as_trimesh(mesh: Mesh) -> trimesh.Trimesh:

@@ -24,6 +24,7 @@ from jaxtyping import Float
 from PIL import Image
 from scipy.ndimage import gaussian_filter
 
+from ...srgb import linear_from_srgb
 from ..pictures import eight_bits, same_shape
 
 WORKING = 640  # pixels, the longer side of what is judged
@@ -93,8 +94,7 @@ def slopes(y: Float[np.ndarray, "height width"], d: int) -> list[float]:
 def brightness(luminance: Float[np.ndarray, "height width"]) -> float:
     """Mean log2 of the linear luminance, the brightest possible being 0; nothing is darker than 1/255 encoded."""
     encoded = np.maximum(luminance, 1) / 255
-    linear = np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
-    return float(np.log2(linear).mean())
+    return float(np.log2(linear_from_srgb(encoded)).mean())
 
 
 def signature(grey: Image.Image) -> Float[np.ndarray, " cell"]:

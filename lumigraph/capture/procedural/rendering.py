@@ -14,8 +14,9 @@ from torch import Tensor
 
 from ...camera import Camera
 from ...rays import Rays, Rendering
+from ...srgb import srgb_from_linear
 from . import tracer
-from .world import World, srgb_from_linear
+from .world import World
 
 RAYS_PER_TASK = 4096
 CONTRAST = 0.08  # samples of a pixel that differ by more than this are not enough (0 is black, 1 white, as it looks)

@@ -13,6 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ...srgb import linear_from_srgb
 from .boxes import hierarchy
 from .shapes import Shape
 from .textures import Colour, Texture
@@ -235,18 +236,6 @@ class World:
             np.array([self.sky.describe()], SKY),
             hierarchy([o.bounds() for o in self.objects]),
         )
-
-
-def linear_from_srgb(colour):
-    """Encoded colours to linear light (IEC 61966-2-1)."""
-    colour = np.asarray(colour, np.float64)
-    return np.where(colour <= 0.04045, colour / 12.92, ((colour + 0.055) / 1.055) ** 2.4)
-
-
-def srgb_from_linear(colour):
-    """Linear light to encoded colours."""
-    colour = np.asarray(colour)
-    return np.where(colour <= 0.0031308, 12.92 * colour, 1.055 * np.maximum(colour, 1e-9) ** (1 / 2.4) - 0.055)
 
 
 def rotation_about(axis: Vector, degrees: float) -> np.ndarray:

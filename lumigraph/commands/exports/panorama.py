@@ -8,8 +8,7 @@ from typing import Annotated
 
 from tyro.conf import Positional, arg
 
-from ..common import choose_device, needed, option, show
-from .points import opened
+from ..common import choose_device, needed, open_run, option, show
 
 Place = Annotated[
     tuple[float, float, float] | None,
@@ -44,7 +43,7 @@ class Panorama:
 
         picture_format(self.output)
         sphere_size(self.size)
-        run, _ = opened(self.source)
+        run = open_run(self.source)
         place, heading, where = standpoint(run.cameras()["train"], run.frame, self.place)
         method = run.method(choose_device(self.device))
         save_sphere(self.output, panorama(method, place, heading, self.size).rgb, whole=True)

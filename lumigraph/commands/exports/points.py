@@ -9,7 +9,7 @@ from typing import Annotated, Any
 from tyro.conf import Positional
 
 from ...errors import LumigraphError
-from ..common import choose_device, needed, option, show
+from ..common import choose_device, needed, open_run, option, show
 
 
 @dataclass(frozen=True)
@@ -56,16 +56,12 @@ class Points:
 
 def opened(source: Path) -> tuple[Any, Any]:
     """A run or a splat file, and the cameras that its surfaces are looked at with."""
-    from ...exchange import is_splat_file
     from ...export.sightings import all_around
-    from ...run import Run
     from ...splat_file import SplatFile
 
-    if is_splat_file(source):
-        file = SplatFile(source)
-        return file, all_around(file.cameras()["train"])
-    run = Run(source)
-    return run, run.cameras()["train"]
+    run = open_run(source)
+    cameras = run.cameras()["train"]
+    return run, all_around(cameras) if isinstance(run, SplatFile) else cameras
 
 
 def check_pictures(size: int, views: int) -> None:

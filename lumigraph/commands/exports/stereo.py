@@ -9,9 +9,8 @@ from typing import Annotated
 from tyro.conf import Positional
 
 from ...errors import LumigraphError
-from ..common import choose_device, needed, option, show
+from ..common import choose_device, needed, open_run, option, show
 from .panorama import Place
-from .points import opened
 
 
 @dataclass(frozen=True)
@@ -47,7 +46,7 @@ class Stereo:
             raise LumigraphError(
                 f"Eyes cannot be {self.interpupillary:g} apart; give --interpupillary a length above 0"
             )
-        run, _ = opened(self.source)
+        run = open_run(self.source)
         place, heading, where = standpoint(run.cameras()["train"], run.frame, self.place)
         method = run.method(choose_device(self.device))
         unit = scale_to_source(run.frame)

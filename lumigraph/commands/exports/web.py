@@ -10,7 +10,7 @@ from typing import Annotated, Any, Literal
 from tyro.conf import Positional, arg
 
 from ...errors import LumigraphError
-from ..common import choose_device, needed, option, show
+from ..common import choose_device, needed, open_run, option, show
 
 FACES = 300_000  # of a mesh in a page, at most: about 4 MB
 Kind = Literal["auto", "splats", "mesh", "views"]
@@ -44,11 +44,9 @@ class Web:
     """auto, cpu, cuda, cuda:1."""
 
     def run(self) -> int:
-        from ...exchange import is_splat_file
         from ...export.page import look_at_scene
         from ...report import scene_title
         from ...run import Run
-        from ...splat_file import SplatFile
 
         if self.output.suffix.lower() not in (".html", ".htm"):
             raise LumigraphError(f"{self.output} should end in .html, as pages do; rename it")
@@ -56,7 +54,7 @@ class Web:
             raise LumigraphError(f"A page cannot hold {self.views} views; give --views a number from 2 to 1000")
         if not 16 <= self.size <= 4096:
             raise LumigraphError(f"A view cannot be {self.size} pixels large; give --size a number from 16 to 4096")
-        run: Any = SplatFile(self.source) if is_splat_file(self.source) else Run(self.source)
+        run = open_run(self.source)
         title = self.title or (scene_title(run) if isinstance(run, Run) else self.source.name.partition(".")[0])
         cameras, frame = run.cameras()["train"], run.frame
         look = look_at_scene(title, cameras, frame, self._background())
