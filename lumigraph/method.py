@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from .camera import Camera
 from .errors import LumigraphError
 from .gaussians import Gaussians
-from .rays import Rays, Rendering
+from .rays import Look, Rays, Rendering
 from .scene import Batch, Frame, Photograph, Scene
 
 
@@ -34,7 +34,7 @@ class Method(nn.Module, ABC):
 
     @classmethod
     def preset(cls, device: torch.device) -> Any:
-        """The Config to use where the user chose none."""
+        """The Config to use where the user chose none: the paper's on a GPU, on a CPU what learns most in a minute."""
         return cls.Config()
 
     @abstractmethod
@@ -92,6 +92,13 @@ class RayMethod(Method):
     @abstractmethod
     def render_rays(self, rays: Rays, background: Float[Tensor, "#ray 3"]) -> Rendering:
         """What each ray sees, in front of a background colour."""
+
+    def looks(self, rays: Rays) -> list[Look]:
+        """What lies along rays, one entry for each pass, the one that is composited into the picture last.
+
+        Raises LumigraphError for methods that do not march along rays.
+        """
+        raise LumigraphError(f"{type(self).__name__} takes no samples along rays, so there is nothing to draw of one")
 
     @torch.no_grad()
     def render(self, camera: Camera) -> Rendering:

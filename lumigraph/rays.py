@@ -1,4 +1,4 @@
-"""Rays, the samples along them, and what was seen: the three nouns that every ray method speaks."""
+"""Rays, the samples along them, what is looked up there, and what was seen: the nouns that every ray method speaks."""
 
 from __future__ import annotations
 
@@ -86,6 +86,21 @@ class Samples:
         ray = self.ray_index
         directions = rays.directions[ray]
         return rays.origins[ray] + self.t[:, None] * directions, directions
+
+
+@dataclass(frozen=True)
+class Look:
+    """What a method found along rays in one pass, before it is composited.
+
+    name:    of the pass, e.g. "coarse" and "fine"
+    density: per scene unit, constant over each sample
+    rgb:     sRGB-encoded, of each sample
+    """
+
+    name: str
+    samples: Samples
+    density: Float[Tensor, " sample"]
+    rgb: Float[Tensor, "sample 3"]
 
 
 @dataclass(frozen=True)

@@ -53,8 +53,8 @@ class Train:
     """Of all random choices."""
     device: Annotated[str, option("NAME")] = "auto"
     """auto, cpu, cuda, cuda:1."""
-    preset: Literal["auto", "cpu", "gpu"] = "auto"
-    """Which machine the method's own defaults are for; auto is that of --device."""
+    preset: Literal["auto", "laptop", "paper"] = "auto"
+    """The method's own defaults: the paper's, or what learns most on a plain CPU; auto looks at --device."""
     pause_at: Annotated[int | None, option("STEP", "never")] = None
     """Stop at this step as if interrupted. The schedule still follows the whole budget."""
     view: bool = False
@@ -118,7 +118,7 @@ def preset_device(device: str, preset: str) -> Any:
     """The kind of machine whose defaults are wanted; it need not be here."""
     import torch
 
-    return choose_device(device) if preset == "auto" else torch.device("cuda" if preset == "gpu" else "cpu")
+    return choose_device(device) if preset == "auto" else torch.device("cuda" if preset == "paper" else "cpu")
 
 
 def tell_outcome(run: Any, outcome: Any) -> None:
