@@ -1,4 +1,4 @@
-"""Charts as SVG text. Colours come from the page's style sheet, so that they follow its light and dark."""
+"""Charts as SVG text. Colours come from charts.css, on a page as in a file of its own, and follow light and dark."""
 
 from __future__ import annotations
 
@@ -6,11 +6,15 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from html import escape
+from pathlib import Path
 
 WIDTH, HEIGHT = 480, 270
 LEFT, RIGHT, TOP, BOTTOM = 52, 14, 30, 40  # margins around the plot
 SMOOTHING = 0.06  # share of a curve over which its bold line averages
 POINTS = 600  # of a curve that are drawn; more cannot be seen
+COLOURS = 8  # that charts.css knows
+LETTER, LINE = 7.2, 18  # width of a letter, about, and height of a line of names
+STYLE = (Path(__file__).parent / "charts.css").read_text("utf-8")
 
 
 @dataclass(frozen=True)
@@ -20,25 +24,56 @@ class Series:
     y: Sequence[float]
 
 
-def line_chart(series: Sequence[Series], x_label: str, y_label: str, log: bool = False) -> str:
-    """Each series twice: faint as measured, bold as averaged. log: of the y axis; values at or below 0 are left out."""
-    kept = [positive(s) for s in series] if log else list(series)
-    kept = [thinned(s) for s in kept if len(s.x) > 1]
+def line_chart(
+    series: Sequence[Series],
+    x_label: str,
+    y_label: str,
+    log: bool = False,
+    log_x: bool = False,
+    marks: bool = False,
+    smoothed: bool = True,
+    note: str = "",
+) -> str:
+    """Each series twice: faint as measured, bold as averaged. Empty if no series has a line to draw.
+
+    log, log_x: of the y and the x axis; what has no logarithm, or is not finite, is left out
+    marks:      a dot at each point, which tells its numbers on hovering
+    smoothed:   if not, the measured curve alone, bold
+    note:       a few words below the plot
+    """
+    kept = [thinned(drawable(s, log_x, log)) for s in series]
+    kept = [s for s in kept if len(s.x) > (0 if marks else 1)]
     if not kept:
         return ""
-    means = [smooth(s) for s in kept]
-    x_axis = Axis(0, max(max(s.x) for s in kept), LEFT, WIDTH - RIGHT)
-    heights = sorted(math.log10(y) if log else y for s in kept for y in s.y)
-    low, high = heights[len(heights) // 50], heights[-1]
-    pad = 0.06 * (high - low) or 0.5
-    y_axis = Axis(low - pad, high + pad, HEIGHT - BOTTOM, TOP)
+    x_axis = spanning([x for s in kept for x in s.x], LEFT, WIDTH - RIGHT, log_x, from_zero=not log_x)
+    y_axis = spanning(
+        [y for s in kept for y in s.y], HEIGHT - BOTTOM, TOP, log, pad=0.06, outliers=0.02 if smoothed else 0.0
+    )
     lines = []
-    for i, (measured, mean) in enumerate(zip(kept, means, strict=True)):
-        lines.append(f"<path class='measured c{i % 4}' d='{path(measured, x_axis, y_axis, log)}'/>")
-        lines.append(f"<path class='mean c{i % 4}' d='{path(mean, x_axis, y_axis, log)}'/>")
-    names = legend([s.name for s in kept]) if len(kept) > 1 else ""
-    y_ticks = log_ticks(y_axis) if log else [(y, number(y)) for y in ticks(y_axis.low, y_axis.high)]
-    return svg(axes(x_axis, y_axis, y_ticks, x_label, y_label) + "".join(lines) + names)
+    for i, measured in enumerate(kept):
+        colour = f"c{i % COLOURS}"
+        if smoothed:
+            lines.append(f"<path class='faint {colour}' d='{path(measured, x_axis, y_axis)}'/>")
+        bold = smooth(measured) if smoothed else measured
+        lines.append(f"<path class='bold {colour}' d='{path(bold, x_axis, y_axis)}'/>")
+        if marks:
+            lines.append(dots(measured, x_axis, y_axis, colour))
+    rows = legend_rows([s.name for s in kept] if len(kept) > 1 else [], y_label)
+    above = LINE * (len(rows) - 1)
+    parts = [axes(x_axis, y_axis), *lines, *(legend_row(row, 16 - above + LINE * i) for i, row in enumerate(rows))]
+    parts.append(f"<text class='label' x='{LEFT}' y='{16 - above}'>{escape(y_label)}</text>")
+    parts.append(f"<text class='label' x='{WIDTH - RIGHT}' y='{HEIGHT - 4}' text-anchor='end'>{escape(x_label)}</text>")
+    if note:
+        parts.append(f"<text x='{LEFT}' y='{HEIGHT - 4}'>{escape(note)}</text>")
+    return svg("".join(parts), WIDTH, HEIGHT, above)
+
+
+def standalone(chart: str) -> bytes:
+    """A chart as a complete .svg file that carries its style, at one pixel for each of its units."""
+    opening, _, body = chart.partition(">")
+    *_, width, height = opening.split("'")[1].split()
+    opening = opening.replace("<svg", f"<svg xmlns='http://www.w3.org/2000/svg' width='{width}' height='{height}'", 1)
+    return f"{opening}><style>\n{STYLE}</style>{body}\n".encode()
 
 
 def bar_chart(names: Sequence[str], values: Sequence[float], label: str) -> str:
@@ -65,47 +100,92 @@ def bar_chart(names: Sequence[str], values: Sequence[float], label: str) -> str:
 
 @dataclass(frozen=True)
 class Axis:
-    """Values from low to high lie between two positions."""
+    """Values from low to high lie between two positions; low and high are powers of ten on a logarithmic axis."""
 
     low: float
     high: float
     start: float
     end: float
+    log: bool = False
 
     def __call__(self, value: float) -> float:
-        share = (value - self.low) / ((self.high - self.low) or 1)
+        share = ((math.log10(value) if self.log else value) - self.low) / ((self.high - self.low) or 1)
         return self.start + min(max(share, 0), 1) * (self.end - self.start)
 
+    def ticks(self) -> list[float]:
+        """Round values along it."""
+        return log_ticks(self.low, self.high) if self.log else ticks(self.low, self.high)
 
-def axes(x_axis: Axis, y_axis: Axis, y_ticks: Sequence[tuple[float, str]], x_label: str, y_label: str) -> str:
+
+def spanning(
+    values: Sequence[float],
+    start: float,
+    end: float,
+    log: bool = False,
+    pad: float = 0.0,
+    outliers: float = 0.0,
+    from_zero: bool = False,
+) -> Axis:
+    """An axis that holds all values, but for a share of outliers among the lowest.
+
+    pad:       room beyond them, as a share of their span
+    from_zero: also where all of them are above it
+    """
+    heights = sorted(math.log10(value) if log else value for value in values)
+    low, high = heights[int(outliers * len(heights))], heights[-1]
+    room = (pad * (high - low) or 0.5) if pad else 0.0
+    return Axis(min(0.0, low) if from_zero else low - room, high + room, start, end, log)
+
+
+def axes(x_axis: Axis, y_axis: Axis) -> str:
     parts = []
-    for y, text in y_ticks:
+    for y in y_axis.ticks():
         parts.append(f"<path class='grid' d='M{x_axis.start} {y_axis(y):.1f}H{x_axis.end}'/>")
-        parts.append(f"<text x='{LEFT - 8}' y='{y_axis(y) + 4:.1f}' text-anchor='end'>{text}</text>")
-    for x in ticks(x_axis.low, x_axis.high):
+        parts.append(f"<text x='{LEFT - 8}' y='{y_axis(y) + 4:.1f}' text-anchor='end'>{number(y)}</text>")
+    for x in x_axis.ticks():
         parts.append(f"<text x='{x_axis(x):.1f}' y='{HEIGHT - BOTTOM + 18}' text-anchor='middle'>{number(x)}</text>")
-    parts.append(f"<text class='label' x='{WIDTH - RIGHT}' y='{HEIGHT - 4}' text-anchor='end'>{escape(x_label)}</text>")
-    parts.append(f"<text class='label' x='{LEFT}' y='16'>{escape(y_label)}</text>")
     return "".join(parts)
 
 
-def legend(names: Sequence[str]) -> str:
+Named = list[tuple[str, int]]  # what is said in a legend, and the number of its colour
+
+
+def legend_rows(names: Sequence[str], label: str) -> list[Named]:
+    """Names in rows: the first stands right of the label, and stays empty if they do not all fit there."""
+    room = (WIDTH - RIGHT - LEFT) / LETTER
+    rows: list[Named] = [[]]
+    if len(label) + sum(len(name) + 2 for name in names) > room:
+        rows.append([])
+    for i, name in enumerate(names):
+        if rows[-1] and sum(len(other) + 2 for other, _ in rows[-1]) + len(name) > room:
+            rows.append([])
+        rows[-1].append((name, i))
+    return rows
+
+
+def legend_row(names: Named, y: float) -> str:
     parts, x = [], float(WIDTH - RIGHT)
-    for i, name in reversed(list(enumerate(names))):
-        parts.append(f"<text class='c{i % 4}' x='{x:.0f}' y='16' text-anchor='end'>{escape(name)}</text>")
-        x -= 7.2 * len(name) + 14
+    for name, i in reversed(names):
+        parts.append(f"<text class='name c{i % COLOURS}' x='{x:.0f}' y='{y}' text-anchor='end'>{escape(name)}</text>")
+        x -= LETTER * len(name) + 14
     return "".join(parts)
 
 
-def path(series: Series, x_axis: Axis, y_axis: Axis, log: bool) -> str:
-    points = (
-        f"{x_axis(x):.1f} {y_axis(math.log10(y) if log else y):.1f}" for x, y in zip(series.x, series.y, strict=True)
+def path(series: Series, x_axis: Axis, y_axis: Axis) -> str:
+    return "M" + "L".join(f"{x_axis(x):.1f} {y_axis(y):.1f}" for x, y in zip(series.x, series.y, strict=True))
+
+
+def dots(series: Series, x_axis: Axis, y_axis: Axis, colour: str) -> str:
+    return "".join(
+        f"<circle class='dot {colour}' cx='{x_axis(x):.1f}' cy='{y_axis(y):.1f}' r='3.2'>"
+        f"<title>{escape(series.name)}: {x:.4g}, {y:.4g}</title></circle>"
+        for x, y in zip(series.x, series.y, strict=True)
     )
-    return "M" + "L".join(points)
 
 
-def svg(body: str, width: int = WIDTH, height: int = HEIGHT) -> str:
-    return f"<svg viewBox='0 0 {width} {height}' role='img'>{body}</svg>"
+def svg(body: str, width: int = WIDTH, height: int = HEIGHT, above: int = 0) -> str:
+    """above: room over the picture's origin, added to its height"""
+    return f"<svg viewBox='0 {-above} {width} {height + above}' role='img'>{body}</svg>"
 
 
 def ticks(low: float, high: float, about: int = 5) -> list[float]:
@@ -117,12 +197,14 @@ def ticks(low: float, high: float, about: int = 5) -> list[float]:
     return [i * step for i in range(first, math.floor(high / step + 1e-9) + 1)]
 
 
-def log_ticks(axis: Axis) -> list[tuple[float, str]]:
-    """Positions (as logarithms) and names: powers of ten, with twos and fives between if there are few."""
-    span = range(math.floor(axis.low), math.ceil(axis.high) + 1)
-    factors = (1,) if axis.high - axis.low > 2 else (1, 2, 5)
-    marks = [(math.log10(f) + power, f"{f * 10.0**power:g}") for power in span for f in factors]
-    return [(y, name) for y, name in marks if axis.low <= y <= axis.high]
+def log_ticks(low: float, high: float, about: int = 8) -> list[float]:
+    """Round numbers between two powers of ten: powers of ten, not all of many, with twos and fives between few."""
+    every = max(1, math.ceil((high - low) / about))
+    factors = (1,) if high - low > 2 else (1, 2, 5)
+    powers = range(math.floor(low), math.ceil(high) + 1)
+    marks = [f * 10.0**power for power in powers if power % every == 0 for f in factors]
+    marks = [mark for mark in marks if low - 1e-9 <= math.log10(mark) <= high + 1e-9]
+    return marks if len(marks) > 1 else [x for x in ticks(10**low, 10**high) if x > 0]
 
 
 def number(value: float) -> str:
@@ -132,8 +214,13 @@ def number(value: float) -> str:
     return f"{value:.6g}"
 
 
-def positive(series: Series) -> Series:
-    kept = [(x, y) for x, y in zip(series.x, series.y, strict=True) if y > 0]
+def drawable(series: Series, log_x: bool, log: bool) -> Series:
+    """The points that have a place on both axes."""
+    kept = [
+        (x, y)
+        for x, y in zip(series.x, series.y, strict=True)
+        if math.isfinite(x) and math.isfinite(y) and (x > 0 or not log_x) and (y > 0 or not log)
+    ]
     return Series(series.name, [x for x, _ in kept], [y for _, y in kept])
 
 

@@ -12,13 +12,14 @@ from typing import Any
 from PIL import Image
 
 from . import __version__
+from .charts import STYLE as CHARTS
 from .charts import Series, bar_chart, line_chart
 from .display import clock, short
 from .files import write_bytes
 from .run import Run
 
 LARGEST_FILM = 12 << 20  # bytes; larger ones are named instead of embedded
-STYLE = (Path(__file__).parent / "report.css").read_text("utf-8")
+STYLE = CHARTS + (Path(__file__).parent / "report.css").read_text("utf-8")
 
 
 def write_report(run: Run) -> Path:

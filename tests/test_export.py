@@ -15,7 +15,6 @@ import torch
 from PIL import Image, ImageSequence
 
 from lumigraph.camera import Camera
-from lumigraph.charts import Series, line_chart, number, ticks
 from lumigraph.cli import main
 from lumigraph.errors import LumigraphError
 from lumigraph.evaluate import evaluate
@@ -386,11 +385,3 @@ def test_a_report_of_a_bare_run_and_of_odd_names(tmp_path):
     run.config["scene"]["source"] = "/photos/<b>me & you</b>"
     text = write_report(run).read_text()
     assert "<b>me" not in text and "&lt;b&gt;me &amp; you&lt;" in text
-
-
-def test_charts_have_round_ticks():
-    assert ticks(0, 60) == [0, 20, 40, 60] and ticks(18.2, 24.1) == [20, 22, 24]
-    assert [number(x) for x in (0, 1500, 20_000, 1.5e6)] == ["0", "1500", "20 k", "1.5 M"]
-    chart = line_chart([Series("a", [1, 2, 3], [1e-3, 1e-2, 0.0])], "step", "loss", log=True)
-    assert chart.count("<path class='m") == 2 and "nan" not in chart
-    assert line_chart([Series("a", [1], [1])], "x", "y") == ""

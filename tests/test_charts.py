@@ -1,0 +1,81 @@
+"""Charts: what is drawn stands where the numbers say, and a chart in a file of its own needs nothing else."""
+
+from __future__ import annotations
+
+import math
+import re
+from xml.etree import ElementTree
+
+import pytest
+
+from lumigraph.charts import COLOURS, STYLE, WIDTH, Series, bar_chart, line_chart, log_ticks, number, standalone, ticks
+
+
+def elements(chart: str, kind: str) -> list[dict[str, str]]:
+    return [x.attrib for x in ElementTree.fromstring(chart).iter(kind)]
+
+
+def points(chart: str, kind: str) -> list[tuple[float, float]]:
+    """Where a chart's first curve of a kind runs."""
+    (first, *_) = (x["d"] for x in elements(chart, "path") if x["class"].startswith(kind))
+    return [tuple(map(float, pair.split())) for pair in first[1:].split("L")]
+
+
+def test_charts_have_round_ticks():
+    assert ticks(0, 60) == [0, 20, 40, 60] and ticks(18.2, 24.1) == [20, 22, 24]
+    assert [number(x) for x in (0, 1500, 20_000, 1.5e6)] == ["0", "1500", "20 k", "1.5 M"]
+    assert log_ticks(-1, 1) == pytest.approx([0.1, 0.2, 0.5, 1, 2, 5, 10])
+    assert len(log_ticks(-12, 6)) <= 8 and all(math.log10(x) == round(math.log10(x)) for x in log_ticks(-12, 6))
+    assert log_ticks(math.log10(3.1), math.log10(3.9)) == pytest.approx([3.2, 3.4, 3.6, 3.8])
+
+
+def test_a_curve_is_drawn_twice_or_once():
+    falling = Series("a", [1, 2, 3], [1e-3, 1e-2, 0.0])
+    chart = line_chart([falling], "step", "loss", log=True)
+    assert "nan" not in chart and len(points(chart, "faint")) == len(points(chart, "bold")) == 2
+    jagged = Series("a", range(100), [x % 2 for x in range(100)])
+    single = line_chart([jagged], "x", "y", smoothed=False)
+    assert "faint" not in single and points(single, "bold") == points(line_chart([jagged], "x", "y"), "faint")
+    assert line_chart([Series("a", [1], [1])], "x", "y") == ""
+
+
+def test_equal_ratios_are_equal_steps_on_logarithmic_axes():
+    x, y = [0.0, 0.01, 0.1, 1.0, 10.0, 100.0], [5.0, 1.0, 3.0, 9.0, 27.0, math.inf]
+    chart = line_chart([Series("a", x, y)], "scale", "y", log=True, log_x=True, smoothed=False)
+    drawn = points(chart, "bold")
+    assert len(drawn) == 4  # neither nought nor infinity
+    steps = [(b[0] - a[0], b[1] - a[1]) for a, b in zip(drawn, drawn[1:], strict=False)]
+    assert all(step == pytest.approx(steps[0], abs=0.15) for step in steps) and steps[0][0] > 0 > steps[0][1]
+
+
+def test_each_point_has_its_mark():
+    chart = line_chart([Series("a & b", [1, 2], [3, 4]), Series("c", [2], [5])], "x", "y", marks=True, smoothed=False)
+    marks = elements(chart, "circle")
+    assert [mark["class"] for mark in marks] == ["dot c0", "dot c0", "dot c1"]
+    assert [(float(m["cx"]), float(m["cy"])) for m in marks[:2]] == points(chart, "bold")
+    assert "a &amp; b: 1, 3" in chart
+
+
+def test_eight_series_have_eight_colours_and_names_that_fit():
+    series = [Series(f"a method called {i}", [1, 2], [i, i + 1]) for i in range(8)]
+    chart = line_chart(series, "seconds of training", "PSNR of held-out views, dB")
+    names = [x for x in elements(chart, "text") if x.get("class", "").startswith("name")]
+    assert {name["class"] for name in names} == {f"name c{i}" for i in range(COLOURS)} and COLOURS == 8
+    assert all(f"--c{i}:" in STYLE and f".c{i} " in STYLE for i in range(COLOURS))
+    left, top, width, height = map(float, re.search("viewBox='([^']*)'", chart)[1].split())
+    assert left == 0 and width == WIDTH and top < 0
+    assert all(float(x["x"]) > 110 and top < float(x["y"]) < 30 for x in names)
+    label = next(x for x in elements(chart, "text") if x.get("class") == "label")
+    assert float(label["y"]) < min(float(x["y"]) for x in names)
+
+
+def test_a_chart_in_a_file_of_its_own_carries_its_style():
+    for chart in (
+        line_chart([Series("a < b", [1, 2], [3, 4])], "x", "y", note="fern & lego"),
+        bar_chart(["one", "two"], [20.0, 21.0], "dB"),
+    ):
+        root = ElementTree.fromstring(standalone(chart))
+        assert root.tag == "{http://www.w3.org/2000/svg}svg" and root[0].text.strip() == STYLE.strip()
+        assert root.attrib["viewBox"].split()[2:] == [root.attrib["width"], root.attrib["height"]]
+        assert "prefers-color-scheme: dark" in STYLE and "url(" not in STYLE and "@import" not in STYLE
+        assert len(root) == len(ElementTree.fromstring(chart)) + 1
