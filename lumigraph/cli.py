@@ -21,6 +21,7 @@ from .commands.capture import Capture
 from .commands.common import say
 from .commands.demo import Demo
 from .commands.eval import Eval
+from .commands.explain import Explain
 from .commands.export import Export
 from .commands.info import Info
 from .commands.methods import Methods
@@ -42,6 +43,7 @@ COMMANDS: dict[str, type] = {
     "view": View,
     "export": Export,
     "report": Report,
+    "explain": Explain,
     "info": Info,
     "methods": Methods,
     "bench": Bench,

@@ -24,6 +24,7 @@ FLOORS: list[set[str]] = [
     {"methods", "export", "viewer"},
     {"run", "evaluate", "splat_file"},
     {"train", "report", "describe"},
+    {"explain"},
     {"commands"},
     {"cli"},
     {"__main__"},
