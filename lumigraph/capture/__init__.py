@@ -7,10 +7,11 @@ from types import ModuleType
 
 from ..errors import LumigraphError
 from ..scene import Scene
-from . import blender, colmap, llff, transforms
+from . import blender, colmap, llff, picture, transforms
 from .assemble import assemble as assemble
 from .capture import Capture as Capture
 from .capture import Shot as Shot
+from .fewer import with_fewer_views
 from .pictures import list_images
 
 # Asked in this order. A transforms.json comes first because someone made it on purpose, often beside the model that it
@@ -25,22 +26,28 @@ def open_scene(
     reader: str | None = None,
     memory: int | None = None,
     cache: Path | None = None,
+    views: int | None = None,
 ) -> Scene:
-    """The Scene in a folder of posed photographs, or a procedural one.
+    """The Scene in a folder of posed photographs, a single picture as a scene, or a procedural one.
 
-    source:    a folder, or "procedural:<name>"
+    source:    a folder, an image file, or "procedural:<name>"
     downscale: how many times to reduce what the lenses were calibrated for; None reduces to at most about 1000 pixels
     reader:    transforms, blender, colmap or llff; None looks into the folder
     memory:    bytes of images to keep in memory, before they go to a file; None means a share of the machine's
     cache:     where that file goes; None means the user's cache folder
+    views:     learn from so many photographs, spread evenly over the cameras; None means all
     Raises LumigraphError for anything that keeps the photographs from becoming a scene.
     """
     if str(source).startswith(PROCEDURAL):
         from . import procedural
 
-        return assemble(procedural.read(str(source).removeprefix(PROCEDURAL)), downscale, memory, cache)
-    folder = Path(source).expanduser()
-    return assemble(choose_reader(folder, reader).read(folder), downscale, memory, cache)
+        capture = procedural.read(str(source).removeprefix(PROCEDURAL))
+    elif picture.recognises(path := Path(source).expanduser()):
+        capture, downscale = picture.read(path, downscale), 1  # it is reduced by now
+    else:
+        capture = choose_reader(path, reader).read(path)
+    scene = assemble(capture, downscale, memory, cache)
+    return scene if views is None else with_fewer_views(scene, views)
 
 
 def choose_reader(folder: Path, name: str | None = None) -> ModuleType:

@@ -49,6 +49,8 @@ class Train:
     """Shrink photographs by a whole number."""
     reader: Annotated[Reader | None, option("NAME", "found by looking into the folder")] = None
     """Layout of the folder: transforms, blender, colmap or llff."""
+    views: Annotated[int | None, option("N", "all")] = None
+    """Learn from so many photographs only, spread evenly over the cameras."""
     seed: Annotated[int, option("N")] = 0
     """Of all random choices."""
     device: Annotated[str, option("NAME")] = "auto"
@@ -77,7 +79,7 @@ class Train:
         source = posed(self.scene)
         output = self.output or next_free(f"runs/{scene_name(source)}-{methods.check(self.method)}")
         check_new(output)
-        options: dict[str, Any] = {"downscale": self.downscale, "reader": self.reader}
+        options: dict[str, Any] = {"downscale": self.downscale, "reader": self.reader, "views": self.views}
         scene = open_scene(source, **options)
         config = self.method_config(kind)
         seed = getattr(config, "seed", self.seed)
