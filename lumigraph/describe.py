@@ -71,6 +71,7 @@ def frame_rows(frame: Frame) -> dict[str, Any]:
         "bounds": f"{vector(low)} to {vector(high)}",
         "reach": frame.reach,
         "near": frame.near,
+        "cameras": frame.forward and f"forward-facing, near plane at {frame.forward.near:.3g}",
         "background": vector(frame.background) + (" behind alpha" if frame.has_alpha else ""),
         "one scene unit": f"{scale:.4g} of the source's",
     }

@@ -41,6 +41,13 @@ class Rays:
         """The point at distance t along each ray."""
         return self.origins + t[:, None] * self.directions
 
+    def through_box(self, box: Float[Tensor, "2 3"]) -> tuple[Float[Tensor, " ray"], Float[Tensor, " ray"]]:
+        """Distances at which each ray enters and leaves a box; it leaves before it enters where it misses."""
+        slow = self.directions.abs() < 1e-9
+        inverse = 1 / torch.where(slow, 1e-9, self.directions)
+        a, b = (box[0] - self.origins) * inverse, (box[1] - self.origins) * inverse
+        return torch.minimum(a, b).amax(-1), torch.maximum(a, b).amin(-1)
+
     def _map(self, change: Callable[[Tensor], Tensor]) -> Rays:
         time, image_index = (None if x is None else change(x) for x in (self.time, self.image_index))
         return Rays(change(self.origins), change(self.directions), change(self.radius), time, image_index)

@@ -41,11 +41,15 @@ FORMAT, CHECKPOINT = "lumigraph run 1", "lumigraph checkpoint 1"
 
 @dataclass(frozen=True)
 class State:
-    """How far training has come: completed steps, and seconds that they took; compilation is counted apart."""
+    """How far training has come: completed steps, and seconds that they took; compilation is counted apart.
+
+    peak_memory: bytes at most, see `memory.peak_memory`; 0 if unknown
+    """
 
     step: int = 0
     seconds: float = 0.0
     compile_seconds: float = 0.0
+    peak_memory: int = 0
 
 
 class Run:
@@ -146,7 +150,8 @@ class Run:
 
         source = source or self.config["scene"]["source"]
         scene = open_scene(source, **self.config["scene"]["options"])
-        if not alike(scene.frame.to_json(), self.config["frame"]):
+        frame, known = scene.frame.to_json(), self.config["frame"]
+        if not alike({name: frame.get(name) for name in known}, known):  # older runs know fewer numbers of a frame
             raise LumigraphError(
                 f"{source} is not what {self.folder} was trained on: cameras or bounds differ; train a new run on it"
             )
@@ -234,7 +239,7 @@ class Run:
     def _state(self, checkpoint: Path) -> State:
         about = self._about(checkpoint)
         with understood(self.folder / f"checkpoints/{checkpoint.name}"):
-            return State(**{field.name: about[field.name] for field in fields(State)})
+            return State(**{field.name: about.get(field.name, field.default) for field in fields(State)})
 
     def _read_tensors(self, checkpoint: Path, name: str) -> dict[str, Tensor]:
         path = checkpoint / name

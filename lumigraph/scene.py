@@ -11,9 +11,24 @@ from torch import Tensor
 
 from .camera import Camera
 from .images import ImageStore
+from .plain import from_plain
 from .rays import Rays
 
 Vector = tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class Forward:
+    """How a capture looks one way: the mean of its cameras, before a plane that they look through.
+
+    pose:  camera-to-world of the mean camera, in scene units
+    scale: focal lengths over half the picture's width and height
+    near:  distance of that plane from the mean camera; what is to be modelled lies beyond
+    """
+
+    pose: tuple[tuple[float, float, float, float], ...]
+    scale: tuple[float, float]
+    near: float
 
 
 @dataclass(frozen=True)
@@ -29,6 +44,7 @@ class Frame:
     image_count: photographs in the scene, held-out ones included
     source_from_scene: the similarity x_source = M x_scene back to the frame that the capture came in, so that exports
                  line up with it
+    forward:     of a capture without bounds whose cameras all look one way; None for any other
     """
 
     bounds: tuple[Vector, Vector] = ((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0))
@@ -43,6 +59,7 @@ class Frame:
         (0.0, 0.0, 1.0, 0.0),
         (0.0, 0.0, 0.0, 1.0),
     )
+    forward: Forward | None = None
 
     def to_json(self) -> dict[str, Any]:
         """Plain numbers and lists; `from_json` turns them back exactly."""
@@ -50,7 +67,7 @@ class Frame:
 
     @staticmethod
     def from_json(data: dict[str, Any]) -> Frame:
-        return Frame(**{name: as_tuples(value) for name, value in data.items()})
+        return from_plain(Frame, data)
 
 
 @dataclass(frozen=True)
@@ -161,8 +178,3 @@ class Scene:
     def view(self, index: int) -> tuple[Camera, Float[Tensor, "height width channel"]]:
         """One photograph and its camera: sRGB-encoded in [0, 1], a fourth channel where the photographs have alpha."""
         return self.cameras[index], self.images[index].div(255)
-
-
-def as_tuples(value: Any) -> Any:
-    """JSON's lists as tuples, however deep."""
-    return tuple(as_tuples(x) for x in value) if isinstance(value, list | tuple) else value

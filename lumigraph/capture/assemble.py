@@ -20,10 +20,11 @@ from ..camera import Camera
 from ..errors import LumigraphError, LumigraphWarning
 from ..images import ImageStore, Picture
 from ..lens import Equirectangular, Lens, Pinhole
-from ..scene import Frame, Scene
+from ..scene import Forward, Frame, Scene
 from .capture import Capture, Shot
+from .forward import find_forward
 from .normalise import Place, find_place
-from .pictures import Chosen, choose
+from .pictures import Chosen, check_downscale, choose
 
 HOLD_OUT = 8  # every 8th photograph by name, starting with the first, where nothing is published
 RIGID = 0.01  # how far a pose's axes may be from unit length and right angles
@@ -40,8 +41,7 @@ def assemble(
     contradict their lens, and published splits that hold nothing out. What is missing or unusual becomes a
     LumigraphWarning, which is kept in `Scene.warnings` too.
     """
-    if downscale is not None and downscale < 1:
-        raise LumigraphError(f"--downscale {downscale} cannot be; it is a whole number from 1 on")
+    check_downscale(downscale)
     told = [about_missing(capture)] if capture.missing else []
     shots = sorted(capture.shots, key=lambda shot: shot.name)
     if len(shots) < 2:
@@ -70,11 +70,15 @@ def assemble(
     place = find_place(shifted(capture, -away), cameras, images, splits["train"].tolist())
     matrix = place.scene_from_source @ translation(-away)
     cameras = make_cameras(shots, moved(poses, matrix), lenses, images.sizes)
+    forward = None
+    if place.reach > 1:
+        train = splits["train"]
+        forward = find_forward(capture, [shots[i] for i in train.tolist()], cameras[train], matrix, place.near)
     points = None if capture.points is None else torch.from_numpy(capture.points @ matrix[:3, :3].T + matrix[:3, 3])
     return Scene(
         cameras,
         images,
-        make_frame(place, matrix, images),
+        make_frame(place, matrix, images, forward),
         splits,
         [shot.name for shot in shots],
         capture.source,
@@ -129,7 +133,7 @@ def make_cameras(
     return Camera(torch.from_numpy(poses).float(), Lens.cat(lenses), sizes, time, torch.arange(len(shots)))
 
 
-def make_frame(place: Place, scene_from_source: np.ndarray, images: ImageStore) -> Frame:
+def make_frame(place: Place, scene_from_source: np.ndarray, images: ImageStore, forward: Forward | None) -> Frame:
     back = np.linalg.inv(scene_from_source)
     return Frame(
         bounds=place.bounds,
@@ -139,6 +143,7 @@ def make_frame(place: Place, scene_from_source: np.ndarray, images: ImageStore) 
         has_alpha=images.has_alpha,
         image_count=len(images),
         source_from_scene=tuple((a, b, c, d) for a, b, c, d in back.tolist()),
+        forward=forward,
     )
 
 

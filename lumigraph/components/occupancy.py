@@ -72,7 +72,7 @@ class OccupancyGrid(nn.Module):
 
         jitter: in [0, 1), moves each ray's lattice by that share of a step
         """
-        enter, leave = _through_box(rays, self.box)
+        enter, leave = rays.through_box(self.box)
         # Whole steps from the near distance, so that the lattice does not follow the box.
         enter = near + ((enter - near) / step).floor().clamp_min(0) * step if growth == 0 else enter.clamp_min(near)
         if jitter is not None:
@@ -148,11 +148,3 @@ class OccupancyGrid(nn.Module):
             if prefix + name in state_dict:
                 setattr(self, name, torch.empty_like(state_dict[prefix + name], device=self.density.device))
         super()._load_from_state_dict(state_dict, prefix, *args)
-
-
-def _through_box(rays: Rays, box: Float[Tensor, "2 3"]) -> tuple[Float[Tensor, " ray"], Float[Tensor, " ray"]]:
-    """Distances at which each ray enters and leaves a box; it leaves before it enters where it misses."""
-    slow = rays.directions.abs() < 1e-9
-    inverse = 1 / torch.where(slow, 1e-9, rays.directions)
-    a, b = (box[0] - rays.origins) * inverse, (box[1] - rays.origins) * inverse
-    return torch.minimum(a, b).amax(-1), torch.maximum(a, b).amin(-1)
