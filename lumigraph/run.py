@@ -237,9 +237,9 @@ class Run:
         return about
 
     def _state(self, checkpoint: Path) -> State:
-        about = self._about(checkpoint)
+        about = {"peak_memory": 0} | self._about(checkpoint)  # older runs do not tell it
         with understood(self.folder / f"checkpoints/{checkpoint.name}"):
-            return State(**{field.name: about.get(field.name, field.default) for field in fields(State)})
+            return State(**{field.name: about[field.name] for field in fields(State)})
 
     def _read_tensors(self, checkpoint: Path, name: str) -> dict[str, Tensor]:
         path = checkpoint / name

@@ -18,6 +18,7 @@ from torch import Tensor
 from .display import TrainingDisplay
 from .errors import LumigraphError
 from .figures import save_picture
+from .memory import peak_memory
 from .method import Method
 from .run import Run, State
 from .scene import Batch, Photograph, Scene
@@ -105,7 +106,8 @@ def fit(
         def save() -> State:
             if not finite(method.parameters()):
                 raise LumigraphError(stop("a parameter is not finite", step, run, method, save))
-            now = State(step, clock.seconds, compile_seconds)
+            memory = max(state.peak_memory, peak_memory(method.device))
+            now = State(step, clock.seconds, compile_seconds, memory)
             with clock.paused():
                 previews.take(step, budget.progress(step, now.seconds))
                 if run:

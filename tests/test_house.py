@@ -14,9 +14,9 @@ import lumigraph
 # Each floor may know the floors above it in this list, and a room on it knows no other room of its own floor.
 # A new room is a new name here, on the floor where it belongs.
 FLOORS: list[set[str]] = [
-    {"errors", "loops", "srgb"},
+    {"errors", "loops", "memory", "srgb"},
     {"files", "plain", "lens", "rays"},
-    {"camera", "images", "kernels", "charts", "figures", "metrics"},
+    {"camera", "images", "kernels", "charts", "figures", "lpips", "metrics"},
     {"volume", "gaussians", "scene"},
     {"splatting"},
     {"components", "capture", "exchange", "method", "paths", "keyframes"},
@@ -24,7 +24,7 @@ FLOORS: list[set[str]] = [
     {"methods", "export", "viewer"},
     {"run", "evaluate", "splat_file"},
     {"train", "report", "describe"},
-    {"explain"},
+    {"benchmark", "explain"},
     {"commands"},
     {"cli"},
     {"__main__"},
