@@ -147,6 +147,11 @@ def choose_file(shot: Shot, files: dict[int, Path], downscale: int | None) -> Ch
     )
 
 
+def check_downscale(downscale: int | None) -> None:
+    if downscale is not None and downscale < 1:
+        raise LumigraphError(f"--downscale {downscale} cannot be; it is a whole number from 1 on")
+
+
 def reduced(size: Size, downscale: int | None) -> Size:
     times = math.ceil(max(size) / LONGEST_SIDE) if downscale is None else downscale
     return max(round(size[0] / times), 1), max(round(size[1] / times), 1)

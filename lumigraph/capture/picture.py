@@ -1,0 +1,56 @@
+"""One image file is a scene too: a picture on a wall, and a camera straight before it that sees exactly that picture.
+
+The camera takes it twice. One shot is masked to the pixels to learn from, the other to those held out: every second
+pixel, drawn at random. What a method makes of the pixels between is then scored like any held-out view.
+"""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from ..errors import LumigraphError
+from ..lens import Pinhole
+from .capture import Capture, Shot
+from .pictures import EXIF_SIDEWAYS, SUFFIXES, check_downscale, measure, read_image, reduced
+
+LONGEST_SIDE = 512  # pixels that a picture is reduced to, where the user asks for nothing
+SMALLEST_SIDE = 16  # pixels; the windows of SSIM are 11 wide
+AWAY = 2.0  # of the camera, where the longer side of the picture is 2
+THICKNESS = 0.05  # of the box around the picture
+FACING = np.array([[1.0, 0, 0, 0], [0, 0, 1, -AWAY], [0, -1, 0, 0]])  # right is +x, down is -z, forward is +y
+SEED = 0  # of the pixels that are held out
+
+
+def recognises(path: Path) -> bool:
+    return path.is_file() and path.suffix.lower() in SUFFIXES
+
+
+def read(path: Path, downscale: int | None = None) -> Capture:
+    """The picture in the plane y = 0, upright, its middle at the origin and its longer side from -1 to 1.
+
+    downscale: how many times to reduce it; None reduces to at most 512 pixels
+    Raises LumigraphError for files that are no image and for pictures that are very small.
+    """
+    check_downscale(downscale)
+    stored, orientation = measure(path)
+    whole = stored[::-1] if orientation in EXIF_SIDEWAYS else stored
+    size = width, height = reduced(whole, downscale or math.ceil(max(whole) / LONGEST_SIDE))
+    if min(size) < SMALLEST_SIDE:
+        raise LumigraphError(
+            f"{path} is {width}x{height} pixels to learn from, and {SMALLEST_SIDE} a side are the least; "
+            f"name a larger picture{' or a smaller --downscale' if size != whole else ''}"
+        )
+    pixels = read_image(path, True, size)
+    held_out = np.random.default_rng(SEED).permutation(width * height).reshape(height, width) % 2 == 1
+    longest = max(size)
+    lens = Pinhole(torch.full((1, 2), AWAY * longest / 2), torch.tensor([[width / 2, height / 2]]))
+    shots = [
+        Shot(name, FACING, lens, size, pixels, mask, split)
+        for name, split, mask in (("held-out", "test", held_out), ("learnt", "train", ~held_out))
+    ]
+    corner = (width / longest, THICKNESS, height / longest)
+    return Capture(str(path), shots, bounds=((-corner[0], -corner[1], -corner[2]), corner), reach=1.0)
