@@ -16,6 +16,7 @@ from .camera import Camera
 from .display import track
 from .errors import LumigraphError
 from .figures import ERROR_GAIN, Row, colour_depth, colour_error, contact_sheet, depth_range
+from .lpips import DEFINITION, Lpips
 from .method import Method
 from .metrics import WINDOW, psnr, ssim_map
 from .rays import Rendering
@@ -27,12 +28,13 @@ WARM_UP_SIZE = 32  # pixels; the first rendering compiles kernels, which is not 
 
 @dataclass(frozen=True)
 class ViewScore:
-    """One view: PSNR in dB, SSIM, and the seconds that rendering it took."""
+    """One view: PSNR in dB, SSIM, the seconds that rendering it took, and LPIPS where its weights are at hand."""
 
     name: str
     psnr: float
     ssim: float
     seconds: float
+    lpips: float | None = None
 
 
 @dataclass(frozen=True)
@@ -53,6 +55,12 @@ class Evaluation:
         return mean(view.ssim for view in self.views)
 
     @property
+    def lpips(self) -> float | None:
+        """None if it was not measured."""
+        found = [view.lpips for view in self.views if view.lpips is not None]
+        return mean(found) if found else None
+
+    @property
     def seconds_per_view(self) -> float:
         return mean(view.seconds for view in self.views)
 
@@ -60,6 +68,7 @@ class Evaluation:
         return {
             "psnr": self.psnr,
             "ssim": self.ssim,
+            "lpips": self.lpips,
             "protocol": self.protocol,
             "seconds_per_view": self.seconds_per_view,
             "render_compile_seconds": self.compile_seconds,
@@ -85,37 +94,42 @@ def evaluate(
     scene: Scene,
     split: str = "test",
     keep: Callable[[str, Rendering], object] = lambda name, rendering: None,
+    views: int | None = None,
+    lpips: Lpips | None = None,
 ) -> Evaluation:
-    """Render every view of a split and compare it with its photograph.
+    """Render the views of a split and compare them with their photographs.
 
-    keep: told each view's name and rendering
+    keep:  told each view's name and rendering
+    views: so many of them at most, evenly spread over the split; None means all
     Pixels that the photograph's mask rules out do not count. Raises LumigraphError if the split has no view.
     """
     chosen = scene.splits.get(split)
     if chosen is None or not len(chosen):
         there = ", ".join(f"{name} ({len(index)} views)" for name, index in scene.splits.items() if len(index))
         raise LumigraphError(f"{scene.source} has no views in the split {split!r}; choose one of: {there}")
-    views = chosen.tolist()
+    if views is not None and views < 1:
+        raise LumigraphError(f"{views} views cannot be compared; give --views a number above 0")
+    compared = evenly(chosen.tolist(), views or len(chosen))
     method.eval()
-    compile_seconds = warm_up(method, scene.cameras[views[0]])
-    spread = {views[round(i)] for i in torch.linspace(0, len(views) - 1, min(SHOWN, len(views))).tolist()}
+    compile_seconds = warm_up(method, scene.cameras[compared[0]])
+    spread = set(evenly(compared, SHOWN))
     scores: list[ViewScore] = []
     shown: dict[str, tuple[Tensor, Rendering]] = {}
     worst: dict[str, tuple[Tensor, Rendering]] = {}
-    for index in track(views, "Comparing views", len(views)):
+    for index in track(compared, "Comparing views", len(compared)):
         camera, image = scene.view(index)
         photograph = on_background(image, scene.frame.background)
         begin = time.perf_counter()
         seen = method.render(camera).cpu()
         seconds = time.perf_counter() - begin
-        score = compare(scene.names[index], seen.rgb.clamp(0, 1), photograph, scene.images.mask(index), seconds)
+        score = compare(scene.names[index], seen.rgb.clamp(0, 1), photograph, scene.images.mask(index), seconds, lpips)
         keep(score.name, seen)
         if index in spread:
             shown[score.name] = photograph, seen
         if all(score.psnr < other.psnr for other in scores):
             worst = {score.name: (photograph, seen)}
         scores.append(score)
-    return Evaluation(scores, protocol(scene, split), compile_seconds, shown | worst)
+    return Evaluation(scores, protocol(scene, split, compared, lpips), compile_seconds, shown | worst)
 
 
 def compare(
@@ -124,13 +138,22 @@ def compare(
     photograph: Float[Tensor, "height width 3"],
     mask: Bool[Tensor, "height width"] | None,
     seconds: float,
+    lpips: Lpips | None = None,
 ) -> ViewScore:
     likeness = ssim_map(rgb, photograph)
     if mask is None:
-        return ViewScore(name, psnr(rgb, photograph), float(likeness.mean()), seconds)
+        perceived = lpips(rgb, photograph) if lpips else None
+        return ViewScore(name, psnr(rgb, photograph), float(likeness.mean()), seconds, perceived)
     edge = WINDOW // 2
     inner = likeness[mask[edge:-edge, edge:-edge]]
-    return ViewScore(name, psnr(rgb[mask], photograph[mask]), float(inner.mean()) if len(inner) else 0.0, seconds)
+    perceived = lpips(torch.where(mask[..., None], rgb, photograph), photograph) if lpips else None
+    closeness = float(inner.mean()) if len(inner) else 0.0
+    return ViewScore(name, psnr(rgb[mask], photograph[mask]), closeness, seconds, perceived)
+
+
+def evenly(items: list[int], count: int) -> list[int]:
+    """So many of them at most, the first and the last among them, in order."""
+    return [items[round(i)] for i in torch.linspace(0, len(items) - 1, min(count, len(items))).tolist()]
 
 
 def warm_up(method: Method, camera: Camera) -> float:
@@ -150,19 +173,20 @@ def on_background(
     return alpha * rgb + (1 - alpha) * torch.tensor(background)
 
 
-def protocol(scene: Scene, split: str) -> dict[str, Any]:
+def protocol(scene: Scene, split: str, compared: list[int], lpips: Lpips | None = None) -> dict[str, Any]:
     """All that one must know to compare these figures with others."""
-    index = scene.splits[split]
-    sizes = sorted({f"{width}x{height}" for width, height in scene.cameras.size[index].tolist()})
+    sizes = sorted({f"{width}x{height}" for width, height in scene.cameras.size[compared].tolist()})
     return {
         "split": split,
-        "views": len(index),
+        "views": len(compared),
+        "of": len(scene.splits[split]),
         "resolution": sizes[0] if len(sizes) == 1 else sizes,
         "background": list(scene.frame.background) if scene.frame.has_alpha else None,
-        "masked": any(scene.images.mask(int(i)) is not None for i in index),
+        "masked": any(scene.images.mask(i) is not None for i in compared),
         "colours": "sRGB in [0, 1]; renderings clipped, not rounded",
         "psnr": "per view, then averaged",
         "ssim": "Wang 2004: Gaussian window 11x11, deviation 1.5, K1 0.01, K2 0.03, windows inside the image",
+        "lpips": DEFINITION if lpips else None,
     }
 
 

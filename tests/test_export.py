@@ -338,6 +338,13 @@ def test_a_contact_sheet_shows_every_view_and_the_worst(trained):
     assert result["protocol"]["resolution"] == "24x24" and result["protocol"]["background"] == [1.0, 1.0, 1.0]
 
 
+@pytest.mark.parametrize(("views", "expected"), [(1, [0]), (2, [0, 8]), (3, [0, 4, 8]), (9, [0, 4, 8])])
+def test_some_views_are_compared_alone(trained, views, expected):
+    result = evaluate(trained.method(), tiny.scene(), views=views).to_json()
+    assert [view["name"] for view in result["views"]] == [f"ball_{i}" for i in expected]
+    assert (result["protocol"]["views"], result["protocol"]["of"]) == (len(expected), 3)
+
+
 def test_evaluation_names_the_splits_there_are(trained):
     with pytest.raises(LumigraphError, match=r"no views in the split 'val'; choose one of: train \(9 views\), test"):
         evaluate(trained.method(), tiny.scene(), "val")

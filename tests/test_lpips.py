@@ -9,6 +9,7 @@ import safetensors.torch
 import torch
 
 from lumigraph.errors import LumigraphError
+from lumigraph.evaluate import compare
 from lumigraph.lpips import SHAPES, Lpips, load_lpips, named_files
 
 
@@ -136,3 +137,14 @@ def test_pictures_may_be_too_small(weights):
     assert Lpips(weights)(a, a) == 0
     with pytest.raises(LumigraphError, match="31 x 31"):
         Lpips(weights)(a[:30], a[:30])
+
+
+def test_what_a_mask_rules_out_does_not_count(weights):
+    a, b = pictures()
+    mask = torch.ones(a.shape[:2], dtype=torch.bool)
+    mask[:, 16:] = False
+    distance = Lpips(weights)
+    spoilt = torch.where(mask[..., None], b, 1 - b)
+    scores = [compare("one", rgb, a, mask, 0.0, distance) for rgb in (b, spoilt)]
+    assert scores[0].lpips == scores[1].lpips
+    assert 0 < scores[0].lpips < compare("one", b, a, None, 0.0, distance).lpips
