@@ -18,7 +18,7 @@ from ..components.lazy_adam import LazyAdam
 from ..components.occupancy import OccupancyGrid
 from ..components.perceptron import Perceptron
 from ..method import RayMethod
-from ..rays import Rays, Rendering, Samples
+from ..rays import Look, Rays, Rendering, Samples
 from ..scene import Batch, Frame, Scene
 from ..volume import composite, visible
 
@@ -146,6 +146,10 @@ class InstantNGP(RayMethod):
     def render_rays(
         self, rays: Rays, background: Float[Tensor, "#ray 3"], jitter: Float[Tensor, " ray"] | None = None
     ) -> Rendering:
+        (look,) = self.looks(rays, jitter)
+        return composite(look.samples, look.density, look.rgb, background)
+
+    def looks(self, rays: Rays, jitter: Float[Tensor, " ray"] | None = None) -> list[Look]:
         step = 2 * math.sqrt(3) / self.lattice
         found = self.occupancy.sample(rays, self.frame.near, step, self.growth, jitter=jitter)
         samples = found.keep(self._visible(rays, found))
@@ -153,7 +157,7 @@ class InstantNGP(RayMethod):
         density, geometry = self.field.density(self.field.encode(points))
         rgb = self.field.colour(geometry, directions)
         self._figures |= {"rays": len(rays), "visible_samples": len(samples)}
-        return composite(samples, density, rgb, background)
+        return [Look("samples", samples, density, rgb)]
 
     @torch.no_grad()
     def _visible(self, rays: Rays, found: Samples) -> Bool[Tensor, " sample"]:
@@ -172,7 +176,7 @@ class InstantNGP(RayMethod):
         return seen
 
     def loss(self, batch: Batch, step: int) -> dict[str, Tensor]:
-        generator = self._random(step)
+        generator = self.random(step)
         jitter = torch.rand(len(batch), generator=generator).to(self.device)
         rays, target = batch.rays, batch.rgb
         background = torch.tensor([self.frame.background], device=self.device)
@@ -216,7 +220,7 @@ class InstantNGP(RayMethod):
         if finer or step % (4 if step < 32 else self.config.grid_every) == 0:
             share, budget = (1.0, None) if finer or step < 32 else (PROBES, self.config.samples_per_step * LOOKS)
             thickness, decay = self.config.cell_thickness, self.config.grid_decay
-            self.occupancy.update(self.density, thickness, self._random(~step), decay, share, budget)
+            self.occupancy.update(self.density, thickness, self.random(~step), decay, share, budget)
 
     def after_step(self, step: int) -> None:
         """So many rays next time as should give the wanted number of samples."""
@@ -244,7 +248,3 @@ class InstantNGP(RayMethod):
         for optimizer in self._optimizers:
             for group in optimizer.param_groups:
                 group["lr"] = rate * group.get("scale", 1.0)
-
-    def _random(self, number: int) -> torch.Generator:
-        """Random numbers that depend on the seed and the step alone, so that a resumed run draws the same."""
-        return torch.Generator().manual_seed((self.config.seed << 40) + (number % (1 << 40)))

@@ -8,7 +8,7 @@ import torch
 from torch import nn
 
 from lumigraph.method import RayMethod
-from lumigraph.rays import Rendering, Samples
+from lumigraph.rays import Look, Rendering, Samples
 from lumigraph.volume import composite
 
 
@@ -43,6 +43,10 @@ class VoxelGrid(RayMethod):
         return batch
 
     def render_rays(self, rays, background, jitter=0.5):
+        (look,) = self.looks(rays, jitter)
+        return composite(look.samples, look.density, look.rgb, background)
+
+    def looks(self, rays, jitter=0.5):
         count = self.config.samples
         edges = torch.linspace(1.0, 5.0, count + 1).expand(len(rays), -1)
         step = 4 / count
@@ -53,7 +57,7 @@ class VoxelGrid(RayMethod):
         values = nn.functional.grid_sample(grid, points.flip(-1)[None, None, None], align_corners=True)[0, :, 0, 0].T
         inside = (points.abs() < 1).all(-1)
         density = nn.functional.softplus(10 * values[:, 0] - 2) * inside
-        return composite(samples, density, torch.sigmoid(10 * values[:, 1:]), background)
+        return [Look("samples", samples, density, torch.sigmoid(10 * values[:, 1:]))]
 
     def loss(self, batch, step):
         target = batch.rgb
