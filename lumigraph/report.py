@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import io
 import json
+from collections.abc import Sequence
 from html import escape
 from pathlib import Path
 from typing import Any
@@ -35,15 +36,19 @@ def write_report(run: Run) -> Path:
         contact_sheet(run),
         settings(run, evaluation),
     ]
-    page = (
+    path = run.folder / "report.html"
+    write_bytes(path, page(title, "".join(sections), str(run.folder)))
+    return path
+
+
+def page(title: str, body: str, footer: str) -> bytes:
+    """A whole page that carries its style."""
+    return (
         f'<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
         f'<meta name="viewport" content="width=device-width, initial-scale=1">\n<title>{escape(title)}</title>\n'
-        f"<style>\n{STYLE}</style>\n</head>\n<body>\n<main>\n{''.join(sections)}</main>\n"
-        f"<footer>Lumigraph {escape(__version__)} · {escape(str(run.folder))}</footer>\n</body>\n</html>\n"
-    )
-    path = run.folder / "report.html"
-    write_bytes(path, page.encode())
-    return path
+        f"<style>\n{STYLE}</style>\n</head>\n<body>\n<main>\n{body}</main>\n"
+        f"<footer>Lumigraph {escape(__version__)} · {escape(footer)}</footer>\n</body>\n</html>\n"
+    ).encode()
 
 
 def scene_title(run: Run) -> str:
@@ -64,14 +69,18 @@ def header(run: Run, evaluation: dict[str, Any] | None) -> str:
         figures.append((f"{state.step:,}".replace(",", "\u202f"), "", "steps"))
     if evaluation:
         figures.append((f"{evaluation['seconds_per_view']:.2f}", "s", "to render a view"))
+    count = run.config["splits"].get("train", 0)
+    sentence = f"{run.method_name}, trained on {count} photograph{'' if count == 1 else 's'}"
+    return heading(scene_title(run), sentence, figures)
+
+
+def heading(title: str, sentence: str, figures: Sequence[tuple[str, str, str]]) -> str:
+    """The top of a page. figures: value, unit, and what it is the value of."""
     cells = "".join(
         f"<div><b>{escape(value)}<small>{escape(unit)}</small></b><span>{escape(label)}</span></div>"
         for value, unit, label in figures
     )
-    return (
-        f"<header><h1>{escape(scene_title(run))}</h1><p>{escape(run.method_name)}, trained on "
-        f"{run.config['splits'].get('train', 0)} photographs</p><div class='figures'>{cells}</div></header>\n"
-    )
+    return f"<header><h1>{escape(title)}</h1><p>{escape(sentence)}</p><div class='figures'>{cells}</div></header>\n"
 
 
 def films(run: Run) -> str:
