@@ -1,0 +1,112 @@
+"""Fourier features: a network that learns a picture from its coordinates, as waves (Tancik 2020, arXiv 2006.10739)."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any, Literal
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor, nn
+
+from ..components.dense import Dense
+from ..components.encodings import FourierFeatures as Waves
+from ..method import RayMethod
+from ..rays import Rays, Rendering
+from ..scene import Batch, Frame, Scene
+
+Encoding = Literal["none", "basic", "positional", "gaussian"]
+
+
+@dataclass(frozen=True)
+class Config:
+    """The paper's numbers for pictures, with where it gives them; those of a step are ours."""
+
+    encoding: Encoding = "gaussian"  # section 6.1
+    scale: float = 10.0  # sigma, cycles across the picture: gaussian's deviation, positional's highest; section 6.1
+    frequencies: int = 256  # rows of B for positional and gaussian, section 6.1
+    layers: int = 4  # the last one gives colours, section 6.1
+    width: int = 256  # of the others, section 6.1
+    learning_rate: float = 1e-3  # Adam's
+    pixels: int = 1 << 13  # per step; the paper takes all of them
+    exact: bool = False  # multiply in float32 even where bfloat16 is faster
+    seed: int = 0
+
+
+class FourierFeatures(RayMethod):
+    """The wall y = 0, painted: gamma encodes a place on it, and a network gives the colour there.
+
+        rgb(v) = sigmoid(W_n relu(... relu(W_1 gamma(v) + b_1) ...) + b_n)
+
+    It learns what all photographs show of that wall, which is a single picture's every pixel (`capture.picture`).
+    """
+
+    Config = Config
+
+    def __init__(self, frame: Frame, config: Any = None):
+        config = config or Config()
+        super().__init__(frame, config)
+        rows = frequencies(config)
+        self.encoding = nn.Identity() if rows is None else Waves(rows)
+        widths = [2 if rows is None else 2 * len(rows), *[config.width] * (config.layers - 1)]
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(config.seed)
+            self.hidden = nn.Sequential(*(Dense(a, b, relu=True, exact=config.exact) for a, b in pairwise(widths)))
+            self.last = Dense(config.width, 3, exact=True)
+
+    def paint(self, place: Float[Tensor, "point 2"]) -> Float[Tensor, "point 3"]:
+        """The colour at places in [0, 1]^2, x to the right and y down, the longer side of the picture being 1."""
+        return torch.sigmoid(self.last(self.hidden(self.encoding(place))))
+
+    def render_rays(self, rays: Rays, background: Float[Tensor, "#ray 3"]) -> Rendering:
+        t, place, hit = self.meet(rays)
+        rgb = background.expand(len(rays), 3).clone()
+        rgb[hit] = self.paint(place[hit])
+        return Rendering(rgb, t.where(hit, math.inf), hit.float())
+
+    def meet(self, rays: Rays) -> tuple[Float[Tensor, " ray"], Float[Tensor, "ray 2"], Bool[Tensor, " ray"]]:
+        """Where rays meet the wall: how far away, at which place, and whether within the scene's bounds at all."""
+        t = -rays.origins[:, 1] / rays.directions[:, 1]
+        x, _, z = rays.at(t).unbind(1)
+        (left, _, bottom), (right, _, top) = self.frame.bounds
+        hit = (t > 0) & (left <= x) & (x <= right) & (bottom <= z) & (z <= top)
+        return t, torch.stack([1 + x, 1 - z], 1) / 2, hit
+
+    def batch(self, scene: Scene, generator: torch.Generator) -> Batch:
+        return scene.sample_rays(self.config.pixels, generator).to(self.device)
+
+    def loss(self, batch: Batch, step: int) -> dict[str, Tensor]:
+        background = torch.tensor([self.frame.background], device=self.device)
+        target = batch.rgb
+        if batch.alpha is not None:
+            target = torch.lerp(background, target, batch.alpha[:, None])
+        error = (self.render_rays(batch.rays, background).rgb - target).square().mean()
+        self._figures = {"mse": float(error.detach())}
+        return {"mse": error}
+
+    def optimizers(self) -> list[torch.optim.Optimizer]:
+        return [torch.optim.Adam(self.parameters(), self.config.learning_rate, foreach=True)]
+
+    def statistics(self) -> dict[str, float]:
+        return self._figures
+
+
+def frequencies(config: Config) -> Float[Tensor, "frequency 2"] | None:
+    """B of the encodings (section 6): gamma(v) = (cos(2 pi B v), sin(2 pi B v)); None leaves v as it is.
+
+    basic:       B = I
+    positional:  sigma^(j/m) along either axis, j = 0 ... m - 1, m being half the number of frequencies
+    gaussian:    independent numbers from N(0, sigma^2)
+    """
+    count, scale, generator = config.frequencies, config.scale, torch.Generator().manual_seed(config.seed)
+    match config.encoding:
+        case "none":
+            return None
+        case "basic":
+            return torch.eye(2)
+        case "positional":
+            return torch.kron(torch.eye(2), (scale ** (torch.arange(count // 2) / (count // 2)))[:, None])
+        case "gaussian":
+            return scale * torch.randn(count, 2, generator=generator)
