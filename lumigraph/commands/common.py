@@ -86,8 +86,9 @@ def show(rows: Mapping[str, str]) -> None:
 
 
 def scene_name(source: str) -> str:
-    """A short name for files: the last part of a path, or of "procedural:<name>"."""
-    last = source.partition(":")[2] if source.startswith("procedural:") else Path(source).resolve().name
+    """A short name for files: the last part of a path, without a file's suffix, or of "procedural:<name>"."""
+    path = Path(source).resolve()
+    last = source.partition(":")[2] if source.startswith("procedural:") else path.stem if path.is_file() else path.name
     return re.sub(r"[^\w.-]+", "-", last) or "scene"
 
 

@@ -46,7 +46,7 @@ class Encodings:
         if not picture.recognises(self.picture):
             raise LumigraphError(f"{self.picture} is no image file; name one picture, as in photograph.png")
         scene = picture.open_picture(self.picture, self.downscale)
-        folder = self.output or Path("explained") / f"{scene_name(str(self.picture.with_suffix('')))}-encodings"
+        folder = self.output or Path("explained") / f"{scene_name(str(self.picture))}-encodings"
         comparison = compare(scene, tuple(sorted(set(self.scales))), self.steps, self.seed, choose_device(self.device))
         write_page(folder, comparison)
         show(comparison.rows() | {"page": str(folder / "index.html")})
