@@ -12,6 +12,7 @@ from .assemble import assemble as assemble
 from .capture import Capture as Capture
 from .capture import Shot as Shot
 from .fewer import with_fewer_views
+from .multiscale import multiscale as multiscale
 from .pictures import list_images
 
 # Asked in this order. A transforms.json comes first because someone made it on purpose, often beside the model that it
@@ -27,6 +28,7 @@ def open_scene(
     memory: int | None = None,
     cache: Path | None = None,
     views: int | None = None,
+    scales: int = 1,
 ) -> Scene:
     """The Scene in a folder of posed photographs, a single picture as a scene, or a procedural one.
 
@@ -36,6 +38,7 @@ def open_scene(
     memory:    bytes of images to keep in memory, before they go to a file; None means a share of the machine's
     cache:     where that file goes; None means the user's cache folder
     views:     learn from so many photographs, spread evenly over the cameras; None means all
+    scales:    every photograph so many times, each half as large as the one before; see `multiscale`
     Raises LumigraphError for anything that keeps the photographs from becoming a scene.
     """
     if str(source).startswith(PROCEDURAL):
@@ -47,7 +50,9 @@ def open_scene(
     else:
         capture = choose_reader(path, reader).read(path)
     scene = assemble(capture, downscale, memory, cache)
-    return scene if views is None else with_fewer_views(scene, views)
+    if views is not None:
+        scene = with_fewer_views(scene, views)
+    return multiscale(scene, scales, memory, cache)
 
 
 def choose_reader(folder: Path, name: str | None = None) -> ModuleType:

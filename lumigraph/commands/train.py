@@ -51,6 +51,8 @@ class Train:
     """Layout of the folder: transforms, blender, colmap or llff."""
     views: Annotated[int | None, option("N", "all")] = None
     """Learn from so many photographs only, spread evenly over the cameras."""
+    scales: Annotated[int, option("N")] = 1
+    """Have every photograph so many times, each half as large as the one before; evaluation counts them all."""
     seed: Annotated[int, option("N")] = 0
     """Of all random choices."""
     device: Annotated[str, option("NAME")] = "auto"
@@ -79,7 +81,12 @@ class Train:
         source = posed(self.scene)
         output = self.output or next_free(f"runs/{scene_name(source)}-{methods.check(self.method)}")
         check_new(output)
-        options: dict[str, Any] = {"downscale": self.downscale, "reader": self.reader, "views": self.views}
+        options: dict[str, Any] = {
+            "downscale": self.downscale,
+            "reader": self.reader,
+            "views": self.views,
+            "scales": self.scales,
+        }
         scene = open_scene(source, **options)
         config = self.method_config(kind)
         seed = getattr(config, "seed", self.seed)
