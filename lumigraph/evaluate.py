@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import torch
@@ -31,6 +31,7 @@ class ViewScore:
     """One view: PSNR in dB, SSIM, the seconds that rendering it took, and LPIPS where its weights are at hand."""
 
     name: str
+    resolution: str
     psnr: float
     ssim: float
     seconds: float
@@ -64,11 +65,20 @@ class Evaluation:
     def seconds_per_view(self) -> float:
         return mean(view.seconds for view in self.views)
 
+    @property
+    def by_resolution(self) -> dict[str, Evaluation]:
+        """The views of each size alone, sizes in the order in which they come."""
+        sizes = dict.fromkeys(view.resolution for view in self.views)
+        return {size: replace(self, views=[view for view in self.views if view.resolution == size]) for size in sizes}
+
+    def means(self) -> dict[str, Any]:
+        return {"psnr": self.psnr, "ssim": self.ssim, "lpips": self.lpips}
+
     def to_json(self) -> dict[str, Any]:
+        parts = {size: part.means() | {"views": len(part.views)} for size, part in self.by_resolution.items()}
         return {
-            "psnr": self.psnr,
-            "ssim": self.ssim,
-            "lpips": self.lpips,
+            **self.means(),
+            **({"by_resolution": parts} if len(parts) > 1 else {}),
             "protocol": self.protocol,
             "seconds_per_view": self.seconds_per_view,
             "render_compile_seconds": self.compile_seconds,
@@ -140,15 +150,15 @@ def compare(
     seconds: float,
     lpips: Lpips | None = None,
 ) -> ViewScore:
-    likeness = ssim_map(rgb, photograph)
+    likeness, size = ssim_map(rgb, photograph), resolution(photograph.shape[1], photograph.shape[0])
     if mask is None:
         perceived = lpips(rgb, photograph) if lpips else None
-        return ViewScore(name, psnr(rgb, photograph), float(likeness.mean()), seconds, perceived)
+        return ViewScore(name, size, psnr(rgb, photograph), float(likeness.mean()), seconds, perceived)
     edge = WINDOW // 2
     inner = likeness[mask[edge:-edge, edge:-edge]]
     perceived = lpips(torch.where(mask[..., None], rgb, photograph), photograph) if lpips else None
     closeness = float(inner.mean()) if len(inner) else 0.0
-    return ViewScore(name, psnr(rgb[mask], photograph[mask]), closeness, seconds, perceived)
+    return ViewScore(name, size, psnr(rgb[mask], photograph[mask]), closeness, seconds, perceived)
 
 
 def evenly(items: list[int], count: int) -> list[int]:
@@ -175,7 +185,7 @@ def on_background(
 
 def protocol(scene: Scene, split: str, compared: list[int], lpips: Lpips | None = None) -> dict[str, Any]:
     """All that one must know to compare these figures with others."""
-    sizes = sorted({f"{width}x{height}" for width, height in scene.cameras.size[compared].tolist()})
+    sizes = sorted({resolution(*size) for size in scene.cameras.size[compared].tolist()})
     return {
         "split": split,
         "views": len(compared),
@@ -188,6 +198,10 @@ def protocol(scene: Scene, split: str, compared: list[int], lpips: Lpips | None 
         "ssim": "Wang 2004: Gaussian window 11x11, deviation 1.5, K1 0.01, K2 0.03, windows inside the image",
         "lpips": DEFINITION if lpips else None,
     }
+
+
+def resolution(width: int, height: int) -> str:
+    return f"{width}x{height}"
 
 
 def mean(values) -> float:

@@ -11,9 +11,11 @@ import torch
 from captures import HEIGHT, WIDTH, Tiny, write_colmap, write_ngp
 
 from lumigraph.capture import multiscale, open_scene
+from lumigraph.cli import main
 from lumigraph.errors import LumigraphError
+from lumigraph.evaluate import evaluate
 from lumigraph.images import ImageStore
-from lumigraph.run import Run
+from lumigraph.run import Run, State
 from lumigraph.scene import Scene
 
 
@@ -104,6 +106,30 @@ def test_masks_shrink_to_pixels_that_are_good_all_over(tmp_path):
 def test_no_smaller_than_can_be_compared(folder, scales):
     with pytest.raises(LumigraphError, match="from 1 to 2"):
         open_scene(folder, scales=scales)
+
+
+def test_scores_are_told_for_each_resolution(folder):
+    scene, method = open_scene(folder, scales=2), tiny.method()
+    found = evaluate(method, scene).to_json()
+    parts = found["by_resolution"]
+    assert list(parts) == ["24x24", "12x12"]
+    for k, (size, part) in enumerate(parts.items()):
+        alone = evaluate(method, replace(scene, splits={"test": scene.splits["test"][3 * k : 3 * k + 3]})).to_json()
+        assert part == {"psnr": alone["psnr"], "ssim": alone["ssim"], "lpips": None, "views": 3}
+        assert "by_resolution" not in alone and alone["protocol"]["resolution"] == size
+    assert found["psnr"] == pytest.approx(sum(part["psnr"] for part in parts.values()) / 2)  # over views, as published
+    assert parts["24x24"]["psnr"] != parts["12x12"]["psnr"]
+
+
+def test_eval_prints_a_line_for_each_resolution(folder, tmp_path, capsys):
+    scene = open_scene(folder, scales=2)
+    method = tiny.method(scene.frame)
+    run = Run.create(tmp_path / "run", method, scene, options={"scales": 2})
+    run.save(State(), method, method.optimizers(), torch.Generator())
+    assert main(["eval", str(run.folder), "--device", "cpu", "--save-images"]) == 0
+    printed = capsys.readouterr().out
+    assert "24x24" in printed and "12x12" in printed and "3 views" in printed
+    assert len(list((run.folder / "eval").glob("*.png"))) == 6
 
 
 def test_a_run_opens_the_same_scales_again(folder, tmp_path):

@@ -16,9 +16,10 @@ from .common import choose_device, needed, option, scene_name, show
 class Eval:
     """Compare a run with photographs that it has not seen.
 
-    Writes RUN/eval.json (per view and mean PSNR and SSIM, the protocol, timings) and RUN/eval.png, a contact sheet of
-    photograph, rendering, error and depth. Other splits than test have their names in the files'. LPIPS is measured
-    where you have the weights: torchvision's AlexNet and the LPIPS authors' v0.1/alex.pth.
+    Writes RUN/eval.json (per view and mean PSNR and SSIM, also by resolution where there are several, the protocol,
+    timings) and RUN/eval.png, a contact sheet of photograph, rendering, error and depth. Other splits than test have
+    their names in the files'. LPIPS is measured where you have the weights: torchvision's AlexNet and the LPIPS
+    authors' v0.1/alex.pth.
     """
 
     run_folder: Annotated[Positional[Path], needed("RUN")]
@@ -47,6 +48,8 @@ class Eval:
         rows = {"PSNR": f"[bold]{result['psnr']:.2f} dB[/bold]", "SSIM": f"[bold]{result['ssim']:.4f}[/bold]"}
         if lpips:
             rows["LPIPS"] = f"[bold]{result['lpips']:.4f}[/bold]"
+        for size, part in result.get("by_resolution", {}).items():
+            rows[size] = f"{part['psnr']:.2f} dB, SSIM {part['ssim']:.4f}, {part['views']} views"
         show(
             rows
             | {
