@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -202,6 +203,11 @@ def protocol(scene: Scene, split: str, compared: list[int], lpips: Lpips | None 
 
 def resolution(width: int, height: int) -> str:
     return f"{width}x{height}"
+
+
+def file_name(name: str) -> str:
+    """A view's name without folders and ending."""
+    return str(Path(name).with_suffix("")).strip("./").replace("/", "-")
 
 
 def mean(values) -> float:

@@ -80,9 +80,9 @@ def hex_colour(text: str) -> Float[Tensor, " 3"]:
 
 @dataclass(frozen=True)
 class Row:
-    """A line of a contact sheet: pictures of one size, and what to say of them."""
+    """A line of a contact sheet: pictures of one size, and what to say of them all, or of each."""
 
-    label: str
+    label: str | Sequence[str]
     pictures: Sequence[Float[Tensor, "height width 3"]]
 
 
@@ -108,7 +108,8 @@ def contact_sheet(title: str, columns: Sequence[str], rows: Sequence[Row], cell:
     for row, images, height in zip(rows, shrunk, heights, strict=True):
         for i, image in enumerate(images):
             sheet.paste(image, (margin + i * (width + gap), y))
-        draw.text((margin, y + height + 2), row.label, ink, small)
+        for i, label in enumerate([row.label] if isinstance(row.label, str) else row.label):
+            draw.text((margin + i * (width + gap), y + height + 2), label, ink, small)
         y += height + line + gap
     return sheet
 

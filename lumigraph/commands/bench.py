@@ -1,30 +1,29 @@
-"""`lumigraph bench`: how fast the kernels are on this machine."""
+"""`lumigraph bench`: how fast kernels are, how good methods are, how many photographs they need."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
-from tyro.conf import Positional
+from tyro.conf import OmitArgPrefixes, OmitSubcommandPrefixes, subcommand
 
-from .common import choose_device, needed, option
+from .benches.kernels import Kernels
+from .benches.methods import Methods
+from .benches.views import Views
+
+# One line for each thing that can be measured; the files are in benches/.
+What = (
+    Annotated[Kernels, subcommand("kernels")]
+    | Annotated[Methods, subcommand("methods")]
+    | Annotated[Views, subcommand("views")]
+)
 
 
 @dataclass(frozen=True)
 class Bench:
-    """Measure every kernel's throughput on every engine, and its ratio to the reference in the same run."""
+    """Measure kernels on this machine, or methods on scenes."""
 
-    what: Annotated[Positional[Literal["kernels"]], needed("kernels")] = "kernels"
-    """What to measure."""
-
-    output: Annotated[Path | None, option("FILE.json", "the table alone")] = None
-    """Also write the figures there."""
-    device: Annotated[str, option("NAME")] = "auto"
-    """auto, cpu, cuda, cuda:1."""
+    what: OmitSubcommandPrefixes[OmitArgPrefixes[What]]
 
     def run(self) -> int:
-        from ..kernels.bench import bench_kernels
-
-        bench_kernels(device=choose_device(self.device), output=self.output)
-        return 0
+        return self.what.run()

@@ -93,7 +93,7 @@ def evaluate_run(
     lpips: Any = None,
 ) -> dict[str, Any]:
     """Evaluate a Run's Method on its Scene and write the files. Returns what eval.json says."""
-    from ..evaluate import evaluate
+    from ..evaluate import evaluate, file_name
     from ..figures import save_picture
     from ..files import write_json
 
@@ -120,8 +120,3 @@ def evaluate_run(
     save_picture(run.folder / f"{stem(split)}.png", evaluation.contact_sheet(title))
     write_json(run.folder / f"{stem(split)}.json", result)
     return result
-
-
-def file_name(name: str) -> str:
-    """A view's name without folders and ending."""
-    return str(Path(name).with_suffix("")).strip("./").replace("/", "-")

@@ -1,0 +1,143 @@
+"""A cell of a benchmark: one training and its evaluation, as commands that anybody could type."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from .. import files
+from ..errors import LumigraphError
+from ..run import Run
+from ..train import Budget
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What all cells of a benchmark share; the command line's options of the same names.
+
+    eval_views: held-out views that are compared; None for all
+    lpips:      files with the weights of LPIPS, if it is wanted
+    """
+
+    downscale: int | None = None
+    reader: str | None = None
+    preset: str = "auto"
+    device: str = "auto"
+    eval_views: int | None = None
+    lpips: tuple[Path, ...] = ()
+
+    def to_json(self) -> dict[str, Any]:
+        return asdict(self) | {"lpips": [path.name for path in self.lpips]}
+
+
+@dataclass(frozen=True)
+class Cell:
+    """A method, what it learns, and for how long: seconds or steps.
+
+    scene:  its short name, the same for all cells of the scene
+    source: where it is
+    views:  photographs to learn from; None for all
+    """
+
+    method: str
+    scene: str
+    source: str
+    budget: Budget
+    seed: int = 0
+    views: int | None = None
+
+    @property
+    def name(self) -> str:
+        """For folders: unique among cells that share their settings."""
+        long = f"{self.budget.seconds:g}s" if self.budget.seconds else f"{self.budget.steps}steps"
+        views = "" if self.views is None else f"-{self.views}views"
+        return f"{self.scene}-{self.method}{views}-{long}-seed{self.seed}"
+
+    @property
+    def title(self) -> str:
+        """For people."""
+        views = "" if self.views is None else f" from {self.views} views"
+        return f"{self.method} on {self.scene}{views}, {duration(self.budget)}, seed {self.seed}"
+
+
+def duration(budget: Budget) -> str:
+    return f"{budget.seconds:g} s" if budget.seconds else f"{budget.steps} steps"
+
+
+def training(cell: Cell, folder: Path, settings: Settings) -> list[str]:
+    """What one would type after `lumigraph` to train the cell, or to go on with it; nothing if it is trained."""
+    if (folder / "config.json").exists():
+        return [] if trained(folder) else ["resume", str(folder)]
+    return [*train_command(cell, settings), "--output", str(folder)]
+
+
+def train_command(cell: Cell, settings: Settings) -> list[str]:
+    told = {
+        "--seconds": cell.budget.seconds,
+        "--steps": cell.budget.steps,
+        "--seed": cell.seed,
+        "--views": cell.views,
+        "--downscale": settings.downscale,
+        "--reader": settings.reader,
+        "--preset": settings.preset,
+        "--device": settings.device,
+    }
+    return ["train", cell.method, cell.source, *options(told)]
+
+
+def evaluation(cell: Cell, folder: Path, settings: Settings) -> list[str]:
+    """What one would type after `lumigraph` to compare the cell's held-out views; nothing if that is done."""
+    if evaluated(folder, settings):
+        return []
+    weights = ["--lpips", *map(str, settings.lpips)] if settings.lpips else []
+    told = {"--views": settings.eval_views, "--device": settings.device}
+    return ["eval", str(folder), "--save-images", *options(told), *weights]
+
+
+def options(told: dict[str, Any]) -> list[str]:
+    return [word for name, value in told.items() if value is not None for word in (name, str(value))]
+
+
+def trained(folder: Path) -> bool:
+    """Whether a run has spent its budget."""
+    run = Run(folder)
+    return (
+        run.has_state
+        and Budget(**{"steps": None, "seconds": None} | run.config["budget"]).progress(
+            run.state.step, run.state.seconds
+        )
+        >= 1
+    )
+
+
+def evaluated(folder: Path, settings: Settings) -> bool:
+    """Whether a run's latest state has been compared as the settings want it."""
+    run = Run(folder)
+    result = run.evaluation()
+    if result is None or result["steps"] != run.state.step or not (folder / "eval").is_dir():
+        return False
+    protocol = result["protocol"]
+    wanted = min(settings.eval_views or protocol["of"], protocol["of"])
+    return protocol["views"] == wanted and (result["lpips"] is not None or not settings.lpips)
+
+
+def claim(output: Path, cells: Sequence[Cell], settings: Settings) -> None:
+    """Note in the output's folder what its cells share. Raises LumigraphError if they shared something else so far."""
+    path = output / "settings.json"
+    shared = {name: getattr(settings, name) for name in ("downscale", "reader", "preset", "device")}
+    known = files.read_json(path) if path.exists() else {"settings": shared, "scenes": {}}
+    for name, value in shared.items():
+        if known["settings"][name] != value:
+            raise LumigraphError(
+                f"{output} was begun with --{name} {known['settings'][name]}, which is now {value}; "
+                "choose another --output"
+            )
+    for cell in cells:
+        if known["scenes"].setdefault(cell.scene, cell.source) != cell.source:
+            raise LumigraphError(
+                f"Two scenes are called {cell.scene}: {known['scenes'][cell.scene]} and {cell.source}; "
+                "rename a folder, or choose another --output"
+            )
+    files.write_json(path, known)

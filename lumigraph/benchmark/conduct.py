@@ -1,0 +1,88 @@
+"""From cells to results: what is still to be done about each, in a process of its own, and the table after each."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+from .. import files
+from ..display import clock
+from ..errors import LumigraphError
+from .cell import Cell, Settings, claim, evaluation, training
+from .launch import STOPPED, Launch, launch, reason
+from .pictures import draw_charts, draw_views
+from .results import read_rows, row_of
+from .table import markdown
+
+
+def conduct(
+    cells: Sequence[Cell],
+    settings: Settings,
+    output: Path,
+    tell: Callable[[str], object] = print,
+    launch: Launch = launch,
+) -> int:
+    """Train and evaluate all cells, and write results.json, results.md and pictures to `output`.
+
+    Cells that are done are kept, half-trained ones go on, failed ones are tried again. A cell that fails is a row that
+    says why. tell: hears which cell is next. Returns the signal's exit code if one stopped it, otherwise 0.
+    """
+    claim(output, cells, settings)
+    rows, patience = read_rows(output), Patience()
+    for number, cell in enumerate(cells, 1):
+        todo = [one for one in cells[number - 1 :] if unfinished(one, output, settings)]
+        if cell in todo:
+            tell(f"{number} of {len(cells)}: {cell.title}; {patience.left(todo)}")
+        begin, (code, failure) = time.monotonic(), carry_out(cell, output, settings, launch)
+        if code in STOPPED:
+            return code
+        if cell in todo and not failure:
+            patience.note(cell, time.monotonic() - begin)
+        if failure:
+            tell(f"{cell.title} failed: {failure}")
+        rows[f"runs/{cell.name}"] = row_of(cell, output, settings, failure)
+        found = list(rows.values())
+        files.write_json(output / "results.json", {"settings": settings.to_json(), "cells": found})
+        files.write_bytes(output / "results.md", markdown(found, draw_charts(found, output)).encode())
+    found = list(rows.values())
+    pictures = draw_charts(found, output) + draw_views(found, output)
+    files.write_bytes(output / "results.md", markdown(found, pictures).encode())
+    return 0
+
+
+def carry_out(cell: Cell, output: Path, settings: Settings, launch: Launch) -> tuple[int, str | None]:
+    """Do what is still to be done about a cell. Returns the last exit code, and why it failed if it did."""
+    folder, log = output / "runs" / cell.name, output / "runs" / f"{cell.name}.log"
+    for task in (training, evaluation):
+        try:
+            command = task(cell, folder, settings)
+        except LumigraphError as fault:
+            return 2, str(fault)
+        code = launch(command, log) if command else 0
+        if code:
+            return code, reason(log, code)
+    return 0, None
+
+
+def unfinished(cell: Cell, output: Path, settings: Settings) -> bool:
+    folder = output / "runs" / cell.name
+    try:
+        return bool(training(cell, folder, settings) or evaluation(cell, folder, settings))
+    except LumigraphError:  # a damaged run, which the cell's row will tell
+        return True
+
+
+class Patience:
+    """How long the rest will take, by what cells have needed beside their seconds of training so far."""
+
+    def __init__(self) -> None:
+        self.needed: list[float] = []
+
+    def note(self, cell: Cell, seconds: float) -> None:
+        self.needed.append(seconds - (cell.budget.seconds or 0))
+
+    def left(self, todo: Sequence[Cell]) -> str:
+        beside = sum(self.needed) / len(self.needed) if self.needed else 0.0
+        seconds = sum((cell.budget.seconds or 0) + beside for cell in todo)
+        return f"{'about' if self.needed else 'at least'} {clock(max(seconds, 0))} left"

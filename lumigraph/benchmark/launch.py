@@ -1,0 +1,58 @@
+"""Commands in processes of their own, so that their memory is theirs alone and a fault of one is not another's."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+from .. import files
+from ..train import Interrupt
+
+Launch = Callable[[Sequence[str], Path], int]
+STOPPED = (130, 143)  # after Ctrl-C and SIGTERM
+LOOKS = 0.2  # seconds between looks at whether to stop
+
+
+def launch(arguments: Sequence[str], log: Path) -> int:
+    """Run `lumigraph ARGUMENTS`, with all that it says added to a log. Returns its exit code, as shells count.
+
+    Ctrl-C and SIGTERM are passed on, and the command may end as it does by itself: with its state saved. It lives in a
+    session of its own, because a terminal would send it Ctrl-C a second time.
+    """
+    with files.explained(log):
+        log.parent.mkdir(parents=True, exist_ok=True)
+        out = open(log, "ab")
+    with out, Interrupt() as interrupt:
+        out.write(f"$ lumigraph {' '.join(arguments)}\n".encode())
+        out.flush()
+        command = [sys.executable, "-m", "lumigraph", *arguments]
+        process = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=out, stderr=out, start_new_session=True)
+        passed_on = False
+        try:
+            while (code := ended(process)) is None:
+                if interrupt.signal and not passed_on:
+                    process.send_signal(interrupt.signal)
+                    passed_on = True
+        finally:
+            if process.poll() is None:  # a second Ctrl-C
+                process.kill()
+                process.wait()
+    return code if code >= 0 else 128 - code
+
+
+def ended(process: subprocess.Popen[bytes]) -> int | None:
+    """The exit code; None if the process has not ended after a moment."""
+    try:
+        return process.wait(LOOKS)
+    except subprocess.TimeoutExpired:
+        return None
+
+
+def reason(log: Path, code: int) -> str:
+    """Why a command failed: the sentence it said last."""
+    if code > 128:
+        return f"ended by signal {code - 128}" + (", perhaps because memory was short" if code == 137 else "")
+    lines = [line for line in log.read_text("utf-8", errors="replace").splitlines() if line.strip()]
+    return lines[-1].removeprefix("lumigraph: ") if lines else f"exit code {code}"

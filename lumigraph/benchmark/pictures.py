@@ -1,0 +1,110 @@
+"""A benchmark as pictures: PSNR over time, PSNR over views, and one held-out view as every method shows it."""
+
+from __future__ import annotations
+
+import statistics
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from PIL import Image
+from torch import Tensor
+
+from .. import files
+from ..charts import Series, line_chart, standalone
+from ..evaluate import file_name, on_background
+from ..figures import Row as Line
+from ..figures import contact_sheet, save_picture
+from ..run import Run
+from .results import Row
+from .table import protocol, trained_for
+
+SHEET = "views.png"
+
+
+def draw_charts(rows: Sequence[Row], output: Path) -> list[str]:
+    """Draw what the rows have at least two points of. Returns the names of the files."""
+    measured, drawn = [row for row in rows if not row["failed"]], []
+    for scene in sorted({row["scene"] for row in measured}):
+        of_scene = [row for row in measured if row["scene"] == scene]
+        over_time = curves([row for row in of_scene if row["views"] is None], "training_seconds", budget)
+        over_views = curves(of_scene, "train_views", lambda row: row["train_views"], per=trained_for)
+        for name, series, label in (
+            ("time", over_time, "seconds of training"),
+            ("views", over_views, "photographs to learn from"),
+        ):
+            if not any(len(one.x) > 1 for one in series):
+                continue
+            chart = line_chart(
+                series,
+                label,
+                "held-out PSNR, dB",
+                log_x=True,
+                marks=True,
+                smoothed=False,
+                note=f"{scene}: {protocol(of_scene[0])}",
+            )
+            drawn.append(f"{scene}-psnr-over-{name}.svg")
+            files.write_bytes(output / drawn[-1], standalone(chart))
+    return drawn
+
+
+def curves(
+    rows: Sequence[Row], x: str, point: Callable[[Row], Any], per: Callable[[Row], Any] = lambda row: ""
+) -> list[Series]:
+    """PSNR over x, a curve for each method. Cells that differ in their seeds alone are one point: their means.
+
+    point: what cells of one point have in common;  per: what else tells curves apart
+    """
+    groups: dict[tuple[str, Any], dict[Any, list[Row]]] = {}
+    for row in rows:
+        groups.setdefault((row["method"], per(row)), {}).setdefault(point(row), []).append(row)
+    several = len({other for _, other in groups}) > 1
+    series = []
+    for (method, other), points in sorted(groups.items()):
+        found = sorted(
+            (statistics.fmean(row[x] for row in cells), statistics.fmean(row["psnr"] for row in cells))
+            for cells in points.values()
+        )
+        name = f"{method}, {other}" if several else method
+        series.append(Series(name, [at for at, _ in found], [psnr for _, psnr in found]))
+    return series
+
+
+def budget(row: Row) -> tuple[tuple[str, float], ...]:
+    return tuple(row["budget"].items())
+
+
+def draw_views(rows: Sequence[Row], output: Path) -> list[str]:
+    """One held-out view of each scene as its photograph and as every method shows it, after its longest training."""
+    best: dict[tuple[str, int], dict[str, Row]] = {}
+    for row in sorted(
+        (row for row in rows if not row["failed"]), key=lambda row: (*row["budget"].values(), -row["seed"])
+    ):
+        best.setdefault((row["scene"], row["train_views"]), {})[row["method"]] = row
+    methods = sorted({method for cells in best.values() for method in cells})
+    lines = []
+    for (scene, views), cells in sorted(best.items()):
+        truth = photograph(next(iter(cells.values())), output)
+        seen = [rendering(cells[method], output) if method in cells else torch.ones_like(truth) for method in methods]
+        scores = [f"{cells[method]['shown']['psnr']:.2f} dB" if method in cells else "" for method in methods]
+        lines.append(Line([f"{scene}, {views} views", *scores], [truth, *seen]))
+    if not lines:
+        return []
+    save_picture(output / SHEET, contact_sheet("Held-out views", ["photograph", *methods], lines))
+    return [SHEET]
+
+
+def photograph(row: Row, output: Path) -> Float[Tensor, "height width 3"]:
+    scene = Run(output / row["run"]).scene()
+    _, image = scene.view(scene.names.index(row["shown"]["name"]))
+    return on_background(image, scene.frame.background)
+
+
+def rendering(row: Row, output: Path) -> Float[Tensor, "height width 3"]:
+    """As the evaluation kept it."""
+    path = output / row["run"] / "eval" / f"{file_name(row['shown']['name'])}.png"
+    return torch.from_numpy(np.array(Image.open(path).convert("RGB"))).float() / 255

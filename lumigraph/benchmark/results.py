@@ -1,0 +1,70 @@
+"""What came of a cell, in one row; and all rows of a benchmark in a file."""
+
+from __future__ import annotations
+
+import shlex
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from .. import files
+from ..run import Run
+from .cell import Cell, Settings, train_command
+from .published import published
+
+Row = dict[str, Any]
+MEASURED = (
+    "psnr",
+    "ssim",
+    "lpips",
+    "steps",
+    "training_seconds",
+    "compile_seconds",
+    "peak_memory",
+    "seconds_per_view",
+    "protocol",
+    "trained_on",
+    "evaluated_on",
+    "versions",
+)
+
+
+def row_of(cell: Cell, output: Path, settings: Settings, failure: str | None) -> Row:
+    """A cell's figures out of its run's folder, under the names that eval.json has for them; or why there are none."""
+    folder = output / "runs" / cell.name
+    row: Row = {
+        "method": cell.method,
+        "scene": cell.scene,
+        "views": cell.views,
+        "budget": {name: value for name, value in asdict(cell.budget).items() if value is not None},
+        "seed": cell.seed,
+        "command": shlex.join(["lumigraph", *train_command(cell, settings)]),
+        "run": f"runs/{cell.name}",
+        "failed": failure,
+    }
+    if failure:
+        return row
+    run = Run(folder)
+    result = run.evaluation() or {}
+    figure = published(cell.method, cell.scene) if cell.views is None else None
+    row |= {name: result[name] for name in MEASURED}
+    row |= {
+        "train_views": run.config["splits"]["train"],
+        "model_bytes": model_bytes(run),
+        "shown": result["views"][len(result["views"]) // 2],
+        "published": figure and asdict(figure),
+    }
+    if "by_resolution" in result:
+        row["by_resolution"] = result["by_resolution"]
+    return row
+
+
+def model_bytes(run: Run) -> int:
+    """Size of the trained weights, which are all that rendering needs."""
+    return (run.folder / "checkpoints" / f"{run.state.step:06d}" / "weights.safetensors").stat().st_size
+
+
+def read_rows(output: Path) -> dict[str, Row]:
+    """The rows so far by their runs, earlier commands' among them."""
+    path = output / "results.json"
+    return {row["run"]: row for row in files.read_json(path)["cells"]} if path.exists() else {}

@@ -1,0 +1,85 @@
+"""What benchmarks that train have in common."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+from ... import methods
+from ...errors import LumigraphError
+from ..capture import posed
+from ..common import Reader, choose_device, needed, option, say, scene_name, show
+from ..train import DEFAULT_SECONDS
+
+
+@dataclass(frozen=True, kw_only=True)
+class Cells:
+    """Options of benchmarks that train methods and compare them."""
+
+    methods: Annotated[tuple[str, ...], needed("METHOD ...")]
+    """What to train, for example instant-ngp gaussian-splatting."""
+    scenes: Annotated[tuple[str, ...], needed("SCENE ...")]
+    """What to train it on, as for `lumigraph train`."""
+    output: Annotated[Path, needed("OUTPUT")]
+    """Folder for runs, table and charts."""
+    seeds: Annotated[tuple[int, ...], option("N")] = (0,)
+    """Of all random choices; several make means with deviations."""
+    eval_views: Annotated[int | None, option("N", "all")] = None
+    """Compare so many held-out views only, evenly spread."""
+    lpips: Annotated[tuple[Path, ...], option("FILE", "those in LUMIGRAPH_LPIPS, if any")] = ()
+    """Files with the weights of LPIPS, as for `lumigraph eval`."""
+    downscale: Annotated[int | None, option("N", "none, or what suits the photographs")] = None
+    """Shrink photographs by a whole number."""
+    reader: Annotated[Reader | None, option("NAME", "found by looking into the folder")] = None
+    """Layout of the folders: transforms, blender, colmap or llff."""
+    device: Annotated[str, option("NAME")] = "auto"
+    """auto, cpu, cuda, cuda:1."""
+    preset: Literal["auto", "laptop", "paper"] = "auto"
+    """The methods' own defaults: their papers', or what learns most on a plain CPU; auto looks at --device."""
+
+    def conduct(
+        self,
+        seconds: Sequence[float],
+        steps: Sequence[int],
+        views: Callable[[str], list[int | None]],
+    ) -> int:
+        """Train and compare everything with everything. views: numbers of photographs by the scene's source."""
+        from ...benchmark.cell import Cell, Settings
+        from ...benchmark.conduct import conduct
+        from ...lpips import load_lpips, named_files
+        from ...train import Budget
+
+        if seconds and steps:
+            raise LumigraphError("--steps and --seconds are two ways to say how long; give one of them")
+        budgets = [Budget(n, None) for n in steps] or [Budget(None, s) for s in seconds or (DEFAULT_SECONDS,)]
+        names = [methods.check(name) for name in self.methods]
+        choose_device(self.device)
+        weights = tuple(path.resolve() for path in named_files(self.lpips))
+        if weights:
+            load_lpips(weights)  # refuses what is wrong, before anything is trained
+        if self.eval_views is not None and self.eval_views < 1:
+            raise LumigraphError(f"{self.eval_views} views cannot be compared; give --eval-views a number above 0")
+        settings = Settings(self.downscale, self.reader, self.preset, self.device, self.eval_views, weights)
+        sources = [located(posed(scene)) for scene in self.scenes]
+        cells = [
+            Cell(name, scene_name(source), source, budget, seed, number)
+            for source in sources
+            for number in views(source)
+            for budget in budgets
+            for seed in self.seeds
+            for name in names
+        ]
+        code = conduct(cells, settings, self.output, say)
+        if code:
+            say("Stopped; what is done is kept, and the same command goes on")
+            return code
+        show({"table": str(self.output / "results.md"), "figures": str(self.output / "results.json")})
+        return 0
+
+
+def located(source: str) -> str:
+    """A source that means the same in every folder."""
+    path = Path(source).expanduser()
+    return str(path.resolve()) if path.exists() else source

@@ -1,0 +1,25 @@
+"""`lumigraph bench kernels`: how fast the kernels are on this machine."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+from ..common import choose_device, option
+
+
+@dataclass(frozen=True)
+class Kernels:
+    """Measure every kernel's throughput on every engine, and its ratio to the reference in the same run."""
+
+    output: Annotated[Path | None, option("FILE.json", "the table alone")] = None
+    """Also write the figures there."""
+    device: Annotated[str, option("NAME")] = "auto"
+    """auto, cpu, cuda, cuda:1."""
+
+    def run(self) -> int:
+        from ...kernels.bench import bench_kernels
+
+        bench_kernels(device=choose_device(self.device), output=self.output)
+        return 0

@@ -1,0 +1,27 @@
+"""`lumigraph bench methods`: methods side by side on the same scenes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Annotated
+
+from ..common import option
+from .cells import Cells
+
+
+@dataclass(frozen=True, kw_only=True)
+class Methods(Cells):
+    """Train methods on scenes, for several durations and from several seeds, and compare held-out views.
+
+    Every cell is a run of its own in OUTPUT/runs, trained by `lumigraph train` and compared by `lumigraph eval` in
+    processes of their own. OUTPUT/results.md has the table, results.json all figures; charts show PSNR over time.
+    Ctrl-C stops; the same command goes on.
+    """
+
+    seconds: Annotated[tuple[float, ...], option("S", "60")] = ()
+    """Train for so long; several make a chart."""
+    steps: Annotated[tuple[int, ...], option("N", "as long as --seconds")] = ()
+    """Train for so many steps instead."""
+
+    def run(self) -> int:
+        return self.conduct(self.seconds, self.steps, lambda source: [None])
