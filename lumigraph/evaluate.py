@@ -186,7 +186,7 @@ def on_background(
 
 def protocol(scene: Scene, split: str, compared: list[int], lpips: Lpips | None = None) -> dict[str, Any]:
     """All that one must know to compare these figures with others."""
-    sizes = sorted({resolution(*size) for size in scene.cameras.size[compared].tolist()})
+    sizes = list(dict.fromkeys(resolution(*size) for size in scene.cameras.size[compared].tolist()))
     return {
         "split": split,
         "views": len(compared),

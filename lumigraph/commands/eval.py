@@ -53,7 +53,7 @@ class Eval:
         show(
             rows
             | {
-                "views": f"{counted_views(protocol)}, {protocol['resolution']}",
+                "views": f"{counted_views(protocol)}, {resolutions(protocol)}",
                 "rendering": f"{result['seconds_per_view']:.3f} s per view",
                 "files": f"{run.folder / self.stem}.json, {run.folder / self.stem}.png",
             }
@@ -81,6 +81,11 @@ def counted_views(protocol: dict[str, Any]) -> str:
     """How many views were compared, of how many."""
     views, there = protocol["views"], protocol["of"]
     return f"{views} of {protocol['split']}" if views == there else f"{views} of {there} of {protocol['split']}"
+
+
+def resolutions(protocol: dict[str, Any]) -> str:
+    sizes = protocol["resolution"]
+    return sizes if isinstance(sizes, str) else ", ".join(sizes)
 
 
 def evaluate_run(
