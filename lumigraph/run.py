@@ -162,6 +162,12 @@ class Run:
         with understood(self.folder / "cameras.json"):
             return cameras_from_json(files.read_json(self.folder / "cameras.json"))
 
+    def view_names(self) -> dict[str, list[str]]:
+        """What the photographs are called, by split, in the order of `cameras`."""
+        with understood(self.folder / "cameras.json"):
+            data = files.read_json(self.folder / "cameras.json")
+            return {split: [data["names"][i] for i in index] for split, index in data["splits"].items()}
+
     # Its state
 
     @property

@@ -8,9 +8,10 @@ from typing import Annotated
 from tyro.conf import OmitArgPrefixes, OmitSubcommandPrefixes, subcommand
 
 from .explains.encodings import Encodings
+from .explains.ray import Ray
 
 # One line for each thing that can be explained; the files are in explains/.
-What = Annotated[Encodings, subcommand("encodings")]
+What = Annotated[Encodings, subcommand("encodings")] | Annotated[Ray, subcommand("ray")]
 
 
 @dataclass(frozen=True)

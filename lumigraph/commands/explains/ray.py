@@ -1,0 +1,87 @@
+"""`lumigraph explain ray`: what a method finds along one ray."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from tyro.conf import Positional
+
+from ...errors import LumigraphError
+from ..common import choose_device, needed, option, say, show
+
+
+@dataclass(frozen=True)
+class Ray:
+    """Draw density, transmittance, weights and samples along the ray of a pixel, and the colour that they build up.
+
+    One figure, which opens in a browser; its numbers lie beside it as JSON. The photograph's own colour is drawn where
+    the photographs are at hand.
+    """
+
+    run_folder: Annotated[Positional[Path], needed("RUN")]
+    """Folder of the run."""
+    pixel: Annotated[tuple[int, int] | None, option("X Y", "the middle of the picture")] = None
+    """Column and row, from 0 0 at the upper left."""
+    view: Annotated[str, option("NAME_OR_NUMBER")] = "0"
+    """Which photograph of the split: its name, or its number from 0."""
+    split: Literal["test", "val", "train"] = "test"
+    """Which photographs."""
+    output: Annotated[Path | None, option("FILE.svg", "RUN/rays/VIEW-X-Y.svg")] = None
+    """The figure."""
+    scene: Annotated[str | None, option("SCENE", "where they were")] = None
+    """Where the photographs are now, if they have moved."""
+    device: Annotated[str, option("NAME")] = "auto"
+    """auto, cpu, cuda, cuda:1."""
+
+    def run(self) -> int:
+        if self.output and self.output.suffix != ".svg":
+            raise LumigraphError(f"{self.output} does not say that it is a figure; give --output a name ending in .svg")
+        from ...charts import standalone
+        from ...evaluate import file_name
+        from ...explain.ray import along_ray
+        from ...explain.ray_figure import ray_figure
+        from ...files import write_bytes, write_json
+        from ...run import Run
+
+        run = Run(self.run_folder)
+        method = run.method(choose_device(self.device))
+        name, camera = find_view(run, self.split, self.view)
+        x, y = pixel = self.pixel or tuple((camera.size[0] // 2).tolist())
+        sight = along_ray(method, camera, pixel)
+        sight = sight.beside(self._photograph(run, camera))
+        output = self.output or run.folder / "rays" / f"{file_name(name)}-{x}-{y}.svg"
+        title = f"{run.method_name}: pixel ({x}, {y}) of {name}"
+        write_bytes(output, standalone(ray_figure(sight, title)))
+        about = {"run": str(run.folder), "method": run.method_name, "view": name, "split": self.split}
+        write_json(output.with_suffix(".json"), about | sight.to_json())
+        show(sight.rows() | {"files": f"{output}, {output.with_suffix('.json')}"})
+        return 0
+
+    def _photograph(self, run: Any, camera: Any) -> Any:
+        """The camera's photograph before the run's background, or None if it is gone and nobody said where to."""
+        from ...evaluate import on_background
+
+        try:
+            _, image = run.scene(self.scene).view(int(camera.image_index))
+        except LumigraphError as error:
+            if self.scene:
+                raise
+            say(f"The figure does without the photograph: {error}")
+            return None
+        return on_background(image, run.frame.background)
+
+
+def find_view(run: Any, split: str, view: str) -> tuple[str, Any]:
+    """Name and Camera of a photograph, by its name or number in a split of a Run. LumigraphError if there is none."""
+    names = run.view_names().get(split, [])
+    if not names:
+        raise LumigraphError(f"{run.folder} has no views in the split {split!r}; choose another --split")
+    number = names.index(view) if view in names else int(view) if view.isdecimal() else len(names)
+    if number >= len(names):
+        raise LumigraphError(
+            f"There is no view {view!r} in the split {split!r} of {run.folder}; give --view a number from 0 to "
+            f"{len(names) - 1}, or a name such as {names[0]}"
+        )
+    return names[number], run.cameras()[split][number]

@@ -1,0 +1,156 @@
+"""One ray: what a method finds along it, and how the colour of a pixel comes of that."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from ..camera import Camera
+from ..errors import LumigraphError
+from ..method import Method, RayMethod
+from ..rays import Look
+from ..volume import composite, weights_of
+
+SEEN = 1e-3  # weight from which on a sample shows in a picture of 256 levels
+INSET = 400  # pixels of the small picture's longer side, at most
+
+
+@dataclass(frozen=True)
+class Pass:
+    """One look along the ray, in the notation of Mildenhall 2020, eq. 3.
+
+    start, end:    of each sample, in scene units from the camera
+    density:       sigma_i, per scene unit
+    rgb:           c_i, sRGB-encoded
+    weight:        w_i = T_i (1 - exp(-sigma_i delta_i))
+    transmittance: T_i, of the light in front of each sample, and behind the last
+    so_far:        sum_{j<i} w_j c_j + T_i background: the colour, had the ray ended in front of each sample; and behind
+                   the last, the pixel's own
+    """
+
+    name: str
+    start: Float[Tensor, " sample"]
+    end: Float[Tensor, " sample"]
+    density: Float[Tensor, " sample"]
+    rgb: Float[Tensor, "sample 3"]
+    weight: Float[Tensor, " sample"]
+    transmittance: Float[Tensor, " sample_plus_one"]
+    so_far: Float[Tensor, "sample_plus_one 3"]
+
+    @staticmethod
+    def of(look: Look, background: Float[Tensor, " 3"]) -> Pass:
+        tau, weight = look.density * look.samples.length, weights_of(look.samples, look.density)
+        T = torch.exp(-torch.nn.functional.pad(tau.cumsum(0), (1, 0)))
+        colour = torch.nn.functional.pad((weight[:, None] * look.rgb).cumsum(0), (0, 0, 1, 0))
+        columns = look.samples.t_start, look.samples.t_end, look.density, look.rgb, weight, T
+        return Pass(look.name, *(x.cpu() for x in (*columns, colour + T[:, None] * background)))
+
+    def __len__(self) -> int:
+        return len(self.weight)
+
+    def to_json(self) -> dict[str, Any]:
+        names = ("start", "end", "density", "rgb", "weight", "transmittance", "so_far")
+        return {"name": self.name, **{name: getattr(self, name).tolist() for name in names}}
+
+
+@dataclass(frozen=True)
+class Sight:
+    """A pixel (column, row) of a picture, and all that was found along its ray.
+
+    passes:     the one that is composited into the picture last
+    rgb:        what they make of the pixel, the background behind it
+    depth:      expected distance, in scene units; infinity where nothing is
+    opacity:    share of light that the scene stops
+    picture:    what the camera sees, made small
+    photograph: the pixel as it was photographed, where that is known
+    """
+
+    camera: Camera
+    pixel: tuple[int, int]
+    passes: list[Pass]
+    rgb: Float[Tensor, " 3"]
+    depth: float
+    opacity: float
+    picture: Float[Tensor, "height width 3"]
+    photograph: Float[Tensor, " 3"] | None = None
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height of the whole picture."""
+        width, height = self.camera.size[0].tolist()
+        return width, height
+
+    def beside(self, photograph: Float[Tensor, "height width 3"] | None) -> Sight:
+        """The same with what the photograph shows at the pixel."""
+        x, y = self.pixel
+        return self if photograph is None else replace(self, photograph=photograph[y, x])
+
+    def rows(self) -> dict[str, str]:
+        """The figures worth a line, by name."""
+        last, counts = self.passes[-1], ", ".join(f"{len(each)} {each.name}" for each in self.passes)
+        found = {"pixel": triple(self.rgb)}
+        if self.photograph is not None:
+            found["photograph"] = triple(self.photograph)
+        return found | {
+            "opacity": f"{self.opacity:.4f}",
+            "depth": f"{self.depth:.4g} scene units, expected" if self.depth < float("inf") else "none",
+            "samples": f"{counts}; {int((last.weight > SEEN).sum())} with a weight above {SEEN:g}",
+        }
+
+    def to_json(self) -> dict[str, Any]:
+        return {
+            "pixel": self.pixel,
+            "size": self.size,
+            "rgb": self.rgb.tolist(),
+            "photograph": None if self.photograph is None else self.photograph.tolist(),
+            "depth": self.depth if self.depth < float("inf") else None,
+            "opacity": self.opacity,
+            "passes": [each.to_json() for each in self.passes],
+        }
+
+
+def triple(rgb: Float[Tensor, " 3"]) -> str:
+    return " ".join(f"{value:.3f}" for value in rgb.tolist())
+
+
+@torch.no_grad()
+def along_ray(method: Method, camera: Camera, pixel: tuple[int, int]) -> Sight:
+    """What a method in eval mode finds along the ray through the middle of a camera's pixel (column, row).
+
+    Raises LumigraphError if the method does not march along rays, the pixel lies outside the picture, or there are no
+    samples on its ray.
+    """
+    if not isinstance(method, RayMethod):
+        raise LumigraphError(
+            f"{type(method).__name__} takes no samples along rays, so there is nothing to draw of one; "
+            f"choose a run of a method that does, such as instant-ngp"
+        )
+    width, height = camera.size[0].tolist()
+    x, y = pixel
+    if not (0 <= x < width and 0 <= y < height):
+        raise LumigraphError(
+            f"Pixel ({x}, {y}) lies outside of the picture; give --pixel from 0 0 to {width - 1} {height - 1}"
+        )
+    rays = camera.rays(torch.tensor([[x + 0.5, y + 0.5]])).to(method.device)
+    background = torch.tensor(method.frame.background, device=method.device)
+    looks = method.looks(rays)
+    last = looks[-1]
+    if not len(last.samples):
+        raise LumigraphError(
+            f"No sample is taken along the ray of pixel ({x}, {y}), so there is only background to see; "
+            f"choose another --pixel"
+        )
+    seen = composite(last.samples, last.density, last.rgb, background[None])
+    return Sight(
+        camera,
+        pixel,
+        [Pass.of(look, background) for look in looks if len(look.samples)],
+        seen.rgb[0].cpu(),
+        float(seen.depth),
+        float(seen.opacity),
+        method.render(camera.resized(min(1.0, INSET / max(width, height)))).rgb.cpu(),
+    )
