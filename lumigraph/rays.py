@@ -42,7 +42,10 @@ class Rays:
         return self.origins + t[:, None] * self.directions
 
     def through_box(self, box: Float[Tensor, "2 3"]) -> tuple[Float[Tensor, " ray"], Float[Tensor, " ray"]]:
-        """Distances at which each ray enters and leaves a box; it leaves before it enters where it misses."""
+        """Distances at which each ray enters and leaves a box (the slab test of Kay & Kajiya 1986).
+
+        It leaves before it enters where it misses.
+        """
         slow = self.directions.abs() < 1e-9
         inverse = 1 / torch.where(slow, 1e-9, self.directions)
         a, b = (box[0] - self.origins) * inverse, (box[1] - self.origins) * inverse
@@ -82,6 +85,13 @@ class Samples:
         counts = self.ray_starts.diff()
         rays = torch.arange(len(counts), device=counts.device)
         return torch.repeat_interleave(rays, counts, output_size=len(self))
+
+    @staticmethod
+    def rows(t: Float[Tensor, "ray count"], end: Float[Tensor, " ray"]) -> Samples:
+        """As many samples on each ray, each from one distance to the next, the last one to `end`."""
+        ends = torch.cat([t[:, 1:], end[:, None]], -1)
+        starts = torch.arange(len(t) + 1, device=t.device) * t.shape[1]
+        return Samples(t.flatten(), ends.flatten(), starts)
 
     def keep(self, mask: Bool[Tensor, " sample"]) -> Samples:
         """The samples that a mask picks, still packed by ray."""

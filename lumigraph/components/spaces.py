@@ -15,7 +15,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from ..rays import Rays
+from ..rays import Rays, Samples
 from ..scene import Forward, Frame, Vector
 
 INFINITY = 1000.0  # times the near plane's distance: rays in normalised device coordinates end at 0.998 instead of 1
@@ -27,7 +27,7 @@ def space_of(frame: Frame) -> Space:
     if frame.reach <= 1:
         return Box(frame.bounds, frame.near)
     if frame.forward is not None:
-        return NDC(frame.forward)
+        return NDC(frame.forward, frame.near)
     return Contraction(frame.near, 2 * math.sqrt(3) * frame.reach)
 
 
@@ -58,6 +58,14 @@ class Space(ABC):
     @abstractmethod
     def stretch(self, points: Float[Tensor, "n 3"]) -> Float[Tensor, " n"]:
         """|det J|^(1/3): the length in coordinates of a unit of the scene, whatever its direction."""
+
+    def along(self, rays: Rays, samples: Samples) -> Float[Tensor, " sample"]:
+        """Coordinates that a ray passes for a unit of the scene, on average over each sample."""
+        ray = samples.ray_index
+        first, last = (
+            self.warp(rays.origins[ray] + t[:, None] * rays.directions[ray]) for t in (samples.t_start, samples.t_end)
+        )
+        return (last - first).norm(dim=-1) / samples.length.clamp_min(1e-9)
 
     def warp_gaussians(
         self,
@@ -102,21 +110,25 @@ class Box(Space):
     def stretch(self, points):
         return points.new_ones(len(points))
 
+    def along(self, rays, samples):
+        return torch.ones_like(samples.t_start)
+
 
 @dataclass(frozen=True)
 class NDC(Space):
     """Normalised device coordinates of the mean camera: (s_x x / z, s_y y / z, 1 - 2 n / z), n the near plane.
 
     Mildenhall 2020, appendix C, which looks along -z where we look along +z. The frustum beyond the near plane becomes
-    a cube, and lines stay lines. Samples are even in the paper's t', from the near plane, or the camera if it stands
-    beyond, to nearly infinity. What lies before the near plane is taken for what is on it.
+    a cube, and lines stay lines. Samples are even in the paper's t', from the near plane, or from the frame's near
+    distance where a camera stands beyond, to nearly infinity. What lies before the plane is taken for what is on it.
     """
 
     forward: Forward
+    near: float
 
     def interval(self, rays):
         z, speed = self._depths(rays)
-        near = ((self.forward.near - z) / speed).clamp_min(0)
+        near = ((self.forward.near - z) / speed).clamp_min(self.near)
         far = (INFINITY * self.forward.near - z) / speed
         reaches = (rays.directions @ self._pose(rays.origins)[:, 2] > SIDEWAYS) & (far > near)
         return torch.where(reaches, near, 0), torch.where(reaches, far, 0)

@@ -36,12 +36,9 @@ class Box:
         return ((points >= lower - margin) & (points <= upper + margin)).all(-1)
 
     def entered(self, rays: Rays) -> tuple[Float[Tensor, " ray"], Bool[Tensor, " ray"]]:
-        """Distance at which each ray is first inside, 0 for one that begins inside, and whether it ever is
-        (the slab test of Kay & Kajiya 1986)."""
-        lower, upper = torch.tensor(self.lower).to(rays.origins), torch.tensor(self.upper).to(rays.origins)
-        direction = torch.where(rays.directions.abs() < 1e-9, 1e-9, rays.directions)
-        a, b = (lower - rays.origins) / direction, (upper - rays.origins) / direction
-        enter, leave = torch.minimum(a, b).amax(-1).clamp_min(0), torch.maximum(a, b).amin(-1)
+        """Distance at which each ray is first inside, 0 for one that begins inside, and whether it ever is."""
+        enter, leave = rays.through_box(rays.origins.new_tensor((self.lower, self.upper)))
+        enter = enter.clamp_min(0)
         return enter, enter < leave
 
     def cropped(self, cloud: Gaussians) -> Gaussians:
