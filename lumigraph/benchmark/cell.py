@@ -97,7 +97,9 @@ def evaluation(cell: Cell, folder: Path, settings: Settings) -> list[str]:
 
 
 def options(told: dict[str, Any]) -> list[str]:
-    return [word for name, value in told.items() if value is not None for word in (name, str(value))]
+    """Options as words; those that stand as they would anyway are left out."""
+    given = {name: f"{x:g}" if isinstance(x, float) else str(x) for name, x in told.items() if x not in (None, "auto")}
+    return [word for option in given.items() for word in option]
 
 
 def trained(folder: Path) -> bool:

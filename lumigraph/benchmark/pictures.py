@@ -20,7 +20,7 @@ from ..figures import Row as Line
 from ..figures import contact_sheet, save_picture
 from ..run import Run
 from .results import Row
-from .table import protocol, trained_for
+from .table import resolution, trained_for
 
 SHEET = "views.png"
 
@@ -45,7 +45,7 @@ def draw_charts(rows: Sequence[Row], output: Path) -> list[str]:
                 log_x=True,
                 marks=True,
                 smoothed=False,
-                note=f"{scene}: {protocol(of_scene[0])}",
+                note=f"{scene}, {resolution(of_scene[0])}",
             )
             drawn.append(f"{scene}-psnr-over-{name}.svg")
             files.write_bytes(output / drawn[-1], standalone(chart))

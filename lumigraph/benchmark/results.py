@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shlex
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -38,7 +38,7 @@ def row_of(cell: Cell, output: Path, settings: Settings, failure: str | None) ->
         "views": cell.views,
         "budget": {name: value for name, value in asdict(cell.budget).items() if value is not None},
         "seed": cell.seed,
-        "command": shlex.join(["lumigraph", *train_command(cell, settings)]),
+        "command": shlex.join(["lumigraph", *train_command(replace(cell, source=public(cell)), settings)]),
         "run": f"runs/{cell.name}",
         "failed": failure,
     }
@@ -57,6 +57,11 @@ def row_of(cell: Cell, output: Path, settings: Settings, failure: str | None) ->
     if "by_resolution" in result:
         row["by_resolution"] = result["by_resolution"]
     return row
+
+
+def public(cell: Cell) -> str:
+    """A scene without the place where it lies on this machine."""
+    return cell.scene if Path(cell.source).exists() else cell.source
 
 
 def model_bytes(run: Run) -> int:

@@ -1,0 +1,227 @@
+"""Methods side by side: cells are runs, what is done is kept, what fails says why."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import statistics
+import threading
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tiny
+from PIL import Image
+
+from lumigraph.benchmark.cell import Cell, Settings
+from lumigraph.benchmark.conduct import Patience, conduct
+from lumigraph.benchmark.launch import launch, reason
+from lumigraph.benchmark.published import FIGURES, published
+from lumigraph.cli import main
+from lumigraph.errors import LumigraphError
+from lumigraph.methods import available
+from lumigraph.run import Run
+from lumigraph.train import Budget
+
+SETTINGS = Settings(device="cpu", eval_views=2)
+
+
+class Here:
+    """Launches in this process, where the tests' own method is known, and remembers what it launched."""
+
+    def __init__(self, *more: str, code: int | None = None):
+        self.more, self.code, self.seen = list(more), code, []
+
+    def __call__(self, arguments: Sequence[str], log: Path) -> int:
+        self.seen.append(arguments[0])
+        log.parent.mkdir(parents=True, exist_ok=True)
+        log.write_text("lumigraph: it did not like the weather\n")
+        code = main([*arguments, *self.more])
+        return code if self.code is None else self.code
+
+
+@pytest.fixture
+def ball(tmp_path) -> Path:
+    return tiny.write_blender(tmp_path / "ball")
+
+
+def cell(ball: Path, steps: int = 4, seed: int = 0, views: int | None = None) -> Cell:
+    return Cell("voxel-grid", "ball", str(ball), Budget(steps, None), seed, views)
+
+
+def rows(output: Path) -> list[dict]:
+    return json.loads((output / "results.json").read_text())["cells"]
+
+
+def test_every_cell_is_a_run_and_a_row(ball, tmp_path):
+    output, here = tmp_path / "out", Here()
+    cells = [cell(ball, steps, seed) for steps in (4, 30) for seed in (0, 1)]
+    assert conduct(cells, SETTINGS, output, launch=here) == 0
+    assert here.seen == ["train", "eval"] * 4
+    found = rows(output)
+    for one, row in zip(cells, found, strict=True):
+        run = Run(output / row["run"])
+        evaluation = run.evaluation()
+        assert (run.method_name, run.config["seed"], run.state.step) == ("voxel-grid", one.seed, one.budget.steps)
+        assert all(row[name] == evaluation[name] for name in ("psnr", "ssim", "seconds_per_view", "protocol"))
+        assert (row["protocol"]["views"], row["protocol"]["of"], row["train_views"]) == (2, 3, 9)
+        assert row["peak_memory"] == run.state.peak_memory > 0
+        assert row["model_bytes"] == sum(file.stat().st_size for file in run.folder.rglob("weights.safetensors"))
+    page = (output / "results.md").read_text()
+    for steps in (4, 30):
+        scores = [row["psnr"] for row in found if row["budget"] == {"steps": steps}]
+        assert f"{statistics.mean(scores):.2f} ± {abs(scores[0] - scores[1]) / 2**0.5:.2f}" in page
+        assert all(f"| {score:.2f} |" in page for score in scores)
+    assert "24x24, 2 of 3 of test, evenly spread, white background" in page and "LPIPS |" not in page
+    assert (output / "ball-psnr-over-time.svg").read_text().count("<circle") == 2
+    assert "(ball-psnr-over-time.svg)" in page and "(views.png)" in page
+
+
+def test_the_sheet_shows_photograph_and_rendering(ball, tmp_path):
+    output = tmp_path / "out"
+    conduct([cell(ball, 30)], SETTINGS, output, launch=Here())
+    row = rows(output)[0]
+    name = Path(row["shown"]["name"]).stem
+    sheet = np.array(Image.open(output / "views.png"))
+    photograph = np.array(Image.open(ball / f"{name}.png")).astype(float)
+    photograph = photograph[..., :3] * photograph[..., 3:] / 255 + (255 - photograph[..., 3:])
+    rendering = np.array(Image.open(output / row["run"] / "eval" / f"{name}.png").convert("RGB"))
+    top = next(y for y in range(len(sheet)) if (sheet[y : y + 24, 158:182] == rendering).all())
+    assert np.abs(sheet[top : top + 24, 28:52] - photograph).max() <= 1
+
+
+def test_what_is_done_is_kept(ball, tmp_path):
+    output, cells = tmp_path / "out", [cell(ball, seed=seed) for seed in (0, 1)]
+    conduct(cells[:1], SETTINGS, output, launch=Here())
+    again = Here()
+    assert conduct(cells, SETTINGS, output, launch=again) == 0
+    assert again.seen == ["train", "eval"] and len(rows(output)) == 2
+    other = Here()
+    assert conduct(cells[:1], Settings(device="cpu", eval_views=3), output, launch=other) == 0
+    assert other.seen == ["eval"] and len(rows(output)) == 2
+    assert rows(output)[0]["protocol"]["views"] == 3
+
+
+def test_a_stopped_benchmark_goes_on(ball, tmp_path):
+    output, cells = tmp_path / "out", [cell(ball), cell(ball, seed=1)]
+    assert conduct(cells, SETTINGS, output, launch=Here("--pause-at", "2", code=130)) == 130
+    assert Run(output / "runs" / cells[0].name).state.step == 2
+    again = Here()
+    assert conduct(cells, SETTINGS, output, launch=again) == 0
+    assert again.seen == ["resume", "eval", "train", "eval"]
+    assert [row["steps"] for row in rows(output)] == [4, 4]
+
+
+def test_a_cell_that_fails_is_a_row_that_says_why(ball, tmp_path):
+    output = tmp_path / "out"
+    lost = Cell("voxel-grid", "lost", str(tmp_path / "lost"), Budget(4, None))
+    assert conduct([lost, cell(ball)], SETTINGS, output, launch=Here()) == 0
+    first, second = rows(output)
+    assert first["failed"] == "it did not like the weather" and second["failed"] is None
+    page = (output / "results.md").read_text()
+    assert "| failed: it did not like the weather |" in page and f"{second['psnr']:.2f}" in page
+    again = Here()
+    conduct([lost, cell(ball)], SETTINGS, output, launch=again)
+    assert again.seen == ["train"]
+
+
+def test_a_damaged_run_stops_nothing(ball, tmp_path):
+    output, cells = tmp_path / "out", [cell(ball), cell(ball, seed=1)]
+    conduct(cells[:1], SETTINGS, output, launch=Here())
+    next((output / "runs").rglob("state.json")).write_text("{}")
+    assert conduct(cells, SETTINGS, output, launch=Here()) == 0
+    assert "is not a checkpoint" in rows(output)[0]["failed"] and rows(output)[1]["failed"] is None
+
+
+def test_fewer_views_make_a_chart(ball, tmp_path):
+    output = tmp_path / "out"
+    conduct([cell(ball, views=views) for views in (2, 4, None)], SETTINGS, output, launch=Here())
+    assert [row["train_views"] for row in rows(output)] == [2, 4, 9]
+    assert (output / "ball-psnr-over-views.svg").read_text().count("<circle") == 3
+    assert not (output / "ball-psnr-over-time.svg").exists()
+
+
+def test_cells_that_share_nothing_are_kept_apart(ball, tmp_path):
+    output = tmp_path / "out"
+    conduct([cell(ball)], SETTINGS, output, launch=Here())
+    with pytest.raises(LumigraphError, match="begun with --preset auto, which is now paper"):
+        conduct([cell(ball)], Settings(device="cpu", preset="paper"), output, launch=Here())
+    with pytest.raises(LumigraphError, match="Two scenes are called ball"):
+        conduct([cell(tmp_path)], SETTINGS, output, launch=Here())
+
+
+def test_time_left_counts_what_is_not_training():
+    cells = [Cell("nerf", "lego", "lego", Budget(None, 60.0), seed) for seed in range(3)]
+    patience = Patience()
+    assert patience.left(cells) == "at least 3:00 left"
+    patience.note(cells[0], 75.0)
+    patience.note(cells[1], 65.0)
+    assert patience.left(cells[2:]) == "about 1:10 left"
+
+
+def test_published_figures_are_of_methods_and_scenes():
+    assert published("nerf", "Lego") == FIGURES["nerf", "lego"] and published("nerf", "my-garden") is None
+    assert all(
+        10 < figure.psnr < 50 and "x" in figure.resolution and "20" in figure.source for figure in FIGURES.values()
+    )
+
+
+def test_processes_of_their_own(tmp_path):
+    log = tmp_path / "a.log"
+    assert launch(["methods"], log) == 0
+    assert all(name in log.read_text() for name in available() if name != "voxel-grid")
+    assert launch(["eval", str(tmp_path / "nowhere")], log) == 2
+    assert reason(log, 2).startswith(str(tmp_path / "nowhere")) and "is not a run" in reason(log, 2)
+    assert "memory" in reason(log, 137)
+
+
+def test_ctrl_c_is_passed_on(ball, tmp_path):
+    press = threading.Timer(2.0, os.kill, (os.getpid(), signal.SIGINT))
+    press.start()
+    arguments = ["train", "instant-ngp", str(ball), "--seconds", "300", "--output", str(tmp_path / "run")]
+    assert launch(arguments, tmp_path / "run.log") == 130
+    press.join()
+
+
+def test_the_command(ball, tmp_path, capsys):
+    output = tmp_path / "out"
+    arguments = [
+        "bench",
+        "views",
+        "--methods",
+        "instant-ngp",
+        "--scenes",
+        str(ball),
+        "--views",
+        "3",
+        "40",
+        "--steps",
+        "2",
+    ]
+    assert main([*arguments, "--eval-views", "1", "--output", str(output)]) == 0
+    told = capsys.readouterr()
+    assert "leaving out 40" in told.err and "1 of 1: instant-ngp on ball from 3 views, 2 steps, seed 0" in told.err
+    (row,) = rows(output)
+    assert row["train_views"] == 3 and row["steps"] == 2 and row["peak_memory"] > 50e6
+    assert row["command"] == "lumigraph train instant-ngp ball --steps 2 --seed 0 --views 3"
+    assert str(tmp_path) not in (output / "results.json").read_text() + (output / "results.md").read_text()
+
+
+@pytest.mark.parametrize(
+    ("more", "why"),
+    [
+        (["--steps", "3", "--seconds", "3"], "give one of them"),
+        (["--steps", "0"], "above 0"),
+        (["--eval-views", "0"], "--eval-views"),
+        (["--lpips", "nowhere.pth"], "nowhere.pth"),
+        (["--device", "abacus"], "abacus"),
+    ],
+)
+def test_numbers_are_checked_before_anything_is_trained(ball, tmp_path, capsys, more, why):
+    output = tmp_path / "out"
+    arguments = ["bench", "methods", "--methods", "voxel-grid", "--scenes", str(ball), "--output", str(output)]
+    assert main([*arguments, *more]) == 2
+    told = capsys.readouterr().err
+    assert why in told and len(told.splitlines()) == 1 and not output.exists()
