@@ -102,6 +102,12 @@ def test_masks_shrink_to_pixels_that_are_good_all_over(tmp_path):
         multiscale(replace(scene, images=ImageStore.from_arrays(arrays, masks)), 2)
 
 
+def test_copies_from_a_file_are_those_from_memory(folder, tmp_path):
+    kept, mapped = open_scene(folder, scales=2), open_scene(folder, scales=2, memory=0, cache=tmp_path / "cache")
+    assert mapped.images.shuffled and not kept.images.shuffled
+    assert all(torch.equal(kept.images[i], mapped.images[i]) for i in range(24))
+
+
 @pytest.mark.parametrize("scales", [0, 3])
 def test_no_smaller_than_can_be_compared(folder, scales):
     with pytest.raises(LumigraphError, match="from 1 to 2"):
