@@ -143,6 +143,18 @@ def test_fewer_views_make_a_chart(ball, tmp_path):
     assert not (output / "ball-psnr-over-time.svg").exists()
 
 
+def test_photographs_at_several_scales_count_once(ball, tmp_path):
+    output = tmp_path / "out"
+    conduct([cell(ball)], Settings(device="cpu", scales=2), output, launch=Here())
+    (row,) = rows(output)
+    assert row["train_views"] == 9 and row["protocol"]["views"] == 6
+    assert set(row["by_resolution"]) == {"24x24", "12x12"} and row["shown"]["resolution"] == "24x24"
+    assert (
+        row["command"].endswith("--scales 2 --device cpu")
+        and "| 2 sizes, 6 of test" in (output / "results.md").read_text()
+    )
+
+
 def test_cells_that_share_nothing_are_kept_apart(ball, tmp_path):
     output = tmp_path / "out"
     conduct([cell(ball)], SETTINGS, output, launch=Here())

@@ -23,6 +23,7 @@ class Settings:
 
     downscale: int | None = None
     reader: str | None = None
+    scales: int = 1
     preset: str = "auto"
     device: str = "auto"
     eval_views: int | None = None
@@ -81,6 +82,7 @@ def train_command(cell: Cell, settings: Settings) -> list[str]:
         "--views": cell.views,
         "--downscale": settings.downscale,
         "--reader": settings.reader,
+        "--scales": settings.scales if settings.scales > 1 else None,
         "--preset": settings.preset,
         "--device": settings.device,
     }
@@ -128,7 +130,7 @@ def evaluated(folder: Path, settings: Settings) -> bool:
 def claim(output: Path, cells: Sequence[Cell], settings: Settings) -> None:
     """Note in the output's folder what its cells share. Raises LumigraphError if they shared something else so far."""
     path = output / "settings.json"
-    shared = {name: getattr(settings, name) for name in ("downscale", "reader", "preset", "device")}
+    shared = {name: getattr(settings, name) for name in ("downscale", "reader", "scales", "preset", "device")}
     known = files.read_json(path) if path.exists() else {"settings": shared, "scenes": {}}
     for name, value in shared.items():
         if known["settings"][name] != value:

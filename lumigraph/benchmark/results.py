@@ -46,12 +46,12 @@ def row_of(cell: Cell, output: Path, settings: Settings, failure: str | None) ->
         return row
     run = Run(folder)
     result = run.evaluation() or {}
-    figure = published(cell.method, cell.scene) if cell.views is None else None
+    figure = published(cell.method, cell.scene) if cell.views is None and settings.scales == 1 else None
     row |= {name: result[name] for name in MEASURED}
     row |= {
-        "train_views": run.config["splits"]["train"],
+        "train_views": run.config["splits"]["train"] // settings.scales,
         "model_bytes": model_bytes(run),
-        "shown": result["views"][len(result["views"]) // 2],
+        "shown": result["views"][len(result["views"]) // 2 // settings.scales],  # at full size
         "published": figure and asdict(figure),
     }
     if "by_resolution" in result:

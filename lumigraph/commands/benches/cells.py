@@ -34,6 +34,8 @@ class Cells:
     """Shrink photographs by a whole number."""
     reader: Annotated[Reader | None, option("NAME", "found by looking into the folder")] = None
     """Layout of the folders: transforms, blender, colmap or llff."""
+    scales: Annotated[int, option("N")] = 1
+    """Have every photograph so many times, each half as large as the one before; the figures count them all."""
     device: Annotated[str, option("NAME")] = "auto"
     """auto, cpu, cuda, cuda:1."""
     preset: Literal["auto", "laptop", "paper"] = "auto"
@@ -61,7 +63,9 @@ class Cells:
             load_lpips(weights)  # refuses what is wrong, before anything is trained
         if self.eval_views is not None and self.eval_views < 1:
             raise LumigraphError(f"{self.eval_views} views cannot be compared; give --eval-views a number above 0")
-        settings = Settings(self.downscale, self.reader, self.preset, self.device, self.eval_views, weights)
+        settings = Settings(
+            self.downscale, self.reader, self.scales, self.preset, self.device, self.eval_views, weights
+        )
         sources = [located(posed(scene)) for scene in self.scenes]
         cells = [
             Cell(name, scene_name(source), source, budget, seed, number)
