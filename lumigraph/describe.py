@@ -23,7 +23,8 @@ def run_tree(run: Run) -> Tree:
         rows = {"step": state.step, "seconds": state.seconds, "compiling, beside": state.compile_seconds}
         branch(tree, "trained", rows | {"budget": config["budget"], "seed": config["seed"], "on": config["device"]})
     if evaluation := run.evaluation():
-        rows = {name: evaluation[name] for name in ("psnr", "ssim", "seconds_per_view")}
+        measured = ("psnr", "ssim", "lpips", "seconds_per_view")
+        rows = {name: evaluation[name] for name in measured if evaluation.get(name) is not None}
         branch(
             tree, "evaluated", rows | {name: evaluation["protocol"][name] for name in ("split", "views", "resolution")}
         )

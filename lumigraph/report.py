@@ -63,6 +63,8 @@ def header(run: Run, evaluation: dict[str, Any] | None) -> str:
         held_out = "held-out views" if protocol["split"] == "test" else f"{protocol['split']} views"
         figures.append((f"{evaluation['psnr']:.2f}", "dB", f"PSNR, {protocol['views']} {held_out}"))
         figures.append((f"{evaluation['ssim']:.3f}", "", "SSIM"))
+        if evaluation.get("lpips") is not None:
+            figures.append((f"{evaluation['lpips']:.3f}", "", "LPIPS"))
     if run.has_state:
         state = run.state
         figures.append((f"{state.seconds:.0f}" if state.seconds < 1000 else clock(state.seconds), "s", "of training"))

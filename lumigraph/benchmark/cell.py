@@ -133,10 +133,10 @@ def claim(output: Path, cells: Sequence[Cell], settings: Settings) -> None:
     shared = {name: getattr(settings, name) for name in ("downscale", "reader", "scales", "preset", "device")}
     known = files.read_json(path) if path.exists() else {"settings": shared, "scenes": {}}
     for name, value in shared.items():
-        if known["settings"][name] != value:
+        begun = known["settings"].get(name, getattr(Settings, name))  # older folders know fewer options
+        if begun != value:
             raise LumigraphError(
-                f"{output} was begun with --{name} {known['settings'][name]}, which is now {value}; "
-                "choose another --output"
+                f"{output} was begun with --{name} {begun}, which is now {value}; choose another --output"
             )
     for cell in cells:
         if known["scenes"].setdefault(cell.scene, cell.source) != cell.source:

@@ -45,7 +45,7 @@ def draw_charts(rows: Sequence[Row], output: Path) -> list[str]:
                 log_x=True,
                 marks=True,
                 smoothed=False,
-                note=f"{scene}, {resolution(of_scene[0])}",
+                note=", ".join([*(one.name for one in series if len(series) == 1), scene, resolution(of_scene[0])]),
             )
             drawn.append(f"{scene}-psnr-over-{name}.svg")
             files.write_bytes(output / drawn[-1], standalone(chart))
@@ -80,15 +80,17 @@ def budget(row: Row) -> tuple[tuple[str, float], ...]:
 
 def draw_views(rows: Sequence[Row], output: Path) -> list[str]:
     """One held-out view of each scene as its photograph and as every method shows it, after its longest training."""
-    best: dict[tuple[str, int], dict[str, Row]] = {}
-    for row in sorted(
-        (row for row in rows if not row["failed"]), key=lambda row: (*row["budget"].values(), -row["seed"])
-    ):
-        best.setdefault((row["scene"], row["train_views"]), {})[row["method"]] = row
+    measured = [row for row in rows if not row["failed"]]
+    best: dict[tuple[str, str, int], dict[str, Row]] = {}
+    for row in sorted(measured, key=lambda row: (*row["budget"].values(), -row["seed"])):
+        best.setdefault((row["scene"], row["shown"]["name"], row["train_views"]), {})[row["method"]] = row
     methods = sorted({method for cells in best.values() for method in cells})
+    photographs: dict[tuple[str, str], Float[Tensor, "height width 3"]] = {}
     lines = []
-    for (scene, views), cells in sorted(best.items()):
-        truth = photograph(next(iter(cells.values())), output)
+    for (scene, name, views), cells in sorted(best.items()):
+        if (scene, name) not in photographs:  # opening a scene takes a while
+            photographs[scene, name] = photograph(next(iter(cells.values())), output)
+        truth = photographs[scene, name]
         seen = [rendering(cells[method], output) if method in cells else torch.ones_like(truth) for method in methods]
         scores = [f"{cells[method]['shown']['psnr']:.2f} dB" if method in cells else "" for method in methods]
         lines.append(Line([f"{scene}, {views} views", *scores], [truth, *seen]))
