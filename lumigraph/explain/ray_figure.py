@@ -18,12 +18,12 @@ from .ray import Pass, Sight, triple
 WIDTH, LEFT, RIGHT = 988, 64, 700  # of the whole, and where the axis of distance begins and ends
 SIDE, RIGHT_EDGE = 730, 970  # of the column beside it
 TOP, STRIP, PANEL, LANE, GAP = 70, 26, 104, 16, 42  # heights
-DECADES, NOTHING = 5, 1e-30  # of density that are shown at most, and what has no logarithm
+DECADES = 5  # of density that are shown at most
 FINE = 8  # straight pieces that the curve of transmittance has within a sample
 STYLE = """<style>
 .thin { stroke: currentColor; stroke-width: 1; }
 svg path.filled { fill: currentColor; fill-opacity: 0.2; }
-.edge { stroke: var(--faint); stroke-width: 0.6; }
+.edge { stroke: var(--faint); stroke-width: 0.5; stroke-opacity: 0.7; }
 .frame { fill: none; stroke: var(--line); }
 .patch { shape-rendering: crispEdges; }
 .depth { stroke: var(--ink); stroke-dasharray: 3 4; }
@@ -43,7 +43,9 @@ def ray_figure(sight: Sight, title: str) -> str:
     parts = [STYLE, f"<text class='label' x='{LEFT}' y='26'>{escape(title)}</text>"]
 
     parts.append(caption(colours, "c", f"colour of each {called(last, sight)}"))
-    parts += [patch(x, colours, a, b, c) for a, b, c in zip(last.start, last.end, last.rgb, strict=True)]
+    glowing = last.density > 0  # what is empty has no colour
+    found = zip(*(column[glowing] for column in (last.start, last.end, last.rgb)), strict=True)
+    parts += [patch(x, colours, a, b, c) for a, b, c in found]
     parts.append(inset(sight, colours))
 
     y = density_axis(sight, density + PANEL, density)
@@ -147,13 +149,15 @@ def scale(y: Axis) -> str:
 
 
 def skyline(each: Pass, x: Axis, y: Axis, kind: str) -> str:
-    """Density, which is constant over each sample; down to the ground where samples do not touch."""
+    """Density, which is constant over each sample; down to the ground where there is none, or no sample."""
     d, before = "", None
     for a, b, value in columns(each, "density"):
+        if not value:
+            continue
         if before is None or a - before > 1e-4 * (x.high - x.low):
             d += f"{'' if before is None else f'V{y.start}'}M{x(a):.2f} {y.start}"
-        d, before = d + f"V{y(max(value, NOTHING)):.1f}H{x(b):.2f}", b
-    return f"<path class='{kind}' d='{d}V{y.start}'/>"
+        d, before = d + f"V{y(value):.1f}H{x(b):.2f}", b
+    return f"<path class='{kind}' d='{d}V{y.start}'/>" if d else ""
 
 
 def curve(points: list[tuple[float, float]], x: Axis, y: Axis, kind: str) -> str:
