@@ -53,12 +53,12 @@ class FourierFeatures(RayMethod):
         widths = [2 if rows is None else 2 * len(rows), *[config.width] * (config.layers - 1)]
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(config.seed)
-            self.hidden = nn.Sequential(*(Dense(a, b, relu=True, exact=config.exact) for a, b in pairwise(widths)))
-            self.last = Dense(config.width, 3, exact=True)
+            hidden = [Dense(a, b, relu=True, exact=config.exact) for a, b in pairwise(widths)]
+            self.layers = nn.Sequential(*hidden, Dense(config.width, 3, exact=True))
 
     def paint(self, place: Float[Tensor, "point 2"]) -> Float[Tensor, "point 3"]:
         """The colour at places in [0, 1]^2, x to the right and y down, the longer side of the picture being 1."""
-        return torch.sigmoid(self.last(self.hidden(self.encoding(place))))
+        return torch.sigmoid(self.layers(self.encoding(place)))
 
     def render_rays(self, rays: Rays, background: Float[Tensor, "#ray 3"]) -> Rendering:
         t, place, hit = self.meet(rays)

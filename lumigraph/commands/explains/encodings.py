@@ -24,7 +24,7 @@ class Encodings:
     """An image file."""
     output: Annotated[Path | None, option("FOLDER", "explained/PICTURE-encodings")] = None
     """Where the page goes."""
-    steps: Annotated[int, option("N")] = 400
+    steps: Annotated[int, option("N")] = 500
     """Of training, for each network."""
     scales: Annotated[tuple[float, ...], option("S S ...")] = (1.0, 2.0, 4.0, 8.0, 16.0, 32.0, 64.0)
     """Frequencies in cycles across the picture: the deviation of Gaussian ones, the highest of positional ones."""
@@ -40,14 +40,20 @@ class Encodings:
             raise LumigraphError(f"{self.steps} steps teach nothing; give --steps a number above 0")
         if len(set(self.scales)) < 2 or not all(0 < scale < float("inf") for scale in self.scales):
             raise LumigraphError("A curve over scales needs two or more, all above 0; for example --scales 1 10 100")
-        from ...capture import picture
-        from ...explain.encodings import compare, write_page
+        from dataclasses import replace
 
-        if not picture.recognises(self.picture):
+        from ...capture import open_scene, picture
+        from ...explain.encodings import compare
+        from ...explain.encodings_page import write_page
+        from ...methods.fourier_features import FourierFeatures
+
+        if not picture.recognises(self.picture.expanduser()):
             raise LumigraphError(f"{self.picture} is no image file; name one picture, as in photograph.png")
-        scene = picture.open_picture(self.picture, self.downscale)
+        device = choose_device(self.device)
+        scene = open_scene(self.picture, self.downscale)
+        config = replace(FourierFeatures.preset(device), seed=self.seed)
+        comparison = compare(scene, tuple(sorted(set(self.scales))), self.steps, device, config)
         folder = self.output or Path("explained") / f"{scene_name(str(self.picture))}-encodings"
-        comparison = compare(scene, tuple(sorted(set(self.scales))), self.steps, self.seed, choose_device(self.device))
         write_page(folder, comparison)
-        show(comparison.rows() | {"page": str(folder / "index.html")})
+        show({fit.name: f"{fit.held_out:.2f} dB" for fit in comparison.leading} | {"page": str(folder / "index.html")})
         return 0

@@ -1,0 +1,147 @@
+"""The same network behind each encoding of a picture's pixels, and over a range of scales (Tancik 2020, section 6)."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, replace
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from ..display import track
+from ..evaluate import on_background
+from ..methods.fourier_features import Config, Encoding, FourierFeatures
+from ..metrics import psnr
+from ..run import build
+from ..scene import Scene
+from ..train import fit
+from .tangent_kernel import spectrum, tangent_kernel
+
+FLAT: tuple[Encoding, ...] = ("none", "basic")
+SCALED: tuple[Encoding, ...] = ("positional", "gaussian")
+GRID = 24  # points along each side, at which the tangent kernel is taken
+
+
+@dataclass(frozen=True)
+class Fit:
+    """One trained network.
+
+    scale:           cycles across the picture; None for encodings without one
+    learnt, held_out: PSNR in dB of the pixels that it learnt from, and of the others
+    eigenvalues:     of the tangent kernel before training, as shares of their sum
+    """
+
+    encoding: Encoding
+    scale: float | None
+    learnt: float
+    held_out: float
+    seconds: float
+    rgb: Float[Tensor, "height width 3"]
+    eigenvalues: Float[Tensor, " point"]
+
+    @property
+    def name(self) -> str:
+        return self.encoding if self.scale is None else f"{self.encoding} {self.scale:g}"
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """All fits, and what they were made of."""
+
+    source: str
+    picture: Float[Tensor, "height width 3"]
+    steps: int
+    config: Config
+    fits: list[Fit]
+
+    def of(self, encoding: Encoding) -> list[Fit]:
+        """Fits of one encoding, by scale."""
+        return [fit for fit in self.fits if fit.encoding == encoding]
+
+    def best(self, encoding: Encoding) -> Fit:
+        """The fit that shows held-out pixels best."""
+        return max(self.of(encoding), key=lambda fit: fit.held_out)
+
+    @property
+    def leading(self) -> list[Fit]:
+        """The best of each encoding."""
+        return [self.best(encoding) for encoding in FLAT + SCALED]
+
+    @property
+    def gain(self) -> float:
+        """PSNR that Gaussian features win over none, held out, in dB."""
+        return self.best("gaussian").held_out - self.best("none").held_out
+
+    @property
+    def peak_inside(self) -> bool:
+        """Whether the best scale of Gaussian features is neither the smallest nor the largest that was tried."""
+        return self.best("gaussian") not in (self.of("gaussian")[0], self.of("gaussian")[-1])
+
+    def to_json(self) -> dict[str, Any]:
+        height, width = self.picture.shape[:2]
+        return {
+            "picture": self.source,
+            "resolution": f"{width}x{height}",
+            "held_out": "half of the pixels, at random",
+            "steps": self.steps,
+            "pixels_per_step": self.config.pixels,
+            "seed": self.config.seed,
+            "gain_over_none": self.gain,
+            "peak_inside": self.peak_inside,
+            "fits": [
+                {
+                    "encoding": fit.encoding,
+                    "scale": fit.scale,
+                    "psnr_held_out": fit.held_out,
+                    "psnr_learnt": fit.learnt,
+                    "seconds": fit.seconds,
+                    "eigenvalues": fit.eigenvalues.tolist(),
+                }
+                for fit in self.fits
+            ],
+        }
+
+
+def compare(
+    scene: Scene, scales: tuple[float, ...], steps: int, device: torch.device, config: Config | None = None
+) -> Comparison:
+    """Train one network for every encoding, and those with a scale once for each.
+
+    scene:  of a single picture (`capture.picture`)
+    scales: rising
+    config: the network's other numbers
+    """
+    config = config or FourierFeatures.preset(device)
+    todo = [replace(config, encoding=encoding) for encoding in FLAT]
+    todo += [replace(config, encoding=encoding, scale=scale) for encoding in SCALED for scale in scales]
+    fits = [learn(scene, one, steps, device) for one in track(todo, "Fitting the picture", len(todo))]
+    return Comparison(scene.source, truth(scene), steps, config, fits)
+
+
+def learn(scene: Scene, config: Config, steps: int, device: torch.device) -> Fit:
+    """Train one network and score it."""
+    method = build(FourierFeatures, scene.frame, config, device, config.seed)
+    assert isinstance(method, FourierFeatures)
+    eigenvalues = spectrum(kernel_at_start(method))
+    begin = time.perf_counter()
+    fit(method, scene, steps=steps, seed=config.seed, show=False)
+    seconds = time.perf_counter() - begin
+    rgb, picture = method.render(scene.cameras[0]).rgb.cpu(), truth(scene)
+    masks = [scene.images.mask(int(scene.splits[split][0])) for split in ("train", "test")]
+    learnt, held_out = (psnr(rgb[mask], picture[mask]) for mask in masks)
+    scale = None if config.encoding in FLAT else config.scale
+    return Fit(config.encoding, scale, learnt, held_out, seconds, rgb, eigenvalues)
+
+
+def truth(scene: Scene) -> Float[Tensor, "height width 3"]:
+    """The picture itself, which both of the scene's shots show."""
+    return on_background(scene.view(0)[1], scene.frame.background)
+
+
+def kernel_at_start(method: FourierFeatures) -> Float[Tensor, "point point"]:
+    """The tangent kernel of a network between a grid of places, ahead of its sigmoid."""
+    side = (torch.arange(GRID, device=method.device) + 0.5) / GRID
+    places = torch.cartesian_prod(side, side)
+    return tangent_kernel(method.layers, method.encoding(places)).cpu()

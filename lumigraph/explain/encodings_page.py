@@ -1,0 +1,118 @@
+"""The page of `lumigraph explain encodings`: two charts, a sheet of pictures, and what they say."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from ..charts import Series, line_chart, standalone
+from ..figures import Row, contact_sheet, save_picture
+from ..files import write_bytes, write_json
+from ..report import heading, jpeg, page, section
+from .encodings import SCALED, Comparison, Fit
+
+CROP, ENLARGED = 96, 3  # pixels a side of the picture's middle, and how many times larger the sheet shows them
+CELL = CROP * ENLARGED
+
+
+def write_page(folder: Path, comparison: Comparison) -> None:
+    """Write index.html, which holds everything; and by themselves scales.svg, spectrum.svg, comparison.png and
+    figures.json."""
+    scales, spectrum, sheet = scale_chart(comparison), spectrum_chart(comparison), folder / "comparison.png"
+    save_picture(sheet, comparison_sheet(comparison))
+    write_bytes(folder / "scales.svg", standalone(scales))
+    write_bytes(folder / "spectrum.svg", standalone(spectrum))
+    write_json(folder / "figures.json", comparison.to_json())
+    name = Path(comparison.source).name
+    sections = [
+        header(name, comparison),
+        section("PSNR against scale", f"<figure>{scales}</figure>", about_scales(comparison)),
+        section("What they draw", f"<img class='sheet' src='{jpeg(sheet)}' alt=''>", ABOUT_PICTURES),
+        section("Spectrum of the neural tangent kernel", f"<figure>{spectrum}</figure>", ABOUT_SPECTRUM),
+    ]
+    write_bytes(folder / "index.html", page(f"{name} · encodings", "".join(sections), comparison.source))
+
+
+def header(name: str, comparison: Comparison) -> str:
+    height, width = comparison.picture.shape[:2]
+    sentence = (
+        f"One network behind four encodings of where a pixel is: {comparison.steps} steps on half of "
+        f"{width}x{height} pixels, scored on the other half"
+    )
+    return heading(name, sentence, [(f"{fit.held_out:.1f}", "dB", fit.name) for fit in comparison.leading])
+
+
+def scale_chart(comparison: Comparison) -> str:
+    """PSNR over scales; an encoding without one is a level line."""
+    scales = [fit.scale for fit in comparison.of("gaussian") if fit.scale is not None]
+    series = []
+    for encoding in SCALED:
+        fits = comparison.of(encoding)
+        series.append(Series(f"{encoding}, held out", scales, [fit.held_out for fit in fits]))
+        series.append(Series(f"{encoding}, learnt", scales, [fit.learnt for fit in fits]))
+    for fit in (comparison.best("basic"), comparison.best("none")):
+        series.append(Series(f"{fit.name}, held out", scales, [fit.held_out] * len(scales)))
+    return line_chart(series, "scale, cycles across the picture", "PSNR, dB", log_x=True, marks=True, smoothed=False)
+
+
+def spectrum_chart(comparison: Comparison) -> str:
+    """Eigenvalues in falling order."""
+    series = [
+        Series(fit.name, range(1, len(fit.eigenvalues) + 1), fit.eigenvalues.tolist()) for fit in shown(comparison)
+    ]
+    return line_chart(series, "eigenvalue, by rank", "share of the trace", log=True, log_x=True, smoothed=False)
+
+
+def comparison_sheet(comparison: Comparison):
+    """The picture and what networks make of it: all of it, and its middle pixel by pixel."""
+    fits = shown(comparison)
+    pictures = [comparison.picture, *(fit.rgb.clamp(0, 1) for fit in fits)]
+    columns = ["picture", *(f"{fit.name} · {fit.held_out:.2f} dB" for fit in fits)]
+    rows = [Row("whole", pictures), Row(f"the middle, {ENLARGED} times larger", [middle(p) for p in pictures])]
+    height, width = comparison.picture.shape[:2]
+    title = f"{Path(comparison.source).name} · {width}x{height} · {comparison.steps} steps · PSNR of held-out pixels"
+    return contact_sheet(title, columns, rows, CELL)
+
+
+def shown(comparison: Comparison) -> list[Fit]:
+    """The best of each encoding, and Gaussian ones of the smallest and the largest scale."""
+    smallest, *_, largest = comparison.of("gaussian")
+    *others, best = comparison.leading
+    return [
+        *others,
+        *sorted({fit.scale: fit for fit in (smallest, best, largest)}.values(), key=lambda f: f.scale or 0),
+    ]
+
+
+def middle(picture: Float[Tensor, "height width 3"]) -> Float[Tensor, "tall wide 3"]:
+    """A square out of the middle, every pixel a square of its own."""
+    top, left = (max(0, (size - CROP) // 2) for size in picture.shape[:2])
+    crop = picture[top : top + CROP, left : left + CROP]
+    return torch.repeat_interleave(torch.repeat_interleave(crop, ENLARGED, 0), ENLARGED, 1)
+
+
+def about_scales(comparison: Comparison) -> str:
+    best = comparison.best("gaussian")
+    where = "inside of the range" if comparison.peak_inside else "at the end of the range; give other --scales"
+    return (
+        f"The scale says how far apart two places must be for the network to tell them apart. Too small, and it "
+        f"cannot follow the picture: neither half is learnt. Too large, and every pixel stands for itself: the learnt "
+        f"half gets better, the other worse. Gaussian features are best at {best.scale:g} cycles across the picture, "
+        f"{where}; they win {comparison.gain:.2f} dB over no encoding. Positional features spread their frequencies "
+        f"evenly in octaves up to the scale, along the axes alone."
+    )
+
+
+ABOUT_PICTURES = (
+    "The layers and the steps are the same for all. Without an encoding the network draws a smooth wash. At the best "
+    "scale it draws detail; far beyond it, pixels that were not learnt are noise."
+)
+ABOUT_SPECTRUM = (
+    "The tangent kernel says how far a step on one pixel moves another. What lies along one of its eigenvectors is "
+    "learnt at a rate in proportion to the eigenvalue. Without an encoding eigenvalues fall steeply, so that detail is "
+    "out of reach. The larger the scale, the more level they are, until pixels say nothing of their neighbours. Each "
+    "curve is the exact kernel of one network before its first step, between the points of a grid."
+)
