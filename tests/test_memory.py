@@ -22,9 +22,9 @@ print(peak_memory(torch.device("cpu")) - before)
 
 
 def test_the_peak_grows_by_what_was_taken_and_stays():
-    for size in (100_000_000, 400_000_000):
-        ran = subprocess.run([sys.executable, "-c", TAKE.format(size=size)], capture_output=True, text=True, check=True)
-        assert abs(int(ran.stdout) - size) < 20_000_000
+    size = 300_000_000
+    ran = subprocess.run([sys.executable, "-c", TAKE.format(size=size)], capture_output=True, text=True, check=True)
+    assert abs(int(ran.stdout) - size) < 20_000_000
 
 
 def test_a_run_remembers_its_peak(tmp_path):

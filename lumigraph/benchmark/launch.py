@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 from collections.abc import Callable, Sequence
@@ -32,13 +33,15 @@ def launch(arguments: Sequence[str], log: Path) -> int:
         passed_on = False
         try:
             while (code := ended(process)) is None:
-                if interrupt.signal and not passed_on:
+                if interrupt.signal and not passed_on and os.name != "nt":  # Windows tells both by itself
                     process.send_signal(interrupt.signal)
                     passed_on = True
         finally:
             if process.poll() is None:  # a second Ctrl-C
                 process.kill()
                 process.wait()
+    if interrupt.signal:
+        return 128 + interrupt.signal  # even if the command was done just then: whoever asked wants to stop
     return code if code >= 0 else 128 - code
 
 
