@@ -52,15 +52,19 @@ class Cell:
     @property
     def name(self) -> str:
         """For folders: unique among cells that share their settings."""
-        long = f"{self.budget.seconds:g}s" if self.budget.seconds else f"{self.budget.steps}steps"
         views = "" if self.views is None else f"-{self.views}views"
-        return f"{self.scene}-{self.method}{views}-{long}-seed{self.seed}"
+        return f"{self.scene}-{self.method}{views}-{duration(self.budget).replace(' ', '')}-seed{self.seed}"
 
     @property
     def title(self) -> str:
         """For people."""
         views = "" if self.views is None else f" from {self.views} views"
         return f"{self.method} on {self.scene}{views}, {duration(self.budget)}, seed {self.seed}"
+
+
+def budget_of(plain: dict[str, Any]) -> Budget:
+    """As runs and results hold it."""
+    return Budget(plain.get("steps"), plain.get("seconds"))
 
 
 def duration(budget: Budget) -> str:
@@ -107,13 +111,7 @@ def options(told: dict[str, Any]) -> list[str]:
 def trained(folder: Path) -> bool:
     """Whether a run has spent its budget."""
     run = Run(folder)
-    return (
-        run.has_state
-        and Budget(**{"steps": None, "seconds": None} | run.config["budget"]).progress(
-            run.state.step, run.state.seconds
-        )
-        >= 1
-    )
+    return run.has_state and budget_of(run.config["budget"]).progress(run.state.step, run.state.seconds) >= 1
 
 
 def evaluated(folder: Path, settings: Settings) -> bool:

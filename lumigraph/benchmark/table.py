@@ -6,6 +6,7 @@ import statistics
 from collections.abc import Callable, Sequence
 from typing import Any
 
+from .cell import budget_of, duration
 from .results import Row
 
 NONE = "–"
@@ -42,46 +43,46 @@ def short_table(rows: Sequence[Row]) -> str:
         "model": lambda group: size(max(row["model_bytes"] for row in group)),
         "published PSNR": lambda group: published(group[0]),
     }
-    return table(columns, list(groups.values()))
+    return table([*columns], [[value(group) for value in columns.values()] for group in groups.values()])
+
+
+CELL: dict[str, Callable[[Row], str]] = {
+    "method": lambda row: row["method"],
+    "scene": lambda row: row["scene"],
+    "views": lambda row: str(row.get("train_views") or row["views"] or "all"),
+    "trained for": lambda row: trained_for(row),
+    "seed": lambda row: str(row["seed"]),
+}
+FIGURES: dict[str, Callable[[Row], str]] = {
+    "PSNR": lambda row: f"{row['psnr']:.2f}",
+    "SSIM": lambda row: f"{row['ssim']:.4f}",
+    "LPIPS": lambda row: spread([row["lpips"]], ".4f"),
+    "steps": lambda row: str(row["steps"]),
+    "training s": lambda row: f"{row['training_seconds']:.1f}",
+    "compiling s": lambda row: f"{row['compile_seconds']:.1f}",
+    "memory": lambda row: size(row["peak_memory"]),
+    "model": lambda row: size(row["model_bytes"]),
+    "s/view": lambda row: f"{row['seconds_per_view']:.3g}",
+    "trained on": lambda row: row["trained_on"],
+    "published PSNR": lambda row: published(row),
+}
 
 
 def full_table(rows: Sequence[Row]) -> str:
-    columns: dict[str, Callable[[Row], str]] = {
-        "method": lambda row: row["method"],
-        "scene": lambda row: row["scene"],
-        "views": lambda row: str(row["train_views"]),
-        "trained for": trained_for,
-        "seed": lambda row: str(row["seed"]),
-        "PSNR": lambda row: f"{row['psnr']:.2f}",
-        "SSIM": lambda row: f"{row['ssim']:.4f}",
-        "LPIPS": lambda row: NONE if row["lpips"] is None else f"{row['lpips']:.4f}",
-        "steps": lambda row: str(row["steps"]),
-        "training s": lambda row: f"{row['training_seconds']:.1f}",
-        "compiling s": lambda row: f"{row['compile_seconds']:.1f}",
-        "memory": lambda row: size(row["peak_memory"]),
-        "model": lambda row: size(row["model_bytes"]),
-        "s/view": lambda row: f"{row['seconds_per_view']:.3g}",
-        "published PSNR": published,
-        "protocol": protocol,
-        "trained on": lambda row: row["trained_on"],
-    }
-    return table(columns, in_order(rows))
+    """One line for each cell. One that failed says why where its protocol would stand."""
+    lines = []
+    for row in in_order(rows):
+        figures = [NONE if row["failed"] else value(row) for value in FIGURES.values()]
+        how = f"failed: {row['failed']}" if row["failed"] else protocol(row)
+        lines.append([*(value(row) for value in CELL.values()), *figures, how])
+    return table([*CELL, *FIGURES, "protocol"], lines)
 
 
-def table(columns: dict[str, Callable[[Any], str]], entries: Sequence[Any]) -> str:
-    """Markdown with a line for each entry. Columns that say nothing anywhere are left out."""
-    lines = [[say(entry, name, value) for name, value in columns.items()] for entry in entries]
-    kept = [i for i in range(len(columns)) if any(line[i] != NONE for line in lines)]
-    shown = [[line[i] for i in kept] for line in [list(columns), ["---"] * len(columns), *lines]]
-    return "\n".join(f"| {' | '.join(cell.replace('|', '/') for cell in line)} |" for line in shown) if lines else ""
-
-
-def say(entry: Any, name: str, value: Callable[[Any], str]) -> str:
-    """A cell's text. One that failed has no figures, and says why where its protocol would stand."""
-    if isinstance(entry, dict) and entry["failed"]:
-        known = {"views": str(entry["views"] or "all"), "protocol": f"failed: {entry['failed']}"}
-        return known.get(name) or (value(entry) if name in ("method", "scene", "trained for", "seed") else NONE)
-    return value(entry)
+def table(names: Sequence[str], lines: Sequence[Sequence[str]]) -> str:
+    """Markdown. Columns that say nothing anywhere are left out."""
+    kept = [i for i in range(len(names)) if any(line[i] != NONE for line in lines)]
+    shown = [[line[i].replace("|", "/") for i in kept] for line in (names, ["---"] * len(names), *lines)]
+    return "\n".join(f"| {' | '.join(line)} |" for line in shown) if lines else ""
 
 
 def in_order(rows: Sequence[Row]) -> list[Row]:
@@ -92,7 +93,7 @@ def in_order(rows: Sequence[Row]) -> list[Row]:
 
 
 def trained_for(row: Row) -> str:
-    return f"{row['budget']['seconds']:g} s" if "seconds" in row["budget"] else f"{row['budget']['steps']} steps"
+    return duration(budget_of(row["budget"]))
 
 
 def resolution(row: Row) -> str:
@@ -108,8 +109,8 @@ def published(row: Row) -> str:
 def protocol(row: Row) -> str:
     """How the cell was compared, in a few words."""
     how = row["protocol"]
-    whole = how["views"] == how["of"]
-    parts = [resolution(row), f"{how['views']} of {how['split']}" if whole else some(how)]
+    some = f"{how['views']} of {how['of']} of {how['split']}, evenly spread"
+    parts = [resolution(row), f"{how['views']} of {how['split']}" if how["views"] == how["of"] else some]
     if how["background"] is not None:
         known = {(1.0, 1.0, 1.0): "white", (0.0, 0.0, 0.0): "black"}
         colour = tuple(how["background"])
@@ -117,10 +118,6 @@ def protocol(row: Row) -> str:
     if how["masked"]:
         parts.append("masked")
     return ", ".join(parts)
-
-
-def some(how: dict[str, Any]) -> str:
-    return f"{how['views']} of {how['of']} of {how['split']}, evenly spread"
 
 
 def spread(values: Sequence[float | None], form: str) -> str:
