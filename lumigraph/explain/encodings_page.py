@@ -16,6 +16,7 @@ from .encodings import SCALED, Comparison, Fit
 
 CROP, ENLARGED = 96, 3  # pixels a side of the picture's middle, and how many times larger the sheet shows them
 CELL = CROP * ENLARGED
+SMALLEST = 1e-10  # eigenvalue that is drawn, as a share of the trace
 
 
 def write_page(folder: Path, comparison: Comparison) -> None:
@@ -29,9 +30,8 @@ def write_page(folder: Path, comparison: Comparison) -> None:
     name = Path(comparison.source).name
     sections = [
         header(name, comparison),
-        section("PSNR against scale", f"<figure>{scales}</figure>", about_scales(comparison)),
+        section("What the scale does", side_by_side((scales, about_scales(comparison)), (spectrum, ABOUT_SPECTRUM))),
         section("What they draw", f"<img class='sheet' src='{jpeg(sheet)}' alt=''>", ABOUT_PICTURES),
-        section("Spectrum of the neural tangent kernel", f"<figure>{spectrum}</figure>", ABOUT_SPECTRUM),
     ]
     write_bytes(folder / "index.html", page(f"{name} · encodings", "".join(sections), comparison.source))
 
@@ -40,9 +40,15 @@ def header(name: str, comparison: Comparison) -> str:
     height, width = comparison.picture.shape[:2]
     sentence = (
         f"One network behind four encodings of where a pixel is: {comparison.steps} steps on half of "
-        f"{width}x{height} pixels, scored on the other half"
+        f"{width}x{height} pixels, scored on the rest"
     )
     return heading(name, sentence, [(f"{fit.held_out:.1f}", "dB", fit.name) for fit in comparison.leading])
+
+
+def side_by_side(*charts: tuple[str, str]) -> str:
+    """Charts, each with what it says below."""
+    figures = (f"<figure>{chart}<figcaption>{caption}</figcaption></figure>" for chart, caption in charts)
+    return f"<div class='charts'>{''.join(figures)}</div>"
 
 
 def scale_chart(comparison: Comparison) -> str:
@@ -59,11 +65,14 @@ def scale_chart(comparison: Comparison) -> str:
 
 
 def spectrum_chart(comparison: Comparison) -> str:
-    """Eigenvalues in falling order."""
-    series = [
-        Series(fit.name, range(1, len(fit.eigenvalues) + 1), fit.eigenvalues.tolist()) for fit in shown(comparison)
-    ]
-    return line_chart(series, "eigenvalue, by rank", "share of the trace", log=True, log_x=True, smoothed=False)
+    """Eigenvalues in falling order, those that are not lost in rounding."""
+    series = []
+    for fit in shown(comparison):
+        values = [value for value in fit.eigenvalues.tolist() if value > SMALLEST]
+        series.append(Series(fit.name, range(1, len(values) + 1), values))
+    return line_chart(
+        series, "eigenvalue, by rank", "tangent kernel, share of the trace", log=True, log_x=True, smoothed=False
+    )
 
 
 def comparison_sheet(comparison: Comparison):
@@ -99,10 +108,10 @@ def about_scales(comparison: Comparison) -> str:
     where = "inside of the range" if comparison.peak_inside else "at the end of the range; give other --scales"
     return (
         f"The scale says how far apart two places must be for the network to tell them apart. Too small, and it "
-        f"cannot follow the picture: neither half is learnt. Too large, and every pixel stands for itself: the learnt "
-        f"half gets better, the other worse. Gaussian features are best at {best.scale:g} cycles across the picture, "
-        f"{where}; they win {comparison.gain:.2f} dB over no encoding. Positional features spread their frequencies "
-        f"evenly in octaves up to the scale, along the axes alone."
+        f"cannot follow the picture: neither half is learnt. Too large, and every pixel stands for itself: what is "
+        f"learnt of one says nothing of the next. Gaussian features are best at {best.scale:g} cycles across the "
+        f"picture, {where}; they win {comparison.gain:.2f} dB over no encoding. Positional features spread their "
+        f"frequencies evenly in octaves up to the scale, along the axes alone."
     )
 
 
