@@ -78,6 +78,11 @@ class Method(nn.Module, ABC):
             f"{type(self).__name__} holds no density at points; what is made of it comes from its renderings instead"
         )
 
+    def random(self, number: int) -> torch.Generator:
+        """Random numbers that depend on the config's seed and a number alone, the step for example, so that a resumed
+        run draws the same."""
+        return torch.Generator().manual_seed((self.config.seed << 40) + (number % (1 << 40)))
+
     @property
     def device(self) -> torch.device:
         return next(self.parameters()).device

@@ -85,6 +85,10 @@ class Batch:
     def __len__(self) -> int:
         return len(self.rgb)
 
+    def before(self, background: Float[Tensor, "#ray 3"]) -> Float[Tensor, "ray 3"]:
+        """The colours with a background behind what is not opaque."""
+        return self.rgb if self.alpha is None else background + self.alpha[:, None] * (self.rgb - background)
+
     def to(self, device: torch.device | str) -> Batch:
         alpha = None if self.alpha is None else self.alpha.to(device)
         return Batch(self.rays.to(device), self.rgb.to(device), alpha)

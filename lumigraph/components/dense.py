@@ -6,7 +6,7 @@ from collections.abc import Callable
 from functools import cache
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor, nn
 from torch.nn import functional as F
 
@@ -38,8 +38,10 @@ class Dense(nn.Linear):
         nn.init.zeros_(self.bias)
 
     def forward(self, x: Float[Tensor, "sample input"]) -> Float[Tensor, "sample output"]:
-        kind = torch.float32 if self.exact else product_type(x.device)
-        return _Layer.apply(x.to(kind), self.weight, self.bias, self.relu)
+        return _Layer.apply(x.to(self.type_of_products(x)), self.weight, self.bias, self.relu)
+
+    def type_of_products(self, x: Tensor) -> torch.dtype:
+        return torch.float32 if self.exact else product_type(x.device)
 
 
 class _Layer(torch.autograd.Function):
@@ -69,8 +71,19 @@ def _activated(x: Tensor, w: Tensor, b: Tensor) -> Tensor:
     return F.linear(x, w, b).relu_()
 
 
-def in_chunks(network: Callable[..., tuple[Tensor, ...]], *inputs: Tensor) -> tuple[Tensor, ...]:
-    """What a network says of very many samples, asked for a cacheful at a time."""
+def in_chunks(
+    network: Callable[..., tuple[Tensor, ...]], *inputs: Tensor, where: Bool[Tensor, " sample"] | None = None
+) -> tuple[Tensor, ...]:
+    """What a network says of very many samples, asked for a cacheful at a time.
+
+    where: the samples to ask about; the answer is zero elsewhere
+    """
+    index = None if where is None else where.nonzero()[:, 0]
+    if index is not None:
+        inputs = tuple(x[index] for x in inputs)
     size = CHUNK_GPU if inputs[0].device.type == "cuda" else CHUNK_CPU
     parts = [network(*chunk) for chunk in zip(*(x.split(size) for x in inputs), strict=True)]
-    return tuple(torch.cat(part) for part in zip(*parts, strict=True))
+    answers = tuple(torch.cat(part) for part in zip(*parts, strict=True))
+    if where is None or index is None:
+        return answers
+    return tuple(x.new_zeros(len(where), *x.shape[1:]).index_copy(0, index, x) for x in answers)

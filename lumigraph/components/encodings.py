@@ -37,6 +37,31 @@ class FrequencyEncoding(nn.Module):
         return torch.cat([points, waves], 1) if self.keep_input else waves
 
 
+class IntegratedEncoding(nn.Module):
+    """What a frequency encoding is on average over a Gaussian: waves shorter than it fade (Barron 2021, eq. 14).
+
+        gamma(mu, sigma^2) = (sin(2^l mu), cos(2^l mu)) exp(-4^l sigma^2 / 2),  l = 0 ... L - 1
+
+    inputs: coordinates of a point
+    bands:  L, octaves
+    Only the variances along each coordinate are needed, for the encoding takes each by itself (eq. 13).
+    """
+
+    octaves: Tensor
+
+    def __init__(self, inputs: int, bands: int):
+        super().__init__()
+        self.width = 2 * inputs * bands
+        self.register_buffer("octaves", 2.0 ** torch.arange(bands), persistent=False)
+
+    def forward(
+        self, means: Float[Tensor, "sample input"], variances: Float[Tensor, "sample input"]
+    ) -> Float[Tensor, "sample feature"]:
+        angles = self.octaves[:, None] * means[:, None]  # (sample, octave, input)
+        left = torch.exp(-0.5 * self.octaves.square()[:, None] * variances[:, None])
+        return torch.stack([angles.sin() * left, angles.cos() * left], 2).flatten(1)
+
+
 class FourierFeatures(nn.Module):
     """Waves in the directions and at the frequencies that the rows of B hold (Tancik 2020, section 4).
 

@@ -75,7 +75,7 @@ class GaussianSplatting(Method):
     def __init__(self, frame: Frame, config: Any = None):
         config = config or Config()
         super().__init__(frame, config)
-        placeholder = random_cloud(frame, min(1000, config.most), config.degree, self._random(0))
+        placeholder = random_cloud(frame, min(1000, config.most), config.degree, self.random(0))
         self.cloud = Cloud(placeholder)
         self.cloud.antialiased = config.antialiased
         self.density_control = AdaptiveDensity(len(self.cloud), config.pull)
@@ -104,7 +104,7 @@ class GaussianSplatting(Method):
 
     def begin(self, scene: Scene) -> None:
         config = self.config
-        found = initial_cloud(scene, config.initial, config.most, config.degree, self._random(1))
+        found = initial_cloud(scene, config.initial, config.most, config.degree, self.random(1))
         self.cloud.replace(found, self._optimizer)
         self.density_control.begin(len(found))
         self.began.fill_(len(found))
@@ -121,7 +121,7 @@ class GaussianSplatting(Method):
             self._cameras = scene.cameras[train]
         turn, place = divmod(int(self.drawn), len(train))
         self.drawn += 1
-        order = torch.randperm(len(train), generator=self._random(1_000_000 + turn))
+        order = torch.randperm(len(train), generator=self.random(1_000_000 + turn))
         photograph = scene.photograph(int(train[order[place]]))
         return photograph.reduced(self._reduction(min(photograph.rgb.shape[:2]))).to(self.device)
 
@@ -137,7 +137,7 @@ class GaussianSplatting(Method):
         rgb, target = seen.rgb, batch.rgb
         background = torch.tensor(self.frame.background, device=rgb.device)
         if batch.alpha is not None:  # a random colour behind everything, so that only opacity can imitate opacity
-            background = torch.rand(3, generator=self._random(~step)).to(rgb.device)
+            background = torch.rand(3, generator=self.random(~step)).to(rgb.device)
             target = background + batch.alpha[..., None] * (target - background)
         if background.any():
             rgb = rgb + (1 - seen.opacity)[..., None] * background
@@ -185,7 +185,7 @@ class GaussianSplatting(Method):
         self._seen, size = None, len(self.cloud)
         due = step >= config.refine_from and step % config.refine_every == 0
         if config.strategy == "mcmc":
-            self._sample(due, optimizer, self._random(step))
+            self._sample(due, optimizer, self.random(step))
         elif self._progress < config.refine_until:
             self._densify(step, due, seen, optimizer)
         if config.smooth and (due or len(self.cloud) != size):
@@ -198,7 +198,7 @@ class GaussianSplatting(Method):
         control = self.density_control
         control.note(seen.centres.grad, seen.opacities > 0, (width, height))
         if due:
-            most, chance = self._most_by_now(), self._random(step)
+            most, chance = self._most_by_now(), self.random(step)
             wanted_more = control.refine(self.cloud, optimizer, float(self.extent), most, chance)
             if wanted_more and len(self.cloud) >= 0.99 * self._most():
                 self._tell_full()
@@ -247,7 +247,3 @@ class GaussianSplatting(Method):
         if prefix + "interval" in state_dict:
             self.interval = self.interval.new_empty(state_dict[prefix + "interval"].shape)
         super()._load_from_state_dict(state_dict, prefix, *rest)
-
-    def _random(self, number: int) -> torch.Generator:
-        """Random numbers that depend on the seed and the step alone, so that a resumed run draws the same."""
-        return torch.Generator().manual_seed((self.config.seed << 40) + (number % (1 << 40)))

@@ -17,6 +17,7 @@ from ..components.corrections import Exposure, PoseRefinement
 from ..components.lazy_adam import LazyAdam
 from ..components.occupancy import OccupancyGrid
 from ..components.perceptron import Perceptron
+from ..components.schedules import set_learning_rate
 from ..method import RayMethod
 from ..rays import Look, Rays, Rendering, Samples
 from ..scene import Batch, Frame, Scene
@@ -245,6 +246,4 @@ class InstantNGP(RayMethod):
         c = self.config
         fall = max(0.0, progress - c.hold) / (1 - c.hold)
         rate = c.learning_rate * (c.last_learning_rate / c.learning_rate) ** fall * min(1.0, (step + 1) / 20)
-        for optimizer in self._optimizers:
-            for group in optimizer.param_groups:
-                group["lr"] = rate * group.get("scale", 1.0)
+        set_learning_rate(self._optimizers, rate)

@@ -1,0 +1,72 @@
+"""Empty space: what a coordinate network need not be asked about."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor, nn
+from torch.nn.functional import max_pool3d
+
+from ..scene import Scene
+from .carving import visual_hull
+from .occupancy import OccupancyGrid
+
+BEGINS = 0.02  # share of the budget before the grid rules anything out: a young network is thin everywhere
+EVERY, DECAY = 16, 0.95  # steps between looks at the grid, and what it remembers of the last one
+LOOKS = 1 << 15  # at the grid, each time
+PROBES = 0.02  # share of all cells looked at again at random, in case something has grown there
+
+
+class EmptySpace(nn.Module):
+    """A grid over the cube of coordinates, [-1, 1]^3, that remembers where a network found something.
+
+    cells:     along each axis
+    thickness: optical thickness across a cell below which it is empty
+    """
+
+    def __init__(self, cells: int, thickness: float):
+        super().__init__()
+        self.cells, self.thickness = cells, thickness
+        self.grid = OccupancyGrid(1.0, cells)
+
+    def begin(self, scene: Scene) -> None:
+        """Rule out what photographs of an object see through."""
+        if scene.images.has_alpha and scene.frame.reach <= 1:
+            self.grid.rule_out(visual_hull(scene, self.cells)[None])
+
+    def look(
+        self,
+        step: int,
+        progress: float,
+        density_at: Callable[[Float[Tensor, "point 3"]], Float[Tensor, " point"]],
+        generator: torch.Generator,
+    ) -> None:
+        """Look again now and then, ahead of a training step. density_at: per unit of the coordinates."""
+        if progress >= BEGINS and step % EVERY == 0:
+            self.grid.update(density_at, self.thickness, generator, DECAY, PROBES, LOOKS)
+
+    def may_hold(
+        self, coordinates: Float[Tensor, "sample 3"], radius: Float[Tensor, " sample"] | None = None
+    ) -> Bool[Tensor, " sample"]:
+        """Whether something may be at coordinates, or within a radius around them."""
+        if radius is None:
+            return self.grid.holds(coordinates)
+        found = torch.zeros(len(coordinates), dtype=torch.bool, device=coordinates.device)
+        level = (radius * (0.5 * self.cells)).clamp_min(1).log2().ceil()
+        for k in range(int(level.max()) + 1 if len(level) else 0):
+            here = (level == k).nonzero()[:, 0]
+            found[here] = self._neighbourhood(k)[self._cells_of(coordinates[here], 2**k)]
+        return found
+
+    def _neighbourhood(self, level: int) -> Bool[Tensor, " cell"]:
+        """Cells 2^level times as large that hold something themselves or beside them."""
+        grid = self.grid.occupied.float()[None]
+        merged = max_pool3d(grid, 2**level, ceil_mode=True)
+        return (max_pool3d(merged, 3, 1, 1) > 0).flatten()
+
+    def _cells_of(self, coordinates: Float[Tensor, "sample 3"], size: int) -> Tensor:
+        n = -(-self.cells // size)
+        x, y, z = ((coordinates + 1) * (0.5 * self.cells / size)).long().clamp(0, n - 1).unbind(-1)
+        return (x * n + y) * n + z
