@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import signal
 import statistics
 import threading
@@ -21,7 +22,6 @@ from lumigraph.benchmark.launch import launch, reason
 from lumigraph.benchmark.published import FIGURES, published
 from lumigraph.cli import main
 from lumigraph.errors import LumigraphError
-from lumigraph.methods import available
 from lumigraph.run import Run
 from lumigraph.train import Budget
 
@@ -42,9 +42,9 @@ class Here:
         return code if self.code is None else self.code
 
 
-@pytest.fixture
-def ball(tmp_path) -> Path:
-    return tiny.write_blender(tmp_path / "ball")
+@pytest.fixture(scope="module")
+def ball(tmp_path_factory) -> Path:
+    return tiny.write_blender(tmp_path_factory.mktemp("scenes") / "ball")
 
 
 def cell(ball: Path, steps: int = 4, seed: int = 0, views: int | None = None) -> Cell:
@@ -55,91 +55,96 @@ def rows(output: Path) -> list[dict]:
     return json.loads((output / "results.json").read_text())["cells"]
 
 
-def test_every_cell_is_a_run_and_a_row(ball, tmp_path):
-    output, here = tmp_path / "out", Here()
-    cells = [cell(ball, steps, seed) for steps in (4, 30) for seed in (0, 1)]
+@pytest.fixture(scope="module")
+def cells(ball) -> list[Cell]:
+    return [cell(ball), cell(ball, seed=1), cell(ball, steps=30)]
+
+
+@pytest.fixture(scope="module")
+def done(cells, tmp_path_factory) -> Path:
+    output, here = tmp_path_factory.mktemp("done") / "out", Here()
     assert conduct(cells, SETTINGS, output, launch=here) == 0
-    assert here.seen == ["train", "eval"] * 4
-    found = rows(output)
-    for one, row in zip(cells, found, strict=True):
-        run = Run(output / row["run"])
+    assert here.seen == ["train", "eval"] * 3
+    return output
+
+
+@pytest.fixture
+def output(done, tmp_path) -> Path:
+    """A copy that a test may spoil."""
+    return shutil.copytree(done, tmp_path / "out")
+
+
+def test_every_cell_is_a_run_and_a_row(cells, done):
+    for one, row in zip(cells, rows(done), strict=True):
+        run = Run(done / row["run"])
         evaluation = run.evaluation()
         assert (run.method_name, run.config["seed"], run.state.step) == ("voxel-grid", one.seed, one.budget.steps)
         assert all(row[name] == evaluation[name] for name in ("psnr", "ssim", "seconds_per_view", "protocol"))
         assert (row["protocol"]["views"], row["protocol"]["of"], row["train_views"]) == (2, 3, 9)
         assert row["peak_memory"] == run.state.peak_memory > 0
         assert row["model_bytes"] == sum(file.stat().st_size for file in run.folder.rglob("weights.safetensors"))
-    page = (output / "results.md").read_text()
-    for steps in (4, 30):
-        scores = [row["psnr"] for row in found if row["budget"] == {"steps": steps}]
-        assert f"{statistics.mean(scores):.2f} ± {abs(scores[0] - scores[1]) / 2**0.5:.2f}" in page
-        assert all(f"| {score:.2f} |" in page for score in scores)
+
+
+def test_the_page_has_means_and_every_cell(done):
+    page, scores = (done / "results.md").read_text(), [row["psnr"] for row in rows(done)]
+    assert f"{statistics.mean(scores[:2]):.2f} ± {abs(scores[0] - scores[1]) / 2**0.5:.2f}" in page
+    assert all(f"| {score:.2f} |" in page for score in scores)
     assert "24x24, 2 of 3 of test, evenly spread, white background" in page and "LPIPS |" not in page
-    assert (output / "ball-psnr-over-time.svg").read_text().count("<circle") == 2
+    assert (done / "ball-psnr-over-time.svg").read_text().count("<circle") == 2
     assert "(ball-psnr-over-time.svg)" in page and "(views.png)" in page
 
 
-def test_the_sheet_shows_photograph_and_rendering(ball, tmp_path):
-    output = tmp_path / "out"
-    conduct([cell(ball, 30)], SETTINGS, output, launch=Here())
-    row = rows(output)[0]
+def test_the_sheet_shows_photograph_and_rendering(ball, done):
+    row = rows(done)[2]  # the longest training
     name = Path(row["shown"]["name"]).stem
-    sheet = np.array(Image.open(output / "views.png"))
+    sheet = np.array(Image.open(done / "views.png"))
     photograph = np.array(Image.open(ball / f"{name}.png")).astype(float)
     photograph = photograph[..., :3] * photograph[..., 3:] / 255 + (255 - photograph[..., 3:])
-    rendering = np.array(Image.open(output / row["run"] / "eval" / f"{name}.png").convert("RGB"))
+    rendering = np.array(Image.open(done / row["run"] / "eval" / f"{name}.png").convert("RGB"))
     top = next(y for y in range(len(sheet)) if (sheet[y : y + 24, 158:182] == rendering).all())
     assert np.abs(sheet[top : top + 24, 28:52] - photograph).max() <= 1
 
 
-def test_what_is_done_is_kept(ball, tmp_path):
-    output, cells = tmp_path / "out", [cell(ball, seed=seed) for seed in (0, 1)]
-    conduct(cells[:1], SETTINGS, output, launch=Here())
+def test_what_is_done_is_kept(cells, output):
     again = Here()
-    assert conduct(cells, SETTINGS, output, launch=again) == 0
-    assert again.seen == ["train", "eval"] and len(rows(output)) == 2
-    other = Here()
-    assert conduct(cells[:1], Settings(device="cpu", eval_views=3), output, launch=other) == 0
-    assert other.seen == ["eval"] and len(rows(output)) == 2
+    assert conduct(cells[:1], SETTINGS, output, launch=again) == 0
+    assert again.seen == [] and len(rows(output)) == 3
+    assert conduct(cells[:1], Settings(device="cpu", eval_views=3), output, launch=again) == 0
+    assert again.seen == ["eval"] and len(rows(output)) == 3
     assert rows(output)[0]["protocol"]["views"] == 3
 
 
 def test_a_stopped_benchmark_goes_on(ball, tmp_path):
-    output, cells = tmp_path / "out", [cell(ball), cell(ball, seed=1)]
-    assert conduct(cells, SETTINGS, output, launch=Here("--pause-at", "2", code=130)) == 130
-    assert Run(output / "runs" / cells[0].name).state.step == 2
-    again = Here()
-    assert conduct(cells, SETTINGS, output, launch=again) == 0
-    assert again.seen == ["resume", "eval", "train", "eval"]
-    assert [row["steps"] for row in rows(output)] == [4, 4]
+    one, again = cell(ball), Here()
+    assert conduct([one], SETTINGS, tmp_path, launch=Here("--pause-at", "2", code=130)) == 130
+    assert Run(tmp_path / "runs" / one.name).state.step == 2 and not (tmp_path / "results.json").exists()
+    assert conduct([one], SETTINGS, tmp_path, launch=again) == 0
+    assert again.seen == ["resume", "eval"] and rows(tmp_path)[0]["steps"] == 4
 
 
-def test_a_cell_that_fails_is_a_row_that_says_why(ball, tmp_path):
-    output = tmp_path / "out"
+def test_a_cell_that_fails_is_a_row_that_says_why(cells, output, tmp_path):
     lost = Cell("voxel-grid", "lost", str(tmp_path / "lost"), Budget(4, None))
-    assert conduct([lost, cell(ball)], SETTINGS, output, launch=Here()) == 0
-    first, second = rows(output)
-    assert first["failed"] == "it did not like the weather" and second["failed"] is None
+    for _ in range(2):  # it is tried again
+        here = Here()
+        assert conduct([lost, *cells], SETTINGS, output, launch=here) == 0
+        assert here.seen == ["train"]
+        assert [row["failed"] for row in rows(output)] == [None, None, None, "it did not like the weather"]
     page = (output / "results.md").read_text()
-    assert "| failed: it did not like the weather |" in page and f"{second['psnr']:.2f}" in page
-    again = Here()
-    conduct([lost, cell(ball)], SETTINGS, output, launch=again)
-    assert again.seen == ["train"]
+    assert "| failed: it did not like the weather |" in page and f"| {rows(output)[0]['psnr']:.2f} |" in page
 
 
-def test_a_damaged_run_stops_nothing(ball, tmp_path):
-    output, cells = tmp_path / "out", [cell(ball), cell(ball, seed=1)]
-    conduct(cells[:1], SETTINGS, output, launch=Here())
-    next((output / "runs").rglob("state.json")).write_text("{}")
+def test_a_damaged_run_stops_nothing(cells, output):
+    next((output / "runs" / cells[0].name).rglob("state.json")).write_text("{}")
     assert conduct(cells, SETTINGS, output, launch=Here()) == 0
-    assert "is not a checkpoint" in rows(output)[0]["failed"] and rows(output)[1]["failed"] is None
+    faults = [row["failed"] for row in rows(output)]
+    assert "is not a checkpoint" in faults[0] and faults[1:] == [None, None]
 
 
 def test_fewer_views_make_a_chart(ball, tmp_path):
     output = tmp_path / "out"
-    conduct([cell(ball, views=views) for views in (2, 4, None)], SETTINGS, output, launch=Here())
-    assert [row["train_views"] for row in rows(output)] == [2, 4, 9]
-    assert (output / "ball-psnr-over-views.svg").read_text().count("<circle") == 3
+    conduct([cell(ball, views=views) for views in (2, None)], SETTINGS, output, launch=Here())
+    assert [row["train_views"] for row in rows(output)] == [2, 9]
+    assert (output / "ball-psnr-over-views.svg").read_text().count("<circle") == 2
     assert not (output / "ball-psnr-over-time.svg").exists()
 
 
@@ -155,13 +160,11 @@ def test_photographs_at_several_scales_count_once(ball, tmp_path):
     )
 
 
-def test_cells_that_share_nothing_are_kept_apart(ball, tmp_path):
-    output = tmp_path / "out"
-    conduct([cell(ball)], SETTINGS, output, launch=Here())
+def test_cells_that_share_nothing_are_kept_apart(ball, done, tmp_path):
     with pytest.raises(LumigraphError, match="begun with --preset auto, which is now paper"):
-        conduct([cell(ball)], Settings(device="cpu", preset="paper"), output, launch=Here())
+        conduct([cell(ball)], Settings(device="cpu", preset="paper"), done, launch=Here())
     with pytest.raises(LumigraphError, match="Two scenes are called ball"):
-        conduct([cell(tmp_path)], SETTINGS, output, launch=Here())
+        conduct([cell(tmp_path)], SETTINGS, done, launch=Here())
 
 
 def test_time_left_counts_what_is_not_training():
@@ -180,10 +183,8 @@ def test_published_figures_are_of_methods_and_scenes():
     )
 
 
-def test_processes_of_their_own(tmp_path):
+def test_a_process_says_why_it_failed(tmp_path):
     log = tmp_path / "a.log"
-    assert launch(["methods"], log) == 0
-    assert all(name in log.read_text() for name in available() if name != "voxel-grid")
     assert launch(["eval", str(tmp_path / "nowhere")], log) == 2
     assert reason(log, 2).startswith(str(tmp_path / "nowhere")) and "is not a run" in reason(log, 2)
     assert "memory" in reason(log, 137)
