@@ -61,7 +61,7 @@ def test_gradients_of_fourier_features(generator):
 
 
 def test_inner_products_of_fourier_features_know_only_differences(generator):
-    """gamma(p) . gamma(q) = sum_j cos(2 pi b_j . (p - q)): the kernel is stationary (Tancik 2020, eq. 6)."""
+    """gamma(p) . gamma(q) = sum_j cos(2 pi b_j . (p - q)): the kernel is stationary (Tancik 2020, section 4)."""
     frequencies = 3 * torch.randn(64, 2, generator=generator)
     encoding = FourierFeatures(frequencies).double()
     p, q = points(generator, 20, 2).double(), points(generator, 20, 2).double()

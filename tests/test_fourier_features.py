@@ -60,6 +60,14 @@ def test_the_papers_network_has_its_shapes():
     assert [tuple(layer.weight.shape)[1] for layer in painted(encoding="none").layers][0] == 2
 
 
+@pytest.mark.parametrize("encoding", ["none", "basic", "positional", "gaussian"])
+def test_neighbouring_pixels_are_told_apart(encoding):
+    """Also where products are taken in bfloat16, which has three numbers between 3/4 and 3/4 + 1/100."""
+    along = 0.75 + torch.arange(20) / 2000
+    colours = painted(encoding=encoding).paint(torch.stack([along, along], 1))
+    assert len(colours.unique(dim=0)) == 20
+
+
 # The wall
 
 

@@ -18,17 +18,18 @@ from ..rays import Rays, Rendering
 from ..scene import Batch, Frame, Scene
 
 Encoding = Literal["none", "basic", "positional", "gaussian"]
+FEW = 16  # inputs to a layer below which it multiplies in float32: in bfloat16 alone they tell no pixel from the next
 
 
 @dataclass(frozen=True)
 class Config:
-    """The paper's numbers for pictures, with where it gives them; those of a step are ours."""
+    """The paper's numbers for pictures (section 6.1, and its appendix on implementation); those of a step are ours."""
 
-    encoding: Encoding = "gaussian"  # section 6.1
-    scale: float = 10.0  # sigma, cycles across the picture: gaussian's deviation, positional's highest; section 6.1
-    frequencies: int = 256  # rows of B for positional and gaussian, section 6.1
-    layers: int = 4  # the last one gives colours, section 6.1
-    width: int = 256  # of the others, section 6.1
+    encoding: Encoding = "gaussian"
+    scale: float = 10.0  # sigma, in cycles across the picture: gaussian's deviation, positional's highest frequency
+    frequencies: int = 256  # rows of B, for positional and gaussian
+    layers: int = 4  # the last of them gives colours
+    width: int = 256  # of the others
     learning_rate: float = 1e-3  # Adam's
     pixels: int = 1 << 13  # per step; the paper takes all of them
     exact: bool = False  # multiply in float32 even where bfloat16 is faster
@@ -40,7 +41,7 @@ class FourierFeatures(RayMethod):
 
         rgb(v) = sigmoid(W_n relu(... relu(W_1 gamma(v) + b_1) ...) + b_n)
 
-    It learns what all photographs show of that wall, which is a single picture's every pixel (`capture.picture`).
+    It learns what photographs show of that wall. A picture, as a scene (`capture.picture`), shows nothing else.
     """
 
     Config = Config
@@ -53,7 +54,7 @@ class FourierFeatures(RayMethod):
         widths = [2 if rows is None else 2 * len(rows), *[config.width] * (config.layers - 1)]
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(config.seed)
-            hidden = [Dense(a, b, relu=True, exact=config.exact) for a, b in pairwise(widths)]
+            hidden = [Dense(a, b, relu=True, exact=config.exact or a < FEW) for a, b in pairwise(widths)]
             self.layers = nn.Sequential(*hidden, Dense(config.width, 3, exact=True))
 
     def paint(self, place: Float[Tensor, "point 2"]) -> Float[Tensor, "point 3"]:
@@ -94,7 +95,7 @@ class FourierFeatures(RayMethod):
 
 
 def frequencies(config: Config) -> Float[Tensor, "frequency 2"] | None:
-    """B of the encodings (section 6): gamma(v) = (cos(2 pi B v), sin(2 pi B v)); None leaves v as it is.
+    """B of the encodings (section 6.1): gamma(v) = (cos(2 pi B v), sin(2 pi B v)); None leaves v as it is.
 
     basic:       B = I
     positional:  sigma^(j/m) along either axis, j = 0 ... m - 1, m being half the number of frequencies
