@@ -17,7 +17,7 @@ class Info:
     """Say what a run, a scene or a splat file holds."""
 
     what: Annotated[Positional[str], needed("RUN_OR_SCENE")]
-    """Folder of a run, folder of photographs, procedural:NAME, or a splat file."""
+    """Folder of a run, folder of photographs, a picture, procedural:NAME, or a splat file."""
     downscale: Annotated[int | None, option("N", "none, or what suits the photographs")] = None
     """Shrink a scene's photographs by a whole number."""
     reader: Annotated[Reader | None, option("NAME", "found by looking into the folder")] = None

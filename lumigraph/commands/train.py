@@ -30,8 +30,8 @@ DEFAULT_SECONDS = 60.0
 class Train:
     """Learn a scene from its photographs.
 
-    The scene is a folder of photographs, a video, or procedural:NAME. Where photographs have no poses, `lumigraph
-    capture` finds them first. `lumigraph train METHOD --help` adds the method's own options, `lumigraph methods` lists
+    The scene is a folder of photographs, a video, a single picture, or procedural:NAME. Where photographs have no poses,
+    `lumigraph capture` finds them first. `lumigraph train METHOD --help` adds the method's own options, `lumigraph methods` lists
     the methods. Ctrl-C saves; `lumigraph resume` goes on.
     """
 
