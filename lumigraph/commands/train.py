@@ -30,9 +30,9 @@ DEFAULT_SECONDS = 60.0
 class Train:
     """Learn a scene from its photographs.
 
-    The scene is a folder of photographs, a video, a single picture, or procedural:NAME. Where photographs have no poses,
-    `lumigraph capture` finds them first. `lumigraph train METHOD --help` adds the method's own options, `lumigraph methods` lists
-    the methods. Ctrl-C saves; `lumigraph resume` goes on.
+    The scene is a folder of photographs, a video, a single picture, or procedural:NAME. Where photographs have no
+    poses, `lumigraph capture` finds them first. `lumigraph train METHOD --help` adds the method's own options,
+    `lumigraph methods` lists the methods. Ctrl-C saves; `lumigraph resume` goes on.
     """
 
     method: Annotated[Positional[str], needed("METHOD")]

@@ -28,9 +28,9 @@ GRID = 24  # points along each side, at which the tangent kernel is taken
 class Fit:
     """One trained network.
 
-    scale:           cycles across the picture; None for encodings without one
-    learnt, held_out: PSNR in dB of the pixels that it learnt from, and of the others
-    eigenvalues:     of the tangent kernel before training, as shares of their sum
+    scale:       cycles across the picture; None for encodings without one
+    learnt:      PSNR of the pixels that it learnt from, in dB; held_out of the others
+    eigenvalues: of the tangent kernel before training, as shares of their sum
     """
 
     encoding: Encoding
@@ -58,11 +58,11 @@ class Comparison:
 
     def of(self, encoding: Encoding) -> list[Fit]:
         """Fits of one encoding, by scale."""
-        return [fit for fit in self.fits if fit.encoding == encoding]
+        return [one for one in self.fits if one.encoding == encoding]
 
     def best(self, encoding: Encoding) -> Fit:
         """The fit that shows held-out pixels best."""
-        return max(self.of(encoding), key=lambda fit: fit.held_out)
+        return max(self.of(encoding), key=lambda one: one.held_out)
 
     @property
     def leading(self) -> list[Fit]:
@@ -92,14 +92,14 @@ class Comparison:
             "peak_inside": self.peak_inside,
             "fits": [
                 {
-                    "encoding": fit.encoding,
-                    "scale": fit.scale,
-                    "psnr_held_out": fit.held_out,
-                    "psnr_learnt": fit.learnt,
-                    "seconds": fit.seconds,
-                    "eigenvalues": fit.eigenvalues.tolist(),
+                    "encoding": one.encoding,
+                    "scale": one.scale,
+                    "psnr_held_out": one.held_out,
+                    "psnr_learnt": one.learnt,
+                    "seconds": one.seconds,
+                    "eigenvalues": one.eigenvalues.tolist(),
                 }
-                for fit in self.fits
+                for one in self.fits
             ],
         }
 
