@@ -19,8 +19,8 @@ LOOKS = 0.2  # seconds between looks at whether to stop
 def launch(arguments: Sequence[str], log: Path) -> int:
     """Run `lumigraph ARGUMENTS`, with all that it says added to a log. Returns its exit code, as shells count.
 
-    Ctrl-C and SIGTERM are passed on, and the command may end as it does by itself: with its state saved. It stands apart
-    from the terminal, which would send it Ctrl-C a second time.
+    Ctrl-C and SIGTERM are passed on, and the command may end as it does by itself: with its state saved. It stands
+    apart from the terminal, which would send it Ctrl-C a second time.
     """
     with files.explained(log):
         log.parent.mkdir(parents=True, exist_ok=True)
