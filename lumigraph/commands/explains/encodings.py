@@ -26,7 +26,7 @@ class Encodings:
     """Where the page goes."""
     steps: Annotated[int, option("N")] = 500
     """Of training, for each network."""
-    scales: Annotated[tuple[float, ...], option("S S ...")] = (1.0, 2.0, 4.0, 8.0, 16.0, 32.0, 64.0)
+    scales: Annotated[tuple[float, ...], option("S S ...")] = (1.0, 2.0, 4.0, 8.0, 16.0, 32.0, 64.0, 128.0)
     """Frequencies in cycles across the picture: the deviation of Gaussian ones, the highest of positional ones."""
     downscale: Annotated[int | None, option("N", "to about 512 pixels")] = None
     """Shrink the picture by a whole number."""
