@@ -7,7 +7,7 @@ import math
 import pytest
 import torch
 
-from lumigraph.components.encodings import FourierFeatures, FrequencyEncoding
+from lumigraph.components.encodings import FourierFeatures, FrequencyEncoding, IntegratedEncoding
 
 
 def points(generator, count: int = 500, inputs: int = 3) -> torch.Tensor:
@@ -79,3 +79,18 @@ def test_frequencies_survive_saving_and_octaves_need_none(generator):
     p = points(generator, 9, 2)
     assert torch.equal(other(p), encoding(p))
     assert not FrequencyEncoding(3, 10).state_dict() and encoding.width == 8
+
+
+def test_an_integrated_encoding_is_the_mean_over_a_gaussian(generator):
+    """Barron 2021, eqs. 11 to 14, against the mean of the plain encoding over samples."""
+    mean, deviation = torch.tensor([0.3, -0.7, 0.1]), torch.tensor([0.05, 0.3, 0.01])
+    samples = mean + deviation * torch.randn(400_000, 3, generator=generator)
+    plain = FrequencyEncoding(3, 6, keep_input=False, base=1.0)
+    seen = IntegratedEncoding(3, 6)(mean[None], deviation.square()[None])
+    torch.testing.assert_close(seen[0], plain(samples).double().mean(0).float(), rtol=0, atol=5e-3)
+
+
+def test_without_width_it_is_the_plain_encoding(generator):
+    p = points(generator)
+    plain = FrequencyEncoding(3, 8, keep_input=False, base=1.0)
+    torch.testing.assert_close(IntegratedEncoding(3, 8)(p, torch.zeros_like(p)), plain(p), rtol=0, atol=1e-5)

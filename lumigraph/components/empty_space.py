@@ -13,7 +13,7 @@ from ..scene import Scene
 from .carving import visual_hull
 from .occupancy import OccupancyGrid
 
-BEGINS = 0.02  # share of the budget before the grid rules anything out: a young network is thin everywhere
+BEGINS = 0.1  # share of the budget before the grid rules anything out: a young network is thin everywhere
 EVERY, DECAY = 16, 0.95  # steps between looks at the grid, and what it remembers of the last one
 LOOKS = 1 << 15  # at the grid, each time
 PROBES = 0.02  # share of all cells looked at again at random, in case something has grown there
@@ -26,10 +26,13 @@ class EmptySpace(nn.Module):
     thickness: optical thickness across a cell below which it is empty
     """
 
+    known: Tensor
+
     def __init__(self, cells: int, thickness: float):
         super().__init__()
         self.cells, self.thickness = cells, thickness
         self.grid = OccupancyGrid(1.0, cells)
+        self.register_buffer("known", torch.tensor(False))
 
     def begin(self, scene: Scene) -> None:
         """Rule out what photographs of an object see through."""
@@ -44,8 +47,11 @@ class EmptySpace(nn.Module):
         generator: torch.Generator,
     ) -> None:
         """Look again now and then, ahead of a training step. density_at: per unit of the coordinates."""
-        if progress >= BEGINS and step % EVERY == 0:
-            self.grid.update(density_at, self.thickness, generator, DECAY, PROBES, LOOKS)
+        if progress < BEGINS or step % EVERY:
+            return
+        share, looks = (PROBES, LOOKS) if self.known else (1.0, None)  # everywhere for once
+        self.grid.update(density_at, self.thickness, generator, DECAY, share, looks)
+        self.known.fill_(True)
 
     def may_hold(
         self, coordinates: Float[Tensor, "sample 3"], radius: Float[Tensor, " sample"] | None = None

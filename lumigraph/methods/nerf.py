@@ -16,6 +16,7 @@ from ..components.encodings import FrequencyEncoding
 from ..components.sampling import inverse_transform, midpoints, stratified
 from ..components.schedules import falling, set_learning_rate
 from ..components.spaces import space_of
+from ..errors import LumigraphError
 from ..method import RayMethod
 from ..rays import Look, Rays, Rendering, Samples
 from ..scene import Batch, Frame, Scene
@@ -54,6 +55,11 @@ class NeRF(RayMethod):
 
     def __init__(self, frame: Frame, config: Any = None):
         config = config or Config()
+        if config.networks not in (1, 2) or (config.networks == 2 and not config.coarse_loss):
+            raise LumigraphError(
+                f"nerf has 1 or 2 networks, and the first of 2 learns from --coarse-loss alone; --networks "
+                f"{config.networks} with --coarse-loss {config.coarse_loss:g} cannot be"
+            )
         super().__init__(frame, config)
         self.space = space_of(frame)
         self.encode_position = FrequencyEncoding(3, config.position_bands, keep_input=False)
@@ -75,9 +81,11 @@ class NeRF(RayMethod):
             depth=6,
             width=128,
             rejoin=3,
-            fine_samples=32,
-            learning_rate=2e-3,
-            last_learning_rate=1e-4,
+            coarse_samples=32,
+            fine_samples=16,
+            rays_per_step=1024,
+            learning_rate=4e-3,
+            last_learning_rate=2e-4,
             warm_up=0.02,
             networks=1,
             coarse_loss=0.0,
@@ -144,9 +152,10 @@ class NeRF(RayMethod):
     ) -> Look:
         """Ask a network at places along rays; its answer holds as far as the next place (eq. 3)."""
         near, far = self.space.interval(rays)
-        samples = Samples.rows(self.space.distance(shares, rays, near, far), far)
-        ray = samples.ray_index
-        coordinates = self.space.warp(rays.origins[ray] + samples.t_start[:, None] * rays.directions[ray])
+        t = self.space.distance(shares, rays, near, far)
+        samples, ray = Samples.rows(t, far), torch.arange(t.numel(), device=t.device) // t.shape[1]
+        points = rays.origins[:, None] + t[..., None] * rays.directions[:, None]
+        coordinates = self.space.warp(points.flatten(0, 1))
         directions = self.encode_direction(rays.directions)
         noise = self.config.density_noise if generator and self.frame.reach > 1 else 0.0
 

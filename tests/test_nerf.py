@@ -1,0 +1,181 @@
+"""NeRF and Mip-NeRF, small: they learn, both looks agree, what saves time keeps the picture, and every space will do."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import tiny
+import torch
+
+from lumigraph.camera import Camera
+from lumigraph.errors import LumigraphError
+from lumigraph.evaluate import evaluate
+from lumigraph.images import ImageStore
+from lumigraph.lens import Pinhole
+from lumigraph.method import RayMethod
+from lumigraph.methods import mip_nerf, nerf
+from lumigraph.rays import Rays
+from lumigraph.run import build
+from lumigraph.scene import Forward, Frame, Scene
+from lumigraph.train import fit
+from lumigraph.volume import composite
+
+SMALL = {"depth": 3, "width": 32, "rejoin": 2, "coarse_samples": 24, "fine_samples": 16, "rays_per_step": 256}
+KINDS = {"nerf": nerf.NeRF, "mip-nerf": mip_nerf.MipNeRF}
+QUICK = {"learning_rate": 5e-3, "last_learning_rate": 5e-4, "warm_up": 0.0}
+KIND = pytest.mark.parametrize("kind", KINDS.values(), ids=KINDS)
+
+
+def method(kind: type[RayMethod], frame: Frame | None = None, **options) -> RayMethod:
+    config = kind.Config(**SMALL | QUICK | {"position_bands": 6} | options)
+    return build(kind, frame or tiny.scene().frame, config, torch.device("cpu"), 0)
+
+
+def some_rays(count: int = 64) -> Rays:
+    camera = tiny.scene().cameras[2]
+    return camera.rays(camera.pixels()[:: 576 // count][:count])
+
+
+@KIND
+@pytest.mark.parametrize("options", [{}, {"occupancy": 16, "coarse_loss": 0.0}], ids=["paper", "quick"])
+def test_it_learns_held_out_views(kind, options):
+    if kind is nerf.NeRF and options:
+        options = options | {"networks": 1, "stop": 1e-3}
+    scene, made = tiny.scene(), method(kind, **options)
+    before = evaluate(made, scene).psnr
+    fit(made, scene, steps=150, show=False)
+    assert evaluate(made, scene).psnr > max(before, 9) + 6
+
+
+@KIND
+def test_the_last_look_is_the_picture(kind):
+    made = method(kind).eval()
+    rays, background = some_rays(), torch.ones(1, 3)
+    coarse, fine = made.looks(rays)
+    assert [coarse.name, fine.name] == ["coarse", "fine"]
+    assert len(fine.samples) > len(coarse.samples) * 16 / 24 - 1
+    seen = made.render_rays(rays, background)
+    torch.testing.assert_close(composite(fine.samples, fine.density, fine.rgb, background).rgb, seen.rgb)
+
+
+def test_the_fine_look_of_nerf_holds_the_coarse_places_too():
+    """Section 5.2: the union of both sets is evaluated by the fine network."""
+    coarse, fine = (look.samples for look in method(nerf.NeRF).looks(some_rays(8)))
+    first, second = coarse.t_start.view(8, 24), fine.t_start.view(8, 40)
+    assert (second.diff(dim=1) >= 0).all()
+    for a, b in zip(first, second, strict=True):
+        assert torch.isin(a, b).all()
+
+
+@KIND
+def test_samples_go_where_the_first_look_found_something(kind):
+    """With a network that knows of a thin shell alone, most fine samples lie near it."""
+    made = method(kind, bfloat16=False).eval()
+    found = lambda x: 60 * ((x.norm(dim=-1) - 0.5).abs() < 0.05).float()  # noqa: E731
+
+    class Shell(torch.nn.Module):
+        def forward(self, encoded, seen):
+            return self.density(encoded), torch.zeros(len(encoded), 3)
+
+        def density(self, encoded):
+            sine, cosine = encoded[:, :3], encoded[:, 3:6]
+            x = torch.atan2(sine, cosine) / (torch.pi if kind is nerf.NeRF else 1)
+            return found(x) - 30 * (kind is mip_nerf.MipNeRF)
+
+    for name in ("fine", "coarse", "network"):
+        if hasattr(made, name):
+            setattr(made, name, Shell())
+    middle = Rays(torch.tensor([[0.0, 0.0, -3.0]]), torch.tensor([[0.0, 0.0, 1.0]]), torch.tensor([1e-3]))
+    _, fine = made.looks(middle)
+    near = (fine.samples.t - 2.5).abs() < 0.15
+    assert float(near.float().mean()) > (0.4 if kind is nerf.NeRF else 0.6)
+
+
+@KIND
+def test_skipping_empty_space_keeps_the_picture(kind):
+    """Where the network says nothing is, not asking it changes nothing."""
+    scene = tiny.scene()
+    made = method(kind, occupancy=32, coarse_loss=0.1)
+    fit(made, scene, steps=100, show=False)
+    assert 0 < made.empty.grid.share < 0.6
+    camera = scene.cameras[0]
+    skipping, asked = made.render(camera).rgb, made.statistics()["samples"]
+    made.empty = None
+    everywhere = made.render(camera).rgb
+    assert made.statistics()["samples"] > 1.5 * asked
+    assert float((skipping - everywhere).square().mean()) < 1e-3
+
+
+@KIND
+def test_gradients_reach_every_weight(kind):
+    made, scene = method(kind).train(), tiny.scene()
+    terms = made.loss(made.batch(scene, torch.Generator().manual_seed(0)), 0)
+    assert terms.keys() == {"fine", "coarse"}
+    torch.stack(list(terms.values())).sum().backward()
+    for name, parameter in made.named_parameters():
+        assert parameter.grad is not None and parameter.grad.isfinite().all() and parameter.grad.any(), name
+
+
+def wall(reach: float, forward: bool) -> Scene:
+    """A coloured wall, photographed from places side by side."""
+    count, size = 9, 16
+    y, x = torch.meshgrid(torch.linspace(-0.3, 0.3, 3), torch.linspace(-0.3, 0.3, 3), indexing="ij")
+    pose = torch.eye(3, 4).repeat(count, 1, 1)
+    pose[:, 0, 3], pose[:, 1, 3] = x.flatten(), y.flatten()
+    lens = Pinhole(torch.full((count, 2), 16.0), torch.full((count, 2), size / 2))
+    cameras = Camera(pose, lens, torch.full((count, 2), size), image_index=torch.arange(count))
+    pictures = []
+    for camera in (cameras[i] for i in range(count)):
+        rays = camera.rays(camera.pixels())
+        hit = rays.at(2.0 / rays.directions[:, 2])
+        rgb = 0.5 + 0.4 * torch.stack(
+            [(6 * hit[:, 0]).sin(), (5 * hit[:, 1]).sin(), (7 * hit[:, :2].sum(-1)).sin()], -1
+        )
+        pictures.append((rgb.clamp(0, 1) * 255).byte().view(size, size, 3).numpy())
+    look = Forward(((1.0, 0, 0, 0), (0, 1, 0, 0), (0, 0, 1, 0)), (2.0, 2.0), 1.0) if forward else None
+    frame = Frame(reach=reach, near=0.5, image_count=count, forward=look)
+    split = {"train": torch.tensor([0, 1, 2, 3, 5, 6, 7, 8]), "test": torch.tensor([4])}
+    return Scene(cameras, ImageStore.from_arrays(pictures), frame, split, [str(i) for i in range(count)], "in memory")
+
+
+@KIND
+@pytest.mark.parametrize("forward", [True, False], ids=["ndc", "contracted"])
+def test_it_learns_in_every_space(kind, forward):
+    scene = wall(4.0, forward)
+    made = method(kind, scene.frame, **({"density_noise": 0.0} if kind is nerf.NeRF else {}))
+    fit(made, scene, steps=150, show=False)
+    evaluation = evaluate(made, scene)
+    assert evaluation.psnr > 20
+    seen = made.render(scene.cameras[4])
+    assert seen.depth.isfinite().all()
+    assert float(seen.depth.median()) == pytest.approx(2.0, rel=0.35)
+
+
+@KIND
+def test_density_of_points_is_what_rays_integrate(kind):
+    """The optical thickness of a short way is density times length, whatever the space."""
+    frame = wall(4.0, True).frame
+    made = method(kind, frame).eval()
+    look = made.looks(Rays(torch.zeros(1, 3), torch.tensor([[0.0, 0.0, 1.0]]), torch.tensor([1e-2])))[1]
+    points = torch.stack([0 * look.samples.t_start, 0 * look.samples.t_start, look.samples.t_start], -1)
+    ratio = made.space.along(Rays(torch.zeros(1, 3), torch.tensor([[0.0, 0.0, 1.0]]), torch.ones(1)), look.samples)
+    if kind is nerf.NeRF:
+        raw = made._density_at(made.space.warp(points))
+        torch.testing.assert_close(look.density, raw * ratio, rtol=2e-2, atol=1e-4)
+    assert made.density(points).shape == (len(points),) and (made.density(points) >= 0).all()
+
+
+def test_mip_nerf_sees_less_detail_through_wider_cones():
+    """The same point, seen from a wide cone and a narrow one: what the network is told has faded."""
+    made = method(mip_nerf.MipNeRF)
+    p, wide = torch.tensor([[0.3, 0.1, -0.2]]), torch.full((1, 3), 0.3)
+    narrow = made.encode_frustum(p, torch.zeros(1, 3)).abs()
+    faded = made.encode_frustum(p, wide).abs()
+    assert (faded <= narrow + 1e-6).all()
+    assert float(faded[:, -6:].max()) < 1e-6 < float(narrow[:, -6:].max())
+
+
+def test_two_networks_need_a_loss_each():
+    with pytest.raises(LumigraphError, match="--networks 2 with --coarse-loss 0"):
+        method(nerf.NeRF, coarse_loss=0.0)

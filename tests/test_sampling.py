@@ -1,0 +1,120 @@
+"""Where rays are looked at: evenly, then like what was found; and where there is no need."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from lumigraph.components.empty_space import EmptySpace
+from lumigraph.components.frustums import frustum_moments
+from lumigraph.components.occupancy import OccupancyGrid
+from lumigraph.components.sampling import inverse_transform, stratified
+from lumigraph.methods.mip_nerf import blurred
+
+
+def test_one_in_each_bin(generator):
+    shares = stratified(500, 8, generator)
+    assert torch.equal((shares * 8).floor(), torch.arange(8.0).expand(500, 8))
+    torch.testing.assert_close(shares.mean(0), stratified(1, 8)[0], rtol=0, atol=0.01)
+    assert shares.std(0).min() > 0.9 / 8 / 12**0.5
+
+
+def test_samples_spread_like_the_weights(generator):
+    """Their distribution function is the weights' own, up to the step between two samples."""
+    edges = torch.tensor([[0.0, 0.1, 0.5, 0.6, 2.0]])
+    weights = torch.tensor([[1.0, 0.0, 5.0, 2.0]])
+    found = inverse_transform(edges, weights, stratified(1, 4000, generator))[0]
+    assert (found.diff() >= 0).all()
+    for x, below in [(0.1, 1 / 8), (0.5, 1 / 8), (0.55, 3.5 / 8), (0.6, 6 / 8), (1.3, 7 / 8)]:
+        assert float((found <= x).float().mean()) == pytest.approx(below, abs=2e-3)
+
+
+def test_where_nothing_was_found_samples_are_even():
+    edges = torch.linspace(2, 6, 9)[None]
+    found = inverse_transform(edges, torch.zeros(1, 8), stratified(1, 16))
+    torch.testing.assert_close(found, 2 + 4 * stratified(1, 16))
+
+
+def test_no_sample_leaves_its_bins():
+    shares = torch.tensor([[0.0, 1e-9, 0.5, 1 - 1e-7, 1.0]])
+    found = inverse_transform(torch.tensor([[1.0, 1.5, 3.0]]), torch.tensor([[0.0, 1e9]]), shares)
+    assert found.min() >= 1 and found.max() <= 3 and found.isfinite().all()
+
+
+def test_blurred_weights_surround_what_was_found():
+    weights = torch.tensor([[0.0, 0.0, 1.0, 0.0, 0.0, 0.0]])
+    assert blurred(weights).tolist() == [[0.0, 0.5, 1.0, 0.5, 0.0, 0.0]]
+    assert blurred(torch.ones(2, 5)).tolist() == [[1.0] * 5] * 2
+
+
+def cone_points(start: float, end: float, radius: float, generator, count: int = 400_000) -> torch.Tensor:
+    """Points filling a conical frustum around the z axis evenly."""
+    u = torch.rand(count, generator=generator, dtype=torch.float64)
+    t = (start**3 + u * (end**3 - start**3)) ** (1 / 3)
+    r = radius * t * torch.rand(count, generator=generator, dtype=torch.float64).sqrt()
+    angle = 2 * torch.pi * torch.rand(count, generator=generator, dtype=torch.float64)
+    return torch.stack([r * angle.cos(), r * angle.sin(), t], -1)
+
+
+@pytest.mark.parametrize(
+    ("start", "end", "radius"), [(1.0, 1.5, 0.1), (0.0, 1.0, 0.5), (2.0, 2.1, 0.02), (0.1, 4.0, 1.0)]
+)
+def test_moments_are_those_of_sampled_cones(start, end, radius, generator):
+    points = cone_points(start, end, radius, generator)
+    mean, along, across = (float(x) for x in frustum_moments(*(torch.tensor([v]) for v in (start, end, radius))))
+    assert mean == pytest.approx(float(points[:, 2].mean()), rel=2e-3)
+    assert along == pytest.approx(float(points[:, 2].var()), rel=1e-2)
+    assert across == pytest.approx(float(points[:, 0].var()), rel=1e-2)
+
+
+def test_moments_of_thin_frusta_keep_their_digits():
+    start = torch.tensor([1.0, 4.0, 100.0])
+    end = start * (1 + 1e-3)
+    radius = torch.full((3,), 1e-3)
+    for thin, wide in zip(
+        frustum_moments(start, end, radius), frustum_moments(start.double(), end.double(), radius.double()), strict=True
+    ):
+        torch.testing.assert_close(thin.double(), wide, rtol=2e-3, atol=0)
+
+
+def test_a_grid_holds_the_points_in_its_occupied_cells(generator):
+    grid = OccupancyGrid(4.0, 8)
+    grid.occupied = torch.rand(grid.occupied.shape, generator=generator) < 0.5
+    points = 9 * torch.rand(2000, 3, generator=generator) - 4.5
+    for point, held in zip(points, grid.holds(points), strict=True):
+        size = float(point.abs().max())
+        cascade = next((c for c in range(3) if size <= 2.0**c), None)
+        if cascade is None:
+            assert not held
+            continue
+        cell = ((point / 2.0**cascade + 1) * 4).long().clamp(max=7)
+        assert held == grid.occupied[cascade, cell[0], cell[1], cell[2]]
+
+
+def test_nothing_near_what_is_there_is_ruled_out(generator):
+    """However wide the blur, a place that has something within its radius may hold something."""
+    empty = EmptySpace(32, 0.01)
+    there = torch.zeros(1, 32, 32, 32, dtype=torch.bool)
+    there[0, 20, 9, 30] = True
+    empty.grid.rule_out(there)
+    cell = torch.tensor([20.5, 9.5, 30.5]) / 16 - 1
+    points = 2 * torch.rand(4000, 3, generator=generator) - 1
+    radius = torch.rand(4000, generator=generator) * 0.5
+    near = (points - cell).norm(dim=-1) < radius
+    found = empty.may_hold(points, radius)
+    assert near.any() and found[near].all()
+    small = empty.may_hold(points, torch.full((4000,), 1e-3))
+    assert small.sum() < 40  # 27 cells of 32 768 hold about 3 of them
+    assert torch.equal(empty.may_hold(points), empty.grid.holds(points))
+
+
+def test_a_grid_that_looks_finds_what_is_there():
+    empty = EmptySpace(16, 0.01)
+
+    def ball(x: torch.Tensor) -> torch.Tensor:
+        return 10.0 * (x.norm(dim=-1) < 0.5)
+
+    for step in range(0, 1600, 16):
+        empty.look(step, 0.5, ball, torch.Generator().manual_seed(step))
+    points = torch.tensor([[0.0, 0, 0], [0.3, 0.2, 0], [0.9, 0.9, 0.9], [-0.8, 0, 0]])
+    assert empty.may_hold(points).tolist() == [True, True, False, False]
