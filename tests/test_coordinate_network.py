@@ -1,4 +1,4 @@
-"""The network of NeRF and its wide layers: the paper's shapes and numbers, in bfloat16 and float32, in chunks and whole."""
+"""The network of NeRF and its wide layers: the paper's shapes, bfloat16 and float32, in chunks and whole."""
 
 from __future__ import annotations
 

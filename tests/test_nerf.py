@@ -1,8 +1,6 @@
-"""NeRF and Mip-NeRF, small: they learn, both looks agree, what saves time keeps the picture, and every space will do."""
+"""NeRF and Mip-NeRF, small: they learn, both looks agree, what saves time keeps the picture, any space will do."""
 
 from __future__ import annotations
-
-from dataclasses import replace
 
 import pytest
 import tiny
