@@ -66,7 +66,7 @@ def test_direction_changes_colour_and_not_density(generator):
 
 
 @pytest.mark.parametrize("relu", [False, True])
-@pytest.mark.parametrize(("kind", "tolerance"), [(torch.float32, 1e-6), (torch.bfloat16, 4e-2)])
+@pytest.mark.parametrize(("kind", "tolerance"), [(torch.float32, 1e-6), (torch.bfloat16, 1e-1)])
 @pytest.mark.parametrize("samples", [0, 1, 33, 200])
 def test_a_layer_and_its_gradients(samples, kind, tolerance, relu, generator, monkeypatch):
     monkeypatch.setattr(dense, "product_type", lambda device: kind)
@@ -105,14 +105,15 @@ def test_chunks_change_nothing(samples, generator, monkeypatch):
         torch.testing.assert_close(a, b)
 
 
-def test_only_where_it_is_worth_asking(generator):
+def test_only_where_it_is_worth_asking(generator, monkeypatch):
+    monkeypatch.setattr(dense, "ROUND", 4)
     network = CoordinateNetwork(6, 4, 3, 16, 2, **EXACT)
     x, d = torch.randn(30, 6, generator=generator), torch.randn(30, 4, generator=generator)
     where = torch.rand(30, generator=generator) < 0.3
     asked: list[int] = []
     density, rgb = in_chunks(lambda x, d: asked.append(len(x)) or network(x, d), x, d, where=where)
     whole = network(x, d)
-    assert sum(asked) == int(where.sum())
+    assert where.sum() <= sum(asked) < where.sum() + 4
     torch.testing.assert_close(density, whole[0] * where)
     torch.testing.assert_close(rgb, whole[1] * where[:, None])
     rgb.sum().backward()

@@ -17,10 +17,15 @@ NAMES = methods.available()  # tiny adds the tests' own
 DEVICES = ["cpu", pytest.param("cuda", marks=pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU"))]
 
 
+def preset(kind, device: str = "cpu"):
+    """What a user would get, learning from fewer rays at a time."""
+    config = kind.preset(torch.device(device))
+    return dataclasses.replace(config, rays_per_step=256) if hasattr(config, "rays_per_step") else config
+
+
 def begin(name: str, folder, device: str = "cpu") -> Run:
     scene, kind = tiny.scene(), methods.find(name)
-    config = kind.preset(torch.device(device))
-    return Run.create(folder, build(kind, scene.frame, config, torch.device(device), 0), scene)
+    return Run.create(folder, build(kind, scene.frame, preset(kind, device), torch.device(device), 0), scene)
 
 
 def train(run: Run, device: str = "cpu", **options):
@@ -68,7 +73,7 @@ def test_looking_changes_nothing(name, tmp_path):
     """Renderings between steps, as previews are, leave training as it was."""
     scene, kind, states = tiny.scene(), methods.find(name), []
     for looks in (False, True):
-        method = build(kind, scene.frame, kind.preset(torch.device("cpu")), torch.device("cpu"), 0)
+        method = build(kind, scene.frame, preset(kind), torch.device("cpu"), 0)
         if looks:
             step = type(method).after_step
 
@@ -90,5 +95,5 @@ def test_its_config_and_frame_survive_the_folder(name, tmp_path):
     run = begin(name, tmp_path / "run")
     fresh = Run(run.folder).new_method()
     kind = methods.find(name)
-    assert fresh.config == kind.preset(torch.device("cpu")) and fresh.frame == tiny.scene().frame
+    assert fresh.config == preset(kind) and fresh.frame == tiny.scene().frame
     assert methods.name_of(fresh) == name

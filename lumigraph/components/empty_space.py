@@ -22,7 +22,7 @@ PROBES = 0.02  # share of all cells looked at again at random, in case something
 class EmptySpace(nn.Module):
     """A grid over the cube of coordinates, [-1, 1]^3, that remembers where a network found something.
 
-    cells:     along each axis
+    cells:     along each axis; the hull of an object may make them finer
     thickness: optical thickness across a cell below which it is empty
     """
 
@@ -60,7 +60,7 @@ class EmptySpace(nn.Module):
         if radius is None:
             return self.grid.holds(coordinates)
         found = torch.zeros(len(coordinates), dtype=torch.bool, device=coordinates.device)
-        level = (radius * (0.5 * self.cells)).clamp_min(1).log2().ceil()
+        level = (radius * (0.5 * self.grid.resolution)).clamp_min(1).log2().ceil()
         for k in range(int(level.max()) + 1 if len(level) else 0):
             here = (level == k).nonzero()[:, 0]
             found[here] = self._neighbourhood(k)[self._cells_of(coordinates[here], 2**k)]
@@ -73,6 +73,6 @@ class EmptySpace(nn.Module):
         return (max_pool3d(merged, 3, 1, 1) > 0).flatten()
 
     def _cells_of(self, coordinates: Float[Tensor, "sample 3"], size: int) -> Tensor:
-        n = -(-self.cells // size)
-        x, y, z = ((coordinates + 1) * (0.5 * self.cells / size)).long().clamp(0, n - 1).unbind(-1)
+        n = -(-self.grid.resolution // size)
+        x, y, z = ((coordinates + 1) * (0.5 * self.grid.resolution / size)).long().clamp(0, n - 1).unbind(-1)
         return (x * n + y) * n + z

@@ -110,6 +110,10 @@ class Box(Space):
     def stretch(self, points):
         return points.new_ones(len(points))
 
+    def warp_gaussians(self, means, directions, along, across):
+        ray = directions.square()
+        return means, along[:, None] * ray + across[:, None] * (1 - ray)
+
     def along(self, rays, samples):
         return torch.ones_like(samples.t_start)
 
