@@ -22,7 +22,7 @@ class Forward:
     """How a capture looks one way: the mean of its cameras, before a plane that they look through.
 
     pose:  camera-to-world of the mean camera, in scene units
-    scale: focal lengths over half the picture's width and height
+    scale: of x / z and y / z in that camera, bringing all that the cameras see within [-1, 1]
     near:  distance of that plane from the mean camera; what is to be modelled lies beyond
     """
 

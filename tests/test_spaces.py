@@ -217,15 +217,20 @@ def test_cameras_that_look_one_way_are_known_by_it():
     scene = assemble(facing())
     forward = scene.frame.forward
     assert forward is not None and scene.frame.reach > 1
-    assert forward.scale == pytest.approx((60 / 24, 60 / 18), rel=1e-3)
+    assert forward.scale < (60 / 24, 60 / 18)  # cameras beside the mean one see beyond its picture
     assert 0.7 * 5 < near_in_source(scene) < 0.8 * 5
     pose = torch.tensor(forward.pose)
     train = scene.cameras[scene.splits["train"]]
     torch.testing.assert_close(pose[:, 3], train.position.mean(0))
     torch.testing.assert_close(pose[:, :3].T @ pose[:, :3], torch.eye(3), atol=1e-5, rtol=0)
     assert (train.forward @ pose[:, 2]).min() > 0.97
-    coordinates = space_of(scene.frame).warp(scene.points)
-    assert (coordinates[:, 2] > -1).all() and (coordinates[:, 2] < 1).all()
+    space = space_of(scene.frame)
+    depths = space.warp(scene.points)[:, 2]
+    assert (depths > -1).all() and (depths < 1).all()
+    for camera in (train[i] for i in range(len(train))):
+        rays = camera.rays(camera.pixels())
+        for t in space.interval(rays):
+            assert space.warp(rays.at(t)).abs().max() < 1 + 1e-3
 
 
 def test_what_the_source_says_of_depths_comes_first():

@@ -15,10 +15,9 @@ from .capture import Capture, Shot
 from .normalise import reliable_points
 
 ONE_WAY = math.cos(math.radians(30))  # of the angle between a camera's axis and the mean camera's, at most
-WIDEST = math.tan(math.radians(70))  # half a picture, seen from its camera
-BEFORE_NEAREST = (
-    0.75  # of the way from the mean camera to the nearest thing: where the plane stands (LLFF's own factor)
-)
+WIDEST = math.tan(math.radians(70))  # that a camera may see, from the mean camera's axis
+BORDER = tuple((x, y) for x in (0.0, 0.5, 1.0) for y in (0.0, 0.5, 1.0))  # of a picture, and its middle
+BEFORE_NEAREST = 0.75  # of the way from the mean camera to the nearest thing: where the plane stands, as LLFF has it
 STRAY = 0.005  # share of sparse points that may lie nearer by mistake
 
 
@@ -32,8 +31,8 @@ def find_forward(
     They do where each looks within 30 degrees of the mean camera, and a plane across its axis stands beyond all of them
     and before all that they see.
     """
-    pose, scale = mean_pose(cameras), mean_scale(cameras)
-    if scale is None or float((cameras.forward.double() @ pose[:, 2]).min()) < ONE_WAY:
+    pose = mean_pose(cameras)
+    if float((cameras.forward.double() @ pose[:, 2]).min()) < ONE_WAY:
         return None
     standing = (cameras.position.double() - pose[:, 3]) @ pose[:, 2]
     unit = float(np.cbrt(np.linalg.det(scene_from_source[:3, :3])))
@@ -49,8 +48,10 @@ def find_forward(
     foremost = float(standing.max())
     if nearest <= foremost:
         return None
+    plane = max(BEFORE_NEAREST * nearest, foremost)
+    scale = fitting_scale(cameras, pose, plane)
     rows = tuple((a, b, c, d) for a, b, c, d in pose.tolist())
-    return Forward(rows, scale, max(BEFORE_NEAREST * nearest, foremost))
+    return None if scale is None else Forward(rows, scale, plane)
 
 
 def mean_pose(cameras: Camera) -> Float[Tensor, "3 4"]:
@@ -61,17 +62,20 @@ def mean_pose(cameras: Camera) -> Float[Tensor, "3 4"]:
     return torch.cat([u * proper @ vt, mean[:, 3:]], 1)
 
 
-def mean_scale(cameras: Camera) -> tuple[float, float] | None:
-    """Focal lengths over half the picture, as the middles of its edges tell; None for lenses that see too widely."""
-    width, height = cameras.size.float().T
-    every = torch.arange(len(cameras))
-    found = []
-    for axis, far in enumerate((torch.stack([width, height / 2], -1), torch.stack([width / 2, height], -1))):
-        near = far.clone()
-        near[:, axis] = 0
-        slopes = [edge[:, axis].abs() / edge[:, 2] for edge in (cameras.lens.unproject(e, every) for e in (near, far))]
-        tangent = torch.stack(slopes)
-        if not bool(((tangent > 0) & (tangent < WIDEST)).all()):
-            return None
-        found.append(float(1 / tangent.mean()))
-    return found[0], found[1]
+def fitting_scale(cameras: Camera, pose: Float[Tensor, "3 4"], plane: float) -> tuple[float, float] | None:
+    """What x / z and y / z in the mean camera are multiplied by, so that all that cameras see beyond the plane lies
+    within [-1, 1]; None for lenses that see too widely.
+
+    Mildenhall 2020 takes the focal lengths over half the picture. Cameras beside the mean one then see places beyond 1,
+    which a positional encoding cannot tell from others.
+    """
+    count = len(BORDER) * len(cameras)
+    pixels = (torch.tensor(BORDER) * cameras.size[:, None]).reshape(count, 2)
+    rays = cameras.rays(pixels, torch.arange(len(cameras)).repeat_interleave(len(BORDER)))
+    origins, directions = (rays.origins - pose[:, 3]) @ pose[:, :3], rays.directions.double() @ pose[:, :3]
+    if float(directions[:, 2].min()) <= 0:
+        return None
+    at_infinity = directions[:, :2] / directions[:, 2:]
+    at_plane = (origins[:, :2] + at_infinity * (plane - origins[:, 2:])) / plane
+    width, height = torch.stack([at_infinity, at_plane]).abs().amax((0, 1)).tolist()
+    return None if max(width, height) > WIDEST else (1 / width, 1 / height)
