@@ -16,6 +16,7 @@ from .normalise import reliable_points
 
 ONE_WAY = math.cos(math.radians(30))  # of the angle between a camera's axis and the mean camera's, at most
 WIDEST = math.tan(math.radians(70))  # that a camera may see, from the mean camera's axis
+MOST = 2.0  # times what is seen at infinity: a plane just before the cameras must not squeeze what lies far behind it
 BORDER = tuple((x, y) for x in (0.0, 0.5, 1.0) for y in (0.0, 0.5, 1.0))  # of a picture, and its middle
 BEFORE_NEAREST = 0.75  # of the way from the mean camera to the nearest thing: where the plane stands, as LLFF has it
 STRAY = 0.005  # share of sparse points that may lie nearer by mistake
@@ -77,5 +78,6 @@ def fitting_scale(cameras: Camera, pose: Float[Tensor, "3 4"], plane: float) -> 
         return None
     at_infinity = directions[:, :2] / directions[:, 2:]
     at_plane = (origins[:, :2] + at_infinity * (plane - origins[:, 2:])) / plane
-    width, height = torch.stack([at_infinity, at_plane]).abs().amax((0, 1)).tolist()
-    return None if max(width, height) > WIDEST else (1 / width, 1 / height)
+    far, near = (x.abs().amax(0) for x in (at_infinity, at_plane))
+    width, height = near.clamp(far, MOST * far).tolist()
+    return None if float(far.max()) > WIDEST else (1 / width, 1 / height)
