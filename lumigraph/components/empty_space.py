@@ -33,6 +33,7 @@ class EmptySpace(nn.Module):
         self.cells, self.thickness = cells, thickness
         self.grid = OccupancyGrid(1.0, cells)
         self.register_buffer("known", torch.tensor(False))
+        self._coarser: tuple[Tensor, dict[int, Tensor]] = self.grid.occupied, {}
 
     def begin(self, scene: Scene) -> None:
         """Rule out what photographs of an object see through."""
@@ -67,10 +68,14 @@ class EmptySpace(nn.Module):
         return found
 
     def _neighbourhood(self, level: int) -> Bool[Tensor, " cell"]:
-        """Cells 2^level times as large that hold something themselves or beside them."""
-        grid = self.grid.occupied.float()[None]
-        merged = max_pool3d(grid, 2**level, ceil_mode=True)
-        return (max_pool3d(merged, 3, 1, 1) > 0).flatten()
+        """Cells 2^level times as large that hold something themselves or beside them; kept until the grid changes."""
+        if self._coarser[0] is not self.grid.occupied:
+            self._coarser = self.grid.occupied, {}
+        kept = self._coarser[1]
+        if level not in kept:
+            merged = max_pool3d(self.grid.occupied.float()[None], 2**level, ceil_mode=True)
+            kept[level] = (max_pool3d(merged, 3, 1, 1) > 0).flatten()
+        return kept[level]
 
     def _cells_of(self, coordinates: Float[Tensor, "sample 3"], size: int) -> Tensor:
         n = -(-self.grid.resolution // size)
