@@ -80,10 +80,7 @@ class FourierFeatures(RayMethod):
 
     def loss(self, batch: Batch, step: int) -> dict[str, Tensor]:
         background = torch.tensor([self.frame.background], device=self.device)
-        target = batch.rgb
-        if batch.alpha is not None:
-            target = torch.lerp(background, target, batch.alpha[:, None])
-        error = (self.render_rays(batch.rays, background).rgb - target).square().mean()
+        error = (self.render_rays(batch.rays, background).rgb - batch.before(background)).square().mean()
         self._figures = {"mse": float(error.detach())}
         return {"mse": error}
 

@@ -179,11 +179,10 @@ class InstantNGP(RayMethod):
     def loss(self, batch: Batch, step: int) -> dict[str, Tensor]:
         generator = self.random(step)
         jitter = torch.rand(len(batch), generator=generator).to(self.device)
-        rays, target = batch.rays, batch.rgb
+        rays = batch.rays
         background = torch.tensor([self.frame.background], device=self.device)
         if batch.alpha is not None:  # a random colour behind each ray, so that only opacity can imitate opacity
             background = torch.rand(len(batch), 3, generator=generator).to(self.device)
-            target = background + batch.alpha[:, None] * (target - background)
         if self.poses:
             rays = self.poses(rays)
         rendering = self.render_rays(rays, background, jitter)
@@ -191,7 +190,7 @@ class InstantNGP(RayMethod):
         if self.exposure and rays.image_index is not None:  # the gain is the scene's, not the background's
             behind = (1 - rendering.opacity)[:, None] * background
             rgb = self.exposure(rgb - behind, rays.image_index) + behind
-        residual = rgb - target
+        residual = rgb - batch.before(background)
         self._figures["mse"] = float(residual.detach().square().mean())
         if batch.alpha is not None:  # and before the opposite colour, where only what opacity lacks looks different
             lacking = (batch.alpha - rendering.opacity)[:, None]

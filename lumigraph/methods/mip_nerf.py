@@ -18,6 +18,7 @@ from ..components.frustums import frustum_moments
 from ..components.sampling import inverse_transform, stratified
 from ..components.schedules import falling, set_learning_rate
 from ..components.spaces import space_of
+from ..components.two_looks import squared_errors
 from ..method import RayMethod
 from ..rays import Look, Rays, Rendering, Samples
 from ..scene import Batch, Frame, Scene
@@ -104,12 +105,8 @@ class MipNeRF(RayMethod):
     def loss(self, batch: Batch, step: int) -> dict[str, Tensor]:
         """The squared error of both looks (section 3.2)."""
         background = torch.tensor([self.frame.background], device=self.device)
-        target = batch.before(background)
         looks = self._looks(batch.rays, self.random(step), colours=self.config.coarse_loss > 0)
-        coarse, fine = (composite(x.samples, x.density, x.rgb, background).rgb for x in looks)
-        terms = {"fine": (fine - target).square().mean()}
-        if self.config.coarse_loss:
-            terms["coarse"] = self.config.coarse_loss * (coarse - target).square().mean()
+        terms = squared_errors(looks, batch.before(background), background, self.config.coarse_loss)
         self._figures["mse"] = float(terms["fine"].detach())
         return terms
 

@@ -16,6 +16,7 @@ from ..components.encodings import FrequencyEncoding
 from ..components.sampling import inverse_transform, midpoints, stratified
 from ..components.schedules import falling, set_learning_rate
 from ..components.spaces import space_of
+from ..components.two_looks import squared_errors
 from ..errors import LumigraphError
 from ..method import RayMethod
 from ..rays import Look, Rays, Rendering, Samples
@@ -110,12 +111,8 @@ class NeRF(RayMethod):
     def loss(self, batch: Batch, step: int) -> dict[str, Tensor]:
         """The squared error of both looks (eq. 6)."""
         background = torch.tensor([self.frame.background], device=self.device)
-        target = batch.before(background)
         looks = self._looks(batch.rays, self.random(step), colours=self.config.coarse_loss > 0)
-        coarse, fine = (composite(x.samples, x.density, x.rgb, background).rgb for x in looks)
-        terms = {"fine": (fine - target).square().mean()}
-        if self.config.coarse_loss:
-            terms["coarse"] = self.config.coarse_loss * (coarse - target).square().mean()
+        terms = squared_errors(looks, batch.before(background), background, self.config.coarse_loss)
         self._figures["mse"] = float(terms["fine"].detach())
         return terms
 

@@ -60,11 +60,9 @@ class VoxelGrid(RayMethod):
         return [Look("samples", samples, density, torch.sigmoid(10 * values[:, 1:]))]
 
     def loss(self, batch, step):
-        target = batch.rgb
-        if batch.alpha is not None:
-            target = target * batch.alpha[:, None] + 1 - batch.alpha[:, None]
-        seen = self.render_rays(batch.rays, torch.tensor([self.frame.background]), self.jitter)
-        error = (seen.rgb - target).square().mean()
+        background = torch.tensor([self.frame.background])
+        seen = self.render_rays(batch.rays, background, self.jitter)
+        error = (seen.rgb - batch.before(background)).square().mean()
         self.mse = error.item()
         return {"colour": error, "thin": 1e-4 * self.logits.abs().mean()}
 
