@@ -57,9 +57,9 @@ class EmptySpace(nn.Module):
     def may_hold(
         self, coordinates: Float[Tensor, "sample 3"], radius: Float[Tensor, " sample"] | None = None
     ) -> Bool[Tensor, " sample"]:
-        """Whether something may be at coordinates, or within a radius around them."""
+        """Whether something may be at coordinates, or within a radius around them. Outside the nearest cell answers."""
         if radius is None:
-            return self.grid.holds(coordinates)
+            return self.grid.occupied.view(-1).index_select(0, self._cells_of(coordinates, 1))
         found = torch.zeros(len(coordinates), dtype=torch.bool, device=coordinates.device)
         level = (radius * (0.5 * self.grid.resolution)).clamp_min(1).log2().ceil()
         for k in range(int(level.max()) + 1 if len(level) else 0):
@@ -79,5 +79,6 @@ class EmptySpace(nn.Module):
 
     def _cells_of(self, coordinates: Float[Tensor, "sample 3"], size: int) -> Tensor:
         n = -(-self.grid.resolution // size)
-        x, y, z = ((coordinates + 1) * (0.5 * self.grid.resolution / size)).long().clamp(0, n - 1).unbind(-1)
+        half = 0.5 * self.grid.resolution / size
+        x, y, z = (coordinates * half + half).int().clamp_(0, n - 1).unbind(-1)  # 32 bits: half of what is to be moved
         return (x * n + y) * n + z

@@ -59,17 +59,6 @@ class OccupancyGrid(nn.Module):
         self.occupied, self.density = self.possible.clone(), torch.zeros_like(self.possible, dtype=torch.float32)
         self.box.copy_(self._box())
 
-    def holds(self, points: Float[Tensor, "*n 3"]) -> Bool[Tensor, "*n"]:
-        """Whether points lie in occupied cells, each in the smallest cascade around it; outside of all, they do not."""
-        n = self.resolution
-        size = points.abs().amax(-1)
-        cascade = size.clamp_min(1).log2().ceil().long()
-        inside = cascade < len(self.occupied)
-        cascade = cascade.clamp(max=len(self.occupied) - 1)
-        scaled = points * (0.5 * n / 2.0 ** cascade[..., None]) + 0.5 * n
-        x, y, z = scaled.long().clamp(0, n - 1).unbind(-1)
-        return inside & self.occupied.view(-1)[((cascade * n + x) * n + y) * n + z]
-
     def sample(
         self,
         rays: Rays,
