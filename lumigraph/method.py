@@ -94,6 +94,11 @@ class RayMethod(Method):
     any_lens: ClassVar[bool] = True
     rays_per_chunk: int = 16_384
 
+    @property
+    def background(self) -> Float[Tensor, "1 3"]:
+        """The scene's own, as `render_rays` takes it."""
+        return torch.tensor([self.frame.background], device=self.device)
+
     @abstractmethod
     def render_rays(self, rays: Rays, background: Float[Tensor, "#ray 3"]) -> Rendering:
         """What each ray sees, in front of a background colour."""
@@ -109,7 +114,7 @@ class RayMethod(Method):
     def render(self, camera: Camera) -> Rendering:
         width, height = camera.size[0].tolist()
         rays = camera.rays(camera.pixels()).to(self.device)
-        background = torch.tensor(self.frame.background, device=self.device)[None]
+        background = self.background
         chunks = [slice(i, i + self.rays_per_chunk) for i in range(0, len(rays), self.rays_per_chunk)]
         parts = [self.render_rays(rays[chunk], background) for chunk in chunks]
         return Rendering.cat(parts).reshape(height, width)

@@ -42,7 +42,7 @@ class Pass:
     so_far: Float[Tensor, "sample_plus_one 3"]
 
     @staticmethod
-    def of(look: Look, background: Float[Tensor, " 3"]) -> Pass:
+    def of(look: Look, background: Float[Tensor, "1 3"]) -> Pass:
         tau, weight = look.density * look.samples.length, weights_of(look.samples, look.density)
         T = torch.exp(-torch.nn.functional.pad(tau.cumsum(0), (1, 0)))
         colour = torch.nn.functional.pad((weight[:, None] * look.rgb).cumsum(0), (0, 0, 1, 0))
@@ -136,7 +136,6 @@ def along_ray(method: Method, camera: Camera, pixel: tuple[int, int]) -> Sight:
             f"Pixel ({x}, {y}) lies outside of the picture; give --pixel from 0 0 to {width - 1} {height - 1}"
         )
     rays = camera.rays(torch.tensor([[x + 0.5, y + 0.5]])).to(method.device)
-    background = torch.tensor(method.frame.background, device=method.device)
     looks = method.looks(rays)
     last = looks[-1]
     if not len(last.samples):
@@ -144,11 +143,11 @@ def along_ray(method: Method, camera: Camera, pixel: tuple[int, int]) -> Sight:
             f"No sample is taken along the ray of pixel ({x}, {y}), so there is only background to see; "
             f"choose another --pixel"
         )
-    seen = composite(last.samples, last.density, last.rgb, background[None])
+    seen = composite(last.samples, last.density, last.rgb, method.background)
     return Sight(
         camera,
         pixel,
-        [Pass.of(look, background) for look in looks if len(look.samples)],
+        [Pass.of(look, method.background) for look in looks if len(look.samples)],
         seen.rgb[0].cpu(),
         float(seen.depth),
         float(seen.opacity),

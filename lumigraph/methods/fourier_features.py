@@ -79,8 +79,7 @@ class FourierFeatures(RayMethod):
         return scene.sample_rays(self.config.pixels, generator).to(self.device)
 
     def loss(self, batch: Batch, step: int) -> dict[str, Tensor]:
-        background = torch.tensor([self.frame.background], device=self.device)
-        error = (self.render_rays(batch.rays, background).rgb - batch.before(background)).square().mean()
+        error = (self.render_rays(batch.rays, self.background).rgb - batch.before(self.background)).square().mean()
         self._figures = {"mse": float(error.detach())}
         return {"mse": error}
 

@@ -180,7 +180,7 @@ class InstantNGP(RayMethod):
         generator = self.random(step)
         jitter = torch.rand(len(batch), generator=generator).to(self.device)
         rays = batch.rays
-        background = torch.tensor([self.frame.background], device=self.device)
+        background = self.background
         if batch.alpha is not None:  # a random colour behind each ray, so that only opacity can imitate opacity
             background = torch.rand(len(batch), 3, generator=generator).to(self.device)
         if self.poses:
