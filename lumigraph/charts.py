@@ -14,6 +14,7 @@ SMOOTHING = 0.06  # share of a curve over which its bold line averages
 POINTS = 600  # of a curve that are drawn; more cannot be seen
 COLOURS = 8  # that charts.css knows
 LETTER, LINE = 7.2, 18  # width of a letter, about, and height of a line of names
+APART = 24  # between two numbers below the plot, at least
 STYLE = (Path(__file__).parent / "charts.css").read_text("utf-8")
 
 
@@ -33,6 +34,7 @@ def line_chart(
     marks: bool = False,
     smoothed: bool = True,
     note: str = "",
+    x_ticks: Sequence[float] = (),
 ) -> str:
     """Each series twice: faint as measured, bold as averaged. Empty if no series has a line to draw.
 
@@ -40,6 +42,7 @@ def line_chart(
     marks:      a dot at each point, which tells its numbers on hovering
     smoothed:   if not, the measured curve alone, bold
     note:       a few words below the plot
+    x_ticks:    what the x axis is marked at, in rising order, instead of round numbers
     """
     kept = [thinned(drawable(s, log_x, log)) for s in series]
     kept = [s for s in kept if len(s.x) > (0 if marks else 1)]
@@ -60,7 +63,8 @@ def line_chart(
             lines.append(dots(measured, x_axis, y_axis, colour))
     rows = legend_rows([s.name for s in kept] if len(kept) > 1 else [], y_label)
     above = LINE * (len(rows) - 1)
-    parts = [axes(x_axis, y_axis), *lines, *(legend_row(row, 16 - above + LINE * i) for i, row in enumerate(rows))]
+    names = (legend_row(row, 16 - above + LINE * i) for i, row in enumerate(rows))
+    parts = [axes(x_axis, y_axis, x_ticks or x_axis.ticks()), *lines, *names]
     parts.append(f"<text class='label' x='{LEFT}' y='{16 - above}'>{escape(y_label)}</text>")
     parts.append(f"<text class='label' x='{WIDTH - RIGHT}' y='{HEIGHT - 4}' text-anchor='end'>{escape(x_label)}</text>")
     if note:
@@ -137,13 +141,16 @@ def spanning(
     return Axis(min(0.0, low) if from_zero else low - room, high + room, start, end, log)
 
 
-def axes(x_axis: Axis, y_axis: Axis) -> str:
+def axes(x_axis: Axis, y_axis: Axis, x_ticks: Sequence[float]) -> str:
     parts = []
     for y in y_axis.ticks():
         parts.append(f"<path class='grid' d='M{x_axis.start} {y_axis(y):.1f}H{x_axis.end}'/>")
         parts.append(f"<text x='{LEFT - 8}' y='{y_axis(y) + 4:.1f}' text-anchor='end'>{number(y)}</text>")
-    for x in x_axis.ticks():
-        parts.append(f"<text x='{x_axis(x):.1f}' y='{HEIGHT - BOTTOM + 18}' text-anchor='middle'>{number(x)}</text>")
+    taken = -math.inf
+    for x in x_ticks:
+        if x_axis(x) - taken >= APART:
+            taken = x_axis(x)
+            parts.append(f"<text x='{taken:.1f}' y='{HEIGHT - BOTTOM + 18}' text-anchor='middle'>{number(x)}</text>")
     return "".join(parts)
 
 

@@ -56,6 +56,15 @@ def test_each_point_has_its_mark():
     assert "a &amp; b: 1, 3" in chart
 
 
+def test_an_axis_is_marked_where_it_was_measured_as_far_as_there_is_room():
+    views = [2, 3, 9, 98, 100]
+    chart = line_chart([Series("a", views, views)], "x", "y", log_x=True, marks=True, smoothed=False, x_ticks=views)
+    below = [x.text for x in ElementTree.fromstring(chart).iter("text") if x.get("text-anchor") == "middle"]
+    assert below == ["2", "3", "9", "98"]
+    round_ones = line_chart([Series("a", views, views)], "x", "y", log_x=True, marks=True, smoothed=False)
+    assert ">20</text>" in round_ones and ">98</text>" not in round_ones
+
+
 def test_eight_series_have_eight_colours_and_names_that_fit():
     series = [Series(f"a method called {i}", [1, 2], [i, i + 1]) for i in range(8)]
     chart = line_chart(series, "seconds of training", "PSNR of held-out views, dB")

@@ -32,9 +32,10 @@ def draw_charts(rows: Sequence[Row], output: Path) -> list[str]:
         of_scene = [row for row in measured if row["scene"] == scene]
         over_time = curves([row for row in of_scene if row["views"] is None], "training_seconds", budget)
         over_views = curves(of_scene, "train_views", lambda row: row["train_views"], per=trained_for)
-        for name, series, label in (
-            ("time", over_time, "seconds of training"),
-            ("views", over_views, "photographs to learn from"),
+        seconds = {row["budget"].get("seconds") for row in of_scene}
+        for name, series, label, ticks in (
+            ("time", over_time, "seconds of training", () if None in seconds else sorted(seconds)),
+            ("views", over_views, "photographs to learn from", sorted({row["train_views"] for row in of_scene})),
         ):
             if not any(len(one.x) > 1 for one in series):
                 continue
@@ -46,6 +47,7 @@ def draw_charts(rows: Sequence[Row], output: Path) -> list[str]:
                 marks=True,
                 smoothed=False,
                 note=", ".join([*(one.name for one in series if len(series) == 1), scene, resolution(of_scene[0])]),
+                x_ticks=ticks,
             )
             drawn.append(f"{scene}-psnr-over-{name}.svg")
             files.write_bytes(output / drawn[-1], standalone(chart))
