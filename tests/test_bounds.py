@@ -6,13 +6,17 @@ that setting NUMBA_BOUNDSCHECK alone checks nothing. Here copies of the engines 
 
 from __future__ import annotations
 
+import importlib
+
 import numba
 import pytest
-from agreement import OPERATIONS, assert_agrees, cases, edit_engine, plain_lanes
+from agreement import OPERATIONS, assert_agrees, cases, edit_engine, module, plain_lanes
 
 
 @pytest.fixture(autouse=True)
 def checked(monkeypatch):
+    for name in OPERATIONS:  # what is imported from here on is serial for good
+        importlib.import_module(f"{module(name).__name__}.cpu")
     njit = numba.njit
 
     def checked_njit(*function, **options):
