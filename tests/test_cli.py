@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -73,6 +74,13 @@ def test_report_and_info_and_methods(trained, photographs, capsys):
     told = capsys.readouterr().out
     assert "12 photographs" in told and "12 of 24x24" in told and "Pinhole" in told
     assert main(["methods"]) == 0 and "voxel-grid" in capsys.readouterr().out
+
+
+def test_info_is_not_cut_where_the_terminal_ends(photographs, tmp_path, capsys):
+    folder = shutil.copytree(photographs, tmp_path / ("far" * 30))
+    assert main(["info", str(folder)]) == 0
+    first, *others = capsys.readouterr().out.splitlines()
+    assert first.endswith("a scene of 12 photographs") and max(map(len, others)) < 100
 
 
 def test_pausing_and_resuming(photographs, tmp_path, capsys):

@@ -11,6 +11,8 @@ from tyro.conf import Positional
 
 from .common import Reader, needed, option
 
+LONG = 4096  # letters; a tree cuts its lines where the console ends, and folders have long names
+
 
 @dataclass(frozen=True)
 class Info:
@@ -36,5 +38,5 @@ class Info:
             tree = cloud_tree(self.what, read_gaussians(self.what))
         else:
             tree = scene_tree(open_scene(self.what, downscale=self.downscale, reader=self.reader))
-        Console(highlight=False, soft_wrap=True).print(tree)
+        Console(highlight=False, width=LONG, soft_wrap=True).print(tree)
         return 0
