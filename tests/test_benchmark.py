@@ -19,6 +19,7 @@ from PIL import Image
 from lumigraph.benchmark.cell import Cell, Settings
 from lumigraph.benchmark.conduct import Patience, conduct
 from lumigraph.benchmark.launch import launch, reason
+from lumigraph.benchmark.pictures import draw_charts
 from lumigraph.benchmark.published import FIGURES, published
 from lumigraph.cli import main
 from lumigraph.errors import LumigraphError
@@ -146,6 +147,23 @@ def test_fewer_views_make_a_chart(ball, tmp_path):
     assert [row["train_views"] for row in rows(output)] == [2, 9]
     assert (output / "ball-psnr-over-views.svg").read_text().count("<circle") == 2
     assert not (output / "ball-psnr-over-time.svg").exists()
+
+
+def test_a_chart_is_marked_at_its_own_budgets(done, tmp_path):
+    """Not at those of cells that learnt from fewer photographs, which are another chart's."""
+    row = rows(done)[0]
+    drawn = [(60, None), (300, None), (20, 2), (20, 3)]
+    draw_charts(
+        [
+            row | {"budget": {"seconds": s}, "training_seconds": s + 0.1, "views": n, "train_views": n or 9}
+            for s, n in drawn
+        ],
+        tmp_path,
+    )
+    over_time = (tmp_path / "ball-psnr-over-time.svg").read_text()
+    assert ">60</text>" in over_time and ">300</text>" in over_time and ">20</text>" not in over_time
+    over_views = (tmp_path / "ball-psnr-over-views.svg").read_text()
+    assert all(f">{n}</text>" in over_views for n in (2, 3, 9))
 
 
 def test_photographs_at_several_scales_count_once(ball, tmp_path):

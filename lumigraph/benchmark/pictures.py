@@ -30,9 +30,10 @@ def draw_charts(rows: Sequence[Row], output: Path) -> list[str]:
     measured, drawn = [row for row in rows if not row["failed"]], []
     for scene in sorted({row["scene"] for row in measured}):
         of_scene = [row for row in measured if row["scene"] == scene]
-        over_time = curves([row for row in of_scene if row["views"] is None], "training_seconds", budget)
+        of_all_views = [row for row in of_scene if row["views"] is None]
+        over_time = curves(of_all_views, "training_seconds", budget)
         over_views = curves(of_scene, "train_views", lambda row: row["train_views"], per=trained_for)
-        seconds = {row["budget"].get("seconds") for row in of_scene}
+        seconds = {row["budget"].get("seconds") for row in of_all_views}
         for name, series, label, ticks in (
             ("time", over_time, "seconds of training", () if None in seconds else sorted(seconds)),
             ("views", over_views, "photographs to learn from", sorted({row["train_views"] for row in of_scene})),
