@@ -79,7 +79,8 @@ class FourierFeatures(RayMethod):
         return scene.sample_rays(self.config.pixels, generator).to(self.device)
 
     def loss(self, batch: Batch, step: int) -> dict[str, Tensor]:
-        error = (self.render_rays(batch.rays, self.background).rgb - batch.before(self.background)).square().mean()
+        background = self.background
+        error = (self.render_rays(batch.rays, background).rgb - batch.before(background)).square().mean()
         self._figures = {"mse": float(error.detach())}
         return {"mse": error}
 

@@ -104,8 +104,9 @@ class MipNeRF(RayMethod):
 
     def loss(self, batch: Batch, step: int) -> dict[str, Tensor]:
         """The squared error of both looks (section 3.2)."""
+        background = self.background
         looks = self._looks(batch.rays, self.random(step), colours=self.config.coarse_loss > 0)
-        terms = squared_errors(looks, batch.before(self.background), self.background, self.config.coarse_loss)
+        terms = squared_errors(looks, batch.before(background), background, self.config.coarse_loss)
         self._figures["mse"] = float(terms["fine"].detach())
         return terms
 
