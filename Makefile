@@ -1,9 +1,12 @@
 # `make demo` and `make test` each work as the very first command on a fresh machine.
+# Some tests, and other options of pytest: make test TESTS='tests/test_lens.py --durations=3', or in PYTEST_ADDOPTS.
+# Two files are tested at a time. In one process, for a debugger: make test WORKERS=0
 # Another interpreter: make demo PYTHON=python3.12. Another build of PyTorch: make demo TORCH='torch==2.13.0 ...'.
 
 PYTHON ?= python3
 TORCH ?= torch==2.13.0
 TESTS ?= tests
+WORKERS ?= 2
 
 BIN := .venv/bin
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check
@@ -23,7 +26,7 @@ demo: .venv/.installed
 	$(BIN)/lumigraph demo
 
 test: .venv/.tools
-	$(BIN)/python -m pytest -q --durations=10 $(TESTS)
+	PYTEST_ADDOPTS="--durations=10 $$PYTEST_ADDOPTS" $(BIN)/python -m pytest -q -n $(WORKERS) --dist loadfile $(TESTS)
 
 check: .venv/.tools
 	$(BIN)/ruff format --check .

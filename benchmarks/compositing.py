@@ -20,7 +20,7 @@ import tyro
 from media import LENGTH, MEDIA, RULES, Medium, errors, exponential_ramp, order
 
 from lumigraph import kernels
-from lumigraph.charts import Series, line_chart, standalone
+from lumigraph.figures.charts import Series, line_chart, standalone
 from lumigraph.files import write_bytes, write_json
 from lumigraph.rays import Samples
 from lumigraph.volume import weights_of

@@ -30,9 +30,10 @@ from scipy.spatial import cKDTree
 
 from lumigraph.capture import open_scene
 from lumigraph.capture.procedural import scenes, signed_distance, trace
-from lumigraph.export.mesh import Mesh, extract_mesh, scale_to_source
+from lumigraph.export.mesh import extract_mesh
 from lumigraph.export.points import extract_points
 from lumigraph.files import write_json
+from lumigraph.mesh import Mesh
 from lumigraph.method import Method
 from lumigraph.run import Run
 
@@ -64,7 +65,7 @@ def main(options: Options) -> None:
 
 def beside_truth(run: Run, views: int) -> dict:
     """Chamfer distance, and whether the mesh is closed."""
-    name = run.config["scene"]["source"].removeprefix("procedural:").partition(",")[0]
+    name = run.settings.scene.source.removeprefix("procedural:").partition(",")[0]
     stage = scenes.stage(name)
     begin = time.perf_counter()
     mesh = extract_mesh(run.method(), run.cameras()["train"], views=views).in_source(run.frame)
@@ -112,7 +113,7 @@ def beside_each_other(run: Run, scene: Path | None, views: int) -> dict:
         inside = positions[((positions > low) & (positions < high)).all(-1)]
         return float(np.median(tree.query(inside)[0]))
 
-    cell = scale_to_source(run.frame) * float(np.ptp(np.array(run.frame.bounds), axis=0).max()) / 256
+    cell = run.frame.to_source.scale * float(np.ptp(np.array(run.frame.bounds), axis=0).max()) / 256
     row = {
         "method": run.method_name,
         "mesh's diagonal": float(np.linalg.norm(high - low)),
@@ -125,7 +126,7 @@ def beside_each_other(run: Run, scene: Path | None, views: int) -> dict:
         cloud = method.gaussians()
         solid = cloud[cloud.opacities.sigmoid() > 0.5].transformed(matrix)
         row["splats to mesh"] = median(solid.means.detach().double().numpy())
-    sparse = None if scene is None else open_scene(str(scene), **run.config["scene"]["options"]).points
+    sparse = None if scene is None else open_scene(str(scene), **run.settings.scene.options).points
     if sparse is not None:
         moved = sparse.double() @ matrix[:3, :3].double().T + matrix[:3, 3].double()
         row["sparse points to mesh"] = median(moved.numpy())

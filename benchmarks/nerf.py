@@ -21,9 +21,9 @@ import tyro
 from torch import Tensor, nn
 
 from lumigraph.capture import open_scene
-from lumigraph.components import dense
-from lumigraph.components.coordinate_network import CoordinateNetwork
-from lumigraph.components.empty_space import EmptySpace
+from lumigraph.components.fields import dense
+from lumigraph.components.fields.coordinate_network import CoordinateNetwork
+from lumigraph.components.sampling.occupancy_mask import OccupancyMask
 from lumigraph.errors import LumigraphError
 from lumigraph.files import write_json
 from lumigraph.methods.nerf import Config, NeRF
@@ -121,9 +121,9 @@ def skipping(options: Options) -> dict[str, float | str]:
     if not isinstance(method, NeRF) or method.empty:
         raise LumigraphError(
             f"{run.folder} is no run of nerf that learnt without a grid, and what a grid rules out is never learnt; "
-            f"train one with --preset laptop --occupancy 0"
+            f"train one with --preset laptop --occupancy-resolution 0"
         )
-    cameras, grid = run.cameras()["test"], EmptySpace(CELLS, Config.cell_thickness).to(method.device)
+    cameras, grid = run.cameras()["test"], OccupancyMask(CELLS, Config.occupancy_threshold).to(method.device)
     for seed in range(LOOKS):
         grid.grid.update(method.density, grid.thickness, torch.Generator().manual_seed(seed), decay=1.0)
     chosen = torch.linspace(0, len(cameras) - 1, options.views).long().tolist()

@@ -20,12 +20,12 @@ import tyro
 from rich.console import Console
 from rich.table import Table
 
-from lumigraph import kernels, methods, splatting
+from lumigraph import kernels, methods
 from lumigraph.capture import open_scene
 from lumigraph.files import write_json
-from lumigraph.gaussians import Gaussians
+from lumigraph.gaussians import Gaussians, splatting
 from lumigraph.run import build
-from lumigraph.splat_file import SplatFile
+from lumigraph.run.splat_file import SplatFile
 
 PARTS = ("batch", "forward and loss", "backward", "optimiser", "after")
 
@@ -58,7 +58,12 @@ def main(options: Options) -> None:
 def steps(options: Options, device: torch.device) -> list[dict]:
     """Milliseconds of each part of a training step, at several sizes of the cloud."""
     scene, kind = open_scene(str(options.scene), downscale=options.downscale), methods.find("gaussian-splatting")
-    numbers = {"refine_from": 100, "raise_degree_every": 1, "half_until": 0.0, "most": 2 * max(options.sizes)}
+    numbers = {
+        "refine_from": 100,
+        "sh_degree_interval": 1,
+        "half_resolution_until": 0.0,
+        "max_gaussians": 2 * max(options.sizes),
+    }
     config = dataclasses.replace(kind.preset(device), **numbers)
     method = build(kind, scene.frame, config, device, 0)
     (optimizer,), generator = method.optimizers(), torch.Generator().manual_seed(0)

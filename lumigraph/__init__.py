@@ -7,7 +7,10 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from .camera import Camera as Camera
+    from .capture import open_dataset as open_dataset
     from .capture import open_scene as open_scene
+    from .collection import Collection as Collection
+    from .dataset import Dataset as Dataset
     from .errors import LumigraphError as LumigraphError
     from .gaussians import Gaussians as Gaussians
     from .lens import Lens as Lens
@@ -16,8 +19,11 @@ if TYPE_CHECKING:
     from .rays import Rays as Rays
     from .rays import Rendering as Rendering
     from .rays import Samples as Samples
+    from .run import Opened as Opened
     from .run import Run as Run
+    from .run import open_any as open_any
     from .scene import Scene as Scene
+    from .shapes import Shapes as Shapes
     from .train import fit as fit
     from .volume import composite as composite
 
@@ -25,18 +31,24 @@ __version__ = "0.1.0"
 
 _homes = {
     "Camera": "camera",
+    "Collection": "collection",
+    "Dataset": "dataset",
     "Gaussians": "gaussians",
     "Lens": "lens",
     "LumigraphError": "errors",
     "Method": "method",
     "RayMethod": "method",
+    "Opened": "run",
     "Rays": "rays",
     "Rendering": "rays",
     "Run": "run",
     "Samples": "rays",
     "Scene": "scene",
+    "Shapes": "shapes",
     "composite": "volume",
     "fit": "train",
+    "open_any": "run",
+    "open_dataset": "capture",
     "open_scene": "capture",
 }
 __all__ = sorted(_homes)

@@ -10,9 +10,11 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from .lens import Lens, one_or_more, rows
+from .geometry import look_at
+from .lens import Lens, Pinhole, one_or_more, rows
 from .rays import Rays
 
+RING, ELEVATION = 24, 15.0  # cameras of a ring, and degrees that they stand above its middle
 # A disc of this radius varies as much as a square pixel of side one (Barron 2021, section 3.1).
 PIXEL_RADIUS = 2 / math.sqrt(12)
 
@@ -115,6 +117,29 @@ class Camera:
             join(c.time for c in cameras),
             join(c.image_index for c in cameras),
         )
+
+
+def ring(
+    bounds: tuple[tuple[float, float, float], tuple[float, float, float]],
+    distance: float = 2.6,
+    angle: float = 50.0,
+    size: int = 800,
+    count: int = RING,
+) -> Camera:
+    """Cameras around a box that look at its middle, for what nobody has photographed.
+
+    distance: from the middle, scene units
+    angle:    of view, degrees
+    size:     pixels a side
+    """
+    middle = torch.tensor(bounds).mean(0)
+    azimuth = torch.arange(count) * (2 * math.pi / count)
+    height = torch.full_like(azimuth, math.radians(ELEVATION))
+    outward = torch.stack([height.cos() * azimuth.cos(), height.cos() * azimuth.sin(), height.sin()], -1)
+    pose = look_at(middle + distance * outward, -outward, torch.tensor([0.0, 0.0, 1.0]))
+    focal = 0.5 * size / math.tan(0.5 * math.radians(angle))
+    lens = Pinhole(torch.full((count, 2), focal), torch.full((count, 2), size / 2))
+    return Camera(pose, lens, torch.full((count, 2), size))
 
 
 def rotate(matrix: Float[Tensor, "#ray 3 _"], vectors: Float[Tensor, "ray 3"]) -> Float[Tensor, "ray 3"]:

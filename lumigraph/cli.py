@@ -17,8 +17,9 @@ import tyro
 
 from . import __version__, methods
 from .commands.bench import Bench
-from .commands.capture import Capture
+from .commands.capture import CaptureCommand
 from .commands.common import say
+from .commands.compose import Compose
 from .commands.demo import Demo
 from .commands.eval import Eval
 from .commands.explain import Explain
@@ -29,18 +30,19 @@ from .commands.render import Render
 from .commands.report import Report
 from .commands.resume import Resume
 from .commands.train import Train, with_options_of
-from .commands.view import View
+from .commands.view import ViewCommand
 from .errors import LumigraphError, LumigraphWarning
 from .files import refusal
 
 COMMANDS: dict[str, type] = {
     "demo": Demo,
-    "capture": Capture,
+    "capture": CaptureCommand,
     "train": Train,
     "resume": Resume,
     "eval": Eval,
     "render": Render,
-    "view": View,
+    "view": ViewCommand,
+    "compose": Compose,
     "export": Export,
     "report": Report,
     "explain": Explain,

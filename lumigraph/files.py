@@ -112,3 +112,10 @@ def refusal(path: Path, error: OSError) -> str:
             return f"{path} needs a folder where a file of that name lies; choose another place"
         case _:
             return f"{path} could not be read or written ({error.strerror or error}); choose another place"
+
+
+def scene_name(source: str) -> str:
+    """A short name for files: the last part of a path, without a file's suffix, or of "procedural:<name>"."""
+    path = Path(source).resolve()
+    last = source.partition(":")[2] if source.startswith("procedural:") else path.stem if path.is_file() else path.name
+    return re.sub(r"[^\w.-]+", "-", last) or "scene"

@@ -13,11 +13,12 @@ from numba import njit, prange
 
 @njit(parallel=True, cache=True, error_model="numpy")
 def look_up(
-    piece, chance, images, first, count, stride, width, start, before, ahead, first_run, pixels, image, xy, rgba
+    piece, chance, images, first, count, stride, width, start, before, ahead, first_run, pixels, image, xy, rgba, where
 ):
     """Where each random number lands, `piece` neighbours in the store at a time, and the bytes there.
 
     One number chooses both: the leading part of its 53 bits the image, the rest the pixel.
+    where: filled with positions in the store, unless it is empty
     """
     for p in prange(len(chance)):
         share = chance[p] * len(images)
@@ -47,6 +48,8 @@ def look_up(
             xy[i, 0] = pixel - y * width[k] + 0.5
             xy[i, 1] = y + 0.5
             rgba[i] = pixels[first[k] + position]
+            if len(where):
+                where[i] = first[k] + position
 
 
 @njit(inline="always")

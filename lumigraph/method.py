@@ -2,81 +2,187 @@
 
 from __future__ import annotations
 
+import copy
 from abc import ABC, abstractmethod
-from typing import Any, ClassVar
+from collections.abc import Sequence
+from typing import Any, ClassVar, Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
 from .camera import Camera
+from .capabilities import HasLooks, needs
+from .controls import Control, Value
 from .errors import LumigraphError
-from .gaussians import Gaussians
-from .rays import Look, Rays, Rendering
-from .scene import Batch, Frame, Photograph, Scene
+from .rays import Rays, Rendering
+from .scene import Batch, Frame, Scene
+from .volume import composite
+
+
+@runtime_checkable
+class Lesson(Protocol):
+    """What one step learns from: rays, a photograph, points of a shape. Its length is how many.
+
+    unit: what is counted, in the plural: "rays", "points"
+    """
+
+    unit: ClassVar[str]
+
+    def __len__(self) -> int: ...
+
+
+@runtime_checkable
+class Descend(Protocol):
+    """The trainer's part of a step: gradients of summed terms, checked to be finite, then the optimizers' step."""
+
+    def __call__(self, terms: dict[str, Tensor], optimizers: Sequence[torch.optim.Optimizer] | None = None) -> None: ...
 
 
 class Method(nn.Module, ABC):
-    """One paper: something that learns from a Scene's batches and can be seen through a Camera.
+    """One paper: something that learns from a dataset's batches and can be seen through a Camera.
 
-    frame:  where the scene is (bounds, reach, near distance, background, number of images). A saved run holds it,
-            so that a method can be built again where the photographs are gone.
-    config: the paper's numbers, a frozen dataclass named Config in the method's file
+    frame:   where the scene is (bounds, reach, near distance, background, number of images). A saved run holds it,
+             so that a method can be built again where the photographs are gone.
+    config:  the paper's numbers, a frozen dataclass named Config in the method's file
+    figures: of the last step, by name, worth a line in metrics.jsonl; "mse", the squared error of colours, becomes
+             the PSNR that training shows
+    told:    what `given` told this one, by the names of its controls
     All that must survive a resume lives in parameters, buffers and optimizers.
     """
 
     Config: ClassVar[type]
+    learns_from: ClassVar[type] = Scene  # the kind of dataset
+    accepts: ClassVar[tuple[type, ...]] = ()  # the kinds of evidence that `given` takes
     any_lens: ClassVar[bool] = False  # whether `render` follows every lens, or flat pictures alone
+    formerly_weights: ClassVar[dict[str, str]] = {}  # beginnings of their names in older runs, and those they have now
+    formerly: ClassVar[dict[str, str]] = {}  # names that Config's fields had in older runs, and those they have now
+    _place: Tensor
 
     def __init__(self, frame: Frame, config: Any):
         super().__init__()
         self.frame, self.config = frame, config
+        self.figures: dict[str, float] = {}
+        self.told: dict[str, Value] = {}
+        self.register_buffer("_place", torch.empty(0), persistent=False)  # knows the device, also without parameters
 
     @classmethod
     def preset(cls, device: torch.device) -> Any:
         """The Config to use where the user chose none: the paper's on a GPU, on a CPU what learns most in a minute."""
         return cls.Config()
 
+    # Learning
+
     @abstractmethod
-    def batch(self, scene: Scene, generator: torch.Generator) -> Batch | Photograph:
+    def batch(self, data: Any, generator: torch.Generator) -> Lesson:
         """What one step learns from. All randomness comes from `generator`, on the CPU."""
 
-    @abstractmethod
     def loss(self, batch: Any, step: int) -> dict[str, Tensor]:
-        """The terms to minimise, by name; the trainer sums them."""
+        """The terms to minimise, by name; their sum descends."""
+        raise NotImplementedError(f"{type(self).__name__} has neither `loss` nor a `step` of its own")
 
-    @abstractmethod
+    def step(self, batch: Any, step: int, descend: Descend) -> dict[str, Tensor]:
+        """One step of learning; gives the terms to record. Once downhill by default; a method may call `descend`
+        several times (adversaries, tracking), with some of its optimizers, or never (fusion)."""
+        terms = self.loss(batch, step)
+        descend(terms)
+        return terms
+
     def optimizers(self) -> list[torch.optim.Optimizer]:
-        """Fresh optimizers over the parameters; the trainer calls this once."""
+        """Fresh optimizers over the parameters; the trainer calls this once. None where nothing descends."""
+        return []
 
-    @abstractmethod
-    def render(self, camera: Camera) -> Rendering:
-        """What one camera sees, (height, width, ...), without gradients, in eval mode."""
+    def learning_rate(self, step: int, progress: float) -> float | dict[str, float] | None:
+        """The learning rate of this step, which the trainer gives to the optimizers: one for all groups of
+        parameters, or by their "name"; each group multiplies it by its own "scale". None leaves them as they are.
 
-    def begin(self, scene: Scene) -> None:
-        """Called once, ahead of the first step of a new run: what the photographs tell without any learning."""
+        progress: share of the budget (steps or seconds) spent, in [0, 1]
+        """
+        return None
+
+    @property
+    def complete(self) -> bool:
+        """Whether there is nothing left to learn, whatever the budget: after the last photograph of a fusion, say."""
+        return False
+
+    def begin(self, data: Any) -> None:
+        """Called once, ahead of the first step of a new run: what the data tell without any learning."""
 
     def before_step(self, step: int, progress: float) -> None:
         """Called ahead of each step. progress is the share of the budget (steps or seconds) spent, in [0, 1]."""
 
     def after_step(self, step: int) -> None:
-        """Called once the optimizers have stepped."""
+        """Called once the step is done."""
 
     def statistics(self) -> dict[str, float]:
         """Figures of the last step worth a line in metrics.jsonl, e.g. rays and samples."""
-        return {}
+        return self.figures
 
-    def gaussians(self) -> Gaussians:
-        """The scene as a cloud of Gaussians, in the scene's frame. Raises LumigraphError for methods without one."""
-        raise LumigraphError(
-            f"{type(self).__name__} holds no Gaussians, so no splats can be made of it; train gaussian-splatting"
-        )
+    # Being seen
 
-    def density(self, points: Float[Tensor, "point 3"]) -> Float[Tensor, " point"]:
-        """Density per scene unit at points of the scene. Raises LumigraphError for methods without a field."""
-        raise LumigraphError(
-            f"{type(self).__name__} holds no density at points; what is made of it comes from its renderings instead"
-        )
+    @abstractmethod
+    def render(self, camera: Camera) -> Rendering:
+        """What one camera sees, (height, width, ...), without gradients, in eval mode."""
+
+    @property
+    def background(self) -> Float[Tensor, "1 3"]:
+        """The colour behind the scene, one row for all rays."""
+        return torch.tensor([self.frame.background], device=self.device)
+
+    # Being told something
+
+    @property
+    def controls(self) -> tuple[Control, ...]:
+        """What a user may turn, beside the camera."""
+        return ()
+
+    def given(self, *evidence: Any, **controls: Value) -> Method:
+        """The same weights, told something: evidence (photographs, points, a light ...) or values of `controls`.
+
+        What comes back shares all parameters and is an ordinary method: films, viewer and exports need nothing more.
+        A method that takes evidence overrides this, and calls it for its controls.
+        Raises LumigraphError for what this method cannot be told.
+        """
+        for piece in evidence:
+            kinds = " or ".join(kind.__name__ for kind in self.accepts) or "nothing but its controls"
+            raise LumigraphError(f"{type(self).__name__} cannot be given a {type(piece).__name__}; it takes {kinds}")
+        known = {control.name: control for control in self.controls}
+        for name in controls:
+            if name not in known:
+                there = f"there are: {', '.join(known)}" if known else "it has none"
+                raise LumigraphError(f"{type(self).__name__} has no control {name!r}; {there}")
+        told = copy.copy(self)
+        for held in ("_parameters", "_buffers", "_modules"):  # the same tensors, in dictionaries of its own
+            told.__dict__[held] = dict(self.__dict__[held])
+        told.figures = {}
+        told.told = self.told | {name: known[name].checked(value) for name, value in controls.items()}
+        return told
+
+    def control(self, name: str) -> Value:
+        """The value of a control: as told, or its default."""
+        if name in self.told:
+            return self.told[name]
+        return next(x.default for x in self.controls if x.name == name)
+
+    def moments(self, rays: Rays) -> Float[Tensor, " ray"]:
+        """When each ray looks, for methods that follow a moving scene and offer `controls.moment`: as told by the
+        control `time`, else as its camera says, else at the first moment of the capture."""
+        if "time" not in self.told and rays.time is not None:
+            return rays.time
+        first, _ = self.frame.times or (0.0, 0.0)
+        return torch.full_like(rays.radius, float(self.told.get("time", first)))
+
+    def refined(self, cameras: Camera) -> Camera:
+        """The cameras of photographs as this method has come to see them, by their `image_index`; as they are where it
+        learns no poses. Evaluation, films and exports go by these."""
+        return cameras
+
+    # Being made of another
+
+    @classmethod
+    def of(cls, other: Method, config: Any) -> Method:
+        """A method of this kind made of another one instead of from data. Raises LumigraphError where none can be."""
+        raise LumigraphError(f"{cls.__name__} cannot be made of {type(other).__name__}; it learns from data alone")
 
     def random(self, number: int) -> torch.Generator:
         """Random numbers that depend on the config's seed and a number alone, the step for example, so that a resumed
@@ -85,30 +191,42 @@ class Method(nn.Module, ABC):
 
     @property
     def device(self) -> torch.device:
-        return next(self.parameters()).device
+        return self._place.device
 
 
 class RayMethod(Method):
-    """A Method that sees one ray at a time: write `render_rays`, inherit the rest."""
+    """A Method that sees one ray at a time: write `looks` or `render_rays`, inherit the rest."""
 
     any_lens: ClassVar[bool] = True
     rays_per_chunk: int = 16_384
 
+    def batch(self, data: Scene, generator: torch.Generator) -> Batch:
+        return data.sample_rays(self.config.rays_per_step, generator).to(self.device)
+
     @property
-    def background(self) -> Float[Tensor, "1 3"]:
-        """The scene's own, as `render_rays` takes it."""
-        return torch.tensor([self.frame.background], device=self.device)
+    def pass_weights(self) -> dict[str, float]:
+        """Weights of the passes' errors in the loss, by the names of their looks; 1 for one that is not named. Nothing
+        is learnt from a pass of weight 0."""
+        return {}
 
-    @abstractmethod
+    def loss(self, batch: Batch, step: int) -> dict[str, Tensor]:
+        """The squared error of each pass's picture (Mildenhall 2020, eq. 6), where `looks` takes a generator beside the
+        rays: of the samples' random places in training."""
+        background = self.background
+        target = batch.before(background)
+        terms = {}
+        for look in needs(self, HasLooks).looks(batch.rays, self.random(step)):
+            if weight := self.pass_weights.get(look.name, 1.0):
+                seen = composite(look.samples, look.density, look.rgb, background)
+                error = (seen.rgb - target).square().mean()
+                self.figures["mse"] = float(error.detach())  # of the last pass in the end
+                terms[look.name] = weight * error
+        return terms
+
     def render_rays(self, rays: Rays, background: Float[Tensor, "#ray 3"]) -> Rendering:
-        """What each ray sees, in front of a background colour."""
-
-    def looks(self, rays: Rays) -> list[Look]:
-        """What lies along rays, one entry for each pass, the one that is composited into the picture last.
-
-        Raises LumigraphError for methods that do not march along rays.
-        """
-        raise LumigraphError(f"{type(self).__name__} takes no samples along rays, so there is nothing to draw of one")
+        """What each ray sees, in front of a background colour: the last look at it, composited."""
+        look = needs(self, HasLooks).looks(rays)[-1]
+        return composite(look.samples, look.density, look.rgb, background)
 
     @torch.no_grad()
     def render(self, camera: Camera) -> Rendering:

@@ -107,7 +107,7 @@ class Samples:
 
 @dataclass(frozen=True)
 class Look:
-    """What a method found along rays in one pass, before it is composited.
+    """The samples of rays in one pass of a method, with the density and colour of its field at each.
 
     name:    of the pass, e.g. "coarse" and "fine"
     density: per scene unit, constant over each sample

@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import io
 import json
+import math
 from collections.abc import Sequence
 from html import escape
 from pathlib import Path
@@ -13,10 +14,11 @@ from typing import Any
 from PIL import Image
 
 from . import __version__
-from .charts import STYLE as CHARTS
-from .charts import Series, bar_chart, line_chart
-from .display import clock, short
+from .figures.charts import STYLE as CHARTS
+from .figures.charts import Series, bar_chart, line_chart
 from .files import write_bytes
+from .metrics import scores_of
+from .progress import clock, short
 from .run import Run
 
 LARGEST_FILM = 12 << 20  # bytes; larger ones are named instead of embedded
@@ -26,7 +28,7 @@ STYLE = CHARTS + (Path(__file__).parent / "report.css").read_text("utf-8")
 def write_report(run: Run) -> Path:
     """Write RUN/report.html from what the run's folder holds: the more commands have run, the more it shows."""
     evaluation = run.evaluation()
-    title = f"{scene_title(run)} · {run.method_name}"
+    title = f"{run.title} · {run.method_name}"
     sections = [
         header(run, evaluation),
         films(run),
@@ -42,7 +44,7 @@ def write_report(run: Run) -> Path:
 
 
 def page(title: str, body: str, footer: str) -> bytes:
-    """A whole page that carries its style."""
+    """A whole HTML page, with its style inside."""
     return (
         f'<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
         f'<meta name="viewport" content="width=device-width, initial-scale=1">\n<title>{escape(title)}</title>\n'
@@ -51,29 +53,33 @@ def page(title: str, body: str, footer: str) -> bytes:
     ).encode()
 
 
-def scene_title(run: Run) -> str:
-    source = run.config["scene"]["source"]
-    return source.partition(":")[2] if source.startswith("procedural:") else Path(source).name
-
-
 def header(run: Run, evaluation: dict[str, Any] | None) -> str:
     figures: list[tuple[str, str, str]] = []
     if evaluation:
         protocol = evaluation["protocol"]
-        held_out = "held-out views" if protocol["split"] == "test" else f"{protocol['split']} views"
-        figures.append((f"{evaluation['psnr']:.2f}", "dB", f"PSNR, {protocol['views']} {held_out}"))
-        figures.append((f"{evaluation['ssim']:.3f}", "", "SSIM"))
-        if evaluation.get("lpips") is not None:
-            figures.append((f"{evaluation['lpips']:.3f}", "", "LPIPS"))
+        what = "views" if "views" in protocol else "shapes"
+        count, split = protocol[what], "held-out" if protocol["split"] == "test" else protocol["split"]
+        if what == "shapes" and count == 1:
+            split, what = "", "shape"
+        for i, score in enumerate(scores_of(evaluation)):
+            value = f"{score.value:.{min(score.digits, 3)}f}"
+            figures.append(
+                (value, score.unit, score.name if i else f"{score.name}, {count} {split} {what}".replace("  ", " "))
+            )
     if run.has_state:
         state = run.state
         figures.append((f"{state.seconds:.0f}" if state.seconds < 1000 else clock(state.seconds), "s", "of training"))
         figures.append((f"{state.step:,}".replace(",", "\u202f"), "", "steps"))
-    if evaluation:
+    if evaluation and "seconds_per_view" in evaluation:
         figures.append((f"{evaluation['seconds_per_view']:.2f}", "s", "to render a view"))
-    count = run.config["splits"].get("train", 0)
-    sentence = f"{run.method_name}, trained on {count} photograph{'' if count == 1 else 's'}"
-    return heading(scene_title(run), sentence, figures)
+    sentence = f"{run.method_name}, trained on {counted(run)}"
+    return heading(run.title, sentence, figures)
+
+
+def counted(run: Run) -> str:
+    """What a run learnt from, and how many of it."""
+    count, one = run.settings.splits.get("train", 0), {"photographs": "photograph", "shapes": "shape"}.get(run.kind)
+    return f"{count} {one}{'' if count == 1 else 's'}" if one else f"{run.kind} of {count}"
 
 
 def heading(title: str, sentence: str, figures: Sequence[tuple[str, str, str]]) -> str:
@@ -86,7 +92,7 @@ def heading(title: str, sentence: str, figures: Sequence[tuple[str, str, str]]) 
 
 
 def films(run: Run) -> str:
-    """The first film there is, beside its depth."""
+    """HTML of the first film in the run's folder, beside its depth."""
     found = [path for path in sorted((run.folder / "renders").glob("*.mp4")) if not path.stem.endswith("-depth")]
     found = sorted(found, key=lambda path: path.stem != "orbit")
     if not found:
@@ -118,13 +124,17 @@ def curves(run: Run) -> str:
     if len(rows) < 3:
         return ""
     seconds, steps = [row["seconds"] for row in rows], [row["step"] for row in rows]
-    psnr = [row["psnr"] for row in rows]
-    charts = [
-        line_chart([Series("PSNR", seconds, psnr)], "seconds of training", "PSNR of training batches, dB"),
-        line_chart([Series("PSNR", steps, psnr)], "step", "PSNR of training batches, dB"),
-    ]
-    losses = [Series(name, steps, [row["terms"][name] for row in rows]) for name in rows[-1]["terms"]]
-    charts.append(line_chart(losses, "step", "loss", log=True))
+    charts = []
+    if any("psnr" in row for row in rows):
+        psnr = [row.get("psnr", math.nan) for row in rows]
+        charts += [
+            line_chart([Series("PSNR", seconds, psnr)], "seconds of training", "PSNR of training batches, dB"),
+            line_chart([Series("PSNR", steps, psnr)], "step", "PSNR of training batches, dB"),
+        ]
+    names = dict.fromkeys(name for row in rows for name in row["terms"])
+    losses = [Series(name, steps, [row["terms"].get(name, math.nan) for row in rows]) for name in names]
+    if losses:
+        charts.append(line_chart(losses, "step", "loss", log=True))
     if all("samples" in row["statistics"] for row in rows):
         speed = [
             (b["step"] - a["step"]) * b["statistics"]["samples"] / max(b["seconds"] - a["seconds"], 1e-9)
@@ -133,11 +143,13 @@ def curves(run: Run) -> str:
         charts.append(
             line_chart([Series("samples/s", seconds[1:], speed)], "seconds of training", "samples per second")
         )
+    if not charts:
+        return ""
     return section("Curves", f"<div class='charts'>{''.join(f'<figure>{chart}</figure>' for chart in charts)}</div>")
 
 
 def views(run: Run, evaluation: dict[str, Any] | None) -> str:
-    if not evaluation or len(evaluation["views"]) < 2:
+    if not evaluation or len(evaluation.get("views", ())) < 2:
         return ""
     scores = evaluation["views"]
     chart = bar_chart([view["name"] for view in scores], [view["psnr"] for view in scores], "PSNR, dB")
@@ -155,21 +167,22 @@ def contact_sheet(run: Run) -> str:
 
 
 def settings(run: Run, evaluation: dict[str, Any] | None) -> str:
-    config = run.config
-    frame = config["frame"]
+    said, frame = run.settings, run.frame
     about = {
-        "scene": config["scene"]["source"],
-        "photographs": ", ".join(f"{count} {name}" for name, count in config["splits"].items()),
-        **{name: value for name, value in config["scene"]["options"].items() if value is not None},
-        "bounds": " to ".join("(" + ", ".join(f"{x:.3g}" for x in corner) + ")" for corner in frame["bounds"]),
-        "reach": f"{frame['reach']:g}",
-        "near": f"{frame['near']:.3g}",
-        "background": ", ".join(f"{x:g}" for x in frame["background"]),
-        "budget": ", ".join(f"{value:g} {name}" for name, value in config["budget"].items()),
-        "seed": config["seed"],
+        "scene": said.scene.source,
+        "shapes" if run.kind == "shapes" else "members" if run.kind == "a collection" else "photographs": ", ".join(
+            f"{count} {name}" for name, count in said.splits.items()
+        ),
+        **{name: value for name, value in said.scene.options.items() if value is not None},
+        "bounds": " to ".join("(" + ", ".join(f"{x:.3g}" for x in corner) + ")" for corner in frame.bounds),
+        "reach": f"{frame.reach:g}",
+        "near": f"{frame.near:.3g}",
+        "background": ", ".join(f"{x:g}" for x in frame.background),
+        "budget": ", ".join(f"{value:g} {name}" for name, value in said.budget.items()),
+        "seed": said.seed,
     }
-    tables = [table("Scene", about), table(config["method"], config["config"])]
-    timings = {"trained on": f"{config['device']}, {config['processor']}"}
+    tables = [table("Scene", about), table(said.method, said.config)]
+    timings = {"trained on": f"{said.device}, {said.processor}"}
     if run.has_state:
         state = run.state
         timings |= {"training": f"{state.seconds:.1f} s", "compiling, beside": f"{state.compile_seconds:.1f} s"}
@@ -178,9 +191,10 @@ def settings(run: Run, evaluation: dict[str, Any] | None) -> str:
     if rows:
         timings["samples per step, at the end"] = short(rows[-1]["statistics"]["samples"])
     if evaluation:
-        timings["rendering"] = f"{evaluation['seconds_per_view']:.3f} s per view, on {evaluation['evaluated_on']}"
+        if "seconds_per_view" in evaluation:
+            timings["rendering"] = f"{evaluation['seconds_per_view']:.3f} s per view, on {evaluation['evaluated_on']}"
         tables.append(table("Protocol", evaluation["protocol"]))
-    tables += [table("Time", timings), table("Made with", config["versions"])]
+    tables += [table("Time", timings), table("Made with", said.versions)]
     return section("Settings", f"<div class='tables'>{''.join(tables)}</div>")
 
 
@@ -209,7 +223,7 @@ def plain(value: Any) -> str:
 
 
 def jpeg(path: Path) -> str:
-    """A picture small enough to embed."""
+    """A picture as a JPEG small enough to embed in a page."""
     file = io.BytesIO()
     Image.open(path).convert("RGB").save(file, "JPEG", quality=90, optimize=True)
     return f"data:image/jpeg;base64,{base64.b64encode(file.getvalue()).decode()}"

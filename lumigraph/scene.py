@@ -2,19 +2,27 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
-from typing import Any
+from functools import partial
+from typing import Any, ClassVar
 
+import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int, UInt8
+from jaxtyping import Bool, Float, Int, Shaped, UInt8
 from torch import Tensor
 
+from .blending import before
 from .camera import Camera
-from .images import ImageStore
+from .errors import LumigraphError
+from .geometry import Similarity
+from .images import UNNAMED, ImageStore, Layer, cosines, resized
 from .plain import from_plain
 from .rays import Rays
 
 Vector = tuple[float, float, float]
+# How values of a layer are reduced, by its name (see `resized`); all others are picked, not averaged.
+AVERAGED = {"colours": "sRGB", "raw": "linear", "albedo": "linear", "flow": "pixels"}
 
 
 @dataclass(frozen=True)
@@ -45,6 +53,8 @@ class Frame:
     source_from_scene: the similarity x_source = M x_scene back to the frame that the capture came in, so that exports
                  line up with it
     forward:     of a capture without bounds whose cameras all look one way; None for any other
+    times:       first and last moment of a capture whose photographs say when they were taken, in its own unit; None
+                 for any other, and where all were taken at once
     """
 
     bounds: tuple[Vector, Vector] = ((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0))
@@ -60,6 +70,12 @@ class Frame:
         (0.0, 0.0, 0.0, 1.0),
     )
     forward: Forward | None = None
+    times: tuple[float, float] | None = None
+
+    @property
+    def to_source(self) -> Similarity:
+        """The way back to the frame that the capture came in."""
+        return Similarity.of(self.source_from_scene)
 
     def to_json(self) -> dict[str, Any]:
         """Plain numbers and lists; `from_json` turns them back exactly."""
@@ -76,22 +92,27 @@ class Batch:
 
     rgb:   sRGB-encoded, not multiplied by alpha
     alpha: opacity, where the photographs have it
+    extra: values of the layers that were asked for, by name; see `Layer.decoded`
     """
+
+    unit: ClassVar[str] = "rays"
 
     rays: Rays
     rgb: Float[Tensor, "ray 3"]
     alpha: Float[Tensor, " ray"] | None = None
+    extra: dict[str, Tensor] = field(default_factory=dict)
 
     def __len__(self) -> int:
         return len(self.rgb)
 
     def before(self, background: Float[Tensor, "#ray 3"]) -> Float[Tensor, "ray 3"]:
         """The colours with a background behind what is not opaque."""
-        return self.rgb if self.alpha is None else background + self.alpha[:, None] * (self.rgb - background)
+        return before(self.rgb, self.alpha, background)
 
     def to(self, device: torch.device | str) -> Batch:
         alpha = None if self.alpha is None else self.alpha.to(device)
-        return Batch(self.rays.to(device), self.rgb.to(device), alpha)
+        extra = {name: values.to(device) for name, values in self.extra.items()}
+        return Batch(self.rays.to(device), self.rgb.to(device), alpha, extra)
 
 
 @dataclass(frozen=True)
@@ -101,24 +122,36 @@ class Photograph:
     rgb:   sRGB-encoded, not multiplied by alpha
     alpha: opacity, where the photographs have it
     mask:  which pixels are to be trusted; None for all
+    extra: values of the layers that were asked for, by name; see `Layer.decoded`
     """
+
+    unit: ClassVar[str] = "rays"  # one through each pixel
 
     camera: Camera
     rgb: Float[Tensor, "height width 3"]
     alpha: Float[Tensor, "height width"] | None = None
     mask: Bool[Tensor, "height width"] | None = None
+    extra: dict[str, Tensor] = field(default_factory=dict)
 
     def __len__(self) -> int:
         """Pixels."""
         return self.rgb.shape[0] * self.rgb.shape[1]
 
+    def before(self, background: Float[Tensor, " 3"] | Vector) -> Float[Tensor, "height width 3"]:
+        """The colours with a background behind what is not opaque."""
+        return before(self.rgb, self.alpha, background)
+
     def to(self, device: torch.device | str) -> Photograph:
         rgb, alpha, mask = (None if x is None else x.to(device) for x in (self.rgb, self.alpha, self.mask))
         assert rgb is not None
-        return Photograph(self.camera.to(device), rgb, alpha, mask)
+        extra = {name: values.to(device) for name, values in self.extra.items()}
+        return Photograph(self.camera.to(device), rgb, alpha, mask, extra)
 
     def reduced(self, factor: int) -> Photograph:
-        """A whole number of times smaller: means over squares of pixels. What does not fill a square is left out."""
+        """A whole number of times smaller: means over squares of pixels. What does not fill a square is left out.
+
+        Of the layers light is averaged too; depth, labels and all else are picked (see `resized`).
+        """
         if factor == 1:
             return self
         height, width = (n // factor * factor for n in self.rgb.shape[:2])
@@ -137,7 +170,20 @@ class Photograph:
         mask = None if mask is None else mean(mask.float()) == 1
         lens = self.camera.lens.resized(torch.full((1, 2), 1 / factor, device=self.rgb.device))
         size = self.camera.size.new_tensor([[width // factor, height // factor]])
-        return Photograph(replace(self.camera, lens=lens, size=size), rgb, alpha, mask)
+        extra = {
+            name: smaller(values[:height, :width], factor, AVERAGED.get(name, "plain"))
+            for name, values in self.extra.items()
+        }
+        return Photograph(replace(self.camera, lens=lens, size=size), rgb, alpha, mask, extra)
+
+
+def smaller(values: Shaped[Tensor, "height width *channels"], factor: int, encoding: str) -> Tensor:
+    """Decoded values of a layer, a whole number of times smaller; see `resized`."""
+    height, width = values.shape[:2]
+    stored = values.cpu().numpy()
+    per_pixel = stored.reshape(height, width, -1)
+    known = ~np.isnan(per_pixel).any(-1) if values.is_floating_point() else (per_pixel != UNNAMED).any(-1)
+    return torch.from_numpy(resized(stored, (width // factor, height // factor), encoding, known)).to(values.device)
 
 
 @dataclass(frozen=True)
@@ -150,7 +196,11 @@ class Scene:
     points:  sparse points in the scene's frame, where structure from motion gave some
     source:  the folder it came from, or "procedural:<name>"
     warnings: what the user should know about the capture, one sentence each
+    layers:  what else is known of every pixel, by name: depth, labels ...; read when asked for
+    about:   what else is known of each photograph, by name: exposure, boxes ...; the first axis is the image
     """
+
+    kind: ClassVar[str] = "photographs"
 
     cameras: Camera
     images: ImageStore
@@ -161,24 +211,52 @@ class Scene:
     points: Float[Tensor, "point 3"] | None = None
     point_colours: UInt8[Tensor, "point 3"] | None = None
     warnings: list[str] = field(default_factory=list)
+    layers: dict[str, Layer] = field(default_factory=dict)
+    about: dict[str, Tensor] = field(default_factory=dict)
 
     def __len__(self) -> int:
         return len(self.names)
 
-    def sample_rays(self, count: int, generator: torch.Generator, split: str = "train") -> Batch:
-        """Random pixels of random photographs: photographs evenly, then their trusted pixels evenly."""
-        drawn = self.images.draw(count, self.splits[split], generator)
+    def layer(self, name: str) -> Layer:
+        """A layer by its name. Raises LumigraphError, naming those that there are, if there is none."""
+        if name not in self.layers:
+            there = f"only {', '.join(self.layers)}" if self.layers else "nothing else"
+            raise LumigraphError(f"{self.source} has no {name} beside its photographs, {there}; add it, or do without")
+        return self.layers[name]
+
+    def sample_rays(
+        self, count: int, generator: torch.Generator, split: str = "train", layers: Sequence[str] = ()
+    ) -> Batch:
+        """Random pixels of random photographs: photographs evenly, then their trusted pixels evenly.
+
+        layers: names of what else to tell of these pixels, in `Batch.extra`. Raises LumigraphError if there is no such
+        """
+        chosen = self.splits[split]
+        drawn = self.images.draw(count, chosen, generator, positions=bool(layers))
         rays = self.cameras.rays(drawn.xy, drawn.image)
         rgb = drawn.rgba[:, :3].float().div_(255)
         alpha = drawn.rgba[:, 3].float().div_(255) if self.images.has_alpha else None
-        return Batch(rays, rgb, alpha)
+        extra = {}
+        for name in layers:
+            layer = self.layer(name)
+            assert drawn.position is not None
+            cosine = partial(cosines, rays.directions, self.cameras.forward[drawn.image])
+            extra[name] = layer.decoded(layer.gathered(drawn.position, chosen), cosine)
+        return Batch(rays, rgb, alpha, extra)
 
-    def photograph(self, index: int) -> Photograph:
-        """One photograph with all that is known of it."""
-        camera, image = self.view(index)
+    def preview(self) -> Camera:
+        """The camera of the first held-out photograph; of the first one, where none is held out."""
+        held_out = self.splits.get("test")
+        return self.cameras[int((held_out if held_out is not None and len(held_out) else self.splits["train"])[0])]
+
+    def photograph(self, index: int, layers: Sequence[str] = ()) -> Photograph:
+        """One photograph, its camera, and of the layers those that are named. Raises LumigraphError as `layer` does."""
+        camera, image = self.cameras[index], self.images[index].div(255)
         alpha = image[..., 3] if image.shape[-1] == 4 else None
-        return Photograph(camera, image[..., :3].contiguous(), alpha, self.images.mask(index))
 
-    def view(self, index: int) -> tuple[Camera, Float[Tensor, "height width channel"]]:
-        """One photograph and its camera: sRGB-encoded in [0, 1], a fourth channel where the photographs have alpha."""
-        return self.cameras[index], self.images[index].div(255)
+        def cosine() -> Tensor:
+            directions = camera.rays(camera.pixels()).directions
+            return cosines(directions, camera.forward).view(image.shape[:2])
+
+        extra = {name: self.layer(name).decoded(self.layer(name).stored(index), cosine) for name in layers}
+        return Photograph(camera, image[..., :3].contiguous(), alpha, self.images.mask(index), extra)

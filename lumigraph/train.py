@@ -8,24 +8,26 @@ import math
 import signal
 import threading
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol, runtime_checkable
 
 import torch
 from torch import Tensor
 
+from . import methods
+from .dataset import Dataset, check_kind
 from .display import TrainingDisplay
 from .errors import LumigraphError
 from .figures import save_picture
 from .memory import peak_memory
-from .method import Method
+from .method import Lesson, Method
 from .run import Run, State
-from .scene import Batch, Photograph, Scene
 
 FIRST_SAVE = 10.0  # seconds of training; a fault or a kill in the first minute should not cost all of it
 PREVIEWS = (0.01, 0.03, 0.1, 0.3, 1.0)  # shares of the budget at which a view is kept
 PREVIEW_SIZE = 256  # pixels along the longer side
+DARKEST_ERROR = 1e-10  # mean squared error below which the PSNR stays 100 dB
 SMALL = 1 << 16  # gradients up to this many numbers are looked at in every step, larger ones in every logged step
 
 
@@ -62,7 +64,7 @@ class Watch(Protocol):
 
 def fit(
     method: Method,
-    scene: Scene,
+    data: Dataset,
     run: Run | None = None,
     *,
     steps: int | None = None,
@@ -73,8 +75,9 @@ def fit(
     log_every: int = 10,
     show: bool = True,
     watch: Watch | None = None,
+    rehearsal: bool = True,
 ) -> Outcome:
-    """Train a method on a scene until its steps are done or its seconds are spent.
+    """Train a method on a dataset until its steps are done or its seconds are spent.
 
     run:        where the state is kept; training goes on from the state it holds. None keeps nothing
     steps, seconds: the whole budget, earlier sittings included; exactly one of them
@@ -82,16 +85,19 @@ def fit(
     pause_at:   stop at this step as if interrupted; the schedule still follows the whole budget
     save_every: seconds of training between states
     watch:      who looks on meanwhile
+    rehearsal:  whether a step on a copy compiles all kernels ahead of the clock; tests that time nothing do without
     Seconds count what training needs; compiling kernels ahead of it, saving, and giving way to who looks on are
     counted apart.
     Ctrl-C and SIGTERM end the step at hand, save and return; a second one breaks off.
-    Raises LumigraphError when a loss or gradient is not finite, with the last good state saved.
+    Raises LumigraphError for a dataset of another kind than the method learns from, and when a loss or gradient is not
+    finite, with the last good state saved.
     """
     budget = Budget(steps, seconds)
+    check_kind(methods.name_of(method), method.learns_from, type(data), data.source)
     state = run.restore_weights(method) if run else State()
     with Interrupt() as interrupt, TrainingDisplay(show) as display:
         display.say("Compiling kernels")
-        compile_seconds = state.compile_seconds + rehearse(method, scene, state.step)
+        compile_seconds = state.compile_seconds + (rehearse(method, data, state.step) if rehearsal else 0.0)
         optimizers, generator = method.optimizers(), torch.Generator().manual_seed(seed)
         if run:
             run.restore_training(optimizers, generator)
@@ -99,44 +105,47 @@ def fit(
         method.train()
         clock, step, watched = Clock(state.seconds), state.step, 0.0
         if step == 0:
-            method.begin(scene)
+            method.begin(data)
         next_save = clock.seconds + min(FIRST_SAVE, save_every)
-        previews = Previews(run, method, scene, budget.progress(step, clock.seconds))
+
+        def spent(seconds: float | None = None) -> float:
+            now = clock.seconds if seconds is None else seconds
+            return 1.0 if method.complete else budget.progress(step, now)
+
+        previews = Previews(run, method, data, spent())
 
         def save() -> State:
             if not finite(method.parameters()):
-                raise LumigraphError(stop("a parameter is not finite", step, run, method, save))
+                refuse("a parameter is not finite")
             memory = max(state.peak_memory, peak_memory(method.device))
             now = State(step, clock.seconds, compile_seconds, memory)
             with clock.paused():
-                previews.take(step, budget.progress(step, now.seconds))
+                previews.take(step, spent(now.seconds))
                 if run:
                     run.save(now, method, optimizers, generator)
             return now
 
-        while (progress := budget.progress(step, clock.seconds)) < 1 and step != pause_at and not interrupt.signal:
+        def refuse(fault: str) -> None:
+            raise LumigraphError(stop(fault, step, run, method, save))
+
+        while (progress := spent()) < 1 and step != pause_at and not interrupt.signal:
             if watch and watch.asked:
                 watched += give_way(watch, method, clock, interrupt)
                 continue
-            method.before_step(step, progress)
-            batch = method.batch(scene, generator)
-            terms = method.loss(batch, step)
-            for optimizer in optimizers:
-                optimizer.zero_grad(set_to_none=True)
-            torch.stack(list(terms.values())).sum().backward()
             logged = (step + 1) % log_every == 0
-            if fault := find_fault(method, terms, batch, step, thorough=logged):
-                raise LumigraphError(stop(fault, step, run, method, save))
-            for optimizer in optimizers:
-                optimizer.step()
+            set_learning_rate(optimizers, method.learning_rate(step, progress))
+            method.before_step(step, progress)
+            batch = method.batch(data, generator)
+            terms = method.step(batch, step, Descent(method, optimizers, batch, step, logged, refuse))
             method.after_step(step)
             step += 1
-            row = display.update(step, clock.seconds, progress, batch, terms, method, needed=logged)
+            row = record(step, clock.seconds, terms, method) if logged or display.due else {}
+            display.update(step, clock.seconds, progress, batch, row)
             if watch:
                 watch.note(step, progress, row)
             if run and logged:
                 run.log(row | {"learning_rate": [g["lr"] for o in optimizers for g in o.param_groups if "lr" in g]})
-            if clock.seconds >= next_save and budget.progress(step, clock.seconds) < 1:  # the last save comes after
+            if clock.seconds >= next_save and spent() < 1:  # the last save comes after
                 save()
                 next_save = clock.seconds + save_every
             elif previews.due(progress):
@@ -144,9 +153,66 @@ def fit(
                     previews.take(step, progress)
 
         final = save()
-        display.done(step, final.seconds, budget.progress(step, final.seconds))
+        finished = spent(final.seconds) >= 1
+        display.done(step, final.seconds, spent(final.seconds))
     method.eval()
-    return Outcome(final, budget.progress(step, final.seconds) >= 1, interrupt.signal, clock.pauses - watched)
+    return Outcome(final, finished, interrupt.signal, clock.pauses - watched)
+
+
+class Descent:
+    """The trainer's part of one step, which `Method.step` is handed as `descend`: gradients of the summed terms, a look
+    whether they are finite, and the optimizers' step.
+
+    thorough: look at all gradients, see `find_fault`
+    refuse:   told what is not finite; it raises
+    """
+
+    def __init__(
+        self,
+        method: Method,
+        optimizers: Sequence[torch.optim.Optimizer],
+        batch: Lesson,
+        step: int,
+        thorough: bool,
+        refuse: Callable[[str], None],
+    ):
+        self.method, self.optimizers, self.batch, self.step = method, optimizers, batch, step
+        self.thorough, self.refuse = thorough, refuse
+
+    def __call__(self, terms: dict[str, Tensor], optimizers: Sequence[torch.optim.Optimizer] | None = None) -> None:
+        """One step downhill, by some of the optimizers or by all."""
+        chosen = self.optimizers if optimizers is None else optimizers
+        for optimizer in chosen:
+            optimizer.zero_grad(set_to_none=True)
+        torch.stack(list(terms.values())).sum().backward()
+        if fault := find_fault(self.method, terms, self.batch, self.step, self.thorough):
+            self.refuse(fault)
+        for optimizer in chosen:
+            optimizer.step()
+
+
+def record(step: int, seconds: float, terms: dict[str, Tensor], method: Method) -> dict[str, Any]:
+    """A line of metrics.jsonl: the loss and its terms, the method's figures, and the PSNR of what the step learnt from
+    where the method reports a squared error of colours."""
+    losses = {name: value.item() for name, value in terms.items()}
+    statistics = {name: float(value) for name, value in method.statistics().items()}
+    row: dict[str, Any] = {"step": step, "seconds": round(seconds, 4)}
+    if losses:
+        row["loss"] = sum(losses.values())
+    if "mse" in statistics:
+        row["psnr"] = -10 * math.log10(max(statistics["mse"], DARKEST_ERROR))
+    return row | {"terms": losses, "statistics": statistics}
+
+
+def set_learning_rate(optimizers: Iterable[torch.optim.Optimizer], rate: float | dict[str, float] | None) -> None:
+    """Give groups of parameters what `Method.learning_rate` says."""
+    if rate is None:
+        return
+    for optimizer in optimizers:
+        for group in optimizer.param_groups:
+            own = rate.get(group.get("name", "")) if isinstance(rate, dict) else rate
+            if own is not None:
+                group["lr"] = own * group.get("scale", 1.0)
 
 
 @dataclass(frozen=True)
@@ -208,22 +274,20 @@ class Interrupt:
 
 
 class Previews:
-    """One view as it comes to be: the first held-out one, small."""
+    """One view as it comes to be: that of the dataset's preview camera, small. None where it has no such camera."""
 
-    def __init__(self, run: Run | None, method: Method, scene: Scene, progress: float):
-        held_out = scene.splits.get("test")
-        index = held_out if held_out is not None and len(held_out) else scene.splits["train"]
-        camera = scene.cameras[int(index[0])]
-        self.camera = camera.resized(min(1.0, PREVIEW_SIZE / int(camera.size.max())))
+    def __init__(self, run: Run | None, method: Method, data: Dataset, progress: float):
+        camera = data.preview() if run else None
+        self.camera = camera and camera.resized(min(1.0, PREVIEW_SIZE / int(camera.size.max())))
         self.run, self.method = run, method
-        self.next = [share for share in PREVIEWS if share > progress] if run else []
+        self.next = [share for share in PREVIEWS if share > progress] if camera else []
 
     def due(self, progress: float) -> bool:
         return bool(self.next) and progress >= self.next[0]
 
     def take(self, step: int, progress: float) -> None:
         """Render and keep the view if it is due."""
-        if not self.run or not self.due(progress):
+        if not self.run or self.camera is None or not self.due(progress):
             return
         self.next = [share for share in self.next if share > progress]
         self.method.eval()
@@ -241,25 +305,20 @@ def give_way(watch: Watch, method: Method, clock: Clock, interrupt: Interrupt) -
     return clock.pauses - before
 
 
-def rehearse(method: Method, scene: Scene, step: int) -> float:
+def rehearse(method: Method, data: Dataset, step: int) -> float:
     """One step on a copy, so that all kernels are compiled before the clock starts. Returns the seconds it took."""
     begin = time.perf_counter()
     double = copy.deepcopy(method).train()
     optimizers = double.optimizers()
+    set_learning_rate(optimizers, double.learning_rate(step, 0.0))
     double.before_step(step, 0.0)
-    terms = double.loss(double.batch(scene, torch.Generator().manual_seed(0)), step)
-    for optimizer in optimizers:
-        optimizer.zero_grad(set_to_none=True)
-    torch.stack(list(terms.values())).sum().backward()
-    for optimizer in optimizers:
-        optimizer.step()
+    batch = double.batch(data, torch.Generator().manual_seed(0))
+    double.step(batch, step, Descent(double, optimizers, batch, step, False, lambda fault: None))
     double.after_step(step)
     return time.perf_counter() - begin
 
 
-def find_fault(
-    method: Method, terms: dict[str, Tensor], batch: Batch | Photograph, step: int, thorough: bool
-) -> str | None:
+def find_fault(method: Method, terms: dict[str, Tensor], batch: Lesson, step: int, thorough: bool) -> str | None:
     """The loss term that is not finite, or whose gradient is not; None if all is well.
 
     thorough: look at all gradients. Small ones, which everything flows through, are always looked at.
@@ -270,7 +329,8 @@ def find_fault(
     named = [(n, p) for n, p in method.named_parameters() if p.grad is not None]
     if finite(p.grad for _, p in named if p.grad is not None and (thorough or p.numel() <= SMALL)):
         return None
-    for term, value in method.loss(batch, step).items():  # once more, one term at a time
+    again = method.loss(batch, step) if type(method).step is Method.step else {}
+    for term, value in again.items():  # one at a time
         gradients = torch.autograd.grad(value, [p for _, p in named], retain_graph=True, allow_unused=True)
         for (parameter, _), gradient in zip(named, gradients, strict=True):
             if gradient is not None and not finite([gradient]):

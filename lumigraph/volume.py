@@ -9,6 +9,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from . import kernels
+from .blending import over
 from .rays import Rendering, Samples
 
 
@@ -31,7 +32,7 @@ def composite(
     total, opacity, weights = kernels.composite(density * samples.length, columns, samples.ray_starts, stop)
     colour, distance, *rest = total.split([3, 1, *(v.shape[-1] for v in values.values())], -1)
     if background is not None:
-        colour = colour + (1 - opacity)[:, None] * background
+        colour = over(colour, opacity, background)
     hit = opacity > 1e-3
     depth = torch.where(hit, distance[:, 0] / opacity.clamp_min(1e-3), torch.inf)
     return Rendering(colour, depth, opacity, dict(zip(values, rest, strict=True)))

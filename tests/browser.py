@@ -1,6 +1,7 @@
 """A real browser for tests: the system's Chromium, without a window, drawing WebGL in software.
 
-The tests of a file share one browser and each gets a page of its own. A test asks for the fixture `page`, and for
+All tests share one browser and each gets a page of its own; they come last (`conftest`), for asyncio.run() is refused
+while playwright is about. A test asks for the fixture `page`, and for
 `faults` to see what went wrong in it; other windows, such as a phone's, come from `chromium.new_context(...)`.
 """
 
@@ -31,7 +32,7 @@ def find_chromium() -> str | None:
     return os.environ.get("CHROMIUM") or next(filter(None, map(shutil.which, NAMES)), None)
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def chromium() -> Iterator[Any]:
     """A playwright Browser. Without Chromium tests are skipped, or fail where LUMIGRAPH_NEEDS_BROWSER=1."""
     program = find_chromium()
@@ -42,7 +43,6 @@ def chromium() -> Iterator[Any]:
         pytest.skip(reason)
     from playwright.sync_api import sync_playwright
 
-    # For a file's tests rather than for all, because asyncio.run() is refused while playwright is about.
     with sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=program, args=ARGUMENTS)  # headless, without a sandbox
         yield browser

@@ -14,19 +14,9 @@ from triton.runtime.driver import driver
 from triton.runtime.jit import JITFunction
 
 from lumigraph import kernels
+from lumigraph.kernels._facts import operations, tensors
 
 TARGETS = [GPUTarget("cuda", 90, 32), GPUTarget("hip", "gfx942", 64)]
-# For each operation, the case whose options reach most of the code.
-CASES = {
-    "spherical_harmonics": 0,
-    "composite": 15,
-    "hash_encode": 3,
-    "march": 7,
-    "project": 5,
-    "tile": 6,
-    "rasterize": 3,
-    "ssim": 4,
-}
 
 
 class Absent:
@@ -58,12 +48,11 @@ def compile_only(kernel, *args, warmup=False, **options):
 JITFunction.run = compile_only
 for target in TARGETS:
     driver.set_active(Absent(target))
-    for name, case in CASES.items():
+    for name in operations():
         operation = importlib.import_module(f"lumigraph.kernels.{name}")
-        inputs = list(operation.cases(torch.Generator().manual_seed(0)))[case]
+        inputs = list(operation.cases(torch.Generator().manual_seed(0)))[operation.FACTS.compiled]
         real = [x.requires_grad_() for x in inputs if torch.is_tensor(x) and x.is_floating_point()]
         with kernels.using("gpu"):
-            found = getattr(operation, name)(*inputs)
-        outputs = [x for x in (found if isinstance(found, tuple) else [found]) if getattr(x, "requires_grad", False)]
+            outputs = [x for x in tensors(getattr(operation, name)(*inputs)) if x.requires_grad]
         if outputs:
             torch.autograd.grad(sum(x.sum() for x in outputs), real)

@@ -1,19 +1,31 @@
-"""Before any test: Triton interprets where there is no GPU, and the shapes written at every door are executed."""
+"""Before any test: Triton interprets where there is no GPU, and the shapes written at every door are executed.
+
+Around each: no test may hang, and what it costs is noted. Tests that need a browser come last, for they share one.
+"""
 
 from __future__ import annotations
 
+import contextlib
 import os
 import re
+import signal
 import sys
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
-import lumigraph  # first, because it sets how OpenMP waits before PyTorch is loaded
+if "PYTEST_XDIST_WORKER" in os.environ:  # a process for each processor, so threads that spin only hold up the others
+    os.environ |= {"OMP_NUM_THREADS": "1", "OMP_WAIT_POLICY": "PASSIVE"}
 
+import lumigraph  # isort: skip
 import pytest  # isort: skip
 import torch  # isort: skip
 from browser import chromium, faults, page  # noqa: F401  # isort: skip
+from budgets import Ledger, busy  # isort: skip
 from jaxtyping import install_import_hook  # isort: skip
+from numba.core import event  # isort: skip
 
+LIMIT = 300  # seconds of waiting, in whatever state the machine is, that a test's setup, body or end may take
 PACKAGE = Path(lumigraph.__file__).parent
 JIT = re.compile(r"^\s*(import|from) (numba|triton)\b", re.MULTILINE)
 
@@ -37,6 +49,109 @@ checker = "beartype.beartype(conf=beartype.BeartypeConf(is_pep484_tower=True))" 
 manager = install_import_hook(["lumigraph"], checker)
 covered = checked_modules()
 manager.hook.should_instrument = covered.__contains__  # type: ignore[method-assign, attr-defined]
+
+
+# Background jobs of a shell ignore Ctrl-C, and so would what tests start; they press it.
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+
+LEDGER = Ledger()
+event.register("numba:compile", LEDGER.compiling)
+
+
+@pytest.hookimpl(trylast=True)
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    items.sort(key=lambda item: "chromium" in getattr(item, "fixturenames", ()))
+    from lumigraph import methods
+
+    LEDGER.methods = len(methods.available())
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_protocol(item: pytest.Item) -> Iterator[None]:
+    before = LEDGER.readings()
+    done = yield
+    LEDGER.note(item.path.stem, before)
+    return done
+
+
+@contextlib.contextmanager
+def limited() -> Iterator[None]:
+    """Fail instead of waiting for ever."""
+
+    def fail(*_: object) -> None:
+        pytest.fail(f"still waiting after {LIMIT} s")
+
+    before = signal.signal(signal.SIGALRM, fail)
+    signal.alarm(LIMIT)
+    try:
+        yield
+    finally:
+        signal.alarm(0)
+        signal.signal(signal.SIGALRM, before)
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_setup() -> Iterator[None]:
+    with limited():
+        return (yield)
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_call() -> Iterator[None]:
+    with limited():
+        return (yield)
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_teardown() -> Iterator[None]:
+    with limited():
+        return (yield)
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_testnodedown(node: Any) -> None:
+    """A worker has ended: its costs are the session's."""
+    LEDGER.add(getattr(node, "workeroutput", {}).get("costs"))
+
+
+@pytest.hookimpl(trylast=True)
+def pytest_sessionfinish(session: pytest.Session, exitstatus: int) -> None:
+    if hasattr(session.config, "workeroutput"):
+        session.config.workeroutput["costs"] = LEDGER.to_plain()
+    elif exitstatus == 0 and LEDGER.excessive() and not busy():
+        session.exitstatus = pytest.ExitCode.TESTS_FAILED
+
+
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
+    terminalreporter.section("what the tests cost")
+    for line in [*LEDGER.table(), *LEDGER.excessive()]:
+        terminalreporter.write_line(line)
+    if LEDGER.excessive() and busy():
+        terminalreporter.write_line("which may be for other programs are running; it counts where the machine is idle")
+
+
+# What many files need, made once. Nobody may change it; a test that would takes a copy.
+
+
+@pytest.fixture(scope="session")
+def ball_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The tiny scene as a Blender folder."""
+    import tiny
+
+    return tiny.write_blender(tmp_path_factory.mktemp("scenes") / "ball")
+
+
+@pytest.fixture(scope="session")
+def ball_run(tmp_path_factory: pytest.TempPathFactory) -> Any:
+    """A Run of the tests' own method, which has learnt the tiny scene for 60 steps."""
+    import tiny
+
+    from lumigraph.train import fit
+
+    run = tiny.new_run(tmp_path_factory.mktemp("runs") / "ball")
+    fit(run.new_method(), tiny.scene(), run, steps=60, show=False, rehearsal=False)
+    return run
 
 
 @pytest.fixture

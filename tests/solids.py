@@ -8,9 +8,9 @@ from collections.abc import Callable
 import torch
 
 from lumigraph.camera import Camera
+from lumigraph.geometry import look_at
 from lumigraph.lens import Pinhole
 from lumigraph.method import RayMethod
-from lumigraph.paths import look_at
 from lumigraph.rays import Rendering
 from lumigraph.scene import Frame
 

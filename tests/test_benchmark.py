@@ -13,7 +13,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import tiny
 from PIL import Image
 
 from lumigraph.benchmark.cell import Cell, Settings
@@ -43,13 +42,8 @@ class Here:
         return code if self.code is None else self.code
 
 
-@pytest.fixture(scope="module")
-def ball(tmp_path_factory) -> Path:
-    return tiny.write_blender(tmp_path_factory.mktemp("scenes") / "ball")
-
-
-def cell(ball: Path, steps: int = 4, seed: int = 0, views: int | None = None) -> Cell:
-    return Cell("voxel-grid", "ball", str(ball), Budget(steps, None), seed, views)
+def cell(ball_folder: Path, steps: int = 4, seed: int = 0, views: int | None = None) -> Cell:
+    return Cell("voxel-grid", "ball", str(ball_folder), Budget(steps, None), seed, views)
 
 
 def rows(output: Path) -> list[dict]:
@@ -57,8 +51,8 @@ def rows(output: Path) -> list[dict]:
 
 
 @pytest.fixture(scope="module")
-def cells(ball) -> list[Cell]:
-    return [cell(ball), cell(ball, seed=1), cell(ball, steps=30)]
+def cells(ball_folder) -> list[Cell]:
+    return [cell(ball_folder), cell(ball_folder, seed=1), cell(ball_folder, steps=30)]
 
 
 @pytest.fixture(scope="module")
@@ -79,7 +73,7 @@ def test_every_cell_is_a_run_and_a_row(cells, done):
     for one, row in zip(cells, rows(done), strict=True):
         run = Run(done / row["run"])
         evaluation = run.evaluation()
-        assert (run.method_name, run.config["seed"], run.state.step) == ("voxel-grid", one.seed, one.budget.steps)
+        assert (run.method_name, run.settings.seed, run.state.step) == ("voxel-grid", one.seed, one.budget.steps)
         assert all(row[name] == evaluation[name] for name in ("psnr", "ssim", "seconds_per_view", "protocol"))
         assert (row["protocol"]["views"], row["protocol"]["of"], row["train_views"]) == (2, 3, 9)
         assert row["peak_memory"] == run.state.peak_memory > 0
@@ -95,11 +89,11 @@ def test_the_page_has_means_and_every_cell(done):
     assert "(ball-psnr-over-time.svg)" in page and "(views.png)" in page
 
 
-def test_the_sheet_shows_photograph_and_rendering(ball, done):
+def test_the_sheet_shows_photograph_and_rendering(ball_folder, done):
     row = rows(done)[2]  # the longest training
     name = Path(row["shown"]["name"]).stem
     sheet = np.array(Image.open(done / "views.png"))
-    photograph = np.array(Image.open(ball / f"{name}.png")).astype(float)
+    photograph = np.array(Image.open(ball_folder / f"{name}.png")).astype(float)
     photograph = photograph[..., :3] * photograph[..., 3:] / 255 + (255 - photograph[..., 3:])
     rendering = np.array(Image.open(done / row["run"] / "eval" / f"{name}.png").convert("RGB"))
     top = next(y for y in range(len(sheet)) if (sheet[y : y + 24, 158:182] == rendering).all())
@@ -115,8 +109,8 @@ def test_what_is_done_is_kept(cells, output):
     assert rows(output)[0]["protocol"]["views"] == 3
 
 
-def test_a_stopped_benchmark_goes_on(ball, tmp_path):
-    one, again = cell(ball), Here()
+def test_a_stopped_benchmark_goes_on(ball_folder, tmp_path):
+    one, again = cell(ball_folder), Here()
     assert conduct([one], SETTINGS, tmp_path, launch=Here("--pause-at", "2", code=130)) == 130
     assert Run(tmp_path / "runs" / one.name).state.step == 2 and not (tmp_path / "results.json").exists()
     assert conduct([one], SETTINGS, tmp_path, launch=again) == 0
@@ -141,9 +135,9 @@ def test_a_damaged_run_stops_nothing(cells, output):
     assert "is not a checkpoint" in faults[0] and faults[1:] == [None, None]
 
 
-def test_fewer_views_make_a_chart(ball, tmp_path):
+def test_fewer_views_make_a_chart(ball_folder, tmp_path):
     output = tmp_path / "out"
-    conduct([cell(ball, views=views) for views in (2, None)], SETTINGS, output, launch=Here())
+    conduct([cell(ball_folder, views=views) for views in (2, None)], SETTINGS, output, launch=Here())
     assert [row["train_views"] for row in rows(output)] == [2, 9]
     assert (output / "ball-psnr-over-views.svg").read_text().count("<circle") == 2
     assert not (output / "ball-psnr-over-time.svg").exists()
@@ -166,9 +160,9 @@ def test_a_chart_is_marked_at_its_own_budgets(done, tmp_path):
     assert all(f">{n}</text>" in over_views for n in (2, 3, 9))
 
 
-def test_photographs_at_several_scales_count_once(ball, tmp_path):
+def test_photographs_at_several_scales_count_once(ball_folder, tmp_path):
     output = tmp_path / "out"
-    conduct([cell(ball)], Settings(device="cpu", scales=2), output, launch=Here())
+    conduct([cell(ball_folder)], Settings(device="cpu", scales=2), output, launch=Here())
     (row,) = rows(output)
     assert row["train_views"] == 9 and row["protocol"]["views"] == 6
     assert set(row["by_resolution"]) == {"24x24", "12x12"} and row["shown"]["resolution"] == "24x24"
@@ -178,9 +172,9 @@ def test_photographs_at_several_scales_count_once(ball, tmp_path):
     )
 
 
-def test_cells_that_share_nothing_are_kept_apart(ball, done, tmp_path):
+def test_cells_that_share_nothing_are_kept_apart(ball_folder, done, tmp_path):
     with pytest.raises(LumigraphError, match="begun with --preset auto, which is now paper"):
-        conduct([cell(ball)], Settings(device="cpu", preset="paper"), done, launch=Here())
+        conduct([cell(ball_folder)], Settings(device="cpu", preset="paper"), done, launch=Here())
     with pytest.raises(LumigraphError, match="Two scenes are called ball"):
         conduct([cell(tmp_path)], SETTINGS, done, launch=Here())
 
@@ -208,23 +202,23 @@ def test_a_process_says_why_it_failed(tmp_path):
     assert "memory" in reason(log, 137)
 
 
-def test_ctrl_c_is_passed_on(ball, tmp_path):
+def test_ctrl_c_is_passed_on(ball_folder, tmp_path):
     press = threading.Timer(2.0, os.kill, (os.getpid(), signal.SIGINT))
     press.start()
-    arguments = ["train", "instant-ngp", str(ball), "--seconds", "300", "--output", str(tmp_path / "run")]
+    arguments = ["train", "fourier-features", str(ball_folder), "--seconds", "300", "--output", str(tmp_path / "run")]
     assert launch(arguments, tmp_path / "run.log") == 130
     press.join()
 
 
-def test_the_command(ball, tmp_path, capsys):
+def test_the_command(ball_folder, tmp_path, capsys):
     output = tmp_path / "out"
     arguments = [
         "bench",
         "views",
         "--methods",
-        "instant-ngp",
+        "fourier-features",
         "--scenes",
-        str(ball),
+        str(ball_folder),
         "--views",
         "3",
         "40",
@@ -233,10 +227,10 @@ def test_the_command(ball, tmp_path, capsys):
     ]
     assert main([*arguments, "--eval-views", "1", "--output", str(output)]) == 0
     told = capsys.readouterr()
-    assert "leaving out 40" in told.err and "1 of 1: instant-ngp on ball from 3 views, 2 steps, seed 0" in told.err
+    assert "leaving out 40" in told.err and "1 of 1: fourier-features on ball from 3 views, 2 steps, seed 0" in told.err
     (row,) = rows(output)
     assert row["train_views"] == 3 and row["steps"] == 2 and row["peak_memory"] > 50e6
-    assert row["command"] == "lumigraph train instant-ngp ball --steps 2 --seed 0 --views 3"
+    assert row["command"] == "lumigraph train fourier-features ball --steps 2 --seed 0 --views 3"
     assert str(tmp_path) not in (output / "results.json").read_text() + (output / "results.md").read_text()
 
 
@@ -250,9 +244,9 @@ def test_the_command(ball, tmp_path, capsys):
         (["--device", "abacus"], "abacus"),
     ],
 )
-def test_numbers_are_checked_before_anything_is_trained(ball, tmp_path, capsys, more, why):
+def test_numbers_are_checked_before_anything_is_trained(ball_folder, tmp_path, capsys, more, why):
     output = tmp_path / "out"
-    arguments = ["bench", "methods", "--methods", "voxel-grid", "--scenes", str(ball), "--output", str(output)]
+    arguments = ["bench", "methods", "--methods", "voxel-grid", "--scenes", str(ball_folder), "--output", str(output)]
     assert main([*arguments, *more]) == 2
     told = capsys.readouterr().err
     assert why in told and len(told.splitlines()) == 1 and not output.exists()

@@ -76,7 +76,7 @@ def test_all_layouts_give_the_same_rays(layout, tiny, tmp_path):
         origins, directions = expected_rays(tiny, number, pixels)
         torch.testing.assert_close(rays.origins, origins, rtol=0, atol=1e-4)
         torch.testing.assert_close(rays.directions, directions, rtol=0, atol=1e-5)
-        assert (scene.view(i)[1][..., 2] * 255).round().unique().tolist() == [10 * number]
+        assert (scene.photograph(i).rgb[..., 2] * 255).round().unique().tolist() == [10 * number]
 
 
 @pytest.mark.parametrize("layout", ["nerfstudio", "colmap binary", "colmap text"])
@@ -227,7 +227,8 @@ def one_frame_scene(folder: Path, image: Image.Image, tiny: Tiny, **save) -> Pat
 
 def test_downscale_averages_areas_and_the_lens_follows(tiny, tmp_path):
     scene = open_scene(write_ngp(tmp_path, tiny), downscale=3)
-    camera, image = scene.view(4)
+    seen = scene.photograph(4)
+    camera, image = seen.camera, seen.rgb
     assert camera.size.tolist() == [[16, 12]]
     torch.testing.assert_close(camera.lens.focal, torch.tensor([[20.0, 20.0]]))
     torch.testing.assert_close(camera.lens.centre, torch.tensor([[8.0, 6.0]]))
@@ -259,8 +260,9 @@ def test_reduced_folders_are_used_where_they_fit(tiny, tmp_path):
             picture[..., 0] = times
         marked.write_images(tmp_path / f"images_{times}", times)
     for downscale, red, width in ((1, None, 48), (2, 2, 24), (4, 4, 12), (8, 4, 6), (3, None, 16), (6, 2, 8)):
-        camera, image = open_scene(tmp_path, downscale=downscale).view(2)
-        assert camera.size[0, 0] == width
+        seen = open_scene(tmp_path, downscale=downscale).photograph(2)
+        image = seen.rgb
+        assert seen.camera.size[0, 0] == width
         assert red is None or (image[..., 0] * 255).round().unique().tolist() == [red]
         assert red is not None or len(image[..., 0].unique()) == width
 
@@ -275,7 +277,7 @@ def test_a_neighbouring_capture_is_no_reduced_folder(tiny, tmp_path):
     for picture in (tmp_path / "room_2").glob("*.png"):
         Image.new("RGB", (24, 18), (255, 0, 0)).save(picture)
     scene = open_scene(tmp_path / "room", downscale=2)
-    assert (scene.view(3)[1][..., 2] * 255).round().unique().tolist() == [30]
+    assert (scene.photograph(3).rgb[..., 2] * 255).round().unique().tolist() == [30]
 
 
 def test_asking_for_more_pixels_than_there_are_is_said(tiny, tmp_path):
@@ -291,7 +293,7 @@ def test_reduced_images_under_other_names_go_by_their_order(tiny, tmp_path):
     renamed.names = [f"image{i:03d}.png" for i in range(10)]
     renamed.write_images(tmp_path / "images_2", 2)
     scene = open_scene(tmp_path, downscale=2)
-    assert [int((scene.view(i)[1][..., 2] * 255).round().mean()) for i in range(10)] == list(range(0, 100, 10))
+    assert [int((scene.photograph(i).rgb[..., 2] * 255).round().mean()) for i in range(10)] == list(range(0, 100, 10))
 
 
 def turned(picture: np.ndarray) -> tuple[Image.Image, Image.Exif]:
@@ -341,6 +343,7 @@ def test_a_plain_change_of_scale_is_followed(tiny, tmp_path):
     ],
     ids=["grey", "16 bits", "palette", "1 bit", "grey and alpha", "alpha"],
 )
+@pytest.mark.filterwarnings("ignore:colours is there for 1 of 10")
 def test_all_kinds_of_pixels_are_read(image, expected, tiny, tmp_path):
     scene = open_scene(one_frame_scene(tmp_path, image, tiny))
     assert scene.images[1].reshape(-1, len(expected)).unique(dim=0).tolist() == [expected]

@@ -8,7 +8,18 @@ from xml.etree import ElementTree
 
 import pytest
 
-from lumigraph.charts import COLOURS, STYLE, WIDTH, Series, bar_chart, line_chart, log_ticks, number, standalone, ticks
+from lumigraph.figures.charts import (
+    COLOURS,
+    STYLE,
+    WIDTH,
+    Series,
+    bar_chart,
+    line_chart,
+    log_ticks,
+    number,
+    standalone,
+    ticks,
+)
 
 
 def elements(chart: str, kind: str) -> list[dict[str, str]]:

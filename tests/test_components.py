@@ -10,20 +10,21 @@ import pytest
 import tiny
 import torch
 
-from lumigraph.components.activations import truncated_exp
-from lumigraph.components.carving import visual_hull
-from lumigraph.components.corrections import Exposure, PoseRefinement
-from lumigraph.components.lazy_adam import LazyAdam
-from lumigraph.components.occupancy import OccupancyGrid
-from lumigraph.components.perceptron import Perceptron
+from lumigraph.components.fields.activations import truncated_exp
+from lumigraph.components.fields.mlp import MLP
+from lumigraph.components.sampling.carving import visual_hull
+from lumigraph.components.sampling.occupancy import OccupancyGrid
+from lumigraph.components.training.corrections import Exposure, PoseRefinement
+from lumigraph.components.training.lazy_adam import LazyAdam
 from lumigraph.images import ImageStore
 from lumigraph.rays import Rays
+from lumigraph.run.checkpoint import take_shapes
 
-# Perceptron
+# MLP
 
 
-def seeded(generator, *widths) -> Perceptron:
-    network = Perceptron(*widths)
+def seeded(generator, *widths) -> MLP:
+    network = MLP(*widths)
     for weight in network.weights:
         weight.data = torch.randn(weight.shape, generator=generator) / weight.shape[1] ** 0.5
     return network
@@ -203,12 +204,12 @@ def test_a_larger_cell_is_occupied_by_thinner_matter(generator):
 
 def test_refining_keeps_what_was_known(generator):
     grid = ball_grid(generator)
-    coarse = [getattr(grid, name).clone() for name in grid.GRIDS]
+    coarse = [getattr(grid, name).clone() for name in grid.grows]
     box = grid.box.clone()
     grid.refine()
     assert grid.resolution == 32
     half = torch.arange(32) // 2
-    for name, parent in zip(grid.GRIDS, coarse, strict=True):
+    for name, parent in zip(grid.grows, coarse, strict=True):
         assert torch.equal(getattr(grid, name), parent[:, half][:, :, half][:, :, :, half])
     assert torch.equal(grid.box, box)
     grid.update(ball(0.5), 1.0, generator)
@@ -291,6 +292,7 @@ def test_a_fine_grid_loads_into_a_fresh_coarse_one(generator):
     grid = ball_grid(generator)
     grid.refine()
     fresh = OccupancyGrid(1.0, 4)
+    take_shapes(fresh, grid.state_dict())
     fresh.load_state_dict(grid.state_dict())
     assert fresh.resolution == 32
     for name, value in grid.state_dict().items():

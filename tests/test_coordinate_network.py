@@ -6,9 +6,9 @@ import pytest
 import torch
 from torch.nn import functional as F
 
-from lumigraph.components import dense
-from lumigraph.components.coordinate_network import CoordinateNetwork
-from lumigraph.components.dense import Dense, in_chunks
+from lumigraph.components.fields import dense
+from lumigraph.components.fields.coordinate_network import CoordinateNetwork
+from lumigraph.components.fields.dense import Dense, in_chunks
 from lumigraph.methods.mip_nerf import Config as MipConfig
 from lumigraph.methods.mip_nerf import MipNeRF
 from lumigraph.methods.nerf import Config, NeRF
@@ -71,6 +71,7 @@ def test_direction_changes_colour_and_not_density(generator):
 def test_a_layer_and_its_gradients(samples, kind, tolerance, relu, generator, monkeypatch):
     monkeypatch.setattr(dense, "product_type", lambda device: kind)
     layer = Dense(20, 24, relu)
+    torch.nn.init.kaiming_uniform_(layer.weight, 5**0.5, generator=generator)
     torch.nn.init.normal_(layer.bias, generator=generator)
     x, g = (torch.randn(samples, n, generator=generator) for n in (20, 24))
     x, g = (a.to(kind).float().requires_grad_(i == 0) for i, a in enumerate((x, g)))

@@ -7,10 +7,10 @@ import tiny
 import torch
 from test_gaussians import NAMES, cloud
 
-from lumigraph.components.cloud import Cloud, CloudAdam
-from lumigraph.components.density_control import FAINT, AdaptiveDensity, MarkovChain, sample_by, shared_out
-from lumigraph.components.initial_cloud import initial_cloud, nearest_distance
-from lumigraph.components.smoothing import VARIANCE, sampling_interval, smoothed
+from lumigraph.components.clouds.cloud import Cloud, CloudAdam
+from lumigraph.components.clouds.density_control import FAINT, AdaptiveDensity, MarkovChain, sample_by, shared_out
+from lumigraph.components.clouds.initial_cloud import initial_cloud, nearest_distance
+from lumigraph.components.clouds.smoothing import VARIANCE, sampling_interval, smoothed
 
 
 def optimizer_of(some: Cloud, rate: float = 0.01) -> CloudAdam:
@@ -40,7 +40,7 @@ def test_where_everything_moves_it_is_adam(generator):
 @pytest.mark.parametrize("device", ["cpu", "as on a GPU"])
 def test_a_row_seen_now_and_then_goes_as_far_as_adam_would_take_it(device, monkeypatch):
     """A row with a gradient in every 20th step: the same as Adam, which moves it in all of them, in the end."""
-    from lumigraph.components import cloud as module
+    from lumigraph.components.clouds import cloud as module
 
     if device != "cpu":
 
@@ -88,7 +88,7 @@ def test_small_ones_are_cloned_large_ones_split_and_faint_ones_go(generator):
         some.log_scales[:] = torch.tensor([0.001, 0.5, 0.01, 0.01]).log()[:, None]
         some.opacities[:] = torch.tensor([0.5, 0.5, 0.5, FAINT / 2]).logit()
     before = some.gaussians().means.detach().clone()
-    optimizer, control = optimizer_of(some, rate=0.0), AdaptiveDensity(4, pull=0.5)
+    optimizer, control = optimizer_of(some, rate=0.0), AdaptiveDensity(4, grad_threshold=0.5)
     stepped(some, optimizer)
     pull = torch.tensor([[1.0, 0.0], [0.0, 1.0], [0.1, 0.1], [9.0, 9.0]])
     control.note(pull, torch.ones(4, dtype=torch.bool), (2, 2))
@@ -105,7 +105,7 @@ def test_a_cloud_grows_no_further_than_it_may_and_says_so(generator):
     some = Cloud(cloud(10))
     with torch.no_grad():
         some.opacities[:] = 0.0
-    optimizer, control = optimizer_of(some), AdaptiveDensity(10, pull=0.5)
+    optimizer, control = optimizer_of(some), AdaptiveDensity(10, grad_threshold=0.5)
     stepped(some, optimizer)
     with torch.no_grad():
         some.log_scales[:] = -9.0
@@ -116,7 +116,7 @@ def test_a_cloud_grows_no_further_than_it_may_and_says_so(generator):
 
 
 def test_opacity_is_reset_for_all_but_the_faint():
-    some, control = Cloud(cloud(20)), AdaptiveDensity(20, pull=1.0)
+    some, control = Cloud(cloud(20)), AdaptiveDensity(20, grad_threshold=1.0)
     optimizer = optimizer_of(some)
     stepped(some, optimizer)
     control.reset_opacity(some, optimizer)

@@ -7,7 +7,7 @@ import math
 import pytest
 import torch
 
-from lumigraph.components.encodings import FourierFeatures, FrequencyEncoding, IntegratedEncoding
+from lumigraph.components.fields.encodings import FourierFeatures, FrequencyEncoding, IntegratedEncoding
 
 
 def points(generator, count: int = 500, inputs: int = 3) -> torch.Tensor:

@@ -604,7 +604,7 @@ def test_ply_rows_that_cannot_be_understood(tmp_path):
 
 
 def spz(version: int = 3, count: int = 1, degree: int = 0, magic: bytes = b"NGSP", body: bytes = bytes(20)) -> bytes:
-    return gzip.compress(magic + struct.pack("<IIBBBB", version, count, degree, 12, 0, 0) + body)
+    return gzip.compress(magic + struct.pack("<IIBBBB", version, count, degree, 12, 0, 0) + body, mtime=0)
 
 
 @pytest.mark.parametrize(

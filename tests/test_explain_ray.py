@@ -13,11 +13,11 @@ from solids import Seen, around, ball, painted
 from test_instant_ngp import method as small_instant_ngp
 
 import lumigraph.methods
-from lumigraph.charts import standalone
 from lumigraph.cli import main
 from lumigraph.errors import LumigraphError
 from lumigraph.explain.ray import Sight, along_ray
 from lumigraph.explain.ray_figure import LEFT, RIGHT, ray_figure
+from lumigraph.figures.charts import standalone
 from lumigraph.rays import Look, Samples
 from lumigraph.run import Run
 from lumigraph.volume import composite
@@ -154,12 +154,10 @@ def test_what_cannot_be_drawn_is_said():
 
 
 @pytest.fixture(scope="module")
-def trained(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("explain")
-    photographs, run = tiny.write_blender(folder / "ball"), folder / "run"
-    assert (
-        main(["train", "voxel-grid", str(photographs), "--output", str(run), "--steps", "30", "--device", "cpu"]) == 0
-    )
+def trained(ball_folder, tmp_path_factory):
+    run = tmp_path_factory.mktemp("explain") / "run"
+    arguments = ["--output", str(run), "--steps", "30", "--device", "cpu"]
+    assert main(["train", "voxel-grid", str(ball_folder), *arguments]) == 0
     return run
 
 

@@ -6,6 +6,7 @@ import html.parser
 import json
 import math
 import re
+from dataclasses import replace
 
 import av
 import numpy as np
@@ -21,13 +22,13 @@ from lumigraph.evaluate import evaluate
 from lumigraph.export.film import film
 from lumigraph.export.video import open_video
 from lumigraph.figures import NOTHING, RAMP, colour_depth, colour_error, depth_range, hex_colour, save_picture
-from lumigraph.keyframes import CameraPath, Keyframe
+from lumigraph.geometry import look_at
 from lumigraph.lens import Equirectangular, Pinhole
-from lumigraph.paths import PATHS, Surroundings, angle_of_view, camera_path, film_size, look_at
+from lumigraph.paths import PATHS, Surroundings, angle_of_view, camera_path, film_size
+from lumigraph.paths.keyframes import CameraPath, Keyframe
 from lumigraph.report import write_report
-from lumigraph.run import Run
+from lumigraph.run.settings import Source
 from lumigraph.scene import Frame
-from lumigraph.train import fit
 
 
 def cameras(positions, targets) -> Camera:
@@ -250,16 +251,9 @@ def test_errors_are_coloured_from_dark_to_bright():
     assert light[0] < light[1] < light[2]
 
 
-@pytest.fixture(scope="module")
-def trained(tmp_path_factory) -> Run:
-    run = tiny.new_run(tmp_path_factory.mktemp("runs") / "ball")
-    fit(run.new_method(), tiny.scene(), run, steps=60, show=False)
-    return run
-
-
-def test_a_film_of_a_method(trained, tmp_path):
-    method = trained.method()
-    path = camera_path("orbit", trained.cameras()["train"], trained.frame, 7, (26, 24))
+def test_a_film_of_a_method(ball_run, tmp_path):
+    method = ball_run.method()
+    path = camera_path("orbit", ball_run.cameras()["train"], ball_run.frame, 7, (26, 24))
     about = film(method, path, tmp_path / "out" / "orbit.mp4", fps=10)
     out = tmp_path / "out"
     assert sorted(x.name for x in out.iterdir()) == ["orbit", "orbit-depth.mp4", "orbit.json", "orbit.mp4"]
@@ -273,19 +267,19 @@ def test_a_film_of_a_method(trained, tmp_path):
     assert len(frames_of(out / "orbit.mp4")) == 2 and len(list((out / "orbit").iterdir())) == 4
 
 
-def test_a_film_as_a_moving_picture_has_a_twin_of_depth(trained, tmp_path):
-    path = camera_path("orbit", trained.cameras()["train"], trained.frame, 3, (26, 24))
-    film(trained.method(), path, tmp_path / "orbit.webp", fps=10)
+def test_a_film_as_a_moving_picture_has_a_twin_of_depth(ball_run, tmp_path):
+    path = camera_path("orbit", ball_run.cameras()["train"], ball_run.frame, 3, (26, 24))
+    film(ball_run.method(), path, tmp_path / "orbit.webp", fps=10)
     assert sorted(x.name for x in tmp_path.iterdir()) == ["orbit", "orbit-depth.webp", "orbit.json", "orbit.webp"]
     assert len(pictures_of(tmp_path / "orbit.webp")) == len(pictures_of(tmp_path / "orbit-depth.webp")) == 3
 
 
-def test_a_film_along_keyframes(trained, tmp_path, capsys):
+def test_a_film_along_keyframes(ball_run, tmp_path, capsys):
     """The command, on a path saved by hand and on what lies beside another film."""
-    poses = trained.cameras()["train"].pose[:2].tolist()  # this capture's frame is its source's
+    poses = ball_run.cameras()["train"].pose[:2].tolist()  # this capture's frame is its source's
     keys = [Keyframe(tuple(map(tuple, pose)), 40.0, 0.2 * i) for i, pose in enumerate(poses)]
     CameraPath(tuple(keys), fps=20).save(tmp_path / "walk.json")
-    command = ["render", str(trained.folder), "--size", "24", "--device", "cpu"]
+    command = ["render", str(ball_run.folder), "--size", "24", "--device", "cpu"]
     assert main([*command, "--path", str(tmp_path / "walk.json"), "--output", str(tmp_path / "film.gif")]) == 0
     about = json.loads((tmp_path / "film.json").read_text())
     assert (about["frames"], about["fps"], about["size"]) == (5, 20, [24, 24])
@@ -310,9 +304,9 @@ def test_a_film_along_keyframes(trained, tmp_path, capsys):
     assert main([*command, "--path", "obrit"]) == 2 and "orbit, spiral" in capsys.readouterr().err
 
 
-def test_a_broken_film_leaves_nothing(trained, tmp_path, monkeypatch):
-    method = trained.method()
-    path = camera_path("orbit", trained.cameras()["train"], trained.frame, 40, (26, 24))
+def test_a_broken_film_leaves_nothing(ball_run, tmp_path, monkeypatch):
+    method = ball_run.method()
+    path = camera_path("orbit", ball_run.cameras()["train"], ball_run.frame, 40, (26, 24))
     render, count = type(method).render, [0]
 
     def fail(self, camera):
@@ -327,8 +321,8 @@ def test_a_broken_film_leaves_nothing(trained, tmp_path, monkeypatch):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_contact_sheet_shows_every_view_and_the_worst(trained):
-    evaluation = evaluate(trained.method(), tiny.scene())
+def test_a_contact_sheet_shows_every_view_and_the_worst(ball_run):
+    evaluation = evaluate(ball_run.method(), tiny.scene())
     worst = min(evaluation.views, key=lambda view: view.psnr).name
     assert worst in evaluation.shown and len(evaluation.shown) == 3
     sheet = evaluation.contact_sheet("ball")
@@ -339,15 +333,15 @@ def test_a_contact_sheet_shows_every_view_and_the_worst(trained):
 
 
 @pytest.mark.parametrize(("views", "expected"), [(1, [0]), (2, [0, 8]), (3, [0, 4, 8]), (9, [0, 4, 8])])
-def test_some_views_are_compared_alone(trained, views, expected):
-    result = evaluate(trained.method(), tiny.scene(), views=views).to_json()
+def test_some_views_are_compared_alone(ball_run, views, expected):
+    result = evaluate(ball_run.method(), tiny.scene(), views=views).to_json()
     assert [view["name"] for view in result["views"]] == [f"ball_{i}" for i in expected]
     assert (result["protocol"]["views"], result["protocol"]["of"]) == (len(expected), 3)
 
 
-def test_evaluation_names_the_splits_there_are(trained):
+def test_evaluation_names_the_splits_there_are(ball_run):
     with pytest.raises(LumigraphError, match=r"no views in the split 'val'; choose one of: train \(9 views\), test"):
-        evaluate(trained.method(), tiny.scene(), "val")
+        evaluate(ball_run.method(), tiny.scene(), "val")
 
 
 class Page(html.parser.HTMLParser):
@@ -363,14 +357,14 @@ class Page(html.parser.HTMLParser):
         self.loads += [value for name, value in attributes if name in ("src", "href", "data", "poster")]
 
 
-def test_the_report_is_one_file_that_loads_nothing(trained):
-    path = camera_path("orbit", trained.cameras()["train"], trained.frame, 6, (24, 24))
-    film(trained.method(), path, trained.folder / "renders" / "orbit.mp4")
-    evaluation = evaluate(trained.method(), tiny.scene())
+def test_the_report_is_one_file_that_loads_nothing(ball_run):
+    path = camera_path("orbit", ball_run.cameras()["train"], ball_run.frame, 6, (24, 24))
+    film(ball_run.method(), path, ball_run.folder / "renders" / "orbit.mp4")
+    evaluation = evaluate(ball_run.method(), tiny.scene())
     result = evaluation.to_json() | {"evaluated_on": "cpu"}
-    (trained.folder / "eval.json").write_text(json.dumps(result))
-    save_picture(trained.folder / "eval.png", evaluation.contact_sheet("ball"))
-    text = write_report(trained).read_text()
+    (ball_run.folder / "eval.json").write_text(json.dumps(result))
+    save_picture(ball_run.folder / "eval.png", evaluation.contact_sheet("ball"))
+    text = write_report(ball_run).read_text()
     page = Page()
     page.feed(text)
     assert page.loads and all(x.startswith("data:") for x in page.loads)
@@ -389,6 +383,6 @@ def test_the_report_is_one_file_that_loads_nothing(trained):
 
 def test_a_report_of_a_bare_run_and_of_odd_names(tmp_path):
     run = tiny.new_run(tmp_path / "run")
-    run.config["scene"]["source"] = "/photos/<b>me & you</b>"
+    run.settings = replace(run.settings, scene=Source("/photos/<b>me & you</b>"))
     text = write_report(run).read_text()
     assert "<b>me" not in text and "&lt;b&gt;me &amp; you&lt;" in text

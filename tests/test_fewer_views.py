@@ -74,7 +74,7 @@ def test_a_run_remembers_its_views(tmp_path):
     assert main([*arguments, "--steps", "4", "--pause-at", "2"]) == 0
     run = Run(output)
     chosen = open_scene(folder, views=3).splits["train"]
-    assert run.config["splits"]["train"] == 3
+    assert run.settings.splits["train"] == 3
     assert torch.equal(run.scene().splits["train"], chosen)
     assert torch.equal(run.cameras()["train"].image_index, chosen)
     assert main(["resume", str(output)]) == 0

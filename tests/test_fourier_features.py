@@ -14,7 +14,7 @@ from PIL import Image
 
 from lumigraph.capture import open_scene
 from lumigraph.cli import main
-from lumigraph.components.dense import Dense
+from lumigraph.components.fields.dense import Dense
 from lumigraph.explain.encodings import GRID, compare, kernel_at_start, learn
 from lumigraph.explain.encodings_page import write_page
 from lumigraph.explain.tangent_kernel import spectrum, tangent_kernel
@@ -24,7 +24,7 @@ from lumigraph.run import build
 from lumigraph.scene import Frame
 
 CPU = torch.device("cpu")
-SMALL = Config(width=64, frequencies=64, pixels=512, learning_rate=5e-3)
+SMALL = Config(hidden_width=64, frequencies=64, pixels_per_step=512, learning_rate=5e-3)
 
 
 def painted(**numbers) -> FourierFeatures:
@@ -72,7 +72,7 @@ def test_neighbouring_pixels_are_told_apart(encoding):
 
 
 def test_rays_meet_the_wall_or_the_background():
-    method = painted(width=8, frequencies=4)
+    method = painted(hidden_width=8, frequencies=4)
     origins = torch.tensor([[0.5, -2.0, 0.0], [0.5, 3.0, 0.0], [0.0, -2.0, 0.0], [0.0, -2.0, 0.0], [5.0, -2.0, 0.0]])
     directions = torch.tensor([[0.0, 1, 0], [0, -1, 0], [0, -1, 0], [1, 0, 0], [0, 1, 0]])
     background = torch.tensor([[0.1, 0.2, 0.3]])
@@ -107,7 +107,7 @@ def test_waves_make_the_kernel_stationary():
     """Section 4: with B the kernel knows only where points differ, up to the chance in a finite width."""
     spread = {}
     for encoding in ("none", "gaussian"):
-        diagonal = kernel_at_start(painted(encoding=encoding, scale=4.0, width=1536)).diagonal()
+        diagonal = kernel_at_start(painted(encoding=encoding, scale=4.0, hidden_width=1536)).diagonal()
         spread[encoding] = (diagonal.std() / diagonal.mean()).item()
     assert spread["gaussian"] < 0.09 and spread["none"] > 0.14
 

@@ -9,21 +9,28 @@ import tiny
 import torch
 from test_gaussians import NAMES, cloud, similarity
 
-from lumigraph import cli, methods
-from lumigraph.components import memory
+from lumigraph import cli, memory, methods
+from lumigraph.capabilities import HasGaussians, needs
 from lumigraph.errors import LumigraphError, LumigraphWarning
 from lumigraph.evaluate import evaluate
 from lumigraph.exchange import read_gaussians, write_gaussians
 from lumigraph.export.splats import export_splats
+from lumigraph.gaussians.splatting import render
 from lumigraph.metrics import psnr
 from lumigraph.run import Run, build
+from lumigraph.run.splat_file import SplatFile
 from lumigraph.scene import Frame
-from lumigraph.splat_file import SplatFile
-from lumigraph.splatting import render
 from lumigraph.train import fit
 
 pytestmark = pytest.mark.filterwarnings("ignore:The cloud stops growing")
-GROWING = {"refine_from": 10, "refine_every": 10, "pull": 1e-5, "most": 600, "initial": 300, "reset_every": 25}
+GROWING = {
+    "refine_from": 10,
+    "refine_every": 10,
+    "densify_grad_threshold": 1e-5,
+    "max_gaussians": 600,
+    "initial_gaussians": 300,
+    "opacity_reset_interval": 25,
+}
 
 
 def new(folder=None, **config):
@@ -33,28 +40,28 @@ def new(folder=None, **config):
     return method, None if folder is None else Run.create(folder, method, scene)
 
 
-@pytest.mark.parametrize("config", [{}, {"strategy": "mcmc"}, {"smooth": True, "antialiased": True}])
+@pytest.mark.parametrize("config", [{}, {"strategy": "mcmc"}, {"filter_3d": True, "antialiased": True}])
 def test_it_learns_a_scene(config):
-    method, _ = new(reset_every=1000, **config)
-    fit(method, tiny.scene(), steps=1, show=False)
+    method, _ = new(opacity_reset_interval=1000, **config)
+    fit(method, tiny.scene(), steps=1, show=False, rehearsal=False)
     before = evaluate(method, tiny.scene()).psnr
-    method, _ = new(reset_every=1000, **config)
-    fit(method, tiny.scene(), steps=250, show=False)
+    method, _ = new(opacity_reset_interval=1000, **config)
+    fit(method, tiny.scene(), steps=160, show=False, rehearsal=False)
     after = evaluate(method, tiny.scene()).psnr
-    assert after > 21.5 and after > before + 8, (before, after)
+    assert after > 20 and after > before + 8, (before, after)
     assert 300 < len(method.cloud) <= 600
 
 
-@pytest.mark.parametrize("config", [{}, {"strategy": "mcmc"}, {"smooth": True}])
+@pytest.mark.parametrize("config", [{}, {"strategy": "mcmc"}, {"filter_3d": True}])
 def test_resuming_across_a_growing_cloud_is_exact(config, tmp_path):
     """Stopped after the cloud has grown, and before it grows again."""
-    config = {"refine_until": 0.9, "most": 2000, "pull": 1e-3, **config}
+    config = {"refine_until": 0.9, "max_gaussians": 2000, "densify_grad_threshold": 1e-3, **config}
     (a, straight), (b, broken) = new(tmp_path / "a", **config), new(tmp_path / "b", **config)
-    fit(a, tiny.scene(), straight, steps=60, show=False)
-    fit(b, tiny.scene(), broken, steps=60, pause_at=25, show=False)
+    fit(a, tiny.scene(), straight, steps=60, show=False, rehearsal=False)
+    fit(b, tiny.scene(), broken, steps=60, pause_at=25, show=False, rehearsal=False)
     assert 300 != len(broken.method().cloud) != len(straight.method().cloud)
     again = broken.new_method()
-    fit(again, tiny.scene(), Run(broken.folder), steps=60, show=False)
+    fit(again, tiny.scene(), Run(broken.folder), steps=60, show=False, rehearsal=False)
     expected, actual = straight.method().state_dict(), Run(broken.folder).method().state_dict()
     assert expected.keys() == actual.keys()
     for name in expected:
@@ -66,7 +73,7 @@ def test_where_memory_is_short_it_stops_growing_and_says_so(strategy, monkeypatc
     monkeypatch.setattr(memory, "free_memory", lambda: 0)
     method, _ = new(strategy=strategy)
     with pytest.warns(LumigraphWarning, match="memory is short"):
-        fit(method, tiny.scene(), steps=60, show=False)
+        fit(method, tiny.scene(), steps=60, show=False, rehearsal=False)
     assert len(method.cloud) <= 300
 
 
@@ -87,7 +94,7 @@ def test_masked_pixels_teach_nothing():
 
 
 def test_harmonics_rise_in_steps():
-    method, _ = new(degree=3)
+    method, _ = new(sh_degree=3)
     method.optimizers()
     raised = []
     for step, progress in [(0, 0.0), (999, 0.01), (1000, 0.01), (10, 0.3), (5000, 0.9)]:
@@ -110,7 +117,7 @@ def test_exports_lie_in_the_frame_of_the_photographs(tmp_path):
 def test_a_run_becomes_a_file_that_opens_as_a_run(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     scene = tiny.write_blender(tmp_path / "scene")
-    options = ["--steps", "30", "--initial", "200", "--output", str(tmp_path / "run")]
+    options = ["--steps", "30", "--initial-gaussians", "200", "--output", str(tmp_path / "run")]
     assert cli.main(["train", "gaussian-splatting", str(scene), *options]) == 0
     for name in ("a.ply", "a.spz", "a.splat", "a.compressed.ply"):
         assert cli.main(["export", "splats", str(tmp_path / "run"), name]) == 0
@@ -156,7 +163,7 @@ def test_faults_in_files_are_one_sentence(tmp_path, capsys):
 
 def test_a_method_without_gaussians_says_so():
     with pytest.raises(LumigraphError, match="holds no Gaussians"):
-        tiny.method().gaussians()
+        needs(tiny.method(), HasGaussians)
 
 
 def test_no_memory_figure_means_no_limit(monkeypatch):

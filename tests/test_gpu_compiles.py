@@ -9,22 +9,24 @@ import sys
 from pathlib import Path
 
 import pytest
-from agreement import OPERATIONS, module
+from agreement import OPERATIONS, depends, folder
 from conftest import PACKAGE
+from proofs import kept
 
 pytest.importorskip("triton")
+SCRIPT = Path(__file__).with_name("compile_for_gpus.py")
 
 
 def kernels_that_are_launched() -> set[tuple[str, str]]:
     """Every function that some engine launches on a grid, as (operation, function)."""
-    sources = {name: Path(module(name).__file__).with_name("gpu.py").read_text() for name in OPERATIONS}
+    sources = {name: (folder(name) / "gpu.py").read_text(encoding="utf-8") for name in OPERATIONS}
     return {(name, kernel) for name, text in sources.items() for kernel in re.findall(r"(\w+)\[.*\]\(", text)}
 
 
+@kept(lambda: {SCRIPT}.union(*map(depends, OPERATIONS)))
 def test_every_kernel_compiles():
     environment = {k: v for k, v in os.environ.items() if k != "TRITON_INTERPRET"} | {"PYTHONPATH": str(PACKAGE.parent)}
-    script = Path(__file__).with_name("compile_for_gpus.py")
-    done = subprocess.run([sys.executable, script], env=environment, capture_output=True, text=True)
+    done = subprocess.run([sys.executable, SCRIPT], env=environment, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr[-4000:]
     compiled = [tuple(line.split()[:3]) for line in done.stdout.splitlines()]
     for architecture in ("90", "gfx942"):

@@ -3,27 +3,31 @@
 from __future__ import annotations
 
 import ast
+import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from conftest import PACKAGE, checked_modules, module_name
+from conftest import JIT, PACKAGE, checked_modules, module_name
 
 import lumigraph
 
 # Each floor may know the floors above it in this list, and a room on it knows no other room of its own floor.
 # A new room is a new name here, on the floor where it belongs.
 FLOORS: list[set[str]] = [
-    {"errors", "loops", "memory", "srgb"},
+    {"errors"},
+    {"blending", "choice", "controls", "geometry", "loops", "memory", "progress", "readers", "srgb"},
     {"files", "plain", "lens", "rays"},
-    {"camera", "images", "kernels", "charts", "figures", "lpips", "metrics"},
-    {"volume", "gaussians", "scene"},
-    {"splatting"},
-    {"components", "capture", "exchange", "method", "paths", "keyframes"},
-    {"display"},
+    {"camera", "images", "kernels", "figures", "metrics"},
+    {"volume", "scene"},
+    {"dataset", "gaussians", "mesh"},
+    {"capabilities", "collection", "shapes"},
+    {"components", "capture", "exchange", "method", "paths"},
+    {"composition", "display"},
     {"methods", "export", "viewer"},
-    {"run", "evaluate", "splat_file"},
-    {"train", "report", "describe"},
+    {"run"},
+    {"evaluate"},
+    {"train", "report"},
     {"benchmark", "explain"},
     {"commands"},
     {"cli"},
@@ -119,12 +123,176 @@ def test_an_arrow_the_right_way_is_not(module, line):
     assert faults(line, module) == []
 
 
-def test_every_kernel_has_a_meaning_and_three_engines():
-    operations = [path for path in (PACKAGE / "kernels").iterdir() if path.is_dir() and not path.name.startswith("__")]
-    assert operations
-    for operation in operations:
-        for file in ("__init__.py", "reference.py", "cpu.py", "gpu.py"):
-            assert (operation / file).is_file(), f"{operation.name} lacks {file}"
+def inner_arrows(sources: dict[str, str], packages: set[str]) -> dict[str, set[str]]:
+    """The modules of its own room that each module imports.
+
+    `from .x import name` in a package's `__init__` leads to x, as it does anywhere; a module that takes a name from its
+    own package leads to that `__init__`. What is between rooms is left to the floors.
+    """
+    arrows: dict[str, set[str]] = {}
+    for module, source in sources.items():
+        found = set()
+        for name in imported(source, module, module in packages):
+            target = name if name in sources else name.rpartition(".")[0]
+            if target in sources and target != module and room(target) == room(module):
+                found.add(target)
+        arrows[module] = found
+    return arrows
+
+
+def circles(arrows: dict[str, set[str]]) -> list[list[str]]:
+    """Sets of modules that import one another, whether directly or by way of others."""
+
+    def reached(start: str) -> set[str]:
+        seen: set[str] = set()
+        ahead = [start]
+        while ahead:
+            fresh = arrows[ahead.pop()] - seen
+            seen |= fresh
+            ahead += fresh
+        return seen
+
+    reach = {module: reached(module) for module in arrows}
+    found = {tuple(sorted(m for m in reach[module] if module in reach[m])) for module in arrows}
+    return [list(circle) for circle in sorted(found) if circle]
+
+
+def test_no_room_has_a_circle_of_imports():
+    files = {module_name(path): path for path in sorted(PACKAGE.rglob("*.py"))}
+    del files["lumigraph"]  # the front door imports by name when asked
+    sources = {module: path.read_text(encoding="utf-8") for module, path in files.items()}
+    packages = {module for module, path in files.items() if path.name == "__init__.py"}
+    arrows = inner_arrows(sources, packages)
+    assert sum(map(len, arrows.values())) > 200  # it sees most imports
+    assert circles(arrows) == []
+
+
+@pytest.mark.parametrize(
+    ("sources", "members"),
+    [
+        ({"a": "from .b import B", "b": "def later():\n    from .a import A"}, {"a", "b"}),
+        ({"a": "from .b import B", "b": "if TYPE_CHECKING:\n    from .a import A"}, {"a", "b"}),
+        ({"a": "from . import b", "b": "from .c import C", "c": "import lumigraph.viewer.a"}, {"a", "b", "c"}),
+        ({"": "from .a import A as A", "a": "from . import NAME", "b": "from .a import A"}, {"", "a"}),
+        ({"": "from .a import A as A", "a": "from ..viewer import NAME"}, {"", "a"}),
+        ({"": "from .b.a import A", "b": "", "b.a": "from .. import NAME"}, {"", "b.a"}),
+    ],
+)
+def test_a_circle_is_noticed(sources, members):
+    assert circles(room_arrows(sources)) == [sorted(f"lumigraph.viewer.{name}".rstrip(".") for name in members)]
+
+
+@pytest.mark.parametrize(
+    "sources",
+    [
+        {"": "from .a import A as A\nfrom .b import B as B", "a": "from .b import B", "b": "from ..scene import Scene"},
+        {"": "from . import a, b", "a": "from . import b", "b": "import torch"},
+        {"": "NAME = 1", "a": "from . import NAME", "b": "from .a import A\nfrom . import NAME"},
+        {"a": "from .b import B\nfrom .c import C", "b": "from .d import D", "c": "from .d import D", "d": ""},
+    ],
+)
+def test_what_is_no_circle_is_not(sources):
+    assert circles(room_arrows(sources)) == []
+
+
+def room_arrows(sources: dict[str, str]) -> dict[str, set[str]]:
+    """Arrows of a made-up room, its modules by their names inside it."""
+    named = {f"lumigraph.viewer.{name}".rstrip("."): source for name, source in sources.items()}
+    return inner_arrows(named, {module for module in named if any(m.startswith(module + ".") for m in named)})
+
+
+KERNEL = {  # what each file of a kernel's folder defines
+    "__init__.py": {
+        "FACTS": "its unit, its outputs, its differentiable inputs, its typical case",
+        "cases": "what the engines are compared on",
+        "benchmark_case": "what they are timed on",
+    },
+    "reference.py": {"run": "what the operation means"},
+    "cpu.py": {"run": "the Numba engine"},
+    "gpu.py": {"run": "the Triton engine"},
+    "faults.py": {"FAULTS": "faults for its engines", "ASTRAY": "indices that leave their arrays"},
+}
+
+
+def definitions(path: Path) -> dict[str, ast.AST]:
+    """What a file defines, assigns or imports at its top."""
+    found: dict[str, ast.AST] = {}
+    for node in ast.parse(path.read_text(encoding="utf-8")).body if path.is_file() else []:
+        if isinstance(node, ast.FunctionDef | ast.ClassDef):
+            found[node.name] = node
+        elif isinstance(node, ast.Assign):
+            found |= {x.id: node.value for target in node.targets for x in ast.walk(target) if isinstance(x, ast.Name)}
+        elif isinstance(node, ast.ImportFrom):
+            found |= {alias.asname or alias.name: node for alias in node.names}
+    return found
+
+
+def literal(node: ast.AST | None) -> dict:
+    return ast.literal_eval(node) if node else {}
+
+
+def lacks(operation: Path) -> list[str]:
+    """What the folder of a kernel does not say of it, one sentence each."""
+    name, files = operation.name, {file: definitions(operation / file) for file in KERNEL}
+    wanted = {file: dict(meanings) for file, meanings in KERNEL.items()}
+    wanted["__init__.py"][name] = "the operation itself"
+    if (operation / "lanes.py").is_file():
+        files["plain_lanes.py"] = definitions(operation / "plain_lanes.py")
+        lanes = [
+            x for x, node in files["cpu.py"].items() if isinstance(node, ast.ImportFrom) and node.module == "lanes"
+        ]
+        wanted["plain_lanes.py"] = dict.fromkeys(lanes, "its meaning without Numba, which seeded faults run on")
+    found = [
+        f"kernels/{name}/{file} lacks {statement}: {meaning}"
+        for file, meanings in wanted.items()
+        for statement, meaning in meanings.items()
+        if statement not in files[file]
+    ]
+    faults, astray = (literal(files["faults.py"].get(statement)) for statement in ("FAULTS", "ASTRAY"))
+    for engine in ("cpu", "gpu"):
+        path = operation / f"{engine}.py"
+        compiles = path.is_file() and JIT.search(path.read_text(encoding="utf-8"))
+        if compiles and engine not in [fault[0] for fault in faults.values()]:
+            found.append(f"kernels/{name}/faults.py lacks a fault for {engine}.py in FAULTS")
+    if "cpu" not in [fault[0] for fault in astray.values()]:
+        found.append(f"kernels/{name}/faults.py lacks an index for cpu.py in ASTRAY")
+    if name not in definitions(operation.parent / "__init__.py"):
+        found.append(f"kernels/__init__.py lacks a line: from .{name} import {name} as {name}")
+    return found
+
+
+def test_every_kernel_says_what_it_is():
+    folders = [path for path in (PACKAGE / "kernels").iterdir() if path.is_dir() and not path.name.startswith("__")]
+    assert folders
+    found = [sentence for path in folders for sentence in lacks(path)]
+    assert not found, "\n".join(found)
+
+
+@pytest.mark.parametrize(
+    ("file", "before", "after", "sentence"),
+    [
+        ("__init__.py", "FACTS = ", "TRUTHS = ", "composite/__init__.py lacks FACTS: its unit,"),
+        ("__init__.py", "def cases(", "def instances(", "composite/__init__.py lacks cases:"),
+        ("__init__.py", "def benchmark_case(", "def race(", "composite/__init__.py lacks benchmark_case:"),
+        ("__init__.py", "def composite(", "def composed(", "composite/__init__.py lacks composite: the operation"),
+        ("reference.py", "def run(", "def go(", "composite/reference.py lacks run: what the operation means"),
+        ("gpu.py", "def run(", "def go(", "composite/gpu.py lacks run: the Triton engine"),
+        ("faults.py", "FAULTS = ", "ERRORS = ", "composite/faults.py lacks FAULTS:"),
+        ("faults.py", '("cpu",', '("gpu",', "composite/faults.py lacks a fault for cpu.py in FAULTS"),
+        ("faults.py", '("cpu",', '("gpu",', "composite/faults.py lacks an index for cpu.py in ASTRAY"),
+        ("../__init__.py", "composite", "composed", "kernels/__init__.py lacks a line: from .composite import"),
+        ("cpu.py", "from .._dispatch", "from .lanes import add\nfrom .._dispatch", "plain_lanes.py lacks add: "),
+    ],
+)
+def test_a_kernel_that_does_not_is_noticed(file, before, after, sentence, tmp_path):
+    operation = tmp_path / "kernels" / "composite"
+    shutil.copytree(PACKAGE / "kernels" / "composite", operation)
+    shutil.copy(PACKAGE / "kernels" / "__init__.py", operation.parent)
+    (operation / "lanes.py").touch()
+    assert lacks(operation) == []
+    path = operation / file
+    path.write_text(path.read_text(encoding="utf-8").replace(before, after), encoding="utf-8")
+    assert any(sentence in found for found in lacks(operation)), lacks(operation)
 
 
 def test_compiled_functions_stay_outside_the_shape_checks():

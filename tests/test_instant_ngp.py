@@ -18,15 +18,15 @@ from lumigraph.train import fit
 
 SMALL = Config(
     levels=4,
-    log2_entries=11,
-    coarsest=4,
-    finest=32,
-    width=16,
+    log2_hashmap_size=11,
+    base_resolution=4,
+    max_resolution=32,
+    hidden_width=16,
     geometry_features=8,
-    direction_bands=2,
+    sh_bands=2,
     samples_per_step=2048,
-    lattice=128,
-    occupancy=32,
+    steps_per_diagonal=128,
+    occupancy_resolution=32,
 )
 
 
@@ -43,7 +43,7 @@ def black_room(reach: float = 1.0) -> Scene:
 
 
 def train(made: InstantNGP, scene: Scene, steps: int, run: Run | None = None, **options):
-    return fit(made, scene, run, steps=steps, show=False, **options)
+    return fit(made, scene, run, steps=steps, show=False, rehearsal=False, **options)
 
 
 def test_it_learns_held_out_views():
@@ -56,13 +56,13 @@ def test_it_learns_held_out_views():
 
 def test_gradients_reach_everything_that_learns():
     scene = tiny.scene()
-    made = method(scene, exposure=True, refine_cameras=True)
+    made = method(scene, exposure_correction=True, refine_cameras=True)
     made.optimizers()
     made.before_step(0, 0.0)
     sum(made.loss(made.batch(scene, torch.Generator().manual_seed(0)), 0).values()).backward()
     for name, parameter in made.named_parameters():
         assert parameter.grad.abs().sum() > 0, name
-    touched = (made.field.table.grad != 0).float().mean()
+    touched = (made.network.table.grad != 0).float().mean()
     assert 0.01 < touched <= 1
 
 
@@ -94,7 +94,9 @@ def test_the_same_seed_gives_the_same_losses(scene, tmp_path):
     assert all(a != b for a, b in zip(losses[0], losses[2], strict=True))
 
 
-@pytest.mark.parametrize("options", [{}, {"exposure": True, "refine_cameras": True}], ids=["plain", "corrections"])
+@pytest.mark.parametrize(
+    "options", [{}, {"exposure_correction": True, "refine_cameras": True}], ids=["plain", "corrections"]
+)
 def test_resuming_equals_never_having_stopped_to_the_bit(options, tmp_path):
     scene, ends = tiny.scene(), []
     for name, pauses in (("straight", [None]), ("broken", [10, None])):
@@ -119,7 +121,7 @@ def test_exposure_finds_the_dark_photographs():
     dark = scene.splits["train"][::2]
     pictures = [tiny.picture(pose)[..., :3] // (4 if i in dark else 1) for i, pose in enumerate(scene.cameras.pose)]
     scene = replace(scene, images=ImageStore.from_arrays(pictures))
-    made = method(scene, exposure=True, hold=0.9)
+    made = method(scene, exposure_correction=True, decay_start=0.9)
     train(made, scene, 120)
     gain = made.exposure.log_gain.detach()
     bright = scene.splits["train"][1::2]
@@ -142,7 +144,7 @@ def test_an_unbounded_scene_trains_and_renders():
     made = method(scene)
     before = evaluate(made, scene).psnr
     train(made, scene, 40)
-    assert made.growth > 0 and len(made.occupancy.density) == 3
+    assert made.cone_angle > 0 and len(made.occupancy.density) == 3
     seen = made.render(scene.cameras[0])
     assert torch.isfinite(seen.rgb).all() and torch.isfinite(seen.opacity).all() and not seen.depth.isnan().any()
     assert seen.opacity.max() > 0.5 and evaluate(made, scene).psnr > before + 2
@@ -175,16 +177,16 @@ def test_an_empty_grid_renders_and_trains(reach):
     assert seen.rgb.shape == (tiny.SIZE, tiny.SIZE, 3)
     torch.testing.assert_close(seen.rgb[3, 5], torch.tensor([0.2, 0.4, 0.6]))
     assert (seen.opacity == 0).all() and (seen.depth == torch.inf).all()
-    before = made.field.table.detach().clone()
+    before = made.network.table.detach().clone()
     assert train(made, scene, 3).finished
-    assert torch.equal(made.field.table, before)
+    assert torch.equal(made.network.table, before)
 
 
 def test_photographs_with_alpha_carve_the_grid():
     scene = tiny.scene()
     made = method(scene)
     made.begin(scene)
-    assert made.occupancy.resolution == SMALL.occupancy and 0.02 < made.occupancy.share < 0.5
+    assert made.occupancy.resolution == SMALL.occupancy_resolution and 0.02 < made.occupancy.share < 0.5
     unbounded = method(black_room(4.0))
     unbounded.begin(black_room(4.0))
     assert unbounded.occupancy.share == 1
@@ -200,5 +202,5 @@ def test_batches_grow_to_the_wanted_number_of_samples():
 
 def test_the_preset_of_a_cpu_is_smaller_than_the_papers():
     cpu, gpu = (InstantNGP.preset(torch.device(name)) for name in ("cpu", "cuda"))
-    assert gpu == Config() and (gpu.levels, gpu.features, gpu.log2_entries) == (16, 2, 19)
-    assert cpu.samples_per_step < gpu.samples_per_step and cpu.finest < gpu.finest
+    assert gpu == Config() and (gpu.levels, gpu.features_per_level, gpu.log2_hashmap_size) == (16, 2, 19)
+    assert cpu.samples_per_step < gpu.samples_per_step and cpu.max_resolution < gpu.max_resolution

@@ -11,8 +11,8 @@ import torch
 
 from lumigraph.errors import LumigraphError
 from lumigraph.files import write_json
-from lumigraph.kernels.project.reference import to_matrix
-from lumigraph.keyframes import CameraPath, Keyframe
+from lumigraph.geometry import to_matrix
+from lumigraph.paths.keyframes import CameraPath, Keyframe
 from lumigraph.scene import Frame
 
 

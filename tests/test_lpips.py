@@ -10,7 +10,7 @@ import torch
 
 from lumigraph.errors import LumigraphError
 from lumigraph.evaluate import compare
-from lumigraph.lpips import SHAPES, Lpips, load_lpips, named_files
+from lumigraph.metrics.lpips import SHAPES, Lpips, load_lpips, named_files
 
 
 @pytest.fixture(scope="module")

@@ -20,7 +20,7 @@ from lumigraph.camera import Camera
 from lumigraph.cli import main
 from lumigraph.errors import LumigraphError
 from lumigraph.exchange import write_gaussians
-from lumigraph.export.mesh import Mesh, extract_mesh, meshed_box
+from lumigraph.export.mesh import extract_mesh, meshed_box
 from lumigraph.export.mesh_file import write_mesh
 from lumigraph.export.points import extract_points, thinned, write_points
 from lumigraph.export.polygons import BLOCK, Grid, zero_level
@@ -28,6 +28,7 @@ from lumigraph.export.sightings import compare, look_around
 from lumigraph.export.surface import simplified, smoothed
 from lumigraph.gaussians import Gaussians
 from lumigraph.kernels.spherical_harmonics import K00
+from lumigraph.mesh import Mesh
 from lumigraph.rays import Rendering
 from lumigraph.run import Run
 from lumigraph.scene import Frame

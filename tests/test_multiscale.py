@@ -20,8 +20,8 @@ from lumigraph.scene import Scene
 
 
 @pytest.fixture
-def folder(tmp_path):
-    return tiny.write_blender(tmp_path / "scene")
+def folder(ball_folder):
+    return ball_folder
 
 
 def test_every_photograph_is_there_at_every_scale(folder):

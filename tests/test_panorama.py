@@ -10,7 +10,6 @@ from pathlib import Path
 import numba
 import numpy as np
 import pytest
-import tiny
 import torch
 from PIL import Image
 
@@ -22,15 +21,13 @@ from lumigraph.export import panorama as panoramas
 from lumigraph.export.panorama import level_camera, panorama, save_sphere, sphere, standpoint
 from lumigraph.export.stereo import columns_at_once, stereo_pair, surrounding_distances, top_bottom
 from lumigraph.gaussians import Gaussians
+from lumigraph.geometry import look_at
 from lumigraph.lens import Equirectangular, OmnidirectionalStereo, Pinhole
 from lumigraph.method import RayMethod
 from lumigraph.methods import find
 from lumigraph.metrics import psnr
-from lumigraph.paths import look_at
 from lumigraph.rays import Rendering
-from lumigraph.run import Run
 from lumigraph.scene import Frame
-from lumigraph.train import fit
 
 NORTH = torch.tensor([0.0, 1.0, 0.0])
 HERE = torch.tensor([0.1, -0.2, 0.05])
@@ -111,7 +108,7 @@ def cloud() -> Gaussians:
 
 def splatted():
     kind = find("gaussian-splatting")
-    method = kind(Frame(near=0.05), kind.Config(degree=0))
+    method = kind(Frame(near=0.05), kind.Config(sh_degree=0))
     method.cloud.replace(cloud())
     return method.eval()
 
@@ -274,22 +271,15 @@ def test_pictures_say_that_they_are_spheres(tmp_path):
         save_sphere(tmp_path / "a.tif", rgb, whole=True)
 
 
-@pytest.fixture(scope="module")
-def trained(tmp_path_factory) -> Run:
-    run = tiny.new_run(tmp_path_factory.mktemp("runs") / "ball")
-    fit(run.new_method(), tiny.scene(), run, steps=60, show=False)
-    return run
-
-
-def test_the_commands_on_a_run(trained, tmp_path, capsys):
-    command = ["export", "panorama", str(trained.folder), str(tmp_path / "around.jpg"), "--size", "128"]
+def test_the_commands_on_a_run(ball_run, tmp_path, capsys):
+    command = ["export", "panorama", str(ball_run.folder), str(tmp_path / "around.jpg"), "--size", "128"]
     assert main(command) == 0
     assert "the camera in the middle of all" in capsys.readouterr().out
     with Image.open(tmp_path / "around.jpg") as image:
         assert image.size == (128, 64) and metadata(image)["FullPanoWidthPixels"] == "128"
         middle = np.asarray(image)[32:52, 56:72].astype(float)
     assert middle.std() > 10  # the ball is ahead
-    command = ["export", "stereo", str(trained.folder), str(tmp_path / "pair.png"), "--size", "128"]
+    command = ["export", "stereo", str(ball_run.folder), str(tmp_path / "pair.png"), "--size", "128"]
     assert main([*command, "--from", "1.5", "0", "0", "--interpupillary", "0.1"]) == 0
     said = capsys.readouterr().out
     assert "0.1 apart" in said and "1.5 0 0, as asked" in said
@@ -319,8 +309,8 @@ def test_the_commands_on_a_splat_file(tmp_path, capsys, one_thread):
         (["panorama", "{new}", "{new}.png"], "new"),
     ],
 )
-def test_what_cannot_be_ends_in_one_sentence(arguments, words, trained, tmp_path, capsys):
-    places = {"run": str(trained.folder), "new": str(tmp_path / "new")}
+def test_what_cannot_be_ends_in_one_sentence(arguments, words, ball_run, tmp_path, capsys):
+    places = {"run": str(ball_run.folder), "new": str(tmp_path / "new")}
     assert main(["export", *(x.format(**places) for x in arguments)]) == 2
     errors = [x for x in capsys.readouterr().err.splitlines() if "Looking around (" not in x]
     assert len(errors) == 1 and words in errors[0]

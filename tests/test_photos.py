@@ -19,7 +19,7 @@ from PIL import Image
 from scipy.ndimage import gaussian_filter, uniform_filter1d
 
 from lumigraph.capture.photos import Intake, gather, is_bare, is_video
-from lumigraph.capture.photos.judge import MUDDY, blurred, look, sharpness
+from lumigraph.capture.photos.judge import MUDDY, blurred, judge, sharpness
 from lumigraph.capture.photos.movement import Odometer
 from lumigraph.capture.photos.video import choose, extract
 from lumigraph.errors import LumigraphError, LumigraphWarning
@@ -326,7 +326,7 @@ def test_blur_in_any_one_direction_shows():
 def test_brightness_counts_stops():
     encode = {stop: round(255 * (1.055 * (0.5**stop) ** (1 / 2.4) - 0.055)) for stop in (0, 1, 3)}
     for stop, value in encode.items():
-        assert look(Image.new("L", (50, 50), value)).brightness == pytest.approx(-stop, abs=0.02)
+        assert judge(Image.new("L", (50, 50), value)).brightness == pytest.approx(-stop, abs=0.02)
 
 
 def test_only_those_far_below_the_others_are_blurred():
@@ -530,7 +530,7 @@ def test_jpegs_are_judged_from_a_fraction_of_their_size(tmp_path):
     large = Image.fromarray(WALL).resize((2000, 2000), Image.Resampling.BICUBIC)
     quick = io.BytesIO()
     large.save(quick, "JPEG", quality=92)
-    a, b = look(Image.open(quick)), look(large)
+    a, b = judge(Image.open(quick)), judge(large)
     assert a.sharpness == pytest.approx(b.sharpness, rel=0.1)
     assert a.brightness == pytest.approx(b.brightness, abs=0.05)
     assert a.signature @ b.signature > 0.98

@@ -103,7 +103,7 @@ def test_commands_take_a_picture_for_a_scene(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     write(tmp_path / "my wall.png")
     assert main(["info", "my wall.png"]) == 0 and "2 of 40x24" in capsys.readouterr().out
-    options = ["--steps", "4", "--device", "cpu", "--width", "16", "--frequencies", "8"]
+    options = ["--steps", "4", "--device", "cpu", "--hidden-width", "16", "--frequencies", "8"]
     assert main(["train", "fourier-features", "my wall.png", *options]) == 0
     run = "runs/my-wall-fourier-features-1"
     assert main(["eval", run, "--device", "cpu"]) == 0 and "1 of test, 40x24" in capsys.readouterr().out

@@ -359,11 +359,11 @@ def test_open_scene_makes_a_scene_in_the_worlds_own_frame():
     assert scene.frame.has_alpha and scene.frame.background == (1.0, 1.0, 1.0) and scene.frame.reach == 1.0
     torch.testing.assert_close(torch.tensor(scene.frame.source_from_scene), torch.eye(4), atol=1e-6, rtol=0)
     index = int(scene.splits["test"][0])
-    camera, image = scene.view(index)
+    photograph = scene.photograph(index)
     world = scenes.stage("still-life").world
-    seen = render(world, camera)
-    torch.testing.assert_close(image[..., 3], seen.opacity, atol=0.003, rtol=0)
-    torch.testing.assert_close(image[..., :3], seen.rgb, atol=0.003, rtol=0)
+    seen = render(world, photograph.camera)
+    torch.testing.assert_close(photograph.alpha, seen.opacity, atol=0.003, rtol=0)
+    torch.testing.assert_close(photograph.rgb, seen.rgb, atol=0.003, rtol=0)
 
 
 @pytest.mark.parametrize(
@@ -388,11 +388,13 @@ def test_a_scene_written_as_a_blender_folder_reads_back(tmp_path):
     matrix = torch.tensor(scene.frame.source_from_scene)
     for split, cameras in stage.cameras.items():
         for k, index in enumerate(scene.splits[split].tolist()):
-            camera, image = scene.view(index)
-            torch.testing.assert_close(camera.transformed(matrix).pose[0], cameras.pose[k], atol=1e-4, rtol=0)
+            photograph = scene.photograph(index)
+            torch.testing.assert_close(
+                photograph.camera.transformed(matrix).pose[0], cameras.pose[k], atol=1e-4, rtol=0
+            )
             seen = render(stage.world, cameras[k])
-            expected = torch.cat([seen.rgb, seen.opacity[..., None]], -1)
-            torch.testing.assert_close(image, expected, atol=0.003, rtol=0)
+            torch.testing.assert_close(photograph.rgb, seen.rgb, atol=0.003, rtol=0)
+            torch.testing.assert_close(photograph.alpha, seen.opacity, atol=0.003, rtol=0)
     truth = np.load(tmp_path / "toys" / "train" / "r_0000_truth.npz")
     seen = render(stage.world, stage.cameras["train"][0])
     assert (truth["depth"] == seen.depth.numpy()).all() and (truth["ids"] == seen.extra["ids"].numpy()).all()

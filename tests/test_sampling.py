@@ -7,9 +7,9 @@ import math
 import pytest
 import torch
 
-from lumigraph.components.empty_space import EmptySpace
-from lumigraph.components.frustums import frustum_moments
-from lumigraph.components.sampling import inverse_transform, stratified
+from lumigraph.components.sampling.frustums import frustum_moments
+from lumigraph.components.sampling.occupancy_mask import OccupancyMask
+from lumigraph.components.sampling.sampling import inverse_transform, stratified
 from lumigraph.methods.mip_nerf import blurred
 
 
@@ -80,7 +80,7 @@ def test_moments_of_thin_frusta_keep_their_digits():
 
 def test_a_place_may_hold_what_its_cell_does(generator):
     """Outside the cube the nearest cell answers."""
-    empty = EmptySpace(8, 0.01)
+    empty = OccupancyMask(8, 0.01)
     empty.grid.occupied = torch.rand(1, 8, 8, 8, generator=generator) < 0.5
     points = 3 * torch.rand(2000, 3, generator=generator) - 1.5
     points[0], points[1] = -1.0, 1.0
@@ -91,7 +91,7 @@ def test_a_place_may_hold_what_its_cell_does(generator):
 
 def test_nothing_near_what_is_there_is_ruled_out(generator):
     """However wide the blur, a place that has something within its radius may hold something."""
-    empty = EmptySpace(32, 0.01)
+    empty = OccupancyMask(32, 0.01)
     there = torch.zeros(1, 32, 32, 32, dtype=torch.bool)
     there[0, 20, 9, 30] = True
     empty.grid.rule_out(there)
@@ -106,7 +106,7 @@ def test_nothing_near_what_is_there_is_ruled_out(generator):
 
 
 def test_a_grid_that_looks_finds_what_is_there():
-    empty = EmptySpace(16, 0.01)
+    empty = OccupancyMask(16, 0.01)
 
     def ball(x: torch.Tensor) -> torch.Tensor:
         return 10.0 * (x.norm(dim=-1) < 0.5)

@@ -13,7 +13,7 @@ import torch
 
 from lumigraph.camera import Camera
 from lumigraph.errors import LumigraphError
-from lumigraph.images import ImageStore, Picture, Runs, shuffled_order, spread
+from lumigraph.images import ImageSource, ImageStore, Runs, shuffled_order, spread
 from lumigraph.lens import Pinhole
 from lumigraph.scene import Frame, Scene
 
@@ -42,7 +42,7 @@ def pictures(images, masks=None, reads=None):
             reads.append(i)
         return images[i], None if masks is None else masks[i]
 
-    return [Picture(im.shape[1::-1], lambda i=i: read(i), f"picture {i}") for i, im in enumerate(images)]
+    return [ImageSource(im.shape[1::-1], lambda i=i: read(i), f"picture {i}") for i, im in enumerate(images)]
 
 
 def store(kind, images, masks, folder: Path) -> ImageStore:
@@ -139,10 +139,10 @@ def test_a_file_is_used_again_until_a_picture_changes(images, tmp_path):
         ImageStore.load(pictures(images, reads=reads), memory=0, cache=tmp_path)
     assert sorted(reads) == [0, 1, 2, 3]
     changed = pictures(images, reads=reads)
-    changed[1] = Picture(changed[1].size, changed[1].read, "picture 1, edited")
+    changed[1] = ImageSource(changed[1].size, changed[1].read, "picture 1, edited")
     ImageStore.load(changed, memory=0, cache=tmp_path)
     assert len(reads) == 8
-    nameless = [Picture(p.size, p.read) for p in changed]
+    nameless = [ImageSource(p.size, p.read) for p in changed]
     for _ in range(2):
         ImageStore.load(nameless, memory=0, cache=tmp_path)
     assert len(reads) == 16
@@ -172,7 +172,7 @@ def test_a_picture_that_cannot_be_read_leaves_nothing(images, tmp_path):
         raise LumigraphError("b.png is damaged")
 
     with pytest.raises(LumigraphError, match=r"b\.png is damaged"):
-        ImageStore.load([*pictures(images), Picture((3, 3), broken, "b")], memory=0, cache=tmp_path)
+        ImageStore.load([*pictures(images), ImageSource((3, 3), broken, "b")], memory=0, cache=tmp_path)
     assert not list(tmp_path.iterdir())
 
 
@@ -210,10 +210,11 @@ def test_held_out_images_are_never_sampled(scene, generator):
     assert set(scene.sample_rays(500, generator, split="test").rays.image_index.tolist()) == {0}
 
 
-def test_a_view_is_a_camera_and_its_picture(scene, images):
-    camera, image = scene.view(3)
-    assert len(camera) == 1 and camera.size.tolist() == [[13, 64]] and image.shape == (64, 13, 3)
-    torch.testing.assert_close(image, torch.from_numpy(images[3]) / 255.0)
+def test_a_photograph_is_a_camera_and_its_picture(scene, images):
+    photograph = scene.photograph(3)
+    assert len(photograph.camera) == 1 and photograph.camera.size.tolist() == [[13, 64]]
+    assert photograph.alpha is None and photograph.extra == {}
+    torch.testing.assert_close(photograph.rgb, torch.from_numpy(images[3]) / 255.0)
 
 
 def test_alpha_comes_with_the_rays(scene, images, generator):

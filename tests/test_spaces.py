@@ -16,7 +16,7 @@ from captures import Tiny, look_at, write_blender, write_ngp
 from lumigraph import files
 from lumigraph.capture import Capture, Shot, open_scene
 from lumigraph.capture.assemble import assemble
-from lumigraph.components.spaces import INFINITY, NDC, Box, Contraction, space_of
+from lumigraph.components.sampling.spaces import INFINITY, NDC, Box, Contraction, space_of
 from lumigraph.lens import Equirectangular, Pinhole
 from lumigraph.rays import Rays
 from lumigraph.run import Run
@@ -258,7 +258,7 @@ def test_a_frame_comes_back_from_json_and_older_ones_still_open(tmp_path: Path):
 
     scene = open_scene(tiny.write_blender(tmp_path / "scene"))
     run = Run.create(tmp_path / "run", tiny.method(scene.frame), scene)
-    config = run.config
+    config = run.settings.to_json()
     del config["frame"]["forward"]
     files.write_json(run.folder / "config.json", config)
     assert len(Run(run.folder).scene()) == len(scene)

@@ -12,21 +12,22 @@ import torch
 from lumigraph.errors import LumigraphError
 from lumigraph.evaluate import evaluate
 from lumigraph.run import Run
-from lumigraph.train import Budget, Clock, finite, fit, rehearse
+from lumigraph.run.checkpoint import Checkpoints
+from lumigraph.train import Budget, Clock, finite, fit, rehearse, set_learning_rate
 
 
 def final_state(run: Run) -> tuple[dict[str, torch.Tensor], str]:
     """All tensors of a run's checkpoint, and the structure of its optimizers."""
-    checkpoint = run._checkpoint()
+    states = Checkpoints(run.folder, run.method_name)
     tensors: dict[str, torch.Tensor] = {}
     for name in ("weights.safetensors", "optimizer.safetensors"):
-        tensors |= {f"{name}/{key}": value for key, value in run._read_tensors(checkpoint, name).items()}
-    return tensors, json.dumps(run._about(checkpoint)["optimizers"])
+        tensors |= {f"{name}/{key}": value for key, value in states._read_tensors(states.latest, name).items()}
+    return tensors, json.dumps(states._about(states.latest)["optimizers"])
 
 
 def train(run: Run, **options):
     scene, method = tiny.scene(), run.new_method()
-    return method, fit(method, scene, run, show=False, seed=run.config["seed"], **options)
+    return method, fit(method, scene, run, show=False, seed=run.settings.seed, **options)
 
 
 def test_a_method_learns_held_out_views():
@@ -53,6 +54,37 @@ def test_resuming_equals_never_having_stopped_to_the_bit(tmp_path, momentum):
     for name in expected:
         assert torch.equal(expected[name], actual[name]), name
     assert structure == resumed
+
+
+def test_a_step_may_descend_several_times_with_some_of_its_optimizers(monkeypatch):
+    """As adversaries do: each descent moves its own parameters, whatever gradients reach the others."""
+    scene = tiny.scene()
+    method = tiny.method(scene.frame, momentum=True)
+    moved = []
+
+    def step(self, batch, number, descend):
+        for optimizer in self.kept:
+            before = self.logits.detach().clone(), self.colour.detach().clone()
+            terms = self.loss(batch, number)
+            descend(terms, [optimizer])
+            moved.append([not torch.equal(*pair) for pair in zip(before, (self.logits, self.colour), strict=True)])
+        return terms
+
+    monkeypatch.setattr(type(method), "step", step)
+    fit(method, scene, steps=3, show=False, rehearsal=False)
+    assert moved == [[True, False], [False, True]] * 3
+
+
+def test_the_trainer_gives_groups_what_a_method_declares():
+    method = tiny.method()
+    groups = [
+        {"name": "means", "params": [method.logits], "lr": 1.0},
+        {"params": [method.colour], "lr": 1.0, "scale": 0.5},
+    ]
+    (first, second) = (optimizer := torch.optim.SGD(groups)).param_groups
+    for declared, rates in [(None, [1.0, 1.0]), ({"means": 0.3}, [0.3, 1.0]), (0.2, [0.2, 0.1])]:
+        set_learning_rate([optimizer], declared)
+        assert [first["lr"], second["lr"]] == pytest.approx(rates)
 
 
 def test_another_seed_gives_another_result(tmp_path):
@@ -121,13 +153,8 @@ def test_a_second_interrupt_breaks_off(tmp_path, monkeypatch):
         signal.raise_signal(signal.SIGINT)
 
     monkeypatch.setattr(type(method), "before_step", insist)
-    monkeypatch.setattr("lumigraph.train.rehearse", lambda *_: 0.0)
-    inherited = signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background jobs ignore it
-    try:
-        with pytest.raises(KeyboardInterrupt):
-            fit(method, scene, steps=50, show=False)
-    finally:
-        signal.signal(signal.SIGINT, inherited)
+    with pytest.raises(KeyboardInterrupt):
+        fit(method, scene, steps=50, show=False, rehearsal=False)
 
 
 def finite_weights(run: Run) -> bool:

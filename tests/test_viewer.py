@@ -21,23 +21,25 @@ import torch
 from torch import nn
 from viewer_client import Client
 
-from lumigraph import splatting
 from lumigraph.cli import main
 from lumigraph.errors import LumigraphError, LumigraphWarning
-from lumigraph.gaussians import Gaussians
+from lumigraph.figures import NOTHING, RAMP, hex_colour
+from lumigraph.gaussians import Gaussians, splatting
 from lumigraph.method import Method, RayMethod
 from lumigraph.rays import Rendering
 from lumigraph.run import Run
 from lumigraph.train import fit
 from lumigraph.viewer import Subject, Viewer, choose_address
-from lumigraph.viewer.crop import Box, render_inside
+from lumigraph.viewer.cameras import angle_for, angles, pose_of, rows
+from lumigraph.viewer.crop import CropBox, render_inside
+from lumigraph.viewer.extras import PALETTE
 from lumigraph.viewer.flight import upwards
-from lumigraph.viewer.look import Look, angle_for, angles, pose_of, rows
-from lumigraph.viewer.modes import along_axis, normals, picture
+from lumigraph.viewer.modes import along_axis, extra_modes, normals, picture
 from lumigraph.viewer.pace import Pace
 from lumigraph.viewer.painter import Painter
 from lumigraph.viewer.splats import ENLARGED, splats
 from lumigraph.viewer.turns import IDLE_SHARE, SHARE, NotWantedError, Turns
+from lumigraph.viewer.view_request import ViewRequest
 
 WHITE = (1.0, 1.0, 1.0)
 # A client may leave at any moment; viser warns of what was still on its way.
@@ -45,12 +47,9 @@ pytestmark = pytest.mark.filterwarnings("ignore:Queued a .* on a closed connecti
 
 
 @pytest.fixture(scope="module")
-def learnt():
+def learnt(ball_run):
     """The tiny scene, and a method that has learnt it."""
-    scene = tiny.scene()
-    method = tiny.method(scene.frame)
-    fit(method, scene, steps=60, show=False)
-    return scene, method
+    return tiny.scene(), ball_run.method()
 
 
 def subject(scene, folder, **changes) -> Subject:
@@ -58,9 +57,9 @@ def subject(scene, folder, **changes) -> Subject:
     return replace(Subject("ball", scene.frame, cameras, folder / "paths", "lumigraph render RUN"), **changes)
 
 
-def look_of(camera, canvas) -> Look:
+def request_of(camera, canvas) -> ViewRequest:
     pose = tuple(tuple(row) for row in camera.pose[0].tolist())
-    return Look(pose, angles(camera)[1], canvas, 1024, "colour", WHITE)
+    return ViewRequest(pose, angles(camera)[1], canvas, 1024, "colour", WHITE)
 
 
 # Cameras
@@ -74,7 +73,7 @@ def test_a_browsers_camera_is_the_scenes(learnt):
     from viser.transforms import SO3
 
     pose = pose_of(SO3.from_matrix(rotation.numpy()).wxyz, camera.position[0].numpy())
-    seen = Look(pose, angles(camera)[1], (240, 240), 1024, "colour", WHITE).camera((24, 24))
+    seen = ViewRequest(pose, angles(camera)[1], (240, 240), 1024, "colour", WHITE).camera((24, 24))
     a, b = (c.rays(camera.pixels()) for c in (seen, camera))
     assert torch.allclose(a.directions, b.directions, atol=1e-5)
     assert torch.allclose(a.origins, b.origins, atol=1e-5)
@@ -82,7 +81,7 @@ def test_a_browsers_camera_is_the_scenes(learnt):
 
 def test_bands_make_the_whole_picture(learnt):
     scene, method = learnt
-    camera = look_of(scene.cameras[0], (40, 30)).camera((40, 30))
+    camera = request_of(scene.cameras[0], (40, 30)).camera((40, 30))
     whole = method.render(camera)
     parts = [method.render(rows(camera, a, b)) for a, b in ((0, 7), (7, 23), (23, 30))]
     assert torch.allclose(Rendering.cat(parts).rgb, whole.rgb, atol=1e-5)
@@ -135,6 +134,85 @@ def test_modes_differ_and_the_background_is_exchanged(learnt):
     assert torch.allclose(exchanged, black.eval().render(camera).rgb, atol=1e-5)
 
 
+class Labelled(Method):
+    """A grey wall in every column but the first, with extras of many shapes."""
+
+    def batch(self, scene, generator):
+        raise NotImplementedError
+
+    loss = optimizers = batch
+
+    def render(self, camera):
+        width, height = camera.size[0].tolist()
+        right = (torch.arange(width) >= width // 2).expand(height, width)
+        opacity = torch.ones(height, width)
+        opacity[:, 0] = 0
+        share = torch.linspace(0, 1, width).expand(height, width)
+        return Rendering(
+            torch.full((height, width, 3), 0.5),
+            torch.where(opacity > 0, 2.0, torch.inf),
+            opacity,
+            {
+                "heat": (100 * share - 30)[..., None],
+                "tint": torch.stack([2 * share, share, -share], -1),
+                "Labels": torch.where(right, 3, -1),
+                "normals": torch.zeros(height, width, 3),
+                "features": torch.zeros(height, width, 8),
+                "bytes": torch.zeros(height, width, 3, dtype=torch.uint8),
+            },
+        )
+
+
+def test_extras_are_modes_by_their_names(learnt):
+    scene, _ = learnt
+    camera = scene.cameras[0].resized(2)
+    seen = Labelled(scene.frame, None).render(camera)
+    assert extra_modes(seen) == ["heat", "tint", "Labels"]
+    heat, tint, labels = (picture(seen, camera, mode, WHITE, WHITE) for mode in extra_modes(seen))
+    nothing, dark, bright = (hex_colour(text) for text in (NOTHING, RAMP[-1], RAMP[0]))
+    middle = seen.depth.shape[1] // 2
+    assert torch.equal(heat[:, 0], nothing.expand_as(heat[:, 0]))  # the scene is not there
+    assert torch.allclose(heat[0, 1], dark, atol=1e-6) and torch.allclose(heat[0, -1], bright, atol=1e-6)
+    assert (heat[0, 1:].sum(-1).diff() > -1e-3).all() and heat[0, middle].sum() > dark.sum() + 0.3
+    assert torch.equal(tint, seen.extra["tint"].clamp(0, 1))
+    assert torch.equal(labels[0, middle], hex_colour(PALETTE[3]))
+    assert torch.equal(labels[0, middle - 1], nothing)  # labels below zero are none
+    odd = replace(seen, extra={"Labels": seen.extra["Labels"] + len(PALETTE)})
+    assert torch.equal(picture(odd, camera, "Labels", WHITE, WHITE)[0, middle], hex_colour(PALETTE[3]))
+    with pytest.raises(LumigraphError, match="gives no heat"):
+        picture(odd, camera, "heat", WHITE, WHITE)
+
+
+def test_extras_without_a_range(learnt):
+    """One number everywhere, or none that is finite, still gives a picture."""
+    scene, _ = learnt
+    camera = scene.cameras[0]
+    solid = torch.ones(tiny.SIZE, tiny.SIZE)
+    for value, colour in ((4.0, RAMP[-1]), (math.nan, NOTHING), (math.inf, NOTHING)):
+        seen = Rendering(torch.zeros(*solid.shape, 3), solid, solid, {"flat": value * solid})
+        shown = picture(seen, camera, "flat", WHITE, WHITE)
+        assert torch.allclose(shown, hex_colour(colour).expand_as(shown))
+
+
+def test_extras_are_offered_once_a_rendering_has_them(learnt, tmp_path):
+    scene, _ = learnt
+    with Viewer(Labelled(scene.frame, None), subject(scene, tmp_path), choose_address(port=0)) as viewer:
+        client = Client(viewer.address.url)
+        client.picture(width=120)
+        (visitor,) = viewer._everyone()
+        dropdown = visitor.controls._mode
+        assert dropdown.options == ("Colour", "Depth", "Opacity", "Normals", "heat", "tint", "Labels")
+        assert visitor.request().mode == "colour"  # until another is chosen
+        dropdown.value = "Labels"
+        assert visitor.request().mode == "Labels"
+        visitor.painter.ask()
+        label = 255 * hex_colour(PALETTE[3]).numpy()
+        deadline = time.monotonic() + 20
+        while np.abs(client.picture(width=120)[45, 90] - label).max() > 8:  # JPEG's loss
+            assert time.monotonic() < deadline
+        client.close()
+
+
 # Crop
 
 
@@ -178,7 +256,7 @@ def test_a_crop_begins_where_rays_enter_the_box(learnt):
     camera = scene.cameras[0]  # on the side of positive x
     method = Walls(scene.frame)
     assert (method.render(camera).rgb[..., 0] == 1).all()
-    seen = render_inside(method, camera, Box((-0.5, -1.0, -1.0), (0.0, 1.0, 1.0)), False)
+    seen = render_inside(method, camera, CropBox((-0.5, -1.0, -1.0), (0.0, 1.0, 1.0)), False)
     inside = seen.opacity == 1
     assert inside.sum() > 50
     assert (seen.rgb[inside] == torch.tensor([0.0, 0.0, 1.0])).all()
@@ -187,10 +265,31 @@ def test_a_crop_begins_where_rays_enter_the_box(learnt):
     assert torch.allclose(x[inside], torch.tensor(-0.4), atol=1e-4)
 
 
+def test_a_crop_keeps_extras_even_of_bands_beside_the_box(learnt):
+    scene, _ = learnt
+    camera = scene.cameras[0]
+
+    class Numbered(Walls):
+        def render_rays(self, rays, background):
+            seen = super().render_rays(rays, background)
+            return seen.with_extra(wall=1 + (seen.rgb[:, 2] > 0).long(), where=rays.origins)
+
+    bands = [
+        render_inside(Numbered(scene.frame), rows(camera, a, b), CropBox((-0.5, -1.0, -0.1), (0.0, 1.0, 0.1)), False)
+        for a, b in ((0, 1), (1, tiny.SIZE))
+    ]
+    assert (bands[0].opacity == 0).all() and (bands[0].extra["wall"] == 0).all()
+    seen = Rendering.cat(bands)
+    inside = seen.opacity == 1
+    assert 0 < inside.sum() < inside.numel()
+    assert (seen.extra["wall"][inside] == 2).all() and (seen.extra["wall"][~inside] == 0).all()
+    assert seen.extra["where"].shape == (tiny.SIZE, tiny.SIZE, 3) and (seen.extra["where"][~inside] == 0).all()
+
+
 def test_a_crop_of_other_methods_goes_by_depth(learnt):
     scene, _ = learnt
     camera = scene.cameras[0]
-    seen = render_inside(Wall(scene.frame, None), camera, Box((-0.1, -0.3, -1.0), (0.1, 0.3, 1.0)), False)
+    seen = render_inside(Wall(scene.frame, None), camera, CropBox((-0.1, -0.3, -1.0), (0.1, 0.3, 1.0)), False)
     y = camera.rays(camera.pixels()).at(seen.depth.reshape(-1).nan_to_num(0, 0))[:, 1].view_as(seen.depth)
     inside = seen.opacity == 1
     assert 0 < inside.sum() < inside.numel()
@@ -200,7 +299,7 @@ def test_a_crop_of_other_methods_goes_by_depth(learnt):
 
 def test_a_crop_of_a_cloud_picks_centres():
     cloud = some_cloud(50)
-    box = Box((-0.5, -1.0, -1.0), (0.5, 0.2, 1.0))
+    box = CropBox((-0.5, -1.0, -1.0), (0.5, 0.2, 1.0))
     kept = box.cropped(cloud).means
     assert 0 < len(kept) < 50
     assert (kept[:, 0].abs() <= 0.5).all() and (kept[:, 1] <= 0.2).all()
@@ -429,7 +528,7 @@ def test_twenty_clients_and_some_that_leave(learnt, tmp_path):
         assert len(viewer._everyone()) == 10
         clients[-1].look_from((-3.0, 0.0, 0.5))
         moved = clients[-1].picture(width=120)
-        camera = viewer._everyone()[-1].look().camera((120, 90))
+        camera = viewer._everyone()[-1].request().camera((120, 90))
         assert abs(moved / 255 - method.render(camera).rgb.numpy()).mean() < 0.02  # JPEG's loss
         for client in clients[10:]:
             client.close()
@@ -539,13 +638,13 @@ def free_port() -> int:
 def wait_for(url: str) -> str:
     for _ in range(200):
         try:
-            return urllib.request.urlopen(url).read().decode()
+            return urllib.request.urlopen(url, timeout=5).read().decode()
         except OSError:
             time.sleep(0.1)
     raise AssertionError(f"nobody answers at {url}")
 
 
-def test_view_and_train_view(learnt, tmp_path, capsys):
+def test_view_and_train_view(ball_folder, tmp_path, capsys):
     """Training is watched, goes on being shown when it is over, and ends by Ctrl-C; its run is then viewed."""
     folder, url, seen = tmp_path / "run", f"http://127.0.0.1:{free_port()}", []
     port = url.rpartition(":")[2]
@@ -561,9 +660,8 @@ def test_view_and_train_view(learnt, tmp_path, capsys):
                 break
         client.close()
 
-    scene = str(tiny.write_blender(tmp_path / "ball"))
     thread = interrupt_after(watch)
-    arguments = ["voxel-grid", scene, "--steps", "30", "--output", str(folder), "--view", "--port", port]
+    arguments = ["voxel-grid", str(ball_folder), "--steps", "30", "--output", str(folder), "--view", "--port", port]
     assert main(["train", *arguments]) == 0
     thread.join()
     assert seen == ["done", "picture"]

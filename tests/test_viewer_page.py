@@ -15,7 +15,7 @@ from PIL import Image
 from test_viewer import some_cloud, subject
 
 import lumigraph.methods
-from lumigraph.keyframes import CameraPath
+from lumigraph.paths.keyframes import CameraPath
 from lumigraph.scene import Frame
 from lumigraph.train import fit
 from lumigraph.viewer import Viewer, choose_address
@@ -25,7 +25,7 @@ pytestmark = pytest.mark.filterwarnings("ignore:Queued a .* on a closed connecti
 
 SIZE = (800, 420)
 SHARPEST = 400  # pixels of a streamed picture's longer side, so that the tests are quick
-ROWS, COLUMNS = slice(160, None), slice(0, 430)  # beside the panel, and below what viser says of slow graphics
+ROWS, COLUMNS = slice(210, None), slice(0, 430)  # beside the panel, and below viser's notice of slow graphics
 HARMLESS = "computeBoundingSphere"  # viser's own complaint about its splats
 
 
@@ -72,7 +72,7 @@ def shot(page) -> np.ndarray:
 
 def expected(viewer, visitor) -> np.ndarray:
     """What our own renderer sees in that place."""
-    return viewer.method.render(visitor.look().camera(SIZE)).rgb.clamp(0, 1).numpy()[ROWS, COLUMNS]
+    return viewer.method.render(visitor.request().camera(SIZE)).rgb.clamp(0, 1).numpy()[ROWS, COLUMNS]
 
 
 def psnr(a: np.ndarray, b: np.ndarray) -> float:
@@ -99,12 +99,12 @@ def test_the_scene_appears_turns_and_changes_modes(viewer, page, faults):
     assert before.std() > 0.1
     shows(page, before, 28)
 
-    place = visitor.look().pose
+    place = visitor.request().pose
     page.mouse.move(150, 300)
     page.mouse.down()
     page.mouse.move(250, 320, steps=4)
     page.mouse.up()
-    wait(lambda: visitor.look().pose != place)
+    wait(lambda: visitor.request().pose != place)
     wait(visitor.painter.settled.is_set)
     after = expected(viewer, visitor)
     assert psnr(after, before) < 25
@@ -113,7 +113,7 @@ def test_the_scene_appears_turns_and_changes_modes(viewer, page, faults):
     seen = shot(page)
     for mode in ("Depth", "Opacity", "Normals"):
         choose(page, "Show", mode)
-        wait(lambda mode=mode: visitor.look().mode == mode.lower() and visitor.painter.settled.is_set())
+        wait(lambda mode=mode: visitor.request().mode == mode.lower() and visitor.painter.settled.is_set())
         wait(lambda seen=seen: psnr(shot(page), seen) < 20)
         seen = shot(page)
     assert faults == []
@@ -126,7 +126,7 @@ def test_a_click_on_a_camera_flies_there(viewer, page):
     behind = torch.cat([camera.pose[0, :, :3], away[:, None]], 1).double().numpy()  # it is in the middle of the view
 
     def arrived() -> bool:
-        return np.abs(np.array(visitor.look().pose) - camera.pose[0].numpy()).max() < 2e-3
+        return np.abs(np.array(visitor.request().pose) - camera.pose[0].numpy()).max() < 2e-3
 
     for _ in range(8):  # software draws slowly: until the frustum is there to be clicked, and the last pose told
         visitor.flight.place(behind, 3.9, 0.9)
@@ -146,9 +146,9 @@ def test_a_path_is_set_saved_and_opened(viewer, page):
     add = page.get_by_role("button", name="Add keyframe here")
     add.click()
     wait(lambda: len(visitor.path._stops) == 1)
-    first = np.array(visitor.look().pose)
+    first = np.array(visitor.request().pose)
     visitor.flight.place(viewer.subject.cameras["train"].pose[4].double().numpy(), 3.0, 0.9)
-    wait(lambda: np.abs(np.array(visitor.look().pose) - first).max() > 0.1)
+    wait(lambda: np.abs(np.array(visitor.request().pose) - first).max() > 0.1)
     add.click()
     wait(lambda: len(visitor.path._stops) == 2)
     page.get_by_role("button", name="Save").click()
@@ -176,14 +176,14 @@ def test_a_path_is_set_saved_and_opened(viewer, page):
     wait(lambda: len(visitor.path._stops) == 2)
     page.get_by_role("button", name="Play").click()
     last = np.array(path.keyframes[1].pose)
-    wait(lambda: np.abs(np.array(visitor.look().pose) - last).max() < 1e-3)
+    wait(lambda: np.abs(np.array(visitor.request().pose) - last).max() < 1e-3)
 
 
 def test_gaussians_are_drawn_by_the_browser(page, faults, tmp_path):
     cloud = replace(some_cloud(300), harmonics=0.4 * some_cloud(300).harmonics)
     frame = Frame(near=0.05, background=(0.1, 0.2, 0.3))
     kind = lumigraph.methods.find("gaussian-splatting")
-    method = kind(frame, kind.Config(degree=3))
+    method = kind(frame, kind.Config(sh_degree=3))
     method.cloud.replace(cloud)
     with Viewer(method.eval(), subject(replace(tiny.scene(), frame=frame), tmp_path), choose_address(port=0)) as viewer:
         visitor = visit(viewer, page)
@@ -191,6 +191,6 @@ def test_gaussians_are_drawn_by_the_browser(page, faults, tmp_path):
         shows(page, expected(viewer, visitor), 26)  # the browser's sums are half as exact
         assert visitor.controls.status.content == "300 Gaussians, drawn by the browser"
         page.get_by_role("checkbox", name="Draw exactly").click()
-        wait(lambda: visitor.look().here and visitor.painter.settled.is_set())
+        wait(lambda: visitor.request().exact and visitor.painter.settled.is_set())
         shows(page, expected(viewer, visitor), 33)
     assert [fault for fault in faults if HARMLESS not in fault and "WebSocket" not in fault] == []

@@ -19,17 +19,19 @@ from tiny import new_run, poses, scene
 
 from lumigraph.camera import Camera
 from lumigraph.cli import main
-from lumigraph.export.mesh import Mesh
-from lumigraph.export.page import WEB, Look, look_at_scene, mesh_page, splats_page, views, views_page
+from lumigraph.export.page import WEB, Opening, mesh_page, opening_of_scene, splats_page, views, views_page
 from lumigraph.gaussians import Gaussians
+from lumigraph.gaussians.splatting import render
 from lumigraph.lens import Pinhole
+from lumigraph.mesh import Mesh
 from lumigraph.paths import Surroundings
 from lumigraph.run import State
-from lumigraph.splatting import render
 
 SIZE = 256
 PACKAGES = Path(__file__).parent.parent / "web" / "package.json"
-LOOK = Look("A <test> & more", (0.9, 0.8, 0.6), (0.0, -3.0, 1.0), (0.0, 0.0, 0.0), 50.0, 0.05, 100, 0.3, 9, 110, True)
+OPENING = Opening(
+    "A <test> & more", (0.9, 0.8, 0.6), (0.0, -3.0, 1.0), (0.0, 0.0, 0.0), 50.0, 0.05, 100, 0.3, 9, 110, True
+)
 
 
 def cloud(count: int = 400, antialiased: bool = False) -> Gaussians:
@@ -117,26 +119,26 @@ def window(chromium):
 @pytest.mark.parametrize("antialiased", [False, True])
 def test_splats_are_drawn_as_we_draw_them(tmp_path, window, antialiased):
     made = cloud(antialiased=antialiased)
-    splats_page(tmp_path / "page.html", made, LOOK)
+    splats_page(tmp_path / "page.html", made, OPENING)
     assert (tmp_path / "page.html").stat().st_size < 2e6
     opened = window(tmp_path / "page.html")
     for index in (1, 4):
         camera = some_camera(index)
         shown = opened.look(camera)
-        ours = render(made, camera, LOOK.background, LOOK.near).rgb.clamp(0, 1).numpy()
+        ours = render(made, camera, OPENING.background, OPENING.near).rgb.clamp(0, 1).numpy()
         assert psnr(shown, ours) > 42
         without = render(
-            dataclasses.replace(made, harmonics=made.harmonics[:, :1]), camera, LOOK.background, LOOK.near
+            dataclasses.replace(made, harmonics=made.harmonics[:, :1]), camera, OPENING.background, OPENING.near
         ).rgb.clamp(0, 1)
         assert psnr(shown, without.numpy()) < 30  # the harmonics are seen
 
 
 def test_turning_and_going_back(tmp_path, window):
-    splats_page(tmp_path / "page.html", cloud(), LOOK)
+    splats_page(tmp_path / "page.html", cloud(), OPENING)
     opened = window(tmp_path / "page.html")
-    assert opened.page.title() == LOOK.title
+    assert opened.page.title() == OPENING.title
     first = opened.settled()
-    assert psnr(first, np.broadcast_to(LOOK.background, first.shape)) < 20  # something is there from the start
+    assert psnr(first, np.broadcast_to(OPENING.background, first.shape)) < 20  # something is there from the start
     opened.drag(0.25)
     turned = opened.settled()
     assert psnr(turned, first) < 25
@@ -149,7 +151,7 @@ def test_turning_and_going_back(tmp_path, window):
 
 
 def test_a_phone(tmp_path, window):
-    splats_page(tmp_path / "page.html", cloud(), LOOK)
+    splats_page(tmp_path / "page.html", cloud(), OPENING)
     phone = {"viewport": {"width": 130, "height": 280}, "device_scale_factor": 2, "has_touch": True, "is_mobile": True}
     opened = window(tmp_path / "page.html", **phone)
     first = opened.settled()
@@ -172,18 +174,20 @@ def test_a_phone(tmp_path, window):
 
 
 def test_looking_around_from_the_middle(tmp_path, window):
-    look = dataclasses.replace(LOOK, position=(0.0, 0.0, 0.0), target=(0.0, 0.02, 0.0), nearest=0.002, farthest=0.06)
-    mesh_page(tmp_path / "page.html", cube(), dataclasses.replace(look, inward=False))
+    opening = dataclasses.replace(
+        OPENING, position=(0.0, 0.0, 0.0), target=(0.0, 0.02, 0.0), nearest=0.002, farthest=0.06
+    )
+    mesh_page(tmp_path / "page.html", cube(), dataclasses.replace(opening, inward=False))
     opened = window(tmp_path / "page.html")
     first = opened.settled()
     opened.drag(0.25)
     turned = opened.settled()
     assert psnr(turned, first) < 30
-    assert psnr(turned, np.broadcast_to(LOOK.background, first.shape)) < 20  # still inside
+    assert psnr(turned, np.broadcast_to(OPENING.background, first.shape)) < 20  # still inside
 
 
 def test_without_webgl_a_sentence(tmp_path, page, faults):
-    mesh_page(tmp_path / "page.html", cube(), LOOK)
+    mesh_page(tmp_path / "page.html", cube(), OPENING)
     page.add_init_script("HTMLCanvasElement.prototype.getContext = () => null")
     page.goto((tmp_path / "page.html").as_uri())
     page.wait_for_selector("body.failed")
@@ -202,7 +206,7 @@ def traced(mesh: Mesh, camera: Camera) -> np.ndarray:
     """The mesh as rays meet it (Moeller and Trumbore 1997), colours interpolated across each triangle."""
     rays = camera.rays(camera.pixels())
     o, d = rays.origins.double().numpy(), rays.directions.double().numpy()
-    rgb, nearest = np.tile(np.array(LOOK.background), (len(o), 1)), np.full(len(o), np.inf)
+    rgb, nearest = np.tile(np.array(OPENING.background), (len(o), 1)), np.full(len(o), np.inf)
     for face in mesh.faces:
         a, b, c = mesh.vertices[face]
         p = np.cross(d, c - a)
@@ -217,7 +221,7 @@ def traced(mesh: Mesh, camera: Camera) -> np.ndarray:
 
 
 def test_a_mesh_is_drawn_where_it_is(tmp_path, window):
-    mesh_page(tmp_path / "page.html", cube(), LOOK)
+    mesh_page(tmp_path / "page.html", cube(), OPENING)
     assert (tmp_path / "page.html").stat().st_size < 4e5
     opened = window(tmp_path / "page.html")
     camera = some_camera(2)
@@ -230,7 +234,7 @@ def test_a_mesh_is_drawn_where_it_is(tmp_path, window):
 
 def test_pictures_are_turned_over(tmp_path, window):
     made, cameras = tiny_method(), scene().cameras
-    views_page(tmp_path / "page.html", made, cameras, look_at_scene("ball", cameras, made.frame), 8, 96)
+    views_page(tmp_path / "page.html", made, cameras, opening_of_scene("ball", cameras, made.frame), 8, 96)
     assert (tmp_path / "page.html").stat().st_size < 1e5
     opened = window(tmp_path / "page.html", viewport={"width": 96, "height": 96})
     seen_from = views(Surroundings(cameras, made.frame), 8, (96, 96))
@@ -284,8 +288,8 @@ def test_what_cannot_be_is_refused(run, tmp_path, capsys, arguments, told):
 
 
 def test_titles_cannot_break_a_page(tmp_path):
-    look = dataclasses.replace(LOOK, title="</script><b>@@data@@")
-    mesh_page(tmp_path / "page.html", cube(), look)
+    opening = dataclasses.replace(OPENING, title="</script><b>@@data@@")
+    mesh_page(tmp_path / "page.html", cube(), opening)
     page = (tmp_path / "page.html").read_text("utf-8")
     assert "</script><b>" not in page
     assert "<title>&lt;/script&gt;&lt;b&gt;@@data@@</title>" in page

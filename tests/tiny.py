@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import importlib
 import json
 import math
+from functools import cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -22,6 +25,20 @@ SIZE, FOCAL, DISTANCE = 24, 32.0, 3.0
 # What a user would do by putting a file into lumigraph/methods/.
 if (folder := str(Path(__file__).parent / "methods")) not in lumigraph.methods.__path__:
     lumigraph.methods.__path__.append(folder)
+
+
+# What is learnt from, by kind: the module and the function that make the smallest there is.
+DATASETS = {
+    "Scene": ("tiny", "scene"),
+    "Shapes": ("tiny_shapes", "shapes"),
+    "Collection": ("tiny_collection", "collection"),
+}
+
+
+def dataset(kind: type) -> Any:
+    """The smallest dataset of a kind."""
+    module, function = DATASETS[kind.__name__]
+    return getattr(importlib.import_module(module), function)()
 
 
 def poses(count: int = 12) -> torch.Tensor:
@@ -48,9 +65,15 @@ def picture(pose: torch.Tensor) -> np.ndarray:
 
 
 def scene(count: int = 12) -> Scene:
+    """Nobody may change it; what tests change is a copy, by `replace`."""
+    return made(count, SIZE, FOCAL)
+
+
+@cache
+def made(count: int, size: int, focal: float) -> Scene:
     pose, index = poses(count), torch.arange(count)
-    lens = Pinhole(torch.full((count, 2), FOCAL), torch.full((count, 2), SIZE / 2))
-    cameras = Camera(pose, lens, torch.full((count, 2), SIZE), image_index=index)
+    lens = Pinhole(torch.full((count, 2), focal), torch.full((count, 2), size / 2))
+    cameras = Camera(pose, lens, torch.full((count, 2), size), image_index=index)
     frame = Frame(near=0.1, background=(1.0, 1.0, 1.0), has_alpha=True, image_count=count)
     splits = {"train": index[index % 4 != 0], "test": index[index % 4 == 0]}
     images = ImageStore.from_arrays([picture(p) for p in pose])

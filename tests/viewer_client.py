@@ -47,6 +47,11 @@ class Client:
         }
         self.socket.send(msgspec.msgpack.encode(message))
 
+    def turn(self, handle, value) -> None:
+        """Set a slider or a list of this client's panel, as its browser would."""
+        message = {"type": "GuiUpdateMessage", "uuid": handle._impl.uuid, "updates": {"value": value}}
+        self.socket.send(msgspec.msgpack.encode(message))
+
     def messages(self, seconds: float):
         """What comes within so many seconds, each a dict."""
         end = time.monotonic() + seconds

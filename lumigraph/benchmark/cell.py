@@ -51,19 +51,19 @@ class Cell:
 
     @property
     def name(self) -> str:
-        """For folders: unique among cells that share their settings."""
+        """The cell's name for folders, unique among cells that share their settings."""
         views = "" if self.views is None else f"-{self.views}views"
         return f"{self.scene}-{self.method}{views}-{duration(self.budget).replace(' ', '')}-seed{self.seed}"
 
     @property
     def title(self) -> str:
-        """For people."""
+        """The cell's name for people."""
         views = "" if self.views is None else f" from {self.views} views"
         return f"{self.method} on {self.scene}{views}, {duration(self.budget)}, seed {self.seed}"
 
 
 def budget_of(plain: dict[str, Any]) -> Budget:
-    """As runs and results hold it."""
+    """A cell's budget as runs and results hold it: {"seconds": s} or {"steps": n}."""
     return Budget(plain.get("steps"), plain.get("seconds"))
 
 
@@ -111,18 +111,21 @@ def options(told: dict[str, Any]) -> list[str]:
 def trained(folder: Path) -> bool:
     """Whether a run has spent its budget."""
     run = Run(folder)
-    return run.has_state and budget_of(run.config["budget"]).progress(run.state.step, run.state.seconds) >= 1
+    return run.has_state and budget_of(run.settings.budget).progress(run.state.step, run.state.seconds) >= 1
 
 
 def evaluated(folder: Path, settings: Settings) -> bool:
     """Whether a run's latest state has been compared as the settings want it."""
     run = Run(folder)
     result = run.evaluation()
-    if result is None or result["steps"] != run.state.step or not (folder / "eval").is_dir():
+    if result is None or result["steps"] != run.state.step:
         return False
     protocol = result["protocol"]
     wanted = min(settings.eval_views or protocol["of"], protocol["of"])
-    return protocol["views"] == wanted and (result["lpips"] is not None or not settings.lpips)
+    if "views" not in protocol:
+        return protocol["shapes"] == wanted
+    kept = (folder / "eval").is_dir() and (result["lpips"] is not None or not settings.lpips)
+    return kept and protocol["views"] == wanted
 
 
 def claim(output: Path, cells: Sequence[Cell], settings: Settings) -> None:

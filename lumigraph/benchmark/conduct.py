@@ -7,8 +7,8 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from .. import files
-from ..display import clock
 from ..errors import LumigraphError
+from ..progress import clock
 from .cell import Cell, Settings, claim, evaluation, training
 from .launch import STOPPED, Launch, launch, reason
 from .pictures import draw_charts, draw_views
@@ -52,7 +52,7 @@ def conduct(
 
 
 def carry_out(cell: Cell, output: Path, settings: Settings, launch: Launch) -> tuple[int, str | None]:
-    """Do what is still to be done about a cell. Returns the last exit code, and why it failed if it did."""
+    """Train and evaluate a cell as far as that is not done. Returns the last exit code, and why it failed if it did."""
     folder, log = output / "runs" / cell.name, output / "runs" / f"{cell.name}.log"
     for task in (training, evaluation):
         try:

@@ -46,7 +46,7 @@ def launch(arguments: Sequence[str], log: Path) -> int:
 
 
 def ended(process: subprocess.Popen[bytes]) -> int | None:
-    """The exit code; None if the process has not ended after a moment."""
+    """A process's exit code; None if the process has not ended after a moment."""
     try:
         return process.wait(LOOKS)
     except subprocess.TimeoutExpired:

@@ -1,4 +1,4 @@
-"""A benchmark as pictures: PSNR over time, PSNR over views, and one held-out view as every method shows it."""
+"""A benchmark as pictures: the first score over time and over views, and one held-out view as every method shows it."""
 
 from __future__ import annotations
 
@@ -14,10 +14,11 @@ from PIL import Image
 from torch import Tensor
 
 from .. import files
-from ..charts import Series, line_chart, standalone
-from ..evaluate import file_name, on_background
+from ..evaluate import file_name
 from ..figures import Row as Line
 from ..figures import contact_sheet, save_picture
+from ..figures.charts import Series, line_chart, standalone
+from ..metrics import scores_of
 from ..run import Run
 from .results import Row
 from .table import resolution, trained_for
@@ -34,6 +35,7 @@ def draw_charts(rows: Sequence[Row], output: Path) -> list[str]:
         over_time = curves(of_all_views, "training_seconds", budget)
         over_views = curves(of_scene, "train_views", lambda row: row["train_views"], per=trained_for)
         seconds = {row["budget"].get("seconds") for row in of_all_views}
+        headline = scores_of(of_scene[0])[0]
         for name, series, label, ticks in (
             ("time", over_time, "seconds of training", () if None in seconds else sorted(seconds)),
             ("views", over_views, "photographs to learn from", sorted({row["train_views"] for row in of_scene})),
@@ -43,14 +45,14 @@ def draw_charts(rows: Sequence[Row], output: Path) -> list[str]:
             chart = line_chart(
                 series,
                 label,
-                "held-out PSNR, dB",
+                ", ".join(part for part in (f"held-out {headline.name}", headline.unit) if part),
                 log_x=True,
                 marks=True,
                 smoothed=False,
                 note=", ".join([*(one.name for one in series if len(series) == 1), scene, resolution(of_scene[0])]),
                 x_ticks=ticks,
             )
-            drawn.append(f"{scene}-psnr-over-{name}.svg")
+            drawn.append(f"{scene}-{headline.name.lower().replace(' ', '-')}-over-{name}.svg")
             files.write_bytes(output / drawn[-1], standalone(chart))
     return drawn
 
@@ -58,7 +60,7 @@ def draw_charts(rows: Sequence[Row], output: Path) -> list[str]:
 def curves(
     rows: Sequence[Row], x: str, point: Callable[[Row], Any], per: Callable[[Row], Any] = lambda row: ""
 ) -> list[Series]:
-    """PSNR over x, a curve for each method. Cells that differ in their seeds alone are one point: their means.
+    """The first score over x, a curve for each method. Cells that differ in their seeds alone are a point: their means.
 
     point: what cells of one point have in common;  per: what else tells curves apart
     """
@@ -69,11 +71,11 @@ def curves(
     series = []
     for (method, other), points in sorted(groups.items()):
         found = sorted(
-            (statistics.fmean(row[x] for row in cells), statistics.fmean(row["psnr"] for row in cells))
+            (statistics.fmean(row[x] for row in cells), statistics.fmean(scores_of(row)[0].value for row in cells))
             for cells in points.values()
         )
         name = f"{method}, {other}" if several else method
-        series.append(Series(name, [at for at, _ in found], [psnr for _, psnr in found]))
+        series.append(Series(name, [at for at, _ in found], [score for _, score in found]))
     return series
 
 
@@ -83,7 +85,7 @@ def budget(row: Row) -> tuple[tuple[str, float], ...]:
 
 def draw_views(rows: Sequence[Row], output: Path) -> list[str]:
     """One held-out view of each scene as its photograph and as every method shows it, after its longest training."""
-    measured = [row for row in rows if not row["failed"]]
+    measured = [row for row in rows if not row["failed"] and "shown" in row]
     best: dict[tuple[str, str, int], dict[str, Row]] = {}
     for row in sorted(measured, key=lambda row: (*row["budget"].values(), -row["seed"])):
         best.setdefault((row["scene"], row["shown"]["name"], row["train_views"]), {})[row["method"]] = row
@@ -95,7 +97,7 @@ def draw_views(rows: Sequence[Row], output: Path) -> list[str]:
             photographs[scene, name] = photograph(next(iter(cells.values())), output)
         truth = photographs[scene, name]
         seen = [rendering(cells[method], output) if method in cells else torch.ones_like(truth) for method in methods]
-        scores = [f"{cells[method]['shown']['psnr']:.2f} dB" if method in cells else "" for method in methods]
+        scores = [str(scores_of(cells[method]["shown"])[0]) if method in cells else "" for method in methods]
         lines.append(Line([f"{scene}, {views} views", *scores], [truth, *seen]))
     if not lines:
         return []
@@ -105,11 +107,10 @@ def draw_views(rows: Sequence[Row], output: Path) -> list[str]:
 
 def photograph(row: Row, output: Path) -> Float[Tensor, "height width 3"]:
     scene = Run(output / row["run"]).scene()
-    _, image = scene.view(scene.names.index(row["shown"]["name"]))
-    return on_background(image, scene.frame.background)
+    return scene.photograph(scene.names.index(row["shown"]["name"])).before(scene.frame.background)
 
 
 def rendering(row: Row, output: Path) -> Float[Tensor, "height width 3"]:
-    """As the evaluation kept it."""
+    """A run's rendering of a view, as the evaluation kept it."""
     path = output / row["run"] / "eval" / f"{file_name(row['shown']['name'])}.png"
     return torch.from_numpy(np.array(Image.open(path).convert("RGB"))).float() / 255

@@ -14,6 +14,7 @@ from .published import published
 
 Row = dict[str, Any]
 MEASURED = (
+    "scores",
     "psnr",
     "ssim",
     "lpips",
@@ -47,13 +48,14 @@ def row_of(cell: Cell, output: Path, settings: Settings, failure: str | None) ->
     run = Run(folder)
     result = run.evaluation() or {}
     figure = published(cell.method, cell.scene) if cell.views is None and settings.scales == 1 else None
-    row |= {name: result[name] for name in MEASURED}
+    row |= {name: result[name] for name in MEASURED if name in result}
     row |= {
-        "train_views": run.config["splits"]["train"] // settings.scales,
-        "model_bytes": model_bytes(run),
-        "shown": result["views"][len(result["views"]) // 2 // settings.scales],  # at full size
+        "train_views": run.settings.splits["train"] // settings.scales,
+        "model_bytes": run.model_bytes,
         "published": figure and asdict(figure),
     }
+    if views := result.get("views"):
+        row["shown"] = views[len(views) // 2 // settings.scales]  # at full size
     if "by_resolution" in result:
         row["by_resolution"] = result["by_resolution"]
     return row
@@ -62,11 +64,6 @@ def row_of(cell: Cell, output: Path, settings: Settings, failure: str | None) ->
 def public(cell: Cell) -> str:
     """A scene without the place where it lies on this machine."""
     return cell.scene if Path(cell.source).exists() else cell.source
-
-
-def model_bytes(run: Run) -> int:
-    """Size of the trained weights, which are all that rendering needs."""
-    return (run.folder / "checkpoints" / f"{run.state.step:06d}" / "weights.safetensors").stat().st_size
 
 
 def read_rows(output: Path) -> dict[str, Row]:

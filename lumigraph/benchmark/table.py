@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import statistics
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any
 
+from ..metrics import named, scores_of
 from .cell import budget_of, duration
 from .results import Row
 
@@ -13,14 +15,15 @@ NONE = "–"
 
 
 def markdown(rows: Sequence[Row], pictures: Sequence[str] = ()) -> str:
-    """The whole page. pictures: names of files beside it."""
+    """The whole page of a benchmark. pictures: names of files beside it."""
     measured = [row for row in rows if not row["failed"]]
     parts = ["# Methods side by side", short_table(measured), "\n".join(f"![{name}]({name})" for name in pictures)]
     parts += ["## Every cell", full_table(rows)]
     parts += [
         "PSNR in dB and SSIM are means over held-out views, larger is better; LPIPS (AlexNet), smaller is better. "
-        "Training is without compiling, which happens on first use. Memory is the training process's peak, on a GPU "
-        "that of its tensors. Published figures follow their own protocols and are no figures of ours."
+        "Of shapes, IoU and normal consistency are better when larger, chamfer-L1 (tenths of the longest side) when "
+        "smaller. Training is without compiling, which happens on first use. Memory is the training process's peak, "
+        "on a GPU that of its tensors. Published figures follow their own protocols and are no figures of ours."
     ]
     return "\n\n".join(part for part in parts if part) + "\n"
 
@@ -32,13 +35,11 @@ def short_table(rows: Sequence[Row]) -> str:
         groups.setdefault((row["scene"], row["method"], row["train_views"], trained_for(row)), []).append(row)
     columns: dict[str, Callable[[list[Row]], str]] = {
         "method": lambda group: group[0]["method"],
-        "scene": lambda group: f"{group[0]['scene']}, {resolution(group[0])}",
+        "scene": lambda group: ", ".join(part for part in (group[0]["scene"], resolution(group[0])) if part),
         "views": lambda group: str(group[0]["train_views"]),
         "trained for": lambda group: trained_for(group[0]),
-        "PSNR": lambda group: spread([row["psnr"] for row in group], ".2f"),
-        "SSIM": lambda group: spread([row["ssim"] for row in group], ".3f"),
-        "LPIPS": lambda group: spread([row["lpips"] for row in group], ".3f"),
-        "s/view": lambda group: f"{statistics.fmean(row['seconds_per_view'] for row in group):.2g}",
+        **{name: partial(mean_score, name) for name in score_names(rows)},
+        "s/view": lambda group: spread([row.get("seconds_per_view") for row in group[:1]], ".2g"),
         "memory": lambda group: size(max(row["peak_memory"] for row in group)),
         "model": lambda group: size(max(row["model_bytes"] for row in group)),
         "published PSNR": lambda group: published(group[0]),
@@ -54,15 +55,12 @@ CELL: dict[str, Callable[[Row], str]] = {
     "seed": lambda row: str(row["seed"]),
 }
 FIGURES: dict[str, Callable[[Row], str]] = {
-    "PSNR": lambda row: f"{row['psnr']:.2f}",
-    "SSIM": lambda row: f"{row['ssim']:.4f}",
-    "LPIPS": lambda row: spread([row["lpips"]], ".4f"),
     "steps": lambda row: str(row["steps"]),
     "training s": lambda row: f"{row['training_seconds']:.1f}",
     "compiling s": lambda row: f"{row['compile_seconds']:.1f}",
     "memory": lambda row: size(row["peak_memory"]),
     "model": lambda row: size(row["model_bytes"]),
-    "s/view": lambda row: f"{row['seconds_per_view']:.3g}",
+    "s/view": lambda row: spread([row.get("seconds_per_view")], ".3g"),
     "trained on": lambda row: row["trained_on"],
     "published PSNR": lambda row: published(row),
 }
@@ -70,16 +68,18 @@ FIGURES: dict[str, Callable[[Row], str]] = {
 
 def full_table(rows: Sequence[Row]) -> str:
     """One line for each cell. One that failed says why where its protocol would stand."""
+    names = score_names([row for row in rows if not row["failed"]])
+    columns: dict[str, Callable[[Row], str]] = {name: partial(score_in, name) for name in names} | FIGURES
     lines = []
     for row in in_order(rows):
-        figures = [NONE if row["failed"] else value(row) for value in FIGURES.values()]
+        figures = [NONE if row["failed"] else value(row) for value in columns.values()]
         how = f"failed: {row['failed']}" if row["failed"] else protocol(row)
         lines.append([*(value(row) for value in CELL.values()), *figures, how])
-    return table([*CELL, *FIGURES, "protocol"], lines)
+    return table([*CELL, *columns, "protocol"], lines)
 
 
 def table(names: Sequence[str], lines: Sequence[Sequence[str]]) -> str:
-    """Markdown. Columns that say nothing anywhere are left out."""
+    """A Markdown table. Columns that say nothing anywhere are left out."""
     kept = [i for i in range(len(names)) if any(line[i] != NONE for line in lines)]
     shown = [[line[i].replace("|", "/") for i in kept] for line in (names, ["---"] * len(names), *lines)]
     return "\n".join(f"| {' | '.join(line)} |" for line in shown) if lines else ""
@@ -97,7 +97,7 @@ def trained_for(row: Row) -> str:
 
 
 def resolution(row: Row) -> str:
-    sizes = row["protocol"]["resolution"]
+    sizes = row["protocol"].get("resolution", "")
     return sizes if isinstance(sizes, str) else f"{len(sizes)} sizes"
 
 
@@ -109,19 +109,36 @@ def published(row: Row) -> str:
 def protocol(row: Row) -> str:
     """How the cell was compared, in a few words."""
     how = row["protocol"]
-    some = f"{how['views']} of {how['of']} of {how['split']}, evenly spread"
-    parts = [resolution(row), f"{how['views']} of {how['split']}" if how["views"] == how["of"] else some]
-    if how["background"] is not None:
+    count = how["views"] if "views" in how else how["shapes"]
+    some = f"{count} of {how['of']} of {how['split']}, evenly spread"
+    parts = [resolution(row), f"{count} of {how['split']}" if count == how["of"] else some]
+    if how.get("background") is not None:
         known = {(1.0, 1.0, 1.0): "white", (0.0, 0.0, 0.0): "black"}
         colour = tuple(how["background"])
         parts.append(f"{known.get(colour, colour)} background")
-    if how["masked"]:
+    if how.get("masked"):
         parts.append("masked")
-    return ", ".join(parts)
+    return ", ".join(part for part in parts if part)
+
+
+def score_names(rows: Sequence[Row]) -> list[str]:
+    """The names of all scores that some row has, the headline of the first row first."""
+    return list(dict.fromkeys(score.name for row in in_order(rows) for score in scores_of(row)))
+
+
+def score_in(name: str, row: Row) -> str:
+    score = named(scores_of(row), name)
+    return f"{score.value:.{score.digits}f}" if score else NONE
+
+
+def mean_score(name: str, group: list[Row]) -> str:
+    """The mean and deviation of a score, in at most three digits after the point."""
+    found = [score for row in group if (score := named(scores_of(row), name))]
+    return spread([score.value for score in found], f".{min(found[0].digits, 3)}f") if found else NONE
 
 
 def spread(values: Sequence[float | None], form: str) -> str:
-    """Their mean, and their deviation if there are several."""
+    """The mean of some numbers, and their deviation if there are several."""
     known = [value for value in values if value is not None]
     if not known:
         return NONE
@@ -130,5 +147,5 @@ def spread(values: Sequence[float | None], form: str) -> str:
 
 
 def size(bytes_: int) -> str:
-    """In MB or GB; nothing if unknown."""
+    """A size in MB or GB as text; empty if unknown."""
     return NONE if not bytes_ else f"{bytes_ / 1e9:.2f} GB" if bytes_ >= 1e9 else f"{bytes_ / 1e6:.3g} MB"

@@ -1,13 +1,21 @@
-"""Photographs become a Scene: one reader per format, procedural scenes, and one place that finds bounds and splits."""
+"""What lies in files becomes a dataset: photographs a Scene (one reader per format, procedural scenes, one place that
+finds bounds and splits), meshes Shapes, and folders of either a Collection."""
 
 from __future__ import annotations
 
+from functools import partial
+from importlib import import_module
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
+from ..collection import Collection
+from ..dataset import Dataset
 from ..errors import LumigraphError
+from ..readers import LISTED, NAMES
 from ..scene import Scene
-from . import blender, colmap, llff, picture, transforms
+from ..shapes import Shapes
+from . import meshes, single_image
 from .assemble import assemble as assemble
 from .capture import Capture as Capture
 from .capture import Shot as Shot
@@ -15,10 +23,63 @@ from .fewer import with_fewer_views
 from .multiscale import multiscale as multiscale
 from .pictures import list_images
 
-# Asked in this order. A transforms.json comes first because someone made it on purpose, often beside the model that it
-# came from; COLMAP's lenses know more than LLFF's. `reader` overrides the order.
-READERS: dict[str, ModuleType] = {"transforms": transforms, "blender": blender, "colmap": colmap, "llff": llff}
+READERS: dict[str, ModuleType] = {n: import_module(f".{n.replace('-', '_')}", __package__) for n in NAMES}
 PROCEDURAL = "procedural:"
+KINDS: dict[str, type[Any]] = {kind.kind: kind for kind in (Scene, Shapes, Collection)}
+
+
+def open_dataset(source: str | Path, wanted: type[Any] | None = None, **options: Any) -> Dataset:
+    """What can be learnt from a source, whatever kind it is: the one door.
+
+    wanted:  the kind to open it as, where it can be several: Scene, Shapes or Collection; see `kind_of`
+    options: what `open_scene` is told of photographs, of those in a collection too
+    Raises LumigraphError for anything that keeps the source from becoming a dataset.
+    """
+    kind, path = kind_of(source, wanted), Path(source).expanduser()
+    if kind is Collection:
+        return Collection.of(
+            {name: partial(open_dataset, place, **options) for name, place in members_of(path).items()}, str(source)
+        )
+    if kind is Shapes:
+        told = [name for name, value in options.items() if value not in (None, 1)]
+        if told:
+            raise LumigraphError(f"{source} holds shapes, and --{told[0]} is about photographs; leave it out")
+        return meshes.read_shapes(path)
+    return open_scene(source, **options)
+
+
+def kind_of(source: str | Path, wanted: type[Any] | None = None) -> type[Any]:
+    """What `open_dataset` makes of a source, without opening it.
+
+    A mesh, and a folder of meshes, are Shapes. A folder of several scenes or shapes is a Collection where it is no
+    scene itself, or where one is wanted. Everything else is left to the readers of photographs. Raises LumigraphError
+    for a path that does not exist.
+    """
+    path = Path(source).expanduser()
+    if str(source).startswith(PROCEDURAL):
+        return Scene
+    if not path.exists():
+        raise LumigraphError(f"{path} does not exist; check the path")
+    if wanted is Collection and members_of(path):
+        return Collection
+    if path.is_dir() and any(reader.recognises(path) for reader in READERS.values()):
+        return Scene
+    if meshes.recognises(path) or (wanted is Shapes and any(map(meshes.is_mesh, path.rglob("*")))):
+        return Shapes
+    return Collection if len(members_of(path)) > 1 else Scene
+
+
+def members_of(folder: Path) -> dict[str, Path]:
+    """The folders with poses, the folders of meshes and the meshes that lie in a folder, by name."""
+    if not folder.is_dir():
+        return {}
+    readers = [reader.recognises for reader in READERS.values()]
+    found = sorted(
+        path
+        for path in folder.iterdir()
+        if meshes.recognises(path) or (path.is_dir() and any(recognises(path) for recognises in readers))
+    )
+    return {path.stem if path.is_file() else path.name: path for path in found}
 
 
 def open_scene(
@@ -34,7 +95,7 @@ def open_scene(
 
     source:    a folder, an image file, or "procedural:<name>"
     downscale: how many times to reduce what the lenses were calibrated for; None reduces to at most about 1000 pixels
-    reader:    transforms, blender, colmap or llff; None looks into the folder
+    reader:    a name of `readers.NAMES`; None looks into the folder
     memory:    bytes of images to keep in memory, before they go to a file; None means a share of the machine's
     cache:     where that file goes; None means the user's cache folder
     views:     learn from so many photographs, spread evenly over the cameras; None means all
@@ -45,8 +106,8 @@ def open_scene(
         from . import procedural
 
         capture = procedural.read(str(source).removeprefix(PROCEDURAL))
-    elif picture.recognises(path := Path(source).expanduser()):
-        capture, downscale = picture.read(path, downscale), 1  # it is reduced by now
+    elif single_image.recognises(path := Path(source).expanduser()):
+        capture, downscale = single_image.read(path, downscale), 1  # it is reduced by now
     else:
         capture = choose_reader(path, reader).read(path)
     scene = assemble(capture, downscale, memory, cache)
@@ -67,7 +128,7 @@ def choose_reader(folder: Path, name: str | None = None) -> ModuleType:
     if not any(folder.iterdir()):
         raise LumigraphError(f"{folder} is empty; name a folder that holds photographs and their poses")
     if name is not None and name not in READERS:
-        raise LumigraphError(f"there is no reader called {name}; there are {', '.join(READERS)}")
+        raise LumigraphError(f"there is no reader called {name}; there are {LISTED}")
     asked = READERS if name is None else {name: READERS[name]}
     for reader in asked.values():
         if reader.recognises(folder):

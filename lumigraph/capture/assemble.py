@@ -2,25 +2,22 @@
 
 from __future__ import annotations
 
-import time
 import warnings
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import torch
 from jaxtyping import Float, Int
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from torch import Tensor
 
 from ..camera import Camera
 from ..errors import LumigraphError, LumigraphWarning
-from ..images import ImageStore, Picture
+from ..images import ImageSource, ImageStore
 from ..lens import Equirectangular, Lens, Pinhole
+from ..progress import counting
 from ..scene import Forward, Frame, Scene
+from .beside import make_about, make_layers
 from .capture import Capture, Shot
 from .forward import find_forward
 from .normalise import Place, find_place
@@ -28,7 +25,6 @@ from .pictures import Chosen, check_downscale, choose
 
 HOLD_OUT = 8  # every 8th photograph by name, starting with the first, where nothing is published
 RIGID = 0.01  # how far a pose's axes may be from unit length and right angles
-PATIENCE = 1.0  # seconds before a progress bar appears
 NAMED = 20  # missing files at most in a warning; further ones are counted
 
 
@@ -56,7 +52,7 @@ def assemble(
     for warning in told:
         warnings.warn(warning, LumigraphWarning, stacklevel=3)
     lenses = [fitted_lens(shot, c) for shot, c in zip(shots, chosen, strict=True)]
-    with progress(f"Reading {Path(capture.source).name}", len(shots)) as done:
+    with counting(f"Reading {Path(capture.source).name}", len(shots)) as done:
         images = ImageStore.load(masked_by_lens([c.picture for c in chosen], lenses), memory, cache, done)
     for shot, pixels in zip(shots, images.trusted_pixels.tolist(), strict=True):
         if not pixels:
@@ -74,17 +70,22 @@ def assemble(
     if place.reach > 1:
         train = splits["train"]
         forward = find_forward(capture, [shots[i] for i in train.tolist()], cameras[train], matrix, place.near)
+    layers, lost = make_layers(shots, chosen, images, matrix)
+    for warning in lost:
+        warnings.warn(warning, LumigraphWarning, stacklevel=3)
     points = None if capture.points is None else torch.from_numpy(capture.points @ matrix[:3, :3].T + matrix[:3, 3])
     return Scene(
         cameras,
         images,
-        make_frame(place, matrix, images, forward),
+        make_frame(place, matrix, images, forward, cameras.time),
         splits,
         [shot.name for shot in shots],
         capture.source,
         None if points is None else points.float(),
         None if capture.point_colours is None else torch.from_numpy(np.ascontiguousarray(capture.point_colours)),
-        told,
+        told + lost,
+        layers,
+        make_about(shots),
     )
 
 
@@ -133,8 +134,15 @@ def make_cameras(
     return Camera(torch.from_numpy(poses).float(), Lens.cat(lenses), sizes, time, torch.arange(len(shots)))
 
 
-def make_frame(place: Place, scene_from_source: np.ndarray, images: ImageStore, forward: Forward | None) -> Frame:
+def make_frame(
+    place: Place,
+    scene_from_source: np.ndarray,
+    images: ImageStore,
+    forward: Forward | None,
+    time: Float[Tensor, " camera"] | None,
+) -> Frame:
     back = np.linalg.inv(scene_from_source)
+    first, last = (None, None) if time is None else (float(time.min()), float(time.max()))
     return Frame(
         bounds=place.bounds,
         reach=place.reach,
@@ -144,6 +152,7 @@ def make_frame(place: Place, scene_from_source: np.ndarray, images: ImageStore, 
         image_count=len(images),
         source_from_scene=tuple((a, b, c, d) for a, b, c, d in back.tolist()),
         forward=forward,
+        times=None if first is None or last is None or first == last else (first, last),
     )
 
 
@@ -169,7 +178,7 @@ def shifted(capture: Capture, by: Float[np.ndarray, " 3"]) -> Capture:
     return replace(capture, points=points, bounds=(tuple(low.tolist()), tuple(high.tolist())))
 
 
-def masked_by_lens(pictures: list[Picture], lenses: list[Lens]) -> list[Picture]:
+def masked_by_lens(pictures: list[ImageSource], lenses: list[Lens]) -> list[ImageSource]:
     """Pictures that also distrust what lies beyond their lens's reach, such as the black around a fisheye's circle."""
     known: dict[tuple[str, tuple[int, int]], np.ndarray | None] = {}
     masked = []
@@ -182,12 +191,12 @@ def masked_by_lens(pictures: list[Picture], lenses: list[Lens]) -> list[Picture]
     return masked
 
 
-def with_mask(picture: Picture, trusted: np.ndarray, why: str) -> Picture:
+def with_mask(picture: ImageSource, trusted: np.ndarray, why: str) -> ImageSource:
     def read() -> tuple[np.ndarray, np.ndarray | None]:
         image, mask = picture.read()
         return image, trusted if mask is None else mask & trusted
 
-    return Picture(picture.size, read, None if picture.identity is None else f"{picture.identity} {why}")
+    return ImageSource(picture.size, read, None if picture.identity is None else f"{picture.identity} {why}")
 
 
 def within_reach(lens: Lens, size: tuple[int, int]) -> np.ndarray | None:
@@ -235,23 +244,3 @@ def about_small(source: str, chosen: list[Chosen]) -> list[str]:
 
 def counted(number: int, noun: str) -> str:
     return f"{'no' if number == 0 else number} {noun}{'' if number == 1 else 's'}"
-
-
-@contextmanager
-def progress(label: str, total: int) -> Iterator[Callable[[int], None]]:
-    """A bar on the terminal, once the work has taken a second."""
-    console = Console(stderr=True)
-    columns = (TextColumn(label), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    bar = Progress(*columns, console=console, transient=True)
-    task, begin = bar.add_task(label, total=total), time.monotonic()
-
-    def done(count: int) -> None:
-        if console.is_terminal and not bar.live.is_started and time.monotonic() - begin > PATIENCE:
-            bar.start()
-        bar.update(task, completed=count)
-
-    try:
-        yield done
-    finally:
-        if bar.live.is_started:  # otherwise stop() would print an empty line
-            bar.stop()

@@ -19,7 +19,7 @@ def recognises(folder: Path) -> bool:
 
 
 def read(folder: Path) -> Capture:
-    """Raises LumigraphError as `transforms.read` does."""
+    """The capture in a folder. Raises LumigraphError as `transforms.read` does."""
     held_out = next((s for s in ("test", "val") if (folder / f"transforms_{s}.json").is_file()), None)
     files = {"train": "train"} if held_out is None else {"train": "train", held_out: "test"}
     shots: list[Shot] = []

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float, UInt8
@@ -12,6 +13,30 @@ from jaxtyping import Float, UInt8
 from ..lens import Lens
 
 Pixels = np.ndarray  # uint8, (height, width, 3) or (height, width, 4); alpha last, colours not multiplied by it
+
+
+@dataclass(frozen=True)
+class Plane:
+    """Values of one layer beside one photograph, as a reader found them. See `images.Layer`.
+
+    values:   stored numbers, (height, width) or (height, width, channels), a function that makes them, or a file; in
+              any size of the photograph's shape
+    encoding: what they mean
+    scale:    what a stored 1 is worth, in the source's units for lengths
+    unknown, empty, names: as in `Layer`
+    dtype, channels: of what a function makes
+    identity: says all that a function depends on
+    """
+
+    values: Path | np.ndarray | Callable[[], np.ndarray]
+    encoding: str
+    scale: float = 1.0
+    unknown: tuple[float, ...] = ()
+    empty: tuple[float, ...] = ()
+    names: tuple[str, ...] = ()
+    dtype: np.dtype | None = None
+    channels: int = 1
+    identity: str | None = None
 
 
 @dataclass(frozen=True)
@@ -29,6 +54,8 @@ class Shot:
            is held out
     time:  moment of exposure
     depths: (near, far) of what this camera saw, in the source's units
+    planes: what else is known of each pixel, by the layer's name
+    about: what else is known of the photograph, by name: numbers or arrays of them
     """
 
     name: str
@@ -40,11 +67,13 @@ class Shot:
     split: str | None = None
     time: float | None = None
     depths: tuple[float, float] | None = None
+    planes: dict[str, Plane] = field(default_factory=dict)
+    about: dict[str, Any] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
 class Capture:
-    """Everything a reader knows.
+    """Photographs with poses, and everything else that a reader found.
 
     source:   where it came from: a folder, or "procedural:<name>"
     shots:    at least two

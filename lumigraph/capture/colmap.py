@@ -13,7 +13,7 @@ from ..errors import LumigraphError
 from ..lens import Equirectangular, Fisheye, Lens, OpenCV, Pinhole
 from .capture import Capture, Shot
 from .pictures import reductions, versions
-from .points import Points, read_points3d
+from .points import SparsePoints, read_points3d
 
 PLACES = ("sparse/0", "sparse", "colmap/sparse/0", "colmap/sparse", "colmap", ".")
 LOOKED_FOR = "sparse/0 with cameras, images and points3D, .bin or .txt (COLMAP)"
@@ -52,7 +52,10 @@ def model_folder(folder: Path) -> Path | None:
 
 
 def read(folder: Path) -> Capture:
-    """Raises LumigraphError for a damaged model, a camera model our lenses cannot follow, and absent image folders."""
+    """The capture in a folder.
+
+    Raises LumigraphError for a damaged model, a camera model our lenses cannot follow, and absent image folders.
+    """
     place = model_folder(folder)
     assert place is not None
     model = read_model(place)
@@ -119,11 +122,11 @@ def positions(model: pycolmap.Reconstruction) -> dict[str, np.ndarray]:
     return {i.name: i.cam_from_world().inverse().translation for i in model.images.values() if i.has_pose}
 
 
-def read_points(place: Path, model: pycolmap.Reconstruction) -> Points:
+def read_points(place: Path, model: pycolmap.Reconstruction) -> SparsePoints:
     if (place / "images.bin").is_file():
         return read_points3d(place / "points3D.bin")  # much quicker than asking the model for each
     found = list(model.points3D.values())
-    return Points(
+    return SparsePoints(
         np.array([p.xyz for p in found], np.float64).reshape(-1, 3),
         np.array([p.color for p in found], np.uint8).reshape(-1, 3),
         np.array([p.track.length() for p in found], np.int64),

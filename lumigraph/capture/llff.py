@@ -25,7 +25,10 @@ def recognises(folder: Path) -> bool:
 
 
 def read(folder: Path) -> Capture:
-    """Raises LumigraphError where the array is no such table or its rows are not as many as there are images."""
+    """The capture in a folder.
+
+    Raises LumigraphError where the array is no such table or its rows are not as many as there are images.
+    """
     path = folder / "poses_bounds.npy"
     try:
         table = np.load(path, allow_pickle=False)

@@ -14,7 +14,7 @@ import torch
 
 from ..camera import Camera
 from ..errors import LumigraphError
-from ..images import ImageStore, Picture
+from ..images import ImageSource, ImageStore, LayerSource
 from ..metrics import WINDOW
 from ..scene import Scene
 
@@ -24,7 +24,7 @@ def multiscale(scene: Scene, scales: int, memory: int | None = None, cache: Path
 
     Copies are means over squares of pixels, colours weighted by alpha; rows and columns that fill no square are left
     out. They are called NAME@1/2, NAME@1/4 and so on, share their photograph's split and image index, and follow behind
-    all photographs as they are. Frame and points stay.
+    all photographs as they are. Frame and points stay. Layers follow, as `resized` has it.
 
     The paper weights each pixel's loss by its footprint. `Scene.sample_rays` draws photographs evenly, and their pixels
     evenly, so that a pixel of a copy reduced f times is drawn f^2 times as often: the same in expectation, with less
@@ -46,7 +46,7 @@ def multiscale(scene: Scene, scales: int, memory: int | None = None, cache: Path
     sizes = torch.cat([scene.cameras.size // f for f in factors]).tolist()
     copies = [(i, f) for f in factors for i in range(count)]
     pictures = [
-        Picture((width, height), partial(reduced, scene, i, f))
+        ImageSource((width, height), partial(reduced, scene, i, f))
         for (i, f), (width, height) in zip(copies, sizes, strict=True)
     ]
     images = ImageStore.load(pictures, memory, cache)
@@ -57,7 +57,12 @@ def multiscale(scene: Scene, scales: int, memory: int | None = None, cache: Path
             )
     splits = {split: torch.cat([index + k * count for k in range(scales)]) for split, index in scene.splits.items()}
     cameras = Camera.cat([smaller(scene.cameras, f) for f in factors])
-    return replace(scene, cameras=cameras, images=images, splits=splits, names=names)
+    layers = {
+        name: layer.like(images, [LayerSource(partial(layer.reduced, i, f)) for i, f in copies])
+        for name, layer in scene.layers.items()
+    }
+    about = {name: torch.cat([values] * scales) for name, values in scene.about.items()}
+    return replace(scene, cameras=cameras, images=images, splits=splits, names=names, layers=layers, about=about)
 
 
 def reduced(scene: Scene, index: int, factor: int) -> tuple[np.ndarray, np.ndarray | None]:

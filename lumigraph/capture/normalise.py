@@ -14,6 +14,7 @@ import torch
 from jaxtyping import Float
 
 from ..camera import Camera
+from ..choice import evenly
 from ..images import ImageStore
 from ..scene import Vector
 from .capture import Capture
@@ -91,7 +92,7 @@ def nearest_to_box(cameras: Camera, low: np.ndarray, high: np.ndarray) -> float:
 
 
 @dataclass(frozen=True)
-class Cloud:
+class WeightedPoints:
     """Sparse points in the turned frame, and how often each was seen."""
 
     points: Float[np.ndarray, "point 3"]
@@ -115,7 +116,7 @@ class Gaze:
     converging: bool
     half: float
     nearest: float
-    cloud: Cloud | None
+    cloud: WeightedPoints | None
 
 
 def find_gaze(capture: Capture, cameras: Camera, upright: np.ndarray) -> Gaze:
@@ -159,7 +160,7 @@ def open_place(capture: Capture, upright: np.ndarray, gaze: Gaze, background: Ve
     return Place(similarity(upright, centre, half), CUBE, reach, max(near / half, SMALLEST_NEAR), background)
 
 
-def settle(cloud: Cloud, centre: np.ndarray, half: float) -> tuple[np.ndarray, float]:
+def settle(cloud: WeightedPoints, centre: np.ndarray, half: float) -> tuple[np.ndarray, float]:
     """Move a box to the middle of the points inside it, and shrink it where they are fewer than it could hold."""
     points, weights = cloud.points, cloud.weights
     inside = np.abs(points - centre).max(-1) < half
@@ -172,7 +173,7 @@ def settle(cloud: Cloud, centre: np.ndarray, half: float) -> tuple[np.ndarray, f
     return centre, min(half, 1.1 * filled)
 
 
-def reliable_points(capture: Capture, upright: np.ndarray) -> Cloud | None:
+def reliable_points(capture: Capture, upright: np.ndarray) -> WeightedPoints | None:
     """The finite points that were seen at least twice, if there are enough to speak of."""
     if capture.points is None:
         return None
@@ -180,19 +181,19 @@ def reliable_points(capture: Capture, upright: np.ndarray) -> Cloud | None:
     keep = np.isfinite(capture.points).all(-1) & (sightings >= 2)
     if keep.sum() < 16:
         return None
-    return Cloud(capture.points[keep] @ upright[:3, :3].T, sightings[keep].astype(np.float64))
+    return WeightedPoints(capture.points[keep] @ upright[:3, :3].T, sightings[keep].astype(np.float64))
 
 
-def visible_depths(cameras: Camera, cloud: Cloud) -> Float[np.ndarray, "camera 2"] | None:
+def visible_depths(cameras: Camera, cloud: WeightedPoints) -> Float[np.ndarray, "camera 2"] | None:
     """Distance to the nearest (2nd percentile) and the middle of the points inside each picture.
 
     NaN for a picture that none are in, None if that is so for all.
     """
-    chosen = np.linspace(0, len(cloud.points) - 1, min(SAMPLED_POINTS, len(cloud.points))).astype(int)
+    chosen = evenly(range(len(cloud.points)), SAMPLED_POINTS)
     points, weights = cloud.points[chosen], cloud.weights[chosen]
     sampled = torch.from_numpy(points).float()
     depths = []
-    for i in np.linspace(0, len(cameras) - 1, min(SAMPLED_CAMERAS, len(cameras))).round().astype(int).tolist():
+    for i in evenly(range(len(cameras)), SAMPLED_CAMERAS):
         camera = cameras[i]
         pixels, valid = camera.project(sampled)
         inside = (valid & (pixels >= 0).all(-1) & (pixels < camera.size[0]).all(-1)).numpy()

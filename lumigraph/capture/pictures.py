@@ -6,17 +6,20 @@ import math
 import zlib
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 from PIL import Image, ImageOps
 
 from ..errors import LumigraphError
-from ..images import Picture
-from .capture import Shot
+from ..images import ImageSource, resized
+from .capture import Plane, Shot
+from .numbers import TIFF_SUFFIXES, Kind, as_bytes, colours, kind_of, read_numbers, tiff_tags, turned
 
 LONGEST_SIDE = 1100  # pixels that a photograph is reduced to, where the user asks for nothing
-SUFFIXES = (".png", ".jpg", ".jpeg", ".JPG", ".JPEG", ".PNG", ".webp", ".tif", ".tiff", ".bmp")
+SUFFIXES = (".png", ".jpg", ".jpeg", ".JPG", ".JPEG", ".PNG", ".webp", ".tif", ".tiff", ".bmp", ".exr")
+DEEP_SUFFIXES = (".png", ".tif", ".tiff", ".exr")  # of files that may hold more than eight bits
 EXIF_ORIENTATION = 0x0112
 EXIF_UPRIGHT = (None, 0, 1)
 EXIF_SIDEWAYS = (5, 6, 7, 8)
@@ -25,7 +28,7 @@ Size = tuple[int, int]
 
 
 def find_file(path: Path) -> Path:
-    """The file itself, or where it was named without a suffix, the image of that name. May not exist."""
+    """The file itself, or where it was named without a suffix, the image of that name. The file may not exist."""
     if path.is_file():
         return path
     return next((p for s in SUFFIXES if (p := path.with_name(path.name + s)).is_file()), path)
@@ -78,11 +81,15 @@ def stem(name: str) -> str:
 
 @dataclass(frozen=True)
 class Chosen:
-    """A photograph as it will be used: its pixels, the size its lens was calibrated for, and the size wanted."""
+    """A photograph as it will be used: its pixels, the size its lens was calibrated for, and the size wanted.
 
-    picture: Picture
+    plane: all its bits, where they are more than eight
+    """
+
+    picture: ImageSource
     calibrated: Size
     wanted: Size
+    plane: Plane | None = None
 
 
 def choose(shot: Shot, downscale: int | None) -> Chosen:
@@ -106,7 +113,7 @@ def choose(shot: Shot, downscale: int | None) -> Chosen:
         made = pixels if isinstance(pixels, np.ndarray) else pixels()
         return made if size == own else np.asarray(Image.fromarray(made).resize(size, Image.Resampling.BOX))
 
-    return Chosen(Picture(size, with_mask(make, shot.mask, size, False)), calibrated, wanted)
+    return Chosen(ImageSource(size, with_mask(make, shot.mask, size, False)), calibrated, wanted)
 
 
 def choose_file(shot: Shot, files: dict[int, Path], downscale: int | None) -> Chosen:
@@ -141,9 +148,10 @@ def choose_file(shot: Shot, files: dict[int, Path], downscale: int | None) -> Ch
     elif shot.mask is not None:
         identity += f" {zlib.crc32(shot.mask.tobytes())}"
     return Chosen(
-        Picture(size, with_mask(lambda: read_image(path, turn, size), shot.mask, size, turn), identity),
+        ImageSource(size, with_mask(lambda: read_image(path, turn, size), shot.mask, size, turn), identity),
         calibrated,
         wanted,
+        deep_plane(path, turn, identity),
     )
 
 
@@ -158,7 +166,7 @@ def reduced(size: Size, downscale: int | None) -> Size:
 
 
 def smaller(own: Size, wanted: Size) -> Size:
-    """Pictures are never enlarged, nor resampled for the one pixel by which somebody else rounded differently."""
+    """The size to read at: the wanted one, unless that is larger, or smaller only by another program's rounding."""
     return own if max(own) <= max(wanted) + 1 else wanted
 
 
@@ -175,29 +183,68 @@ def stat(path: Path) -> str:
 
 def measure(path: Path) -> tuple[Size, int | None]:
     """Width and height as stored, and how EXIF says to turn it."""
-    with readable(path), Image.open(path) as image:
-        return image.size, image.getexif().get(EXIF_ORIENTATION)
+    with readable(path):
+        if path.suffix.lower() == ".exr":
+            return kind_of(path).size, None
+        if path.suffix.lower() in TIFF_SUFFIXES:
+            return kind_of(path).size, tiff_tags(path).get(EXIF_ORIENTATION)
+        with Image.open(path) as image:
+            return image.size, image.getexif().get(EXIF_ORIENTATION)
 
 
 def read_image(path: Path, turn: bool, size: Size) -> np.ndarray:
     """Pixels as uint8 (height, width, 3 or 4), upright if asked, area-averaged down to a size."""
+    if (kind := deep(path)) is not None:
+        return as_bytes(resized(read_deep(path, turn), size, kind.encoding), kind.encoding)
     with readable(path), Image.open(path) as image:
         upright = ImageOps.exif_transpose(image) if turn else image
         return np.asarray(resize(eight_bits(upright), size))
 
 
+def deep(path: Path) -> Kind | None:
+    """What a photograph's header says, if it holds more than eight bits."""
+    if path.suffix.lower() not in DEEP_SUFFIXES:
+        return None
+    with readable(path):
+        kind = kind_of(path)
+    return kind if kind.deep else None
+
+
+def read_deep(path: Path, turn: bool) -> np.ndarray:
+    """All bits of a photograph, RGB or RGBA, upright if asked."""
+    with readable(path):
+        values = colours(read_numbers(path))
+        return turned(values, measure(path)[1]) if turn else values
+
+
+def deep_plane(path: Path, turn: bool, identity: str) -> Plane | None:
+    """All bits of a photograph as values of a layer; None where eight hold it."""
+    kind = deep(path)
+    if kind is None:
+        return None
+    whole = kind.dtype.kind == "f"
+    return Plane(
+        partial(read_deep, path, turn),
+        kind.encoding,
+        scale=1.0 if whole else 1 / np.iinfo(kind.dtype).max,
+        dtype=kind.dtype,
+        channels=max(kind.channels, 3),
+        identity=identity,
+    )
+
+
 def eight_bits(image: Image.Image) -> Image.Image:
-    """Any kind of image as RGB or RGBA."""
+    """An image of any mode, as RGB or RGBA of 8 bits."""
     if image.mode.startswith("I"):  # 16 bits of grey
         image = Image.fromarray((np.asarray(image).astype(np.uint32) // 257).clip(0, 255).astype(np.uint8))
     elif image.mode == "F":
-        raise ValueError("it holds floating-point numbers; convert it to 8 bits")
+        image = Image.fromarray(as_bytes(np.asarray(image)[..., None], "linear")[..., 0])
     see_through = image.mode in ("RGBA", "LA", "PA", "La", "RGBa") or "transparency" in image.info
     return image.convert("RGBA" if see_through else "RGB")
 
 
 def resize(image: Image.Image, size: Size) -> Image.Image:
-    """Averages areas; where there is alpha, each colour counts as much as it is opaque."""
+    """The image at another size, by averaging areas; with alpha, each colour counts as much as it is opaque."""
     return image if image.size == size else image.resize(size, Image.Resampling.BOX)
 
 

@@ -16,7 +16,7 @@ SAME_PLACE = 0.02  # two sets of camera positions are of the same capture if the
 
 
 @dataclass(frozen=True)
-class Points:
+class SparsePoints:
     """Positions, colours, and how many photographs saw each."""
 
     positions: Float[np.ndarray, "point 3"]
@@ -24,7 +24,7 @@ class Points:
     sightings: np.ndarray
 
 
-def read_ply(path: Path) -> Points:
+def read_ply(path: Path) -> SparsePoints:
     """Vertices with x, y, z and, where they have them, red, green, blue, and sightings (in how many photographs)."""
     try:
         vertex = plyfile.PlyData.read(path)["vertex"]
@@ -39,10 +39,10 @@ def read_ply(path: Path) -> Points:
         sightings = np.array(vertex["sightings"]) if "sightings" in names else np.full(len(positions), 2)
     except Exception as fault:
         raise LumigraphError(f"{path} cannot be read as a point cloud ({fault}); restore or remove it") from fault
-    return Points(positions, colours, sightings)
+    return SparsePoints(positions, colours, sightings)
 
 
-def read_points3d(path: Path) -> Points:
+def read_points3d(path: Path) -> SparsePoints:
     """COLMAP's points3D.bin by itself: per point an id, x y z, r g b, an error, and a track of (image, feature)."""
     data = path.read_bytes()
     try:
@@ -58,7 +58,9 @@ def read_points3d(path: Path) -> Points:
                 raise ValueError("it ends early")
     except (struct.error, ValueError) as fault:
         raise LumigraphError(f"{path} is truncated; restore or remove it") from fault
-    return Points(np.array(positions).reshape(-1, 3), np.array(colours, np.uint8).reshape(-1, 3), np.array(sightings))
+    return SparsePoints(
+        np.array(positions).reshape(-1, 3), np.array(colours, np.uint8).reshape(-1, 3), np.array(sightings)
+    )
 
 
 def similarity(source: Float[np.ndarray, "point 3"], target: Float[np.ndarray, "point 3"]) -> np.ndarray | None:

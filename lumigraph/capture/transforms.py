@@ -18,13 +18,22 @@ from ..errors import LumigraphError
 from ..files import read_json
 from ..lens import Equirectangular, Fisheye, Lens, OpenCV, Pinhole
 from . import colmap
-from .capture import Capture, Shot
+from .capture import Capture, Plane, Shot
 from .pictures import EXIF_SIDEWAYS, find_file, measure, reductions, versions
-from .points import Points, read_ply, similarity
+from .points import SparsePoints, read_ply, similarity
 
 LOOKED_FOR = "transforms.json (instant-ngp, nerfstudio)"
 OPENCV_FROM_OPENGL = np.array([1.0, -1.0, -1.0])  # signs of the camera's axes
 NGP_SCALE = 0.33  # instant-ngp's unit cube is 1 / 0.33 of the file's units wide
+
+# Of a layer, what a frame may call its file: nerfstudio's name or instant-ngp's, and what annotated captures say.
+PLANES = {
+    "depth": ("depth_file_path", "depth_path"),
+    "labels": ("labels_file_path", "semantics_path"),
+    "normals": ("normals_file_path",),
+}
+FACTS = ("exposure", "boxes", "body")  # of a photograph
+NOTHING = (1e10, 65504.0)  # depth that Blender writes where nothing is, in floats and in halves
 
 Json = dict[str, Any]
 
@@ -34,7 +43,10 @@ def recognises(folder: Path) -> bool:
 
 
 def read(folder: Path) -> Capture:
-    """Raises LumigraphError for malformed JSON, frames without a usable pose, and lenses nobody here knows."""
+    """The capture in a folder.
+
+    Raises LumigraphError for malformed JSON, frames without a usable pose, and unknown lenses.
+    """
     path = folder / "transforms.json"
     whole = read_frames_file(path)
     splits = published_splits(whole)
@@ -87,9 +99,38 @@ def read_shots(path: Path, whole: Json, split: str | None = None) -> tuple[list[
                 mask=folder / about["mask_path"] if isinstance(about.get("mask_path"), str) else None,
                 split=split,
                 time=number_or_none(about, "time", where),
+                planes=read_planes(path.parent, about, read_lens(about, size, where), where, missing),
+                about={name: about[name] for name in FACTS if name in frame},
             )
         )
     return shots, missing
+
+
+def read_planes(folder: Path, about: Json, lens: Lens, where: str, missing: list[str]) -> dict[str, Plane]:
+    """Depth, labels and normals whose files a frame names; what it names and is not there joins `missing`."""
+    found = {}
+    for name, keys in PLANES.items():
+        key = next((key for key in keys if isinstance(about.get(key), str)), None)
+        if key is None:
+            continue
+        file = find_file(folder / about[key])
+        if not file.is_file():
+            missing.append(about[key])
+        elif name == "depth":
+            found[name] = depth_plane(file, key, about, lens, where)
+        else:
+            found[name] = Plane(file, {"labels": "index", "normals": "direction"}[name])
+    return found
+
+
+def depth_plane(file: Path, key: str, about: Json, lens: Lens, where: str) -> Plane:
+    """Depth as nerfstudio stores it, thousandths of a unit unless the file says otherwise, or as instant-ngp does."""
+    stated = number_or_none(about, "integer_depth_scale" if key == "depth_path" else "depth_unit_scale_factor", where)
+    scale = stated if stated is not None else 1.0 if file.suffix.lower() == ".exr" else 1e-3
+    along_ray = isinstance(lens, Equirectangular) or bool(about.get("is_euclidean_depth"))
+    whole = file.suffix.lower() in (".png", ".tif", ".tiff")
+    unknown, empty = ((0.0, 65535.0), ()) if whole else ((0.0,), NOTHING)
+    return Plane(file, "distance" if along_ray else "z-depth", scale, unknown, empty)
 
 
 def find_versions(folder: Path, names: list[str]) -> list[dict[int, Path]]:
@@ -192,7 +233,7 @@ def published_splits(whole: Json) -> dict[str, str]:
     return {name: split for split, names in lists.items() for name in names or []}
 
 
-def find_points(folder: Path, whole: Json, shots: list[Shot], missing: list[str]) -> Points | None:
+def find_points(folder: Path, whole: Json, shots: list[Shot], missing: list[str]) -> SparsePoints | None:
     """The points a file names, else those of a COLMAP model of the same photographs, turned into this file's frame."""
     if isinstance(name := whole.get("ply_file_path"), str):
         if (folder / name).is_file():
@@ -209,4 +250,4 @@ def find_points(folder: Path, whole: Json, shots: list[Shot], missing: list[str]
     if matrix is None:
         return None
     points = colmap.read_points(place, model)
-    return Points(points.positions @ matrix[:3, :3].T + matrix[:3, 3], points.colours, points.sightings)
+    return SparsePoints(points.positions @ matrix[:3, :3].T + matrix[:3, 3], points.colours, points.sightings)

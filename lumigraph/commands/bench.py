@@ -7,15 +7,15 @@ from typing import Annotated
 
 from tyro.conf import OmitArgPrefixes, OmitSubcommandPrefixes, subcommand
 
-from .benches.kernels import Kernels
-from .benches.methods import Methods
-from .benches.views import Views
+from .benches.kernels import BenchKernels
+from .benches.methods import BenchMethods
+from .benches.views import BenchViews
 
 # One line for each thing that can be measured; the files are in benches/.
 What = (
-    Annotated[Kernels, subcommand("kernels")]
-    | Annotated[Methods, subcommand("methods")]
-    | Annotated[Views, subcommand("views")]
+    Annotated[BenchKernels, subcommand("kernels")]
+    | Annotated[BenchMethods, subcommand("methods")]
+    | Annotated[BenchViews, subcommand("views")]
 )
 
 

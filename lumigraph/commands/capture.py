@@ -18,7 +18,7 @@ INDENT = " " * 13
 
 
 @dataclass(frozen=True)
-class Capture:
+class CaptureCommand:
     """Find where photographs were taken from: a folder, a list of files, or a video.
 
     The result is a folder that this and other programs open: images, sparse/0 (COLMAP), transforms.json, and two
@@ -78,7 +78,7 @@ def scene_folder(what: tuple[Path, ...]) -> Path:
 def find_cameras(what: tuple[Path, ...], folder: Path, options: Any = None) -> dict[str, Any]:
     """reconstruct(), with bars; Ctrl-C says how to go on."""
     from ..capture.motion import reconstruct
-    from ..display import track
+    from ..progress import track
 
     try:
         return reconstruct([path.expanduser() for path in what], folder, options, track)

@@ -3,18 +3,22 @@
 from __future__ import annotations
 
 import itertools
-import re
 import sys
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 from rich.console import Console
 
 from ..errors import LumigraphError
+from ..files import scene_name as scene_name
+from ..readers import LISTED, NAMES
 
-Reader = Literal["transforms", "blender", "colmap", "llff"]
+if TYPE_CHECKING:
+    Reader = str
+else:
+    Reader = Literal[NAMES]
 
 
 def option(metavar: str, default: str | None = None) -> Any:
@@ -25,6 +29,14 @@ def option(metavar: str, default: str | None = None) -> Any:
 def needed(metavar: str) -> Any:
     """How an argument without a default looks in --help."""
     return tyro.conf.arg(metavar=metavar, help_behavior_hint="")
+
+
+ReaderOption = Annotated[
+    Reader | None,
+    tyro.conf.arg(
+        metavar="NAME", help_behavior_hint="(default: found by looking)", help=f"Layout of the folder: {LISTED}."
+    ),
+]
 
 
 def choose_device(name: str) -> Any:
@@ -40,15 +52,6 @@ def choose_device(name: str) -> Any:
         reason = str(error).partition("\n")[0].rstrip(".")
         raise LumigraphError(f"Device {name!r} is not usable here ({reason}); try --device cpu") from error
     return device
-
-
-def open_run(source: Path) -> Any:
-    """A Run, or a SplatFile, which offers the same to whoever only looks."""
-    from ..exchange import is_splat_file
-    from ..run import Run
-    from ..splat_file import SplatFile
-
-    return SplatFile(source) if is_splat_file(source) else Run(source)
 
 
 def budget_of(steps: int | None, seconds: float | None) -> dict[str, Any]:
@@ -83,13 +86,6 @@ def show(rows: Mapping[str, str]) -> None:
     console, width = Console(highlight=False, soft_wrap=True), max(map(len, rows))
     for name, value in rows.items():
         console.print(f"[dim]{name:<{width}}[/dim]  {value}")
-
-
-def scene_name(source: str) -> str:
-    """A short name for files: the last part of a path, without a file's suffix, or of "procedural:<name>"."""
-    path = Path(source).resolve()
-    last = source.partition(":")[2] if source.startswith("procedural:") else path.stem if path.is_file() else path.name
-    return re.sub(r"[^\w.-]+", "-", last) or "scene"
 
 
 def next_free(prefix: str) -> Path:

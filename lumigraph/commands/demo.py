@@ -33,13 +33,14 @@ class Demo:
 
     def run(self) -> int:
         from .. import methods
-        from ..capture import open_scene
+        from ..capture import open_dataset
+        from ..evaluate import evaluate_run
         from ..export.film import film
+        from ..metrics import scores_of
+        from ..paths import film_cameras
         from ..report import write_report
         from ..run import Run, build, check_new
         from ..train import fit
-        from .eval import evaluate_run
-        from .render import film_cameras
 
         budget = budget_of(None, self.seconds)
         check_film(self.frames, fps=30, size=None)
@@ -48,20 +49,21 @@ class Demo:
         check_new(output)
 
         say(f"Photographing {self.scene}")
-        scene = open_scene(self.scene)
-        method = build(kind, scene.frame, kind.preset(device), device, seed=0)
-        run = Run.create(output, method, scene, budget=budget)
-        outcome = fit(method, scene, run, **budget)
+        data = open_dataset(self.scene, kind.learns_from)
+        method = build(kind, data.frame, kind.preset(device), device, seed=0)
+        run = Run.create(output, method, data, budget=budget)
+        outcome = fit(method, data, run, **budget)
         if outcome.signal is not None:
             say(f"Stopped and saved after step {outcome.state.step}; go on with: lumigraph resume {run.folder}")
             return exit_code(outcome.signal)
-        result = evaluate_run(run, method, scene)
+        result = evaluate_run(run, method, data)
         orbit = run.folder / "renders" / "orbit.mp4"
-        film(method, film_cameras(run, "orbit", self.frames, size=None), orbit)
+        film(method, film_cameras(run.cameras(), run.frame, "orbit", self.frames), orbit)
         report = write_report(run)
+        headline, what = scores_of(result)[0], "views" if "views" in result["protocol"] else "shapes"
         show(
             {
-                "held-out PSNR": f"[bold]{result['psnr']:.2f} dB[/bold] over {result['protocol']['views']} views",
+                f"held-out {headline.name}": f"[bold]{headline}[/bold] over {result['protocol'][what]} {what}",
                 "film": str(orbit),
                 "report": str(report),
                 "run": str(run.folder),

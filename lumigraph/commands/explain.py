@@ -7,11 +7,11 @@ from typing import Annotated
 
 from tyro.conf import OmitArgPrefixes, OmitSubcommandPrefixes, subcommand
 
-from .explains.encodings import Encodings
-from .explains.ray import Ray
+from .explains.encodings import ExplainEncodings
+from .explains.ray import ExplainRay
 
 # One line for each thing that can be explained; the files are in explains/.
-What = Annotated[Encodings, subcommand("encodings")] | Annotated[Ray, subcommand("ray")]
+What = Annotated[ExplainEncodings, subcommand("encodings")] | Annotated[ExplainRay, subcommand("ray")]
 
 
 @dataclass(frozen=True)

@@ -7,21 +7,21 @@ from typing import Annotated
 
 from tyro.conf import OmitArgPrefixes, OmitSubcommandPrefixes, subcommand
 
-from .exports.mesh import Mesh
-from .exports.panorama import Panorama
-from .exports.points import Points
-from .exports.splats import Splats
-from .exports.stereo import Stereo
-from .exports.web import Web
+from .exports.mesh import ExportMesh
+from .exports.panorama import ExportPanorama
+from .exports.points import ExportPoints
+from .exports.splats import ExportSplats
+from .exports.stereo import ExportStereo
+from .exports.web import ExportWeb
 
 # One line for each thing that can be written; the files are in exports/.
 What = (
-    Annotated[Mesh, subcommand("mesh")]
-    | Annotated[Panorama, subcommand("panorama")]
-    | Annotated[Points, subcommand("points")]
-    | Annotated[Splats, subcommand("splats")]
-    | Annotated[Stereo, subcommand("stereo")]
-    | Annotated[Web, subcommand("web")]
+    Annotated[ExportMesh, subcommand("mesh")]
+    | Annotated[ExportPanorama, subcommand("panorama")]
+    | Annotated[ExportPoints, subcommand("points")]
+    | Annotated[ExportSplats, subcommand("splats")]
+    | Annotated[ExportStereo, subcommand("stereo")]
+    | Annotated[ExportWeb, subcommand("web")]
 )
 
 

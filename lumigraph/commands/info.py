@@ -1,34 +1,33 @@
-"""`lumigraph info`: what a run, a folder of photographs or a splat file is."""
+"""`lumigraph info`: what a run, a folder of photographs, a mesh, a splat file or a composition is."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 from rich.console import Console
 from tyro.conf import Positional
 
-from .common import Reader, needed, option
+from .common import ReaderOption, needed, option
 
 LONG = 4096  # letters; a tree cuts its lines where the console ends, and folders have long names
 
 
 @dataclass(frozen=True)
 class Info:
-    """Say what a run, a scene or a splat file holds."""
+    """Say what a run, a scene, meshes, a splat file or a composition hold."""
 
     what: Annotated[Positional[str], needed("RUN_OR_SCENE")]
-    """Folder of a run, folder of photographs, a picture, procedural:NAME, or a splat file."""
+    """Folder of a run, of photographs or of meshes, a picture, a mesh, procedural:NAME, a splat file, a composition."""
     downscale: Annotated[int | None, option("N", "none, or what suits the photographs")] = None
     """Shrink a scene's photographs by a whole number."""
-    reader: Annotated[Reader | None, option("NAME", "found by looking into the folder")] = None
-    """Layout of a scene's folder: transforms, blender, colmap or llff."""
+    reader: ReaderOption = None
 
     def run(self) -> int:
-        from ..capture import open_scene
-        from ..describe import cloud_tree, run_tree, scene_tree
+        from ..capture import open_dataset
         from ..exchange import is_splat_file, read_gaussians
+        from .info_tree import cloud_tree, composition_tree, dataset_tree, run_tree
 
         if (Path(self.what) / "config.json").exists():
             from ..run import Run
@@ -36,7 +35,12 @@ class Info:
             tree = run_tree(Run(self.what))
         elif is_splat_file(self.what):
             tree = cloud_tree(self.what, read_gaussians(self.what))
+        elif self.what.lower().endswith(".json") and Path(self.what).is_file():
+            from ..run import open_any
+
+            tree = composition_tree(open_any(self.what))
         else:
-            tree = scene_tree(open_scene(self.what, downscale=self.downscale, reader=self.reader))
+            told: dict[str, Any] = {"downscale": self.downscale, "reader": self.reader}
+            tree = dataset_tree(open_dataset(self.what, **told))
         Console(highlight=False, width=LONG, soft_wrap=True).print(tree)
         return 0

@@ -23,7 +23,7 @@ class Resume:
     steps: Annotated[int | None, option("N", "as begun")] = None
     """New total of steps, those already done included."""
     scene: Annotated[str | None, option("SCENE", "where they were")] = None
-    """Where the photographs are now, if they have moved."""
+    """Where what it learns from is now, if it has moved."""
     device: Annotated[str, option("NAME", "the one it began on")] = "same"
     """auto, cpu, cuda, cuda:1."""
     pause_at: Annotated[int | None, option("STEP", "never")] = None
@@ -42,19 +42,19 @@ class Resume:
         from .view import keep_showing, watching
 
         run = Run(self.run_folder)
-        budget = budget_of(self.steps, self.seconds) or run.config["budget"]
+        budget = budget_of(self.steps, self.seconds) or run.settings.budget
         state = run.state if run.has_state else None
         if state and Budget(budget.get("steps"), budget.get("seconds")).progress(state.step, state.seconds) >= 1:
             raise LumigraphError(
                 f"{run.folder} has spent its budget at step {state.step}, {state.seconds:.0f} s; "
                 f"give a larger total by --steps or --seconds"
             )
-        device = choose_device(run.config["device"] if self.device == "same" else self.device)
-        method, scene = run.new_method(device), run.scene(self.scene)
-        if budget != run.config["budget"]:
+        device = choose_device(run.settings.device if self.device == "same" else self.device)
+        method, data = run.new_method(device), run.dataset(self.scene)
+        if budget != run.settings.budget:
             run.set_budget(**budget)
-        with watching(self.view, method, scene, run, self.host, self.port) as watch:
-            outcome = fit(method, scene, run, **budget, seed=run.config["seed"], pause_at=self.pause_at, watch=watch)
+        with watching(self.view, method, data, run, self.host, self.port) as watch:
+            outcome = fit(method, data, run, **budget, seed=run.settings.seed, pause_at=self.pause_at, watch=watch)
             tell_outcome(run, outcome)
             keep_showing(watch, outcome.signal)
         return exit_code(outcome.signal)

@@ -1,4 +1,4 @@
-"""`lumigraph train`: photographs become a trained method."""
+"""`lumigraph train`: photographs, or whatever else a method learns from, become a trained method."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from tyro.conf import Fixed, OmitArgPrefixes, Positional, Suppress
 from .. import methods
 from .capture import posed
 from .common import (
-    Reader,
+    ReaderOption,
     budget_of,
     choose_device,
     exit_code,
@@ -30,7 +30,8 @@ DEFAULT_SECONDS = 60.0
 class Train:
     """Learn a scene from its photographs.
 
-    The scene is a folder of photographs, a video, a single picture, or procedural:NAME. Where photographs have no
+    The scene is a folder of photographs, a video, a single picture, or procedural:NAME. Methods that learn from shapes
+    take a mesh or a folder of meshes, those that learn from a collection a folder of scenes. Where photographs have no
     poses, `lumigraph capture` finds them first. `lumigraph train METHOD --help` adds the method's own options,
     `lumigraph methods` lists the methods. Ctrl-C saves; `lumigraph resume` goes on.
     """
@@ -47,8 +48,7 @@ class Train:
     """Train for so many steps instead."""
     downscale: Annotated[int | None, option("N", "none, or what suits the photographs")] = None
     """Shrink photographs by a whole number."""
-    reader: Annotated[Reader | None, option("NAME", "found by looking into the folder")] = None
-    """Layout of the folder: transforms, blender, colmap or llff."""
+    reader: ReaderOption = None
     views: Annotated[int | None, option("N", "all")] = None
     """Learn from so many photographs only, spread evenly over the cameras."""
     scales: Annotated[int, option("N")] = 1
@@ -69,7 +69,8 @@ class Train:
     """Port that --view listens at."""
 
     def run(self) -> int:
-        from ..capture import open_scene
+        from ..capture import kind_of, open_dataset
+        from ..dataset import check_kind
         from ..run import Run, build, check_new
         from ..train import fit
         from .view import keep_showing, watching
@@ -78,6 +79,8 @@ class Train:
         kind, device = methods.find(self.method), choose_device(self.device)
         if self.output is not None:
             check_new(self.output)
+        found = kind_of(self.scene, kind.learns_from)
+        check_kind(methods.check(self.method), kind.learns_from, found, self.scene, methods.learning_from(found))
         source = posed(self.scene)
         output = self.output or next_free(f"runs/{scene_name(source)}-{methods.check(self.method)}")
         check_new(output)
@@ -87,13 +90,13 @@ class Train:
             "views": self.views,
             "scales": self.scales,
         }
-        scene = open_scene(source, **options)
+        data = open_dataset(source, kind.learns_from, **options)
         config = self.method_config(kind)
         seed = getattr(config, "seed", self.seed)
-        method = build(kind, scene.frame, config, device, seed)
-        run = Run.create(output, method, scene, seed=seed, options=options, budget=budget)
-        with watching(self.view, method, scene, run, self.host, self.port) as watch:
-            outcome = fit(method, scene, run, **budget, seed=seed, pause_at=self.pause_at, watch=watch)
+        method = build(kind, data.frame, config, device, seed)
+        run = Run.create(output, method, data, seed=seed, options=options, budget=budget)
+        with watching(self.view, method, data, run, self.host, self.port) as watch:
+            outcome = fit(method, data, run, **budget, seed=seed, pause_at=self.pause_at, watch=watch)
             tell_outcome(run, outcome)
             keep_showing(watch, outcome.signal)
         return exit_code(outcome.signal)

@@ -10,34 +10,33 @@ from typing import Annotated, Any
 
 from tyro.conf import Positional
 
-from .common import choose_device, needed, open_run, option, show
+from .common import needed, option, show
+from .controls import Set, open_method
 
 
 @dataclass(frozen=True)
-class View:
-    """Look at a run or a splat file in the browser: fly, orbit, crop, and set paths for films.
+class ViewCommand:
+    """Look at a run, a splat file or a composition in the browser: fly, orbit, crop, and set paths for films.
 
     Gaussians are drawn by the browser, everything else here. Ctrl-C ends it. `lumigraph train --view` shows a scene
     while it is learnt.
     """
 
     source: Annotated[Positional[Path], needed("RUN_OR_FILE")]
-    """Folder of the run, or a splat file: .ply, .compressed.ply, .spz, .splat."""
+    """Folder of the run, a splat file (.ply, .compressed.ply, .spz, .splat), or a composition (.json)."""
     host: Annotated[str, option("ADDRESS", "127.0.0.1, this machine alone")] = "127.0.0.1"
     """Where to listen; 0.0.0.0 lets other machines look too."""
     port: Annotated[int | None, option("N", "8080, or the next that is free")] = None
     """Port to listen at."""
+    told: Set = ()
     device: Annotated[str, option("NAME")] = "auto"
     """auto, cpu, cuda, cuda:1."""
 
     def run(self) -> int:
-        from ..splat_file import SplatFile
         from ..viewer import Viewer, choose_address
 
-        device = choose_device(self.device)
-        run = open_run(self.source)
-        method = run.method(device)
-        subject = subject_of_file(run) if isinstance(run, SplatFile) else subject_of_run(run)
+        opened, method, cameras = open_method(self.source, self.device, self.told)
+        subject = subject_of(opened, cameras)
         address = choose_address(self.host, self.port)
         with contextlib.suppress(KeyboardInterrupt), Viewer(method, subject, address) as viewer:
             tell(viewer)
@@ -45,25 +44,23 @@ class View:
         return 0
 
 
-def subject_of_run(run: Any) -> Any:
-    """A run, as the viewer wants it."""
+def subject_of(opened: Any, cameras: Any = None) -> Any:
+    """Something Opened, as the viewer wants it. cameras: by split, where the method sees them otherwise."""
     from ..viewer import Subject
 
-    command = f"lumigraph render {run.folder}"
-    folder = run.folder
-    return Subject(folder.name, run.frame, run.cameras(), folder / "paths", command, run.scene, run.metrics())
-
-
-def subject_of_file(file: Any) -> Any:
-    """A splat file, as the viewer wants it. Paths go where films of it go."""
-    from ..viewer import Subject
-
-    command = f"lumigraph render {file.path}"
-    return Subject(file.path.name, file.frame, file.cameras(), file.renders / "paths", command)
+    return Subject(
+        opened.path.name,
+        opened.frame,
+        cameras or opened.cameras(),
+        opened.paths,
+        f"lumigraph render {opened.path}",
+        opened.open_scene,
+        opened.metrics(),
+    )
 
 
 @contextlib.contextmanager
-def watching(wanted: bool, method: Any, scene: Any, run: Any, host: str, port: int | None) -> Iterator[Any]:
+def watching(wanted: bool, method: Any, data: Any, run: Any, host: str, port: int | None) -> Iterator[Any]:
     """A Viewer for `fit(..., watch=...)` while it trains a run; None if nobody wants to look."""
     if not wanted:
         yield None
@@ -72,7 +69,9 @@ def watching(wanted: bool, method: Any, scene: Any, run: Any, host: str, port: i
 
     from ..viewer import Viewer, choose_address
 
-    subject = dataclasses.replace(subject_of_run(run), open_scene=lambda: scene)
+    subject = subject_of(run)
+    if run.photographed:
+        subject = dataclasses.replace(subject, open_scene=lambda: data)
     with Viewer(method, subject, choose_address(host, port), training=True) as viewer:
         tell(viewer)
         yield viewer

@@ -1,1 +1,1 @@
-"""What two or more methods share: occupancy, perceptrons, optimizers, corrections of exposure and pose."""
+"""What methods are made of, by theme: fields, sampling along rays, clouds of Gaussians, training."""

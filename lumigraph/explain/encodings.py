@@ -10,10 +10,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from ..display import track
-from ..evaluate import on_background
 from ..methods.fourier_features import Config, Encoding, FourierFeatures
 from ..metrics import psnr
+from ..progress import track
 from ..run import build
 from ..scene import Scene
 from ..train import fit
@@ -86,7 +85,7 @@ class Comparison:
             "resolution": f"{width}x{height}",
             "held_out": "half of the pixels, at random",
             "steps": self.steps,
-            "pixels_per_step": self.config.pixels,
+            "pixels_per_step": self.config.pixels_per_step,
             "seed": self.config.seed,
             "gain_over_none": self.gain,
             "peak_inside": self.peak_inside,
@@ -137,7 +136,7 @@ def learn(scene: Scene, config: Config, steps: int, device: torch.device) -> Fit
 
 def truth(scene: Scene) -> Float[Tensor, "height width 3"]:
     """The picture itself, which both of the scene's shots show."""
-    return on_background(scene.view(0)[1], scene.frame.background)
+    return scene.photograph(0).before(scene.frame.background)
 
 
 def kernel_at_start(method: FourierFeatures) -> Float[Tensor, "point point"]:

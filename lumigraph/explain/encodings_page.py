@@ -8,8 +8,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from ..charts import Series, line_chart, standalone
 from ..figures import Row, contact_sheet, save_picture
+from ..figures.charts import Series, line_chart, standalone
 from ..files import write_bytes, write_json
 from ..report import heading, jpeg, page, section
 from .encodings import SCALED, Comparison, Fit

@@ -10,8 +10,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ..camera import Camera
+from ..capabilities import HasLooks, needs
 from ..errors import LumigraphError
-from ..method import Method, RayMethod
+from ..method import Method
 from ..rays import Look
 from ..volume import composite, weights_of
 
@@ -124,11 +125,6 @@ def along_ray(method: Method, camera: Camera, pixel: tuple[int, int]) -> Sight:
     Raises LumigraphError if the method does not march along rays, the pixel lies outside the picture, or there are no
     samples on its ray.
     """
-    if not isinstance(method, RayMethod):
-        raise LumigraphError(
-            f"{type(method).__name__} takes no samples along rays, so there is nothing to draw of one; "
-            f"choose a run of a method that does, such as instant-ngp"
-        )
     width, height = camera.size[0].tolist()
     x, y = pixel
     if not (0 <= x < width and 0 <= y < height):
@@ -136,7 +132,7 @@ def along_ray(method: Method, camera: Camera, pixel: tuple[int, int]) -> Sight:
             f"Pixel ({x}, {y}) lies outside of the picture; give --pixel from 0 0 to {width - 1} {height - 1}"
         )
     rays = camera.rays(torch.tensor([[x + 0.5, y + 0.5]])).to(method.device)
-    looks = method.looks(rays)
+    looks = needs(method, HasLooks).looks(rays)
     last = looks[-1]
     if not len(last.samples):
         raise LumigraphError(

@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from ..components.dense import Dense
+from ..components.fields.dense import Dense
 
 
 @torch.no_grad()

@@ -1,1 +1,1 @@
-"""What leaves the house: films. Exporters know how a Method renders, and no particular method."""
+"""Exports: films, meshes, points, splats, panoramas, pages. They know Method.render and no particular method."""

@@ -9,7 +9,7 @@ from numba import njit, prange
 
 @njit(inline="always")
 def depth_at(depth, x, y, jump):
-    """Between pixels' centres, bilinear; at an edge, where they differ by `jump`, the nearest of the four."""
+    """Depth between pixels' centres, bilinear; at an edge, where they differ by `jump`, the nearest of the four."""
     height, width = depth.shape
     u, v = min(max(x - 0.5, 0.0), width - 1.0), min(max(y - 0.5, 0.0), height - 1.0)
     left, top = int(u), int(v)

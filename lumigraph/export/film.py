@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import time
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,30 +12,37 @@ import torch
 from PIL import Image
 
 from ..camera import Camera
-from ..display import track
+from ..choice import evenly
+from ..controls import Value
 from ..figures import Range, colour_depth, depth_range, to_bytes
 from ..files import replacing, write_json
 from ..method import Method
+from ..progress import track
 from .video import open_video
 
 PROBES, PROBE_SIZE = 6, 64  # frames, and their pixels, that tell the depths to expect
 
 
-def film(method: Method, cameras: Camera, path: Path, fps: float = 30.0) -> dict[str, Any]:
+def film(method: Method | Sequence[Method], cameras: Camera, path: Path, fps: float = 30.0) -> dict[str, Any]:
     """Render every camera of one size. Returns what is written to the JSON file.
 
+    method: one for all frames, or one for each, such as what `animated` makes
     For path/orbit.mp4 also writes path/orbit-depth.mp4, the pictures path/orbit/0000.png and 0000-depth.png, and
-    path/orbit.json with the cameras (poses in the scene's frame; source_from_scene leads back to the capture's).
+    path/orbit.json with the cameras (poses in the scene's frame; source_from_scene leads back to the capture's) and
+    what the method was told.
     """
-    method.eval()
-    within = film_depth_range(method, cameras)
+    shown = [method] * len(cameras) if isinstance(method, Method) else list(method)
+    assert len(shown) == len(cameras), f"{len(shown)} methods for {len(cameras)} frames"
+    for one in shown:
+        one.eval()
+    within = film_depth_range(shown, cameras)
     with contextlib.ExitStack() as stack:
         targets = [stack.enter_context(open_video(x, fps)) for x in (path, path.with_stem(f"{path.stem}-depth"))]
         folder = stack.enter_context(replacing(path.with_suffix("")))
         folder.mkdir()
         begin = time.perf_counter()
         for i in track(range(len(cameras)), f"Filming {path.name}", len(cameras)):
-            seen = method.render(cameras[i]).cpu()
+            seen = shown[i].render(cameras[i]).cpu()
             pictures = to_bytes(seen.rgb), to_bytes(colour_depth(seen.depth, seen.opacity, within))
             for target, ending, picture in zip(targets, ("", "-depth"), pictures, strict=True):
                 target.add(picture)
@@ -46,17 +54,37 @@ def film(method: Method, cameras: Camera, path: Path, fps: float = 30.0) -> dict
         "size": cameras.size[0].tolist(),
         "seconds_per_frame": seconds,
         "depth_range": list(within),
-        "source_from_scene": method.frame.source_from_scene,
+        "source_from_scene": shown[0].frame.source_from_scene,
         "lens": cameras.lens.to_json(),
         "poses": cameras.pose.tolist(),
+        **({} if cameras.time is None else {"times": cameras.time.tolist()}),
+        **({"controls": told} if (told := what_was_told(shown)) else {}),
     }
     write_json(path.with_suffix(".json"), about)
     return about
 
 
-def film_depth_range(method: Method, cameras: Camera) -> Range:
+def animated(method: Method, stations: Mapping[str, Sequence[Value]], frames: int) -> list[Method]:
+    """The method of each frame of a film, with controls that go from one station to the next (`Control.over`).
+
+    Raises LumigraphError for controls that the method does not have, and for values that they cannot take.
+    """
+    method.given(**{name: values[0] for name, values in stations.items()})
+    controls = {control.name: control for control in method.controls}
+    values = {name: controls[name].over(given, frames) for name, given in stations.items()}
+    return [method.given(**{name: value[i] for name, value in values.items()}) for i in range(frames)]
+
+
+def what_was_told(methods: Sequence[Method]) -> dict[str, Value | list[Value]]:
+    """The values of controls that were told: one for all frames, or one for each where they differ."""
+    told = {name: [method.control(name) for method in methods] for name in methods[0].told}
+    return {name: values[0] if len(set(values)) == 1 else values for name, values in told.items()}
+
+
+def film_depth_range(methods: Sequence[Method], cameras: Camera) -> Range:
     """One range for all frames, found from a few small ones, so that colours do not flicker."""
-    chosen = cameras[torch.linspace(0, len(cameras) - 1, min(PROBES, len(cameras))).round().long()]
+    probes = evenly(range(len(cameras)), PROBES)
+    chosen = cameras[torch.tensor(probes)]
     small = chosen.resized(min(1.0, PROBE_SIZE / int(chosen.size.max())))
-    seen = [method.render(small[i]).cpu() for i in range(len(small))]
+    seen = [methods[frame].render(small[i]).cpu() for i, frame in enumerate(probes)]
     return depth_range(torch.cat([x.depth.flatten() for x in seen]), torch.cat([x.opacity.flatten() for x in seen]))

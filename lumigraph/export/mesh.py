@@ -4,20 +4,21 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Float, Int
 from scipy import ndimage
 from torch import Tensor
 from torch.nn.functional import grid_sample
 
 from ..camera import Camera
-from ..display import track
+from ..capabilities import HasDensity, can, needs
 from ..errors import LumigraphError
+from ..mesh import Mesh
 from ..method import Method
+from ..progress import track
 from ..scene import Frame
 from .fusion import Fusion
 from .polygons import BLOCK, Grid, zero_level
@@ -35,35 +36,6 @@ ONSET = 0.2  # share of a ray's light that is spent where the surface is said to
 AT_ONCE = 1 << 18  # points
 
 Way = Literal["auto", "density", "depth"]
-
-
-@dataclass(frozen=True)
-class Mesh:
-    """Triangles with a colour at each vertex, anticlockwise seen from outside.
-
-    vertices: in the frame that whoever made it says
-    colours:  sRGB-encoded
-    """
-
-    vertices: Float[np.ndarray, "vertex 3"]
-    faces: Int[np.ndarray, "face 3"]
-    colours: UInt8[np.ndarray, "vertex 3"]
-
-    def transformed(self, similarity: Float[np.ndarray, "4 4"]) -> Mesh:
-        """The same mesh in another frame, x' = M x. A mirroring turns the triangles, so that outside stays outside."""
-        matrix = np.asarray(similarity, np.float64)
-        vertices = self.vertices @ matrix[:3, :3].T + matrix[:3, 3]
-        faces = self.faces if np.linalg.det(matrix[:3, :3]) > 0 else self.faces[:, ::-1].copy()
-        return replace(self, vertices=vertices, faces=faces)
-
-    def in_source(self, frame: Frame) -> Mesh:
-        """From the scene's frame to that of the capture."""
-        return self.transformed(np.array(frame.source_from_scene))
-
-
-def scale_to_source(frame: Frame) -> float:
-    """Units of the capture's frame to one of the scene's."""
-    return float(abs(np.linalg.det(np.array(frame.source_from_scene)[:3, :3])) ** (1 / 3))
 
 
 @torch.no_grad()
@@ -104,7 +76,7 @@ def extract_mesh(
     sightings = look_around(method, cameras, size, views)
     step = max(2, math.ceil(max(grid.shape) / PROBES))
     seen = from_depth(sightings, grid.cell, closed)
-    if way == "depth" or (way == "auto" and type(method).density is Method.density):
+    if way == "depth" or (way == "auto" and not can(method, HasDensity)):
         value = seen
     else:
         level = surface_level(method, sightings, limits) if level is None else level
@@ -154,7 +126,7 @@ Value = Callable[[Float[Tensor, "point 3"]], Float[Tensor, " point"]]
 
 
 def from_depth(sightings: Sequence[Sighting], cell: float, closed: bool) -> Value:
-    """Zero at the surface of the fused depth pictures, 1 well inside, -1 well outside.
+    """A function of points: 0 at the surface of the fused depth pictures, 1 well inside, -1 well outside.
 
     closed: whether what is pictured but hidden from all cameras counts as solid, rather than as unknown (NaN)
     """
@@ -168,7 +140,7 @@ def from_depth(sightings: Sequence[Sighting], cell: float, closed: bool) -> Valu
 
 
 def from_density(method: Method, level: float, depth: Value) -> Value:
-    """Zero where the density is at its level, 1 well inside, -1 well outside.
+    """A function of points: 0 where the density is at its level, 1 well inside, -1 well outside.
 
     It is the logarithm that counts, for it changes evenly where the density itself grows by orders of magnitude within
     a cell. Farther from the surface that the cameras see than a few cells their word counts: so there are no caves
@@ -177,7 +149,7 @@ def from_density(method: Method, level: float, depth: Value) -> Value:
     inward, outward = INWARD / TRUNCATION, OUTWARD / TRUNCATION
 
     def value(points: Float[Tensor, "point 3"]) -> Float[Tensor, " point"]:
-        density = method.density(points.to(method.device)).cpu().float()
+        density = needs(method, HasDensity).density(points.to(method.device)).cpu().float()
         own, seen = ((density.clamp_min(1e-30) / level).log() / SOFTNESS).clamp(-1, 1), depth(points)
         return own.maximum(seen - inward).minimum(seen + outward)
 
@@ -204,7 +176,7 @@ def surface_level(method: Method, sightings: Sequence[Sighting], box: Float[Tens
             "longer, or give the density at which it is solid as --level"
         )
     found = found[:: max(1, len(found) // AT_ONCE)]
-    at_depth = float(method.density(found.to(method.device)).median())
+    at_depth = float(needs(method, HasDensity).density(found.to(method.device)).median())
     return at_depth * math.log(1 - ONSET) / math.log(0.5)
 
 

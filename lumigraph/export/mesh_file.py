@@ -11,8 +11,8 @@ import trimesh
 
 from ..errors import LumigraphError
 from ..files import write_bytes
+from ..mesh import Mesh
 from ..srgb import linear_from_srgb
-from .mesh import Mesh
 from .surface import vertex_normals
 
 FLOAT, UNSIGNED_INT = 5126, 5125  # glTF 2.0, 3.6.2.2
@@ -31,7 +31,7 @@ def write_mesh(path: Path, mesh: Mesh) -> None:
 
 
 def ending(path: Path) -> str:
-    """Of a file of a mesh. Raises LumigraphError for one that is none."""
+    """The ending of a mesh's file, in lower case. Raises LumigraphError for one that no mesh has."""
     if path.suffix.lower() not in ENCODERS:
         raise LumigraphError(f"{path} does not end like a mesh; name one that ends in {', '.join(ENCODERS)}")
     return path.suffix.lower()

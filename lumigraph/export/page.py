@@ -25,15 +25,15 @@ from torch import Tensor
 
 from .. import __version__
 from ..camera import Camera
-from ..display import track
 from ..exchange import spz
 from ..figures import to_bytes
 from ..files import write_bytes
 from ..gaussians import Gaussians
+from ..mesh import Mesh
 from ..method import Method
 from ..paths import Surroundings, angle_of_view, camera_path, film_size
+from ..progress import track
 from ..scene import Frame, Vector
-from .mesh import Mesh
 
 WEB = Path(__file__).parent / "web"
 NEAREST, FARTHEST = 0.1, 3.0  # times the first distance to what is looked at: how far zooming goes
@@ -49,8 +49,8 @@ ON_THE_SPOT = "Drag to look around", "Drag to look around"
 
 
 @dataclass(frozen=True)
-class Look:
-    """How a page begins: lengths in scene units, angles in degrees.
+class Opening:
+    """Camera, limits and colours with which a page begins: lengths in scene units, angles in degrees.
 
     background: colour behind everything, sRGB in [0, 1]
     position, target: where the camera stands, and what it looks at and turns about
@@ -74,8 +74,8 @@ class Look:
     inward: bool
 
 
-def look_at_scene(title: str, cameras: Camera, frame: Frame, background: Vector | None = None) -> Look:
-    """From where photographs were typically taken, looking at what they look at.
+def opening_of_scene(title: str, cameras: Camera, frame: Frame, background: Vector | None = None) -> Opening:
+    """An opening from where photographs were typically taken, looking at what they look at.
 
     cameras:    of the photographs
     background: instead of the frame's
@@ -86,7 +86,7 @@ def look_at_scene(title: str, cameras: Camera, frame: Frame, background: Vector 
     target = around.focus if around.inward else position + AHEAD * forward
     distance = float((position - target).norm())
     elevation = math.degrees(float(around.polar[:, 1].min()))
-    return Look(
+    return Opening(
         title,
         background or frame.background,
         tuple(position.tolist()),
@@ -101,24 +101,24 @@ def look_at_scene(title: str, cameras: Camera, frame: Frame, background: Vector 
     )
 
 
-def splats_page(path: Path, gaussians: Gaussians, look: Look) -> None:
-    """A cloud in the scene's frame, drawn as splats with its harmonics. The page holds it as .spz, with that loss."""
-    settings = asdict(look) | {"webgl": True, "packed": False, "antialiased": gaussians.antialiased}
+def splats_page(path: Path, gaussians: Gaussians, opening: Opening) -> None:
+    """Write a page that draws a cloud in the scene's frame as splats with harmonics, held as .spz, with its loss."""
+    settings = asdict(opening) | {"webgl": True, "packed": False, "antialiased": gaussians.antialiased}
     write_page(path, "splats", settings, spz.encode(gaussians, steps=FINE))
 
 
-def mesh_page(path: Path, mesh: Mesh, look: Look) -> None:
+def mesh_page(path: Path, mesh: Mesh, opening: Opening) -> None:
     """A mesh in the scene's frame, unlit, for its colours were photographed. Positions are held in 16 bits an axis."""
     low = mesh.vertices.min(0).astype(np.float64)
     size = np.maximum(mesh.vertices.max(0) - low, 1e-12)
     steps = np.rint((mesh.vertices - low) / size * 65535).astype("<u2")
     data = mesh.faces.astype("<u4").tobytes() + steps.tobytes() + mesh.colours.tobytes()
     held = {"vertices": len(steps), "faces": len(mesh.faces), "low": low.tolist(), "high": (low + size).tolist()}
-    settings = asdict(look) | {"webgl": True, "packed": True} | held
+    settings = asdict(opening) | {"webgl": True, "packed": True} | held
     write_page(path, "mesh", settings, gzip.compress(data, 9, mtime=0))
 
 
-def views_page(path: Path, method: Method, cameras: Camera, look: Look, count: int, longest: int) -> None:
+def views_page(path: Path, method: Method, cameras: Camera, opening: Opening, count: int, longest: int) -> None:
     """Pictures rendered here, from all around or along the arc that photographs cover; dragging turns them over.
 
     cameras: of the photographs
@@ -133,7 +133,7 @@ def views_page(path: Path, method: Method, cameras: Camera, look: Look, count: i
     for i in track(range(len(seen_from)), f"Rendering {path.name}", len(seen_from)):
         pictures.append(webp(method.render(seen_from[i]).rgb))
         ends.append(ends[-1] + len(pictures[-1]))
-    settings = asdict(look) | {
+    settings = asdict(opening) | {
         "webgl": False,
         "packed": False,
         "closed": closed,
@@ -146,7 +146,7 @@ def views_page(path: Path, method: Method, cameras: Camera, look: Look, count: i
 
 
 def views(around: Surroundings, count: int, size: tuple[int, int]) -> Camera:
-    """Once around; or evenly along the arc that photographs cover. size: (width, height)."""
+    """Cameras once around the scene, or evenly along the arc that photographs cover. size: (width, height)."""
     path = camera_path("orbit", around.cameras, around.frame, count, size)
     middle, half = around.arc
     if half == math.pi:

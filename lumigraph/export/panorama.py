@@ -18,13 +18,14 @@ from PIL.PngImagePlugin import PngInfo
 from torch import Tensor
 
 from ..camera import Camera
-from ..display import track
 from ..errors import LumigraphError
 from ..figures import to_image
 from ..files import replacing
+from ..geometry import look_at
 from ..lens import Equirectangular, Pinhole
 from ..method import Method
-from ..paths import Surroundings, unit
+from ..paths import Surroundings
+from ..progress import track
 from ..rays import Rendering
 from ..scene import Frame
 
@@ -108,8 +109,7 @@ def flat_camera(camera: Camera, pixels: Float[Tensor, "pixel 2"]) -> tuple[Camer
     assert isinstance(camera.lens, Equirectangular)
     middle = (pixels.amin(0) + pixels.amax(0))[None] / 2
     z = camera.lens.unproject(middle)[0]
-    x = unit(torch.stack([z[2], torch.zeros_like(z[0]), -z[0]]))  # level
-    turn = torch.stack([x, torch.linalg.cross(z, x), z], -1)
+    turn = look_at(torch.zeros(3), z, torch.tensor([0.0, -1.0, 0.0]))[:, :3]  # level
     directions = camera.lens.unproject(pixels) @ turn
     focal = FINENESS * camera.lens.size[0, 0] / (2 * math.pi)
     at = focal * directions[:, :2] / directions[:, 2:]
@@ -135,7 +135,7 @@ def read(
 
 
 def rows_of(camera: Camera, top: int, count: int) -> Camera:
-    """The same camera for some rows of its picture."""
+    """A camera for some rows of another's picture."""
     assert isinstance(camera.lens, Equirectangular)
     lens = replace(camera.lens, centre=camera.lens.centre - camera.lens.centre.new_tensor([[0, top]]))
     return replace(camera, lens=lens, size=torch.tensor([[int(camera.size[0, 0]), count]]))
@@ -152,9 +152,8 @@ def sphere_size(width: int) -> Float[Tensor, "1 2"]:
 
 def level_camera(place: Float[Tensor, " 3"], heading: Float[Tensor, " 3"], lens: Equirectangular) -> Camera:
     """A camera that stands upright and faces a heading."""
-    z = unit(torch.stack([heading[0], heading[1], torch.zeros_like(heading[0])]))
-    down = torch.tensor([0.0, 0.0, -1.0])
-    pose = torch.stack([torch.linalg.cross(down, z), down, z, place], -1)[None]
+    level = torch.stack([heading[0], heading[1], torch.zeros_like(heading[0])])
+    pose = look_at(place[None], level[None], torch.tensor([0.0, 0.0, 1.0]))
     return Camera(pose, lens, lens.size.long())
 
 
@@ -165,17 +164,16 @@ def standpoint(cameras: Camera, frame: Frame, source: Vector | None = None) -> t
             place that is free for certain, and that photographs tell about.
     """
     around = Surroundings(cameras, frame)
-    source_from_scene = torch.tensor(frame.source_from_scene, dtype=torch.double)
     if source is None:
         away = (around.position - around.position.median(0).values).norm(dim=-1)
         place = around.position[int(away.argmin())]
-        given = source_from_scene[:3, :3] @ place + source_from_scene[:3, 3]
+        given = frame.to_source.points(place)
         words = "where the camera in the middle of all stood"
     else:
         given = torch.tensor(source, dtype=torch.double)
         if not given.isfinite().all():
             raise LumigraphError("Nobody can stand at a place that is not finite; give --from three numbers")
-        place = torch.linalg.solve(source_from_scene[:3, :3], given - source_from_scene[:3, 3])
+        place = frame.to_source.inverse.points(given)
         words = "as asked"
     heading = around.axes[0] if not around.inward else around.focus - place - 1e-6 * around.axes[0]
     return place.float(), heading.float(), f"{' '.join(f'{x:.4g}' for x in given.tolist())}, {words}"

@@ -12,10 +12,10 @@ from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
 from ..camera import Camera
-from ..display import track
 from ..errors import LumigraphError
 from ..files import replacing
 from ..method import Method
+from ..progress import track
 from ..scene import Frame
 from .sightings import FAR, Sighting, compare, look_around
 
@@ -26,7 +26,7 @@ WITNESSES = 2  # further cameras that must see a surface at the same place, wher
 
 
 @dataclass(frozen=True)
-class Points:
+class PointCloud:
     """Points of surfaces, in the frame that whoever made them says.
 
     normals: unit length, towards the cameras
@@ -37,16 +37,17 @@ class Points:
     normals: Float[np.ndarray, "point 3"]
     colours: UInt8[np.ndarray, "point 3"]
 
-    def in_source(self, frame: Frame) -> Points:
+    def in_source(self, frame: Frame) -> PointCloud:
         """From the scene's frame to that of the capture."""
-        matrix = np.array(frame.source_from_scene)
-        normals = self.normals @ matrix[:3, :3].T
-        normals /= np.maximum(np.linalg.norm(normals, axis=-1, keepdims=True), 1e-30)
-        return Points(self.positions @ matrix[:3, :3].T + matrix[:3, 3], normals, self.colours)
+        positions, normals = (torch.from_numpy(x) for x in (self.positions, self.normals))
+        there = frame.to_source
+        return PointCloud(there.points(positions).numpy(), there.directions(normals).numpy(), self.colours)
 
 
 @torch.no_grad()
-def extract_points(method: Method, cameras: Camera, count: int = 200_000, size: int = 400, views: int = 64) -> Points:
+def extract_points(
+    method: Method, cameras: Camera, count: int = 200_000, size: int = 400, views: int = 64
+) -> PointCloud:
     """At most `count` points in the scene's frame, spread evenly over what the cameras see.
 
     size:  longer side of the cameras' pictures at most, pixels
@@ -72,7 +73,7 @@ def extract_points(method: Method, cameras: Camera, count: int = 200_000, size: 
         )
     columns = thinned(kept, count)
     normals = columns[:, 3:6] / np.maximum(np.linalg.norm(columns[:, 3:6], axis=-1, keepdims=True), 1e-30)
-    return Points(columns[:, :3], normals, (columns[:, 6:] * 255).round().astype(np.uint8))
+    return PointCloud(columns[:, :3], normals, (columns[:, 6:] * 255).round().astype(np.uint8))
 
 
 def witnessed(points: Float[Tensor, "point 3"], sightings: list[Sighting]) -> Bool[Tensor, " point"]:
@@ -110,7 +111,7 @@ def cells(
     return ((columns[:, :3] - low) / size).astype(np.int64) @ np.array([1 << 42, 1 << 21, 1])
 
 
-def write_points(path: Path, points: Points) -> None:
+def write_points(path: Path, points: PointCloud) -> None:
     """A binary PLY file: x y z, nx ny nz (float32), red green blue (bytes). Raises LumigraphError where it cannot."""
     floats, bytes_ = ("x", "y", "z", "nx", "ny", "nz"), ("red", "green", "blue")
     rows = np.empty(len(points.positions), [*((name, "<f4") for name in floats), *((name, "u1") for name in bytes_)])

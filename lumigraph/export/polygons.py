@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float, Int
 from skimage.measure import marching_cubes
 from torch import Tensor
 
-from ..display import track
+from ..progress import track
 
 BLOCK = 16  # corners of a block along each axis
 AT_ONCE = 64  # blocks whose corners are asked about together
@@ -154,6 +154,6 @@ def edges(
 def compact(
     vertices: Float[np.ndarray, "vertex 3"], faces: Int[np.ndarray, "face 3"]
 ) -> tuple[Float[np.ndarray, "used 3"], Int[np.ndarray, "face 3"]]:
-    """Without vertices that no face has."""
+    """A mesh without the vertices that no face has."""
     used, faces = np.unique(faces, return_inverse=True)
     return vertices[used], faces.reshape(-1, 3)

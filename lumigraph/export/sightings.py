@@ -13,10 +13,11 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from ..camera import Camera
-from ..display import track
+from ..choice import evenly
 from ..errors import LumigraphError
+from ..geometry import look_at, normals_from_depth, unit
 from ..method import Method
-from ..paths import look_at
+from ..progress import track
 from . import depths
 
 SOLID = 0.5  # opacity from which on a pixel shows a surface
@@ -67,7 +68,7 @@ def look_around(method: Method, cameras: Camera, size: int = 400, most: int = 64
     size: longer side of the pictures at most, pixels
     most: cameras at most
     """
-    chosen = torch.linspace(0, len(cameras) - 1, min(most, len(cameras))).round().long().tolist()
+    chosen = evenly(range(len(cameras)), most)
     sightings = []
     for i in track(chosen, "Looking around", len(chosen)):
         camera = cameras[i].to("cpu")
@@ -109,24 +110,11 @@ def surface_normals(
 ) -> tuple[Float[Tensor, "height width 3"], Float[Tensor, "height width"]]:
     """Unit normals towards the camera, from differences between pixels; and their cosine with the way back."""
     rays = camera.rays(camera.pixels())
-    points = rays.at(depth.reshape(-1)).reshape(*depth.shape, 3).double()
-    # On each side the neighbour that is nearer in depth: differences do not reach across edges.
-    across, down = (nearer_difference(points, depth, axis) for axis in (1, 0))
-    normals = torch.nn.functional.normalize(torch.linalg.cross(across, down), dim=-1).float()
+    points = rays.at(depth.reshape(-1)).reshape(*depth.shape, 3)
+    normals = normals_from_depth(points, depth)
     back = -rays.directions.reshape(normals.shape)
     facing = (normals * back).sum(-1)
     return normals * facing.sign()[..., None], facing.abs()
-
-
-def nearer_difference(
-    points: Float[Tensor, "height width 3"], depth: Float[Tensor, "height width"], axis: int
-) -> Float[Tensor, "height width 3"]:
-    """From the last pixel or to the next one along an axis, whichever is the smaller step in depth."""
-    step, jump = points.diff(dim=axis), depth.diff(dim=axis).abs()
-    place = torch.arange(depth.shape[axis])
-    onward, back = place.clamp(max=len(place) - 2), (place - 1).clamp_min(0)
-    nearer = jump.index_select(axis, onward) <= jump.index_select(axis, back)
-    return torch.where(nearer[..., None], step.index_select(axis, onward), step.index_select(axis, back))
 
 
 def compare(sighting: Sighting, points: Float[Tensor, "point 3"], jump: float) -> Compared:
@@ -186,7 +174,7 @@ def colours(
     total, weight = torch.zeros(len(points), 3), torch.zeros(len(points))
     for sighting in sightings:
         seen = compare(sighting, points, tolerance)
-        back = torch.nn.functional.normalize(sighting.camera.position - points, dim=-1)
+        back = unit(sighting.camera.position - points)
         cosine = (normals * back).sum(-1)
         good = seen.smooth & (seen.ahead.abs() < tolerance) & (cosine > 0.05)
         share = torch.where(good, (cosine / seen.away).square(), 0.0)

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import torch
-
 from ..exchange import write_gaussians
 from ..gaussians import Gaussians
 from ..scene import Frame
@@ -16,6 +14,6 @@ def export_splats(gaussians: Gaussians, frame: Frame, path: Path) -> Gaussians:
 
     Returns what was written, in the source's frame. Raises LumigraphError for an ending that is no splat format.
     """
-    moved = gaussians.transformed(torch.tensor(frame.source_from_scene))
+    moved = gaussians.transformed(frame.to_source.matrix)
     write_gaussians(path, moved)
     return moved

@@ -21,7 +21,7 @@ def larger_pieces(
     share: float,
     seen: Bool[np.ndarray, " vertex"],
 ) -> Triangles:
-    """Without the connected pieces whose area is less than a share of the largest one's, or that nobody sees."""
+    """The mesh without connected pieces whose area is less than a share of the largest one's, or that nobody sees."""
     _, piece = connected_components(adjacency(len(vertices), faces), directed=False)
     areas = np.bincount(piece[faces[:, 0]], np.linalg.norm(face_normals(vertices, faces), axis=-1), piece.max() + 1)
     visible = np.bincount(piece[seen], minlength=len(areas)) > 0
@@ -47,7 +47,7 @@ def smoothed(
 
 
 def simplified(vertices: Float[np.ndarray, "vertex 3"], faces: Int[np.ndarray, "face 3"], count: int) -> Triangles:
-    """About so many faces, where they matter most to the shape (Garland and Heckbert 1997)."""
+    """A mesh of about so many faces, kept where they matter most to the shape (Garland and Heckbert 1997)."""
     if len(faces) <= count:
         return vertices, faces
     fewer, triangles = fast_simplification.simplify(
@@ -68,7 +68,7 @@ def vertex_normals(
 def face_normals(
     vertices: Float[np.ndarray, "vertex 3"], faces: Int[np.ndarray, "face 3"]
 ) -> Float[np.ndarray, "face 3"]:
-    """Outward, as long as twice the area."""
+    """Normals of faces: outward, as long as twice the area."""
     a, b, c = vertices[faces].swapaxes(0, 1)
     return np.cross(b - a, c - a)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import math
 import platform
 import statistics
 import time
@@ -17,29 +18,15 @@ from rich.table import Table
 from torch import Tensor
 
 from ..files import write_json
-from ..rays import Samples
 from ._dispatch import Engine, using
-from .tile import Tiles
+from ._facts import operations as all_operations
+from ._facts import tensors
 
-UNITS = {
-    "hash_encode": "samples",
-    "composite": "samples",
-    "march": "rays",
-    "spherical_harmonics": "directions",
-    "perceptron": "samples",
-    "project": "gaussians",
-    "tile": "gaussians",
-    "rasterize": "gaussians",
-    "ssim": "pixels",
-}
-COUNTS: dict[str, Callable[..., int]] = {  # units in a case, where the first input is not a list of them
-    "ssim": lambda image, _: image.shape[0] * image.shape[1],
-}
 PATIENCE = 5.0  # seconds: what takes longer is repeated less often, but three times at least
 
 
 def bench_kernels(
-    operations: Sequence[str] = tuple(UNITS),
+    operations: Sequence[str] | None = None,
     device: torch.device | str | None = None,
     size: int = 2**18,
     repeats: int = 11,
@@ -48,7 +35,7 @@ def bench_kernels(
 ) -> dict[str, Any]:
     """Time the engines that a device has, print a table, and return (and write to `output`) what is in it.
 
-    operations: their names; all by default
+    operations: their names; None for all
     device:     "cpu" for `reference` and `cpu`, "cuda" for `reference` and `gpu`; None for CUDA where there is one
     size:       samples, directions or pixels in each operation's benchmark case; marching takes one ray for every 64
     repeats:    how many calls each median is taken over, after a first one that is reported by itself
@@ -60,14 +47,15 @@ def bench_kernels(
     device = torch.device(device or ("cuda" if torch.cuda.is_available() else "cpu"))
     fast: Engine = "gpu" if device.type == "cuda" else "cpu"
     result: dict[str, Any] = {"protocol": _protocol(device, size, repeats), "operations": {}}
-    for name in operations:
-        case = importlib.import_module(f"{__package__}.{name}").benchmark_case
-        inputs = [_moved(x, device) for x in case(torch.Generator().manual_seed(0), size)]
-        count = COUNTS.get(name, lambda first, *_: len(first))(*inputs)
-        engines = {engine: _measure(name, engine, inputs, count, repeats) for engine in (fast, "reference")}
+    for name in all_operations() if operations is None else operations:
+        folder = importlib.import_module(f"{__package__}.{name}")
+        inputs = [_moved(x, device) for x in folder.benchmark_case(torch.Generator().manual_seed(0), size)]
+        count = math.prod(inputs[0].shape[: folder.FACTS.unit_axes])
+        run = getattr(folder, name)
+        engines = {engine: _measure(run, engine, inputs, count, repeats) for engine in (fast, "reference")}
         ratios = {k: v / engines["reference"][k] for k, v in engines[fast].items() if k.endswith("per_second")}
         engines[fast] |= {k.replace("per_second", "ratio"): v for k, v in ratios.items()}
-        result["operations"][name] = {"unit": UNITS[name], "count": count, "engines": engines}
+        result["operations"][name] = {"unit": folder.FACTS.unit, "count": count, "engines": engines}
     _print(result, console or Console())
     if output is not None:
         write_json(output, result)
@@ -80,18 +68,14 @@ def _moved(x: Any, device: torch.device) -> Any:
     return x.to(device) if hasattr(x, "to") else x
 
 
-def _measure(name: str, engine: Engine, inputs: list[Any], count: int, repeats: int) -> dict[str, float]:
-    operation = getattr(importlib.import_module(f"{__package__}.{name}"), name)
+def _measure(
+    operation: Callable[..., Any], engine: Engine, inputs: list[Any], count: int, repeats: int
+) -> dict[str, float]:
     wanted = [x for x in inputs if isinstance(x, Tensor) and x.requires_grad]
 
     def forward() -> tuple[Tensor, ...]:
         with using(engine):
-            found = operation(*inputs)
-        if isinstance(found, Samples):
-            return found.t_start, found.t_end
-        if isinstance(found, Tiles):
-            return found.order, found.starts
-        return found if isinstance(found, tuple) else (found,)
+            return tensors(operation(*inputs))
 
     first, seconds = _time(forward, inputs[0].device, repeats)
     row = {"forward_per_second": count / seconds, "forward_first_seconds": first}

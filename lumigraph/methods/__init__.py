@@ -48,6 +48,11 @@ def find(name: str) -> type[Any]:
     return method
 
 
+def learning_from(dataset: type[Any]) -> list[str]:
+    """The names of the installed methods that learn from a kind of dataset."""
+    return [name for name in available() if issubclass(dataset, find(name).learns_from)]
+
+
 def name_of(method: Any) -> str:
     """What the user types for a method: the name of the file that holds it."""
     return type(method).__module__.rpartition(".")[2].replace("_", "-")

@@ -5,14 +5,14 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
-from ..components.dense import Dense
-from ..components.encodings import FourierFeatures as Waves
+from ..components.fields.dense import Dense
+from ..components.fields.encodings import FourierFeatures as Waves
 from ..method import RayMethod
 from ..rays import Rays, Rendering
 from ..scene import Batch, Frame, Scene
@@ -29,9 +29,9 @@ class Config:
     scale: float = 10.0  # sigma, in cycles across the picture: gaussian's deviation, positional's highest frequency
     frequencies: int = 256  # rows of B, for positional and gaussian
     layers: int = 4  # the last of them gives colours
-    width: int = 256  # of the others
+    hidden_width: int = 256  # of the others
     learning_rate: float = 1e-3  # Adam's
-    pixels: int = 1 << 13  # per step; the paper takes all of them
+    pixels_per_step: int = 1 << 13  # the paper takes all of them
     exact: bool = False  # multiply in float32 even where bfloat16 is faster
     seed: int = 0
 
@@ -45,17 +45,26 @@ class FourierFeatures(RayMethod):
     """
 
     Config = Config
+    formerly: ClassVar[dict[str, str]] = {
+        "width": "hidden_width",
+        "pixels": "pixels_per_step",
+    }
 
     def __init__(self, frame: Frame, config: Any = None):
         config = config or Config()
         super().__init__(frame, config)
         rows = frequencies(config)
         self.encoding = nn.Identity() if rows is None else Waves(rows)
-        widths = [2 if rows is None else 2 * len(rows), *[config.width] * (config.layers - 1)]
+        widths = [2 if rows is None else 2 * len(rows), *[config.hidden_width] * (config.layers - 1)]
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(config.seed)
             hidden = [Dense(a, b, relu=True, exact=config.exact or a < FEW) for a, b in pairwise(widths)]
-            self.layers = nn.Sequential(*hidden, Dense(config.width, 3, exact=True))
+            self.layers = nn.Sequential(*hidden, Dense(config.hidden_width, 3, exact=True))
+
+    @classmethod
+    def smallest(cls) -> Any:
+        """A few waves and a narrow network, which learn within some twenty quick steps."""
+        return Config(scale=1.0, frequencies=16, layers=3, hidden_width=32, pixels_per_step=256, learning_rate=1e-2)
 
     def paint(self, place: Float[Tensor, "point 2"]) -> Float[Tensor, "point 3"]:
         """The colour at places in [0, 1]^2, x to the right and y down, the longer side of the picture being 1."""
@@ -76,19 +85,16 @@ class FourierFeatures(RayMethod):
         return t, torch.stack([1 + x, 1 - z], 1) / 2, hit
 
     def batch(self, scene: Scene, generator: torch.Generator) -> Batch:
-        return scene.sample_rays(self.config.pixels, generator).to(self.device)
+        return scene.sample_rays(self.config.pixels_per_step, generator).to(self.device)
 
     def loss(self, batch: Batch, step: int) -> dict[str, Tensor]:
         background = self.background
         error = (self.render_rays(batch.rays, background).rgb - batch.before(background)).square().mean()
-        self._figures = {"mse": float(error.detach())}
+        self.figures = {"mse": float(error.detach())}
         return {"mse": error}
 
     def optimizers(self) -> list[torch.optim.Optimizer]:
         return [torch.optim.Adam(self.parameters(), self.config.learning_rate, foreach=True)]
-
-    def statistics(self) -> dict[str, float]:
-        return self._figures
 
 
 def frequencies(config: Config) -> Float[Tensor, "frequency 2"] | None:

@@ -4,69 +4,92 @@ from __future__ import annotations
 
 import warnings
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 import torch
 from torch import Tensor
 
 from .. import kernels
+from ..blending import over
 from ..camera import Camera
-from ..components.cloud import Cloud, CloudAdam
-from ..components.density_control import AdaptiveDensity, MarkovChain
-from ..components.initial_cloud import initial_cloud, random_cloud
-from ..components.memory import room_for
-from ..components.smoothing import sampling_interval, smoothed
+from ..components.clouds.cloud import Cloud, CloudAdam
+from ..components.clouds.density_control import AdaptiveDensity, MarkovChain
+from ..components.clouds.initial_cloud import initial_cloud, random_cloud
+from ..components.clouds.smoothing import sampling_interval, smoothed
 from ..errors import LumigraphWarning
 from ..gaussians import Gaussians
+from ..gaussians.splatting import Splatted, render, splat, view_of
+from ..memory import room_for
 from ..method import Method
 from ..rays import Rendering
 from ..scene import Frame, Photograph, Scene
-from ..splatting import Splatted, render, splat, view_of
 
 
 @dataclass(frozen=True)
 class Config:
     """The paper's numbers, with where it gives them; those without a section are the authors' release's."""
 
-    degree: int = 3  # of the spherical harmonics, section 5.1
-    raise_degree_every: int = 1000  # steps, section 7.1; or the share below of the budget, if that is sooner
-    raise_degree_share: float = 1 / 8
-    ssim: float = 0.2  # share of D-SSIM in the loss, eq. 7
+    sh_degree: int = 3  # of the spherical harmonics, section 5.1
+    sh_degree_interval: int = 1000  # steps, section 7.1; or the share below of the budget, if that is sooner
+    sh_degree_interval_share: float = 1 / 8
+    ssim_weight: float = 0.2  # share of D-SSIM in the loss, eq. 7
     strategy: Literal["adaptive", "mcmc"] = "adaptive"  # density control: section 5, or Kheradmand 2024
-    most: int = 1_000_000  # Gaussians
-    initial: int = 100_000  # random Gaussians where a capture has no points, section 7.1
-    half_until: float = 0.0  # share of the budget that is learnt at half size, and a quarter of that at a quarter
+    max_gaussians: int = 1_000_000  # cap of the cloud's size, under either strategy
+    initial_gaussians: int = 100_000  # at random places, where a capture has no points, section 7.1
+    half_resolution_until: float = 0.0  # share of the budget at half size; the first quarter of it at a quarter
     refine_every: int = 100  # steps between changes of the cloud, section 5.2
     refine_from: int = 500  # step
     refine_until: float = 0.5  # share of the budget; section 7.1: 15 000 of 30 000 steps
-    pull: float = 2e-4  # gradient that asks for more Gaussians, section 5.2
-    reset_every: int = 3000  # steps between resets of opacity, section 5.2
-    means_rate: float = 1.6e-4  # times the extent of the cameras
-    last_means_rate: float = 1.6e-6
-    harmonics_rate: float = 2.5e-3  # a twentieth of it beyond the first band
-    opacities_rate: float = 0.05
-    scales_rate: float = 5e-3
-    quaternions_rate: float = 1e-3
-    opacity_weight: float = 0.01  # of the mean opacity in the loss, for mcmc (Kheradmand 2024, eq. 11)
-    scale_weight: float = 0.01  # of the mean deviation, in extents, for mcmc
-    stop: float = 1e-4  # transmittance at which a pixel is finished, appendix C
+    densify_grad_threshold: float = 2e-4  # gradient of a footprint's centre that asks for more Gaussians, section 5.2
+    opacity_reset_interval: int = 3000  # steps, section 5.2
+    means_lr: float = 1.6e-4  # times the extent of the cameras
+    final_means_lr: float = 1.6e-6
+    sh_lr: float = 2.5e-3  # a twentieth of it beyond the first band
+    opacities_lr: float = 0.05
+    scales_lr: float = 5e-3
+    quaternions_lr: float = 1e-3
+    opacity_regularization: float = 0.01  # weight of the mean opacity in the loss, for mcmc (Kheradmand 2024, eq. 11)
+    scale_regularization: float = 0.01  # weight of the mean deviation, in extents, for mcmc
+    transmittance_threshold: float = 1e-4  # at which a pixel is finished, appendix C
     antialiased: bool = False  # Mip-Splatting's 2-D filter (Yu 2024, section 5.2)
-    smooth: bool = False  # Mip-Splatting's 3-D filter (Yu 2024, section 5.1)
+    filter_3d: bool = False  # Mip-Splatting's 3-D filter (Yu 2024, section 5.1)
     seed: int = 0
 
 
-NEAR = 0.1  # of the distance within which, as the scene says, nothing is
+NEAR = 0.1  # times the scene's near distance: the near plane of splats
 SMALLEST = 64  # pixels of a photograph's shorter side that are kept when it is reduced
-RECOVERY = 3  # times reset_every: steps that must be left after opacities are reset, or the pictures stay dim
+RECOVERY = 3  # opacity_reset_intervals that must be left after opacities are reset, or the pictures stay dim
 GROWTH = 1.05  # of the number at each change, for mcmc (Kheradmand 2024, section 3.2)
-LAST_MOVE = 0.9  # share of the budget from which on nobody is moved any more, so that all settle
+LAST_MOVE = 0.9  # share of the budget after which mcmc moves and adds no Gaussians, so that those there converge
 BYTES = 4096  # that one more Gaussian needs while it learns: itself, its gradient and moments, its share of a picture
 
 
 class GaussianSplatting(Method):
-    """A photograph at a time: splat the cloud, compare, step; now and then change how many Gaussians there are."""
+    """A cloud of Gaussians that learns from one photograph a step; `density_control` changes their number."""
 
     Config = Config
+    formerly: ClassVar[dict[str, str]] = {
+        "degree": "sh_degree",
+        "raise_degree_every": "sh_degree_interval",
+        "raise_degree_share": "sh_degree_interval_share",
+        "ssim": "ssim_weight",
+        "most": "max_gaussians",
+        "initial": "initial_gaussians",
+        "half_until": "half_resolution_until",
+        "pull": "densify_grad_threshold",
+        "reset_every": "opacity_reset_interval",
+        "means_rate": "means_lr",
+        "last_means_rate": "final_means_lr",
+        "harmonics_rate": "sh_lr",
+        "opacities_rate": "opacities_lr",
+        "scales_rate": "scales_lr",
+        "quaternions_rate": "quaternions_lr",
+        "opacity_weight": "opacity_regularization",
+        "scale_weight": "scale_regularization",
+        "stop": "transmittance_threshold",
+        "smooth": "filter_3d",
+    }
+    grows: ClassVar[tuple[str, ...]] = ("interval",)
     extent: Tensor
     drawn: Tensor
     began: Tensor
@@ -75,16 +98,16 @@ class GaussianSplatting(Method):
     def __init__(self, frame: Frame, config: Any = None):
         config = config or Config()
         super().__init__(frame, config)
-        placeholder = random_cloud(frame, min(1000, config.most), config.degree, self.random(0))
+        placeholder = random_cloud(frame, min(1000, config.max_gaussians), config.sh_degree, self.random(0))
         self.cloud = Cloud(placeholder)
         self.cloud.antialiased = config.antialiased
-        self.density_control = AdaptiveDensity(len(self.cloud), config.pull)
+        self.density_control = AdaptiveDensity(len(self.cloud), config.densify_grad_threshold)
         self.exploration = MarkovChain()
         self.register_buffer("extent", torch.tensor(1.0))
         self.register_buffer("drawn", torch.tensor(0))
         self.register_buffer("began", torch.tensor(len(self.cloud)))
-        self.register_buffer("interval", torch.zeros(len(self.cloud) if config.smooth else 0))
-        self._bands = config.degree + 1
+        self.register_buffer("interval", torch.zeros(len(self.cloud) if config.filter_3d else 0))
+        self._bands = config.sh_degree + 1
         self._progress = 0.0
         self._cameras: Camera | None = None
         self._told_full = False
@@ -94,30 +117,47 @@ class GaussianSplatting(Method):
 
     @property
     def _near(self) -> float:
-        """Well ahead of all that is there: what a camera does not see it cannot teach to vanish."""
+        """The near plane of splats, well before the scene's: what lies before it gets no gradient to remove it."""
         return NEAR * self.frame.near
 
     @classmethod
     def preset(cls, device: torch.device) -> Any:
         """On a GPU the paper's numbers; on a CPU a smaller cloud, which learns more in the same time."""
-        return Config() if device.type == "cuda" else Config(most=120_000, initial=20_000, half_until=0.3)
+        if device.type == "cuda":
+            return Config()
+        return Config(max_gaussians=120_000, initial_gaussians=20_000, half_resolution_until=0.3)
+
+    @classmethod
+    def smallest(cls) -> Any:
+        """Some hundred Gaussians that are refined, reset and given harmonics within some twenty quick steps."""
+        return Config(
+            sh_degree=2,
+            sh_degree_interval=4,
+            max_gaussians=300,
+            initial_gaussians=200,
+            refine_every=4,
+            refine_from=4,
+            refine_until=0.8,
+            densify_grad_threshold=1e-6,
+            opacity_reset_interval=5,
+        )
 
     def begin(self, scene: Scene) -> None:
         config = self.config
-        found = initial_cloud(scene, config.initial, config.most, config.degree, self.random(1))
+        found = initial_cloud(scene, config.initial_gaussians, config.max_gaussians, config.sh_degree, self.random(1))
         self.cloud.replace(found, self._optimizer)
         self.density_control.begin(len(found))
         self.began.fill_(len(found))
-        if config.smooth:
+        if config.filter_3d:
             self._cameras = scene.cameras[scene.splits["train"]]
             self.interval = sampling_interval(self.cloud.means, self._cameras, self._near)
         positions = scene.cameras.position[scene.splits["train"]]
         self.extent.fill_(1.1 * float((positions - positions.mean(0)).norm(dim=-1).max()))
 
     def batch(self, scene: Scene, generator: torch.Generator) -> Photograph:
-        """Every photograph once, in a random order, then again."""
+        """The next photograph: each once in a random order, then in another."""
         train = scene.splits["train"]
-        if self.config.smooth and self._cameras is None:  # in a run that was resumed
+        if self.config.filter_3d and self._cameras is None:  # in a run that was resumed
             self._cameras = scene.cameras[train]
         turn, place = divmod(int(self.drawn), len(train))
         self.drawn += 1
@@ -126,21 +166,20 @@ class GaussianSplatting(Method):
         return photograph.reduced(self._reduction(min(photograph.rgb.shape[:2]))).to(self.device)
 
     def _reduction(self, shorter: int) -> int:
-        """How many times smaller photographs are for now; none gets smaller than SMALLEST pixels."""
-        half = self.config.half_until
+        """How many times smaller photographs are at this share of the budget; no side gets below SMALLEST pixels."""
+        half = self.config.half_resolution_until
         wanted = 4 if self._progress < half / 4 else 2 if self._progress < half else 1
         return max(1, min(wanted, shorter // SMALLEST))
 
     def loss(self, batch: Photograph, step: int) -> dict[str, Tensor]:
         config, cloud = self.config, self.gaussians()
-        seen = splat(cloud, view_of(batch.camera, self._near), self._bands, config.stop)
-        rgb, target = seen.rgb, batch.rgb
-        background = torch.tensor(self.frame.background, device=rgb.device)
+        seen = splat(cloud, view_of(batch.camera, self._near), self._bands, config.transmittance_threshold)
+        rgb, background = seen.rgb, torch.tensor(self.frame.background, device=seen.rgb.device)
         if batch.alpha is not None:  # a random colour behind everything, so that only opacity can imitate opacity
             background = torch.rand(3, generator=self.random(~step)).to(rgb.device)
-            target = background + batch.alpha[..., None] * (target - background)
+        target = batch.before(background)
         if background.any():
-            rgb = rgb + (1 - seen.opacity)[..., None] * background
+            rgb = over(rgb, seen.opacity, background)
         if batch.mask is not None:
             target = torch.where(batch.mask[..., None], target, rgb.detach())
         if seen.centres.requires_grad:
@@ -149,34 +188,36 @@ class GaussianSplatting(Method):
         difference = rgb - target
         self._difference = difference.detach()
         terms = {
-            "l1": (1 - config.ssim) * difference.abs().mean(),
-            "ssim": config.ssim * (1 - kernels.ssim(rgb, target)),
+            "l1": (1 - config.ssim_weight) * difference.abs().mean(),
+            "ssim": config.ssim_weight * (1 - kernels.ssim(rgb, target)),
         }
         if config.strategy == "mcmc":
-            terms["opacity"] = config.opacity_weight * cloud.opacities.sigmoid().mean()
-            terms["scale"] = config.scale_weight / float(self.extent) * cloud.log_scales.exp().mean()
+            terms["opacity"] = config.opacity_regularization * cloud.opacities.sigmoid().mean()
+            terms["scale"] = config.scale_regularization / float(self.extent) * cloud.log_scales.exp().mean()
         return terms
 
     def optimizers(self) -> list[torch.optim.Optimizer]:
         c, cloud = self.config, self.cloud
-        columns = [1.0] * 3 + [1 / 20] * (3 * (c.degree + 1) ** 2 - 3)
+        columns = [1.0] * 3 + [1 / 20] * (3 * (c.sh_degree + 1) ** 2 - 3)
         groups = [
-            {"params": [cloud.means], "lr": c.means_rate},
-            {"params": [cloud.quaternions], "lr": c.quaternions_rate},
-            {"params": [cloud.log_scales], "lr": c.scales_rate},
-            {"params": [cloud.opacities], "lr": c.opacities_rate},
-            {"params": [cloud.harmonics], "lr": c.harmonics_rate, "columns": columns},
+            {"name": "means", "params": [cloud.means], "lr": c.means_lr},
+            {"params": [cloud.quaternions], "lr": c.quaternions_lr},
+            {"params": [cloud.log_scales], "lr": c.scales_lr},
+            {"params": [cloud.opacities], "lr": c.opacities_lr},
+            {"params": [cloud.harmonics], "lr": c.sh_lr, "columns": columns},
         ]
         self._optimizer = CloudAdam(groups)
         return [self._optimizer]
 
+    def learning_rate(self, step: int, progress: float) -> dict[str, float]:
+        """Exponential decay of the means' rate (section 7.1), in extents of the cameras; the others stay."""
+        c = self.config
+        return {"means": float(self.extent) * c.means_lr * (c.final_means_lr / c.means_lr) ** progress}
+
     def before_step(self, step: int, progress: float) -> None:
         config, self._progress = self.config, progress
-        assert self._optimizer is not None
-        fall = (config.last_means_rate / config.means_rate) ** progress
-        self._optimizer.param_groups[0]["lr"] = config.means_rate * float(self.extent) * fall
-        raised = max(step // config.raise_degree_every, int(progress / config.raise_degree_share))
-        self._bands = 1 + min(raised, config.degree)
+        raised = max(step // config.sh_degree_interval, int(progress / config.sh_degree_interval_share))
+        self._bands = 1 + min(raised, config.sh_degree)
 
     @torch.no_grad()
     def after_step(self, step: int) -> None:
@@ -188,7 +229,7 @@ class GaussianSplatting(Method):
             self._sample(due, optimizer, self.random(step))
         elif self._progress < config.refine_until:
             self._densify(step, due, seen, optimizer)
-        if config.smooth and (due or len(self.cloud) != size):
+        if config.filter_3d and (due or len(self.cloud) != size):
             assert self._cameras is not None
             self.interval = sampling_interval(self.cloud.means, self._cameras, self._near)
 
@@ -202,7 +243,7 @@ class GaussianSplatting(Method):
             wanted_more = control.refine(self.cloud, optimizer, float(self.extent), most, chance)
             if wanted_more and len(self.cloud) >= 0.99 * self._most():
                 self._tell_full()
-        every = self.config.reset_every
+        every = self.config.opacity_reset_interval
         if step and step % every == 0 and step / max(self._progress, 1e-6) - step >= RECOVERY * every:
             control.reset_opacity(self.cloud, optimizer)
 
@@ -210,40 +251,36 @@ class GaussianSplatting(Method):
         if due and self._progress < LAST_MOVE:
             count = len(self.cloud)
             wanted = int(GROWTH * count) if self._progress < self.config.refine_until else count
-            if wanted > max(most := self._most(), count) and most < self.config.most:
+            if wanted > max(most := self._most(), count) and most < self.config.max_gaussians:
                 self._tell_full()
             self.exploration.refine(self.cloud, optimizer, min(wanted, max(most, count)), chance)
         self.exploration.explore(self.cloud, optimizer.param_groups[0]["lr"], chance)
 
     def _most(self) -> int:
-        """How many Gaussians there may be: as told, or as the memory at hand allows."""
-        return min(self.config.most, len(self.cloud) + room_for(BYTES, self.device))
+        """The cap on the number of Gaussians: `max_gaussians`, or what the memory at hand allows."""
+        return min(self.config.max_gaussians, len(self.cloud) + room_for(BYTES, self.device))
 
     def _most_by_now(self) -> int:
-        """The same at this moment: the number may grow evenly, so that early steps are quick ones."""
+        """The cap at this share of the budget: it rises evenly until `refine_until`, so that early steps are quick."""
         began, most = int(self.began), self._most()
         share = min(1.0, self._progress / self.config.refine_until)
         return min(most, int(began + share * max(most - began, 0)))
 
     def _tell_full(self) -> None:
-        """Once: the cloud would grow further, and may not."""
+        """Warn, once, that the cloud has reached its cap."""
         if not self._told_full:
             self._told_full = True
-            why = "--most says so" if len(self.cloud) >= 0.95 * self.config.most else "memory is short"
+            told = len(self.cloud) >= 0.95 * self.config.max_gaussians
+            why = "--max-gaussians says so" if told else "memory is short"
             warnings.warn(f"The cloud stops growing at {len(self.cloud):,} Gaussians, for {why}", LumigraphWarning, 2)
 
     def gaussians(self) -> Gaussians:
         """The cloud, in the scene's frame; with the 3-D filter in it, where that is used."""
         cloud = self.cloud.gaussians()
-        return smoothed(cloud, self.interval) if self.config.smooth else cloud
+        return smoothed(cloud, self.interval) if self.config.filter_3d else cloud
 
     def render(self, camera: Camera) -> Rendering:
         return render(self.gaussians(), camera.to(self.device), self.frame.background, self._near)
 
     def statistics(self) -> dict[str, float]:
         return {"mse": float(self._difference.square().mean()), "gaussians": len(self.cloud)}
-
-    def _load_from_state_dict(self, state_dict, prefix, *rest):
-        if prefix + "interval" in state_dict:
-            self.interval = self.interval.new_empty(state_dict[prefix + "interval"].shape)
-        super()._load_from_state_dict(state_dict, prefix, *rest)

@@ -4,20 +4,21 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from .. import kernels
-from ..components.activations import truncated_exp
-from ..components.carving import visual_hull
-from ..components.corrections import Exposure, PoseRefinement
-from ..components.lazy_adam import LazyAdam
-from ..components.occupancy import OccupancyGrid
-from ..components.perceptron import Perceptron
-from ..components.schedules import set_learning_rate
+from ..camera import Camera
+from ..components.fields.activations import truncated_exp
+from ..components.fields.mlp import MLP
+from ..components.sampling.carving import visual_hull
+from ..components.sampling.occupancy import OccupancyGrid
+from ..components.training.corrections import Exposure, PoseRefinement
+from ..components.training.lazy_adam import LazyAdam
+from ..controls import Control
 from ..method import RayMethod
 from ..rays import Look, Rays, Rendering, Samples
 from ..scene import Batch, Frame, Scene
@@ -29,37 +30,37 @@ class Config:
     """The paper's numbers, with where it gives them; `InstantNGP.preset` says what a plain CPU does otherwise."""
 
     levels: int = 16  # L, table 1
-    features: int = 2  # F, table 1
-    log2_entries: int = 19  # log2 T, table 1: 14 to 24
-    coarsest: int = 16  # N_min, table 1
-    finest: int = 2048  # N_max for a scene of reach 1; grows with the reach (section 5.4)
-    width: int = 64  # neurons per hidden layer, section 5.4
+    features_per_level: int = 2  # F, table 1
+    log2_hashmap_size: int = 19  # log2 T, table 1: 14 to 24
+    base_resolution: int = 16  # N_min, table 1
+    max_resolution: int = 2048  # N_max for a scene of reach 1; grows with the reach (section 5.4)
+    hidden_width: int = 64  # neurons per hidden layer, section 5.4
     density_layers: int = 1  # hidden layers, section 5.4
     colour_layers: int = 2  # hidden layers, section 5.4
     geometry_features: int = 16  # from the density network to the colour network, section 5.4
-    direction_bands: int = 4  # of spherical harmonics, section 5.4
+    sh_bands: int = 4  # of spherical harmonics, section 5.4
     samples_per_step: int = 1 << 18  # section 5.4: batches are sized by samples, not by rays
-    lattice: int = 1024  # steps across the diagonal of the unit cascade, appendix E.1
-    growth: float = 1 / 256  # of a step with distance in unbounded scenes, appendix E.1
-    stop: float = 1e-4  # transmittance at which a ray is spent, appendix E.1
-    occupancy: int = 128  # cells per axis and cascade, appendix E.2
-    cell_thickness: float = 0.05  # optical thickness across a cell below which it is empty; E.2's threshold at n = 128
-    grid_every: int = 16  # steps between looks at the occupancy grid, appendix E.2
-    grid_decay: float = 0.95  # of what it remembers, appendix E.2
+    steps_per_diagonal: int = 1024  # of the unit cascade, appendix E.1
+    cone_angle: float = 1 / 256  # a step's growth with distance in unbounded scenes, appendix E.1
+    transmittance_threshold: float = 1e-4  # at which a ray is spent, appendix E.1
+    occupancy_resolution: int = 128  # cells per axis and cascade, appendix E.2
+    occupancy_threshold: float = 0.05  # optical thickness across a cell below which it is empty; E.2's at n = 128
+    occupancy_interval: int = 16  # steps between updates of the occupancy grid, appendix E.2
+    occupancy_decay: float = 0.95  # of the densities it remembers, appendix E.2
     learning_rate: float = 1e-2  # section 4
-    last_learning_rate: float = 1e-3  # at the end of the budget
-    hold: float = 0.3  # share of the budget before the learning rate begins to fall
-    table_decay: float = 0.0  # decoupled weight decay of the table; of objects only, for it pulls density towards 1
-    huber: float = 0.1  # residual at which the loss turns from square to linear
-    exposure: bool = False  # learn a gain per photograph
+    final_learning_rate: float = 1e-3  # at the end of the budget
+    decay_start: float = 0.3  # share of the budget before the learning rate begins to fall
+    hash_weight_decay: float = 0.0  # of the table, decoupled; of objects only, for it pulls density towards 1
+    huber_delta: float = 0.1  # residual at which the loss turns from square to linear
+    exposure_correction: bool = False  # learn a gain per photograph
     refine_cameras: bool = False  # learn a correction of each photograph's pose
     seed: int = 0
 
 
-# Coarse to fine: share of the budget from which on, and which part of the Config's occupancy and lattice.
+# Coarse to fine: share of the budget from which on, and which part of occupancy_resolution and steps_per_diagonal.
 STAGES = ((0.0, 1 / 4, 1 / 4), (0.04, 1 / 2, 1 / 2), (0.12, 1, 2 / 3), (0.75, 1, 1))
-LOOKS = 4  # at the grid at most, for each sample of a step
-PROBES = 0.02  # share of all cells looked at again at random, in case something has grown there
+LOOKS = 4  # cells updated at most, for each sample of a step
+PROBES = 0.02  # share of all cells updated at random, in case something has grown there
 BATCH_GROWTH = 1.5  # rays per step at most, from one step to the next
 
 
@@ -68,14 +69,16 @@ class Field(nn.Module):
 
     def __init__(self, config: Config, reach: float):
         super().__init__()
-        self.reach, self.bands = reach, config.direction_bands
-        finest = int(config.finest * reach)
-        self.levels = kernels.HashLevels(config.levels, config.features, config.log2_entries, config.coarsest, finest)
-        self.table = nn.Parameter(torch.empty(self.levels.offsets[-1], config.features).uniform_(-1e-4, 1e-4))
-        hidden = [config.width] * config.density_layers
-        self.density_network = Perceptron(config.levels * config.features, *hidden, config.geometry_features)
-        hidden = [config.width] * config.colour_layers
-        self.colour_network = Perceptron(config.geometry_features + self.bands**2, *hidden, 3)
+        self.reach, self.bands = reach, config.sh_bands
+        finest = int(config.max_resolution * reach)
+        self.levels = kernels.HashLevels(
+            config.levels, config.features_per_level, config.log2_hashmap_size, config.base_resolution, finest
+        )
+        self.table = nn.Parameter(torch.empty(self.levels.offsets[-1], config.features_per_level).uniform_(-1e-4, 1e-4))
+        hidden = [config.hidden_width] * config.density_layers
+        self.density_network = MLP(config.levels * config.features_per_level, *hidden, config.geometry_features)
+        hidden = [config.hidden_width] * config.colour_layers
+        self.colour_network = MLP(config.geometry_features + self.bands**2, *hidden, 3)
 
     def encode(self, points: Float[Tensor, "sample 3"]) -> Float[Tensor, "sample width"]:
         return kernels.hash_encode(points * (0.5 / self.reach) + 0.5, self.table, self.levels)
@@ -83,7 +86,7 @@ class Field(nn.Module):
     def density(
         self, encoded: Float[Tensor, "sample width"]
     ) -> tuple[Float[Tensor, " sample"], Float[Tensor, "sample geometry"]]:
-        """Density per scene unit, and what the colour network wants to know of each place."""
+        """Density per scene unit, and the features of each place that the colour network takes."""
         geometry = self.density_network(encoded)
         return truncated_exp(geometry[:, 0]), geometry
 
@@ -96,9 +99,30 @@ class Field(nn.Module):
 
 
 class InstantNGP(RayMethod):
-    """The occupancy grid says where to look, a first look says what is hidden, the second learns from the rest."""
+    """Rays are sampled in occupied cells; a first pass without gradients drops hidden samples, a second one learns."""
 
     Config = Config
+    formerly_weights: ClassVar[dict[str, str]] = {"field.": "network."}
+    formerly: ClassVar[dict[str, str]] = {
+        "features": "features_per_level",
+        "log2_entries": "log2_hashmap_size",
+        "coarsest": "base_resolution",
+        "finest": "max_resolution",
+        "width": "hidden_width",
+        "direction_bands": "sh_bands",
+        "lattice": "steps_per_diagonal",
+        "growth": "cone_angle",
+        "stop": "transmittance_threshold",
+        "occupancy": "occupancy_resolution",
+        "cell_thickness": "occupancy_threshold",
+        "grid_every": "occupancy_interval",
+        "grid_decay": "occupancy_decay",
+        "last_learning_rate": "final_learning_rate",
+        "hold": "decay_start",
+        "table_decay": "hash_weight_decay",
+        "huber": "huber_delta",
+        "exposure": "exposure_correction",
+    }
     rays_per_step: Tensor
 
     def __init__(self, frame: Frame, config: Any = None):
@@ -106,14 +130,12 @@ class InstantNGP(RayMethod):
         super().__init__(frame, config)
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(config.seed)
-            self.field = Field(config, frame.reach)
-        self.exposure = Exposure(frame.image_count) if config.exposure else None
+            self.network = Field(config, frame.reach)
+        self.exposure = Exposure(frame.image_count) if config.exposure_correction else None
         self.poses = PoseRefinement(frame.image_count) if config.refine_cameras else None
-        self.occupancy = OccupancyGrid(frame.reach, max(4, int(config.occupancy * STAGES[0][1])))
-        self._set_lattice(1.0)
+        self.occupancy = OccupancyGrid(frame.reach, max(4, int(config.occupancy_resolution * STAGES[0][1])))
+        self._set_steps(1.0)
         self.register_buffer("rays_per_step", torch.tensor(256))
-        self._optimizers: list[torch.optim.Optimizer] = []
-        self._figures: dict[str, float] = {}
 
     @classmethod
     def preset(cls, device: torch.device) -> Any:
@@ -123,26 +145,45 @@ class InstantNGP(RayMethod):
             return Config()
         return Config(
             levels=8,
-            features=4,
-            log2_entries=17,
-            finest=512,
-            width=32,
+            features_per_level=4,
+            log2_hashmap_size=17,
+            max_resolution=512,
+            hidden_width=32,
             samples_per_step=1 << 15,
-            lattice=384,
-            stop=1e-3,
-            growth=1 / 96,
-            cell_thickness=0.15,
+            steps_per_diagonal=384,
+            transmittance_threshold=1e-3,
+            cone_angle=1 / 96,
+            occupancy_threshold=0.15,
             learning_rate=2e-2,
-            table_decay=0.3,
-            huber=0.3,
+            hash_weight_decay=0.3,
+            huber_delta=0.3,
+        )
+
+    @classmethod
+    def smallest(cls) -> Any:
+        """Tiny tables and networks with both corrections and a grid of three sizes, within some twenty quick steps."""
+        return Config(
+            levels=4,
+            log2_hashmap_size=11,
+            base_resolution=4,
+            max_resolution=32,
+            hidden_width=16,
+            geometry_features=8,
+            sh_bands=2,
+            samples_per_step=2048,
+            steps_per_diagonal=128,
+            occupancy_resolution=16,
+            learning_rate=2e-2,
+            exposure_correction=True,
+            refine_cameras=True,
         )
 
     def begin(self, scene: Scene) -> None:
         if scene.images.has_alpha and self.frame.reach == 1:
-            self.occupancy.rule_out(visual_hull(scene, self.config.occupancy)[None])
+            self.occupancy.rule_out(visual_hull(scene, self.config.occupancy_resolution)[None])
 
-    def batch(self, scene: Scene, generator: torch.Generator) -> Batch:
-        return scene.sample_rays(int(self.rays_per_step), generator).to(self.device)
+    def batch(self, data: Scene, generator: torch.Generator) -> Batch:
+        return data.sample_rays(int(self.rays_per_step), generator).to(self.device)
 
     def render_rays(
         self, rays: Rays, background: Float[Tensor, "#ray 3"], jitter: Float[Tensor, " ray"] | None = None
@@ -151,18 +192,17 @@ class InstantNGP(RayMethod):
         return composite(look.samples, look.density, look.rgb, background)
 
     def looks(self, rays: Rays, jitter: Float[Tensor, " ray"] | None = None) -> list[Look]:
-        step = 2 * math.sqrt(3) / self.lattice
-        found = self.occupancy.sample(rays, self.frame.near, step, self.growth, jitter=jitter)
+        step = 2 * math.sqrt(3) / self.steps_per_diagonal
+        found = self.occupancy.sample(rays, self.frame.near, step, self.cone_angle, jitter=jitter)
         samples = found.keep(self._visible(rays, found))
         points, directions = samples.along(rays)
-        density, geometry = self.field.density(self.field.encode(points))
-        rgb = self.field.colour(geometry, directions)
-        self._figures |= {"rays": len(rays), "visible_samples": len(samples)}
+        density, rgb = self.field(points, directions)
+        self.figures |= {"rays": len(rays), "visible_samples": len(samples)}
         return [Look("samples", samples, density, rgb)]
 
     @torch.no_grad()
     def _visible(self, rays: Rays, found: Samples) -> Bool[Tensor, " sample"]:
-        """A first look, for most samples lie behind what their ray sees."""
+        """Which samples light reaches, by a first pass without gradients; most lie behind what their ray sees."""
         ray, t, length = found.ray_index, found.t, found.length
         asked_in_all = 0
 
@@ -172,8 +212,8 @@ class InstantNGP(RayMethod):
             on = ray[asked]
             return self.density(rays.origins[on] + t[asked][:, None] * rays.directions[on]) * length[asked]
 
-        seen = visible(found, thickness_of, self.config.stop)
-        self._figures["samples"] = asked_in_all
+        seen = visible(found, thickness_of, self.config.transmittance_threshold)
+        self.figures["samples"] = asked_in_all
         return seen
 
     def loss(self, batch: Batch, step: int) -> dict[str, Tensor]:
@@ -191,58 +231,67 @@ class InstantNGP(RayMethod):
             behind = (1 - rendering.opacity)[:, None] * background
             rgb = self.exposure(rgb - behind, rays.image_index) + behind
         residual = rgb - batch.before(background)
-        self._figures["mse"] = float(residual.detach().square().mean())
+        self.figures["mse"] = float(residual.detach().square().mean())
         if batch.alpha is not None:  # and before the opposite colour, where only what opacity lacks looks different
             lacking = (batch.alpha - rendering.opacity)[:, None]
             residual = torch.cat([residual, residual + lacking * (1 - 2 * background)])
         # Divided by delta, so that the linear part has slope 1.
-        delta = self.config.huber
+        delta = self.config.huber_delta
         return {"huber": nn.functional.huber_loss(residual, torch.zeros_like(residual), delta=delta) / delta}
 
     def optimizers(self) -> list[torch.optim.Optimizer]:
-        networks = [*self.field.density_network.parameters(), *self.field.colour_network.parameters()]
+        networks = [*self.network.density_network.parameters(), *self.network.colour_network.parameters()]
         groups: list[dict[str, Any]] = [{"params": networks, "scale": 1.0}]
         groups += [{"params": [*x.parameters()], "scale": 0.05} for x in (self.exposure, self.poses) if x]
         common = {"lr": self.config.learning_rate, "betas": (0.9, 0.99), "eps": 1e-15}
-        decay = self.config.table_decay if self.frame.reach == 1 else 0.0
-        table = LazyAdam([self.field.table], weight_decay=decay, **common)
-        self._optimizers = [table, torch.optim.Adam(groups, foreach=True, **common)]
-        return self._optimizers
+        decay = self.config.hash_weight_decay if self.frame.reach == 1 else 0.0
+        table = LazyAdam([self.network.table], weight_decay=decay, **common)
+        return [table, torch.optim.Adam(groups, foreach=True, **common)]
+
+    def learning_rate(self, step: int, progress: float) -> float:
+        """Twenty steps of warm-up, then constant, then exponential decay (section 4 decays likewise)."""
+        c = self.config
+        fall = max(0.0, progress - c.decay_start) / (1 - c.decay_start)
+        return c.learning_rate * (c.final_learning_rate / c.learning_rate) ** fall * min(1.0, (step + 1) / 20)
 
     def before_step(self, step: int, progress: float) -> None:
-        self._set_learning_rate(step, progress)
-        _, cells, lattice = max(stage for stage in STAGES if stage[0] <= progress)
-        self._set_lattice(lattice)
+        _, cells, steps = max(stage for stage in STAGES if stage[0] <= progress)
+        self._set_steps(steps)
         finer = False
-        while self.occupancy.resolution < self.config.occupancy * cells:
+        while self.occupancy.resolution < self.config.occupancy_resolution * cells:
             self.occupancy.refine()
             finer = True
-        if finer or step % (4 if step < 32 else self.config.grid_every) == 0:
+        if finer or step % (4 if step < 32 else self.config.occupancy_interval) == 0:
             share, budget = (1.0, None) if finer or step < 32 else (PROBES, self.config.samples_per_step * LOOKS)
-            thickness, decay = self.config.cell_thickness, self.config.grid_decay
+            thickness, decay = self.config.occupancy_threshold, self.config.occupancy_decay
             self.occupancy.update(self.density, thickness, self.random(~step), decay, share, budget)
 
     def after_step(self, step: int) -> None:
-        """So many rays next time as should give the wanted number of samples."""
+        """Set the next step's number of rays so that they give about `samples_per_step` samples."""
         rays = int(self.rays_per_step)
-        wanted = rays * self.config.samples_per_step / max(self._figures["samples"], 1)
+        wanted = rays * self.config.samples_per_step / max(self.figures["samples"], 1)
         self.rays_per_step.fill_(int(min(max(wanted, 64), BATCH_GROWTH * rays, self.config.samples_per_step)))
+
+    def field(
+        self, points: Float[Tensor, "point 3"], directions: Float[Tensor, "point 3"]
+    ) -> tuple[Float[Tensor, " point"], Float[Tensor, "point 3"]]:
+        """Density per scene unit, and sRGB-encoded colour seen along unit directions."""
+        density, geometry = self.network.density(self.network.encode(points))
+        rgb = self.network.colour(geometry, directions)
+        return density, rgb * self.exposure.gain(self.told) if self.told and self.exposure else rgb
 
     def density(self, points: Float[Tensor, "sample 3"]) -> Float[Tensor, " sample"]:
         """Density per scene unit."""
-        return self.field.density(self.field.encode(points))[0]
+        return self.network.density(self.network.encode(points))[0]
 
-    def statistics(self) -> dict[str, float]:
-        return self._figures
+    @property
+    def controls(self) -> tuple[Control, ...]:
+        return self.exposure.controls if self.exposure else ()
 
-    def _set_lattice(self, share: float) -> None:
-        """Coarser, in both its steps and their growth with distance, where the share is below 1."""
-        self.lattice = int(self.config.lattice * share)
-        self.growth = self.config.growth / share if self.frame.reach > 1 else 0.0
+    def refined(self, cameras: Camera) -> Camera:
+        return self.poses.refined(cameras) if self.poses else cameras
 
-    def _set_learning_rate(self, step: int, progress: float) -> None:
-        """Twenty steps of warm-up, then constant, then an exponential fall (section 4 decays likewise)."""
-        c = self.config
-        fall = max(0.0, progress - c.hold) / (1 - c.hold)
-        rate = c.learning_rate * (c.last_learning_rate / c.learning_rate) ** fall * min(1.0, (step + 1) / 20)
-        set_learning_rate(self._optimizers, rate)
+    def _set_steps(self, share: float) -> None:
+        """Set a step's length and its growth with distance: with a share below 1 both are coarser by as much."""
+        self.steps_per_diagonal = int(self.config.steps_per_diagonal * share)
+        self.cone_angle = self.config.cone_angle / share if self.frame.reach > 1 else 0.0

@@ -3,25 +3,24 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import max_pool1d, pad, softplus
 
-from ..components.coordinate_network import CoordinateNetwork
-from ..components.dense import in_chunks
-from ..components.empty_space import EmptySpace
-from ..components.encodings import FrequencyEncoding, IntegratedEncoding
-from ..components.frustums import frustum_moments
-from ..components.sampling import inverse_transform, stratified
-from ..components.schedules import falling, set_learning_rate
-from ..components.spaces import space_of
-from ..components.two_looks import squared_errors
+from ..components.fields.coordinate_network import CoordinateNetwork
+from ..components.fields.dense import in_chunks
+from ..components.fields.encodings import FrequencyEncoding, IntegratedEncoding
+from ..components.sampling.frustums import frustum_moments
+from ..components.sampling.occupancy_mask import OccupancyMask
+from ..components.sampling.sampling import inverse_transform, stratified
+from ..components.sampling.spaces import space_of
+from ..components.training.schedules import falling
 from ..method import RayMethod
 from ..rays import Look, Rays, Rendering, Samples
-from ..scene import Batch, Frame, Scene
+from ..scene import Frame, Scene
 from ..volume import composite, weights_of
 
 
@@ -30,20 +29,20 @@ class Config:
     """The paper's numbers, with where it gives them; below them what saves time and keeps the mathematics."""
 
     depth: int = 8  # hidden layers before density, as NeRF's
-    width: int = 256  # channels of a layer, as NeRF's
-    rejoin: int = 5  # the layer whose activation the input joins again, as NeRF's
-    position_bands: int = 16  # L for frustums, section 4: with cones, more do no harm
-    direction_bands: int = 4  # L for directions, as NeRF's
+    hidden_width: int = 256  # channels of a layer, as NeRF's
+    skip_layer: int = 5  # the layer whose activation the input joins again, as NeRF's
+    position_frequencies: int = 16  # L for frustums, section 4: with cones, more do no harm
+    direction_frequencies: int = 4  # L for directions, as NeRF's
     coarse_samples: int = 128  # frustums of a ray, section 3.2
     fine_samples: int = 128  # of a ray, drawn where the first found something, section 3.2
-    blur: float = 0.01  # alpha, weight that every frustum has at least, eq. 17
-    coarse_loss: float = 0.1  # lambda, section 3.2; 0: the first look only guides the second
+    resample_padding: float = 0.01  # alpha, weight that every frustum has at least, eq. 17
+    coarse_loss_weight: float = 0.1  # lambda, section 3.2; 0: the first look only guides the second
     rays_per_step: int = 4096  # section 4
     learning_rate: float = 5e-4  # section 4
-    last_learning_rate: float = 5e-6  # at the end of the budget, section 4
-    warm_up: float = 0.0025  # share of the budget in which the learning rate grows, section 4
-    occupancy: int = 0  # cells per axis of a grid that knows where to look; 0 looks everywhere
-    cell_thickness: float = 0.01  # optical thickness across a cell below which it is empty
+    final_learning_rate: float = 5e-6  # at the end of the budget, section 4
+    warmup: float = 0.0025  # share of the budget in which the learning rate grows, section 4
+    occupancy_resolution: int = 0  # cells per axis of a grid that tells where to sample; 0 samples everywhere
+    occupancy_threshold: float = 0.01  # optical thickness across a cell below which it is empty
     bfloat16: bool = True  # multiply in bfloat16 where the machine is fast at it
     seed: int = 0
 
@@ -52,22 +51,32 @@ PADDING = 0.001  # colours may reach so far beyond 0 and 1, so that both are wit
 
 
 class MipNeRF(RayMethod):
-    """One network, asked twice about stretches of cones: evenly at first, then where something was found."""
+    """One network, evaluated twice on stretches of cones: evenly at first, then where something was found."""
 
     Config = Config
+    formerly: ClassVar[dict[str, str]] = {
+        "rejoin": "skip_layer",
+        "cell_thickness": "occupancy_threshold",
+        "warm_up": "warmup",
+        "last_learning_rate": "final_learning_rate",
+        "position_bands": "position_frequencies",
+        "direction_bands": "direction_frequencies",
+        "occupancy": "occupancy_resolution",
+        "coarse_loss": "coarse_loss_weight",
+        "width": "hidden_width",
+        "blur": "resample_padding",
+    }
 
     def __init__(self, frame: Frame, config: Any = None):
         config = config or Config()
         super().__init__(frame, config)
         self.space = space_of(frame)
-        self.encode_frustum = IntegratedEncoding(3, config.position_bands)
-        self.encode_direction = FrequencyEncoding(3, config.direction_bands, base=1.0)
+        self.encode_frustum = IntegratedEncoding(3, config.position_frequencies)
+        self.encode_direction = FrequencyEncoding(3, config.direction_frequencies, base=1.0)
         inputs = self.encode_frustum.width, self.encode_direction.width
-        shape = config.depth, config.width, config.rejoin
+        shape = config.depth, config.hidden_width, config.skip_layer
         self.network = CoordinateNetwork(*inputs, *shape, exact=not config.bfloat16)
-        self.empty = EmptySpace(config.occupancy, config.cell_thickness) if config.occupancy else None
-        self._optimizers: list[torch.optim.Optimizer] = []
-        self._figures: dict[str, float] = {}
+        self.empty = OccupancyMask(config.occupancy_resolution, config.occupancy_threshold)
 
     @classmethod
     def preset(cls, device: torch.device) -> Any:
@@ -76,39 +85,48 @@ class MipNeRF(RayMethod):
             return Config()
         return Config(
             depth=6,
-            width=128,
-            rejoin=3,
+            hidden_width=128,
+            skip_layer=3,
             coarse_samples=32,
             fine_samples=16,
             rays_per_step=1024,
             learning_rate=4e-3,
-            last_learning_rate=2e-4,
-            coarse_loss=0.0,
-            warm_up=0.02,
-            occupancy=128,
+            final_learning_rate=2e-4,
+            coarse_loss_weight=0.0,
+            warmup=0.02,
+            occupancy_resolution=128,
+        )
+
+    @classmethod
+    def smallest(cls) -> Any:
+        """The paper's network, tiny, and a grid of what is empty: every part, within some twenty quick steps."""
+        return Config(
+            depth=3,
+            hidden_width=32,
+            skip_layer=2,
+            position_frequencies=6,
+            coarse_samples=16,
+            fine_samples=12,
+            rays_per_step=192,
+            learning_rate=5e-3,
+            final_learning_rate=5e-4,
+            occupancy_resolution=16,
+            warmup=0.1,
         )
 
     def begin(self, scene: Scene) -> None:
-        if self.empty:
-            self.empty.begin(scene)
+        self.empty.begin(scene)
 
-    def batch(self, scene: Scene, generator: torch.Generator) -> Batch:
-        return scene.sample_rays(self.config.rays_per_step, generator).to(self.device)
+    @property
+    def pass_weights(self) -> dict[str, float]:
+        return {"coarse": self.config.coarse_loss_weight}
 
-    def looks(self, rays: Rays) -> list[Look]:
-        return self._looks(rays, None, colours=True)
+    def looks(self, rays: Rays, generator: torch.Generator | None = None) -> list[Look]:
+        return self._looks(rays, generator, colours=generator is None or self.config.coarse_loss_weight > 0)
 
     def render_rays(self, rays: Rays, background: Float[Tensor, "#ray 3"]) -> Rendering:
         _, fine = self._looks(rays, None, colours=False)
         return composite(fine.samples, fine.density, fine.rgb, background)
-
-    def loss(self, batch: Batch, step: int) -> dict[str, Tensor]:
-        """The squared error of both looks (section 3.2)."""
-        background = self.background
-        looks = self._looks(batch.rays, self.random(step), colours=self.config.coarse_loss > 0)
-        terms = squared_errors(looks, batch.before(background), background, self.config.coarse_loss)
-        self._figures["mse"] = float(terms["fine"].detach())
-        return terms
 
     def _looks(self, rays: Rays, generator: torch.Generator | None, colours: bool) -> list[Look]:
         """The coarse look and the fine one.
@@ -124,10 +142,11 @@ class MipNeRF(RayMethod):
             coarse = self._look("coarse", rays, edges, colours)
             weights = weights_of(coarse.samples, coarse.density).view(count, -1).detach()
         again = stratified(count, c.fine_samples + 1, generator, device)
-        return [coarse, self._look("fine", rays, inverse_transform(edges, blurred(weights) + c.blur, again))]
+        edges = inverse_transform(edges, blurred(weights) + c.resample_padding, again)
+        return [coarse, self._look("fine", rays, edges)]
 
     def _look(self, name: str, rays: Rays, edges: Float[Tensor, "ray edge"], colours: bool = True) -> Look:
-        """Ask the network about the frustums between edges, which are shares of the way along each ray."""
+        """The network's outputs for the frustums between edges, which are shares of the way along each ray."""
         near, far = self.space.interval(rays)
         t = self.space.distance(edges, rays, near, far)
         samples = Samples.rows(t[:, :-1], t[:, -1])
@@ -141,42 +160,55 @@ class MipNeRF(RayMethod):
         def answer(mean: Tensor, variance: Tensor, ray: Tensor) -> tuple[Tensor, Tensor]:
             encoded = self.encode_frustum(mean, variance)
             raw, rgb = self.network(encoded, seen[ray]) if colours else (self.network.density(encoded), mean)
-            return softplus(raw - 1), rgb.sigmoid() * (1 + 2 * PADDING) - PADDING
+            return softplus(raw - 1), padded(rgb)
 
-        asked = self.empty.may_hold(means, variances.amax(-1).sqrt()) if self.empty else None
+        asked = self.empty.may_hold(means, variances.amax(-1).sqrt())
         density, rgb = in_chunks(answer, means, variances, ray, where=asked)
-        self._figures |= {"rays": len(rays), "samples": len(samples) if asked is None else int(asked.sum())}
+        self.figures |= {"rays": len(rays), "samples": len(samples) if asked is None else int(asked.sum())}
         return Look(name, samples, density * self.space.along(rays, samples), rgb)
+
+    def field(
+        self, points: Float[Tensor, "point 3"], directions: Float[Tensor, "point 3"]
+    ) -> tuple[Float[Tensor, " point"], Float[Tensor, "point 3"]]:
+        """Density per scene unit, and sRGB-encoded colour seen along unit directions."""
+
+        def answer(mean: Tensor, direction: Tensor) -> tuple[Tensor, Tensor]:
+            raw, rgb = self.network(self._encoded(mean), self.encode_direction(direction))
+            return softplus(raw - 1), padded(rgb)
+
+        density, rgb = in_chunks(answer, self.space.warp(points), directions)
+        return density * self.space.stretch(points), rgb
 
     def density(self, points: Float[Tensor, "point 3"]) -> Float[Tensor, " point"]:
         """Density per scene unit."""
         return self._density_at(self.space.warp(points)) * self.space.stretch(points)
 
     def _density_at(self, coordinates: Float[Tensor, "point 3"]) -> Float[Tensor, " point"]:
-        """Density per unit of the coordinates, over as much space as a cell of a grid of 128 takes: what is smaller no
-        photograph has shown."""
-        variances = torch.full_like(coordinates, (2 / 128) ** 2 / 12)
+        """Density per unit of the coordinates."""
+        return in_chunks(lambda x: (softplus(self.network.density(self._encoded(x)) - 1),), coordinates)[0]
 
-        def answer(mean: Tensor, variance: Tensor) -> tuple[Tensor]:
-            return (softplus(self.network.density(self.encode_frustum(mean, variance)) - 1),)
-
-        return in_chunks(answer, coordinates, variances)[0]
+    def _encoded(self, coordinates: Float[Tensor, "point 3"]) -> Float[Tensor, "point width"]:
+        """Points, encoded over as much space as a cell of a grid of 128 takes: photographs show nothing smaller."""
+        return self.encode_frustum(coordinates, torch.full_like(coordinates, (2 / 128) ** 2 / 12))
 
     def optimizers(self) -> list[torch.optim.Optimizer]:
-        self._optimizers = [torch.optim.Adam(self.network.parameters(), self.config.learning_rate)]
-        return self._optimizers
+        return [torch.optim.Adam(self.network.parameters(), self.config.learning_rate)]
+
+    def learning_rate(self, step: int, progress: float) -> float:
+        """Exponential decay after a warm-up (section 4)."""
+        c = self.config
+        return falling(c.learning_rate, c.final_learning_rate, progress, c.warmup)
 
     def before_step(self, step: int, progress: float) -> None:
-        c = self.config
-        set_learning_rate(self._optimizers, falling(c.learning_rate, c.last_learning_rate, progress, c.warm_up))
-        if self.empty:
-            self.empty.look(step, progress, self._density_at, self.random(~step))
+        self.empty.look(step, progress, self._density_at, self.random(~step))
 
-    def statistics(self) -> dict[str, float]:
-        return self._figures
+
+def padded(raw: Float[Tensor, "sample 3"]) -> Float[Tensor, "sample 3"]:
+    """Colours of a network's raw output, PADDING beyond [0, 1] at most."""
+    return raw.sigmoid() * (1 + 2 * PADDING) - PADDING
 
 
 def blurred(weights: Float[Tensor, "ray bin"]) -> Float[Tensor, "ray bin"]:
-    """A little wider than they are, so that the second look surrounds what the first one found (eq. 17)."""
+    """Weights blurred a little, so that the fine samples surround what the coarse ones found (eq. 17)."""
     larger = max_pool1d(pad(weights, (1, 1)), 2, 1)  # of each two neighbours
     return 0.5 * (larger[:, 1:] + larger[:, :-1])

@@ -3,24 +3,23 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from ..components.coordinate_network import CoordinateNetwork
-from ..components.dense import in_chunks
-from ..components.empty_space import EmptySpace
-from ..components.encodings import FrequencyEncoding
-from ..components.sampling import inverse_transform, midpoints, stratified
-from ..components.schedules import falling, set_learning_rate
-from ..components.spaces import space_of
-from ..components.two_looks import squared_errors
+from ..components.fields.coordinate_network import CoordinateNetwork
+from ..components.fields.dense import in_chunks
+from ..components.fields.encodings import FrequencyEncoding
+from ..components.sampling.occupancy_mask import OccupancyMask
+from ..components.sampling.sampling import inverse_transform, midpoints, stratified
+from ..components.sampling.spaces import space_of
+from ..components.training.schedules import falling
 from ..errors import LumigraphError
 from ..method import RayMethod
 from ..rays import Look, Rays, Rendering, Samples
-from ..scene import Batch, Frame, Scene
+from ..scene import Frame, Scene
 from ..volume import composite, weights_of
 
 
@@ -29,49 +28,59 @@ class Config:
     """The paper's numbers, with where it gives them; below them what saves time and keeps the mathematics."""
 
     depth: int = 8  # hidden layers before density, appendix A
-    width: int = 256  # channels of a layer, appendix A
-    rejoin: int = 5  # the layer whose activation the input joins again, figure 7
-    position_bands: int = 10  # L for points, section 5.1
-    direction_bands: int = 4  # L for directions, section 5.1
+    hidden_width: int = 256  # channels of a layer, appendix A
+    skip_layer: int = 5  # the layer whose activation the input joins again, figure 7
+    position_frequencies: int = 10  # L for points, section 5.1
+    direction_frequencies: int = 4  # L for directions, section 5.1
     coarse_samples: int = 64  # of a ray, appendix A
     fine_samples: int = 128  # of a ray, drawn where the first found something, appendix A
     rays_per_step: int = 4096  # section 5.3
     learning_rate: float = 5e-4  # section 5.3
-    last_learning_rate: float = 5e-5  # at the end of the budget, section 5.3
+    final_learning_rate: float = 5e-5  # at the end of the budget, section 5.3
     density_noise: float = 1.0  # deviation of what is added to captures' raw density in training, appendix A
     networks: int = 2  # one for each look; 1 looks twice with the same
-    coarse_loss: float = 1.0  # weight of the first look's colours, eq. 6; 0 with one network: it only guides
-    occupancy: int = 0  # cells per axis of a grid that knows where to look; 0 looks everywhere
-    cell_thickness: float = 0.01  # optical thickness across a cell below which it is empty
-    stop: float = 0.0  # transmittance at which a ray is spent
-    warm_up: float = 0.0  # share of the budget in which the learning rate grows
+    coarse_loss_weight: float = 1.0  # weight of the first look's colours, eq. 6; 0 with one network: it only guides
+    occupancy_resolution: int = 0  # cells per axis of a grid that tells where to sample; 0 samples everywhere
+    occupancy_threshold: float = 0.01  # optical thickness across a cell below which it is empty
+    transmittance_threshold: float = 0.0  # at which a ray is spent
+    warmup: float = 0.0  # share of the budget in which the learning rate grows
     bfloat16: bool = True  # multiply in bfloat16 where the machine is fast at it
     seed: int = 0
 
 
 class NeRF(RayMethod):
-    """Look once evenly, then again where the first look found something (section 5.2)."""
+    """Coarse samples evenly along each ray, fine ones where the coarse ones found something (section 5.2)."""
 
     Config = Config
+    formerly: ClassVar[dict[str, str]] = {
+        "rejoin": "skip_layer",
+        "cell_thickness": "occupancy_threshold",
+        "stop": "transmittance_threshold",
+        "warm_up": "warmup",
+        "last_learning_rate": "final_learning_rate",
+        "position_bands": "position_frequencies",
+        "direction_bands": "direction_frequencies",
+        "occupancy": "occupancy_resolution",
+        "coarse_loss": "coarse_loss_weight",
+        "width": "hidden_width",
+    }
 
     def __init__(self, frame: Frame, config: Any = None):
         config = config or Config()
-        if config.networks not in (1, 2) or (config.networks == 2 and not config.coarse_loss):
+        if config.networks not in (1, 2) or (config.networks == 2 and not config.coarse_loss_weight):
             raise LumigraphError(
-                f"nerf has 1 or 2 networks, and the first of 2 learns from --coarse-loss alone; --networks "
-                f"{config.networks} with --coarse-loss {config.coarse_loss:g} cannot be"
+                f"nerf has 1 or 2 networks, and the first of 2 learns from --coarse-loss-weight alone; --networks "
+                f"{config.networks} with --coarse-loss-weight {config.coarse_loss_weight:g} cannot be"
             )
         super().__init__(frame, config)
         self.space = space_of(frame)
-        self.encode_position = FrequencyEncoding(3, config.position_bands, keep_input=False)
-        self.encode_direction = FrequencyEncoding(3, config.direction_bands, keep_input=False)
+        self.encode_position = FrequencyEncoding(3, config.position_frequencies, keep_input=False)
+        self.encode_direction = FrequencyEncoding(3, config.direction_frequencies, keep_input=False)
         inputs = self.encode_position.width, self.encode_direction.width
-        common = {"depth": config.depth, "width": config.width, "rejoin": config.rejoin, "exact": not config.bfloat16}
-        self.fine = CoordinateNetwork(*inputs, **common)
-        self.coarse = CoordinateNetwork(*inputs, **common) if config.networks == 2 else None
-        self.empty = EmptySpace(config.occupancy, config.cell_thickness) if config.occupancy else None
-        self._optimizers: list[torch.optim.Optimizer] = []
-        self._figures: dict[str, float] = {}
+        shape, exact = (config.depth, config.hidden_width, config.skip_layer), not config.bfloat16
+        self.fine = CoordinateNetwork(*inputs, *shape, exact=exact)
+        self.coarse = CoordinateNetwork(*inputs, *shape, exact=exact) if config.networks == 2 else None
+        self.empty = OccupancyMask(config.occupancy_resolution, config.occupancy_threshold)
 
     @classmethod
     def preset(cls, device: torch.device) -> Any:
@@ -80,41 +89,51 @@ class NeRF(RayMethod):
             return Config()
         return Config(
             depth=6,
-            width=128,
-            rejoin=3,
+            hidden_width=128,
+            skip_layer=3,
             coarse_samples=32,
             fine_samples=16,
             rays_per_step=1024,
             learning_rate=4e-3,
-            last_learning_rate=2e-4,
-            warm_up=0.02,
+            final_learning_rate=2e-4,
+            warmup=0.02,
             networks=1,
-            coarse_loss=0.0,
-            occupancy=128,
-            stop=1e-3,
+            coarse_loss_weight=0.0,
+            occupancy_resolution=128,
+            transmittance_threshold=1e-3,
+        )
+
+    @classmethod
+    def smallest(cls) -> Any:
+        """The paper's two networks, tiny, and a grid of what is empty: every part, within some twenty quick steps."""
+        return Config(
+            depth=3,
+            hidden_width=32,
+            skip_layer=2,
+            position_frequencies=5,
+            coarse_samples=16,
+            fine_samples=12,
+            rays_per_step=192,
+            learning_rate=5e-3,
+            final_learning_rate=5e-4,
+            occupancy_resolution=16,
+            transmittance_threshold=1e-3,
+            warmup=0.1,
         )
 
     def begin(self, scene: Scene) -> None:
-        if self.empty:
-            self.empty.begin(scene)
+        self.empty.begin(scene)
 
-    def batch(self, scene: Scene, generator: torch.Generator) -> Batch:
-        return scene.sample_rays(self.config.rays_per_step, generator).to(self.device)
+    @property
+    def pass_weights(self) -> dict[str, float]:
+        return {"coarse": self.config.coarse_loss_weight}
 
-    def looks(self, rays: Rays) -> list[Look]:
-        return self._looks(rays, None, colours=True)
+    def looks(self, rays: Rays, generator: torch.Generator | None = None) -> list[Look]:
+        return self._looks(rays, generator, colours=generator is None or self.config.coarse_loss_weight > 0)
 
     def render_rays(self, rays: Rays, background: Float[Tensor, "#ray 3"]) -> Rendering:
         _, fine = self._looks(rays, None, colours=False)
         return composite(fine.samples, fine.density, fine.rgb, background)
-
-    def loss(self, batch: Batch, step: int) -> dict[str, Tensor]:
-        """The squared error of both looks (eq. 6)."""
-        background = self.background
-        looks = self._looks(batch.rays, self.random(step), colours=self.config.coarse_loss > 0)
-        terms = squared_errors(looks, batch.before(background), background, self.config.coarse_loss)
-        self._figures["mse"] = float(terms["fine"].detach())
-        return terms
 
     def _looks(self, rays: Rays, generator: torch.Generator | None, colours: bool) -> list[Look]:
         """The coarse look and the fine one.
@@ -132,8 +151,8 @@ class NeRF(RayMethod):
         )
         shares, order = torch.cat([shares, again], -1).sort(-1)
         lit = None
-        if c.stop:  # the coarse look knows which of its places no light comes back from
-            lit = weights.cumsum(-1) - weights <= 1 - c.stop
+        if c.transmittance_threshold:  # the coarse look knows which of its places no light comes back from
+            lit = weights.cumsum(-1) - weights <= 1 - c.transmittance_threshold
             lit = torch.cat([lit, torch.ones_like(again, dtype=torch.bool)], -1).gather(-1, order).flatten()
         return [coarse, self._look("fine", self.fine, rays, shares, generator, lit)]
 
@@ -147,7 +166,7 @@ class NeRF(RayMethod):
         lit: Bool[Tensor, " all_samples"] | None = None,
         colours: bool = True,
     ) -> Look:
-        """Ask a network at places along rays; its answer holds as far as the next place (eq. 3)."""
+        """A network's outputs at places along rays; each holds as far as the next place (eq. 3)."""
         near, far = self.space.interval(rays)
         t = self.space.distance(shares, rays, near, far)
         samples, ray = Samples.rows(t, far), torch.arange(t.numel(), device=t.device) // t.shape[1]
@@ -163,13 +182,23 @@ class NeRF(RayMethod):
                 raw = raw + noise * torch.randn(len(raw), generator=generator).to(raw.device)
             return raw.relu(), rgb.sigmoid()
 
-        asked = lit
-        if self.empty:
-            there = self.empty.may_hold(coordinates)
-            asked = there if lit is None else lit & there
+        there = self.empty.may_hold(coordinates)
+        asked = there if lit is None else lit if there is None else lit & there
         density, rgb = in_chunks(answer, coordinates, ray, where=asked)
-        self._figures |= {"rays": len(rays), "samples": len(samples) if asked is None else int(asked.sum())}
+        self.figures |= {"rays": len(rays), "samples": len(samples) if asked is None else int(asked.sum())}
         return Look(name, samples, density * self.space.along(rays, samples), rgb)
+
+    def field(
+        self, points: Float[Tensor, "point 3"], directions: Float[Tensor, "point 3"]
+    ) -> tuple[Float[Tensor, " point"], Float[Tensor, "point 3"]]:
+        """Density per scene unit, and sRGB-encoded colour seen along unit directions."""
+
+        def answer(x: Tensor, direction: Tensor) -> tuple[Tensor, Tensor]:
+            raw, rgb = self.fine(self.encode_position(x), self.encode_direction(direction))
+            return raw.relu(), rgb.sigmoid()
+
+        density, rgb = in_chunks(answer, self.space.warp(points), directions)
+        return density * self.space.stretch(points), rgb
 
     def density(self, points: Float[Tensor, "point 3"]) -> Float[Tensor, " point"]:
         """Density per scene unit."""
@@ -180,15 +209,12 @@ class NeRF(RayMethod):
         return in_chunks(lambda x: (self.fine.density(self.encode_position(x)).relu(),), coordinates)[0]
 
     def optimizers(self) -> list[torch.optim.Optimizer]:
-        self._optimizers = [torch.optim.Adam(self.parameters(), self.config.learning_rate, eps=1e-7)]
-        return self._optimizers
+        return [torch.optim.Adam(self.parameters(), self.config.learning_rate, eps=1e-7)]
+
+    def learning_rate(self, step: int, progress: float) -> float:
+        """Exponential decay (section 5.3)."""
+        c = self.config
+        return falling(c.learning_rate, c.final_learning_rate, progress, c.warmup)
 
     def before_step(self, step: int, progress: float) -> None:
-        """The learning rate falls exponentially (section 5.3)."""
-        c = self.config
-        set_learning_rate(self._optimizers, falling(c.learning_rate, c.last_learning_rate, progress, c.warm_up))
-        if self.empty:
-            self.empty.look(step, progress, self._density_at, self.random(~step))
-
-    def statistics(self) -> dict[str, float]:
-        return self._figures
+        self.empty.look(step, progress, self._density_at, self.random(~step))

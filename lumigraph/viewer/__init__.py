@@ -2,5 +2,5 @@
 
 from .address import Address as Address
 from .address import choose_address as choose_address
-from .viewer import Subject as Subject
+from .subject import Subject as Subject
 from .viewer import Viewer as Viewer

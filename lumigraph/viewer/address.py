@@ -1,4 +1,4 @@
-"""Where the viewer listens: a host, a port that is free, and what to say about them."""
+"""Address: the host and port that the viewer listens at."""
 
 from __future__ import annotations
 
@@ -15,25 +15,25 @@ TRIED = 100  # ports after the usual one
 
 @dataclass(frozen=True)
 class Address:
-    """host: as the user named it; port: free a moment ago."""
+    """A host as the user named it, and a port that was free a moment ago."""
 
     host: str
     port: int
 
     @property
     def url(self) -> str:
-        """What to open in a browser on this machine."""
+        """The address to open in a browser on this machine."""
         return self.urls[0]
 
     @property
     def urls(self) -> list[str]:
-        """Everything that the viewer answers to, as far as this machine knows its own names."""
+        """All addresses that the viewer answers to, as far as this machine knows its own."""
         hosts = own_addresses() if is_wildcard(self.host) else [self.host]
         return [f"http://{f'[{host}]' if ':' in host else host}:{self.port}" for host in hosts]
 
 
 def choose_address(host: str = HOST, port: int | None = None) -> Address:
-    """A place to listen at. Without a port, the first free one from 8080 on.
+    """An address to listen at. Without a port, the first free one from 8080 on.
 
     Warns, with the addresses, where others than this machine can reach it.
     Raises LumigraphError if the host is not this machine's or the port is not to be had.
@@ -82,7 +82,7 @@ def is_wildcard(host: str) -> bool:
 
 
 def is_local(host: str) -> bool:
-    """Whether only this machine can reach it."""
+    """Whether only this machine can reach a host."""
     if is_wildcard(host):
         return False
     places = {entry[4][0] for entry in socket.getaddrinfo(host, None)}
@@ -90,7 +90,7 @@ def is_local(host: str) -> bool:
 
 
 def own_addresses() -> list[str]:
-    """This machine's addresses: the loopback first, then those by which others may know it."""
+    """This machine's addresses: the loopback first, then those by which other machines may reach it."""
     found = ["127.0.0.1"]
     try:
         found += [str(entry[4][0]) for entry in socket.getaddrinfo(socket.gethostname(), None, socket.AF_INET)]

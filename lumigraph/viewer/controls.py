@@ -1,4 +1,4 @@
-"""Controls: what one client can set about its own view."""
+"""Controls: the settings of one client's own view."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ import numpy as np
 from jaxtyping import Float
 
 from ..scene import Frame, Vector
-from .crop import Box
-from .modes import MODES, Mode
+from .crop import CropBox
+from .modes import MODES
 from .scenery import CAMERAS, POINTS
 
 SHARPEST = 1024  # pixels along the longer side, unless the client wants another
@@ -20,20 +20,21 @@ NARROWEST, WIDEST = 10.0, 120.0  # degrees
 
 
 class Controls:
-    """A client's tab `View`.
+    """The contents of a client's tab `View`.
 
     client:  viser's
-    tab:     what holds it
+    tab:     viser's, which holds them
     changed: called when anything that is drawn changes
     cloud:   whether the method is a cloud of Gaussians, which the browser can draw
     """
 
     def __init__(self, client: Any, tab: Any, frame: Frame, cloud: bool, changed: Callable[[], None]):
         self._client, self._frame, self._changed = client, frame, changed
+        self._modes = {mode.capitalize(): mode for mode in MODES}  # by how the dropdown names them
         gui = client.gui
         with tab:
-            self._mode = gui.add_dropdown("Show", [mode.capitalize() for mode in MODES])
-            self._here = gui.add_checkbox(
+            self._mode = gui.add_dropdown("Show", list(self._modes))
+            self._exact = gui.add_checkbox(
                 "Draw exactly", False, visible=cloud, hint="Drawn by our own renderer and sent, not by the browser"
             )
             self._angle = gui.add_slider(
@@ -51,7 +52,7 @@ class Controls:
                 self._lower = gui.add_vector3("Lower", lower, step=0.01)
                 self._upper = gui.add_vector3("Upper", upper, step=0.01)
             self.status = gui.add_markdown("")
-        for drawn in (self._mode, self._here, self._sharpest, self._background, self._crop, self._lower, self._upper):
+        for drawn in (self._mode, self._exact, self._sharpest, self._background, self._crop, self._lower, self._upper):
             drawn.on_update(lambda _: self._update())
         self._cameras.on_update(lambda _: self._update())
         self._points.on_update(lambda _: self._update())
@@ -61,32 +62,34 @@ class Controls:
         self._update()
 
     @property
-    def mode(self) -> Mode:
-        return cast(Mode, self._mode.value.lower())
+    def mode(self) -> str:
+        return self._modes[self._mode.value]
 
     @property
-    def here(self) -> bool:
-        return self._here.value
+    def exact(self) -> bool:
+        """Whether Gaussians are rendered here rather than by the browser."""
+        return self._exact.value
 
     @property
     def longest(self) -> int:
+        """Pixels along the longer side of the sharpest picture."""
         return int(self._sharpest.value)
 
     @property
     def background(self) -> Vector:
-        """Exactly the scene's own until another is chosen."""
+        """The background colour: the scene's own, to the last bit, until another is chosen."""
         chosen = tuple(self._background.value)
         own = self._frame.background
         return own if chosen == to_bytes(own) else (chosen[0] / 255, chosen[1] / 255, chosen[2] / 255)
 
     @property
-    def box(self) -> Box | None:
-        """Of what is shown, if not everything is."""
+    def box(self) -> CropBox | None:
+        """The crop box; None while nothing is cropped."""
         if not self._crop.value:
             return None
         a, b = self._lower.value, self._upper.value
         lower, upper = (tuple(float(x) for x in pick(a, b)) for pick in (np.minimum, np.maximum))
-        return Box(cast(Vector, lower), cast(Vector, upper))
+        return CropBox(cast(Vector, lower), cast(Vector, upper))
 
     @property
     def surrounded(self) -> bool:
@@ -94,11 +97,17 @@ class Controls:
         return bool(self._cameras.value or self._points.value or self._crop.value)
 
     def offer_points(self) -> None:
-        """There are points now."""
+        """Show the checkbox for sparse points."""
         self._points.visible = True
 
+    def offer_modes(self, names: list[str]) -> None:
+        """Add modes to the dropdown, those that are not there yet."""
+        if not self._modes.keys() >= set(names):
+            self._modes |= {name: name for name in names}
+            self._mode.options = tuple(self._modes)
+
     def tell_angle(self, radians: float) -> None:
-        """The camera has another angle of view."""
+        """Show the camera's angle of view at the slider."""
         degrees = float(min(max(round(math.degrees(radians)), NARROWEST), WIDEST))
         if degrees != self._angle.value:
             self._angle.value = degrees
@@ -128,8 +137,8 @@ class Controls:
             )
 
 
-def edges(box: Box) -> Float[np.ndarray, "12 2 3"]:
-    """The ends of a box's twelve edges."""
+def edges(box: CropBox) -> Float[np.ndarray, "12 2 3"]:
+    """The two ends of each of a box's twelve edges."""
     corners = np.array(list(itertools.product((0, 1), repeat=3)))
     ends = [(a, b) for a, b in itertools.combinations(corners, 2) if abs(a - b).sum() == 1]
     lower, upper = np.array(box.lower), np.array(box.upper)

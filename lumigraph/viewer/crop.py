@@ -1,8 +1,9 @@
-"""Crop: what a method shows inside a box of the scene, and nothing of what is outside.
+"""Cropping: what a camera sees inside a box of the scene.
 
 A cloud of Gaussians is filtered by its centres. A RayMethod's rays begin where they enter the box, so what stands in
-front of it vanishes; what lies behind it is told by the expected depth, pixel by pixel, which is all that other methods
-offer. Where a see-through surface inside the box stands before a solid one outside, that pixel goes by their mean.
+front of it vanishes. What lies behind the box is removed pixel by pixel, by its expected depth; for all other methods,
+so is what lies before it. Where something see-through inside stands before something solid outside, their mean depth
+decides.
 """
 
 from __future__ import annotations
@@ -10,12 +11,12 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Shaped
 from torch import Tensor
 
-from .. import splatting
 from ..camera import Camera
-from ..gaussians import Gaussians
+from ..capabilities import HasGaussians, needs
+from ..gaussians import Gaussians, splatting
 from ..method import Method, RayMethod
 from ..rays import Rays, Rendering
 from ..scene import Vector
@@ -24,13 +25,14 @@ TOLERANCE = 0.01  # of the box's sides: an expected depth may lie so far outside
 
 
 @dataclass(frozen=True)
-class Box:
-    """Corners in the scene's frame; lower is nowhere above upper."""
+class CropBox:
+    """A box by its corners in the scene's frame; lower is nowhere above upper."""
 
     lower: Vector
     upper: Vector
 
     def holds(self, points: Float[Tensor, "*point 3"], tolerance: float = 0.0) -> Bool[Tensor, "*point"]:
+        """Whether each point lies inside, or outside by no more than a tolerance, a share of the box's sides."""
         lower, upper = torch.tensor(self.lower).to(points), torch.tensor(self.upper).to(points)
         margin = tolerance * (upper - lower)
         return ((points >= lower - margin) & (points <= upper + margin)).all(-1)
@@ -42,14 +44,15 @@ class Box:
         return enter, enter < leave
 
     def cropped(self, cloud: Gaussians) -> Gaussians:
+        """The Gaussians whose centres lie inside."""
         return cloud[self.holds(cloud.means)]
 
 
-def render_inside(method: Method, camera: Camera, box: Box, is_cloud: bool) -> Rendering:
+def render_inside(method: Method, camera: Camera, box: CropBox, is_cloud: bool) -> Rendering:
     """What a camera sees inside a box. is_cloud: whether the method has Gaussians."""
     frame = method.frame
     if is_cloud:
-        cloud = box.cropped(method.gaussians())
+        cloud = box.cropped(needs(method, HasGaussians).gaussians())
         return splatting.render(cloud, camera.to(method.device), frame.background, frame.near)
     rays = camera.rays(camera.pixels())
     if isinstance(method, RayMethod):
@@ -66,20 +69,35 @@ def render_inside(method: Method, camera: Camera, box: Box, is_cloud: bool) -> R
         rgb=torch.where(keep[..., None], rendering.rgb, torch.tensor(frame.background)),
         depth=torch.where(keep, rendering.depth, torch.inf),
         opacity=torch.where(keep, rendering.opacity, 0.0),
+        extra={name: kept(values, keep) for name, values in rendering.extra.items()},
     )
 
 
+def kept(values: Shaped[Tensor, "*all"], where: Bool[Tensor, "*pixels"]) -> Shaped[Tensor, "*all"]:
+    """An extra's values at the pixels of a mask, zeros elsewhere."""
+    where = where.reshape(*where.shape, *(1,) * (values.ndim - where.ndim))
+    return torch.where(where, values, torch.zeros_like(values))
+
+
 @torch.no_grad()
-def from_entry(method: RayMethod, rays: Rays, box: Box) -> Rendering:
-    """What rays see from where they enter a box on; depth is still told from where they began."""
+def from_entry(method: RayMethod, rays: Rays, box: CropBox) -> Rendering:
+    """What rays see from the point at which they enter a box; depth still counts from their origins."""
     enter, hits = box.entered(rays)
-    begin = (enter - method.frame.near).clamp_min(0)[hits]  # methods pass over the first stretch of every ray
-    moved = replace(rays[hits], origins=rays[hits].at(begin))
+    asked = hits.clone()
+    asked[0] = True  # so that a picture beside the box has the method's extras too
+    begin = torch.where(hits, enter - method.frame.near, 0).clamp_min(0)[asked]  # no method looks nearer than near
+    moved = replace(rays[asked], origins=rays[asked].at(begin))
     background = torch.tensor(method.frame.background)
-    rgb, depth, opacity = background.repeat(len(rays), 1), torch.full((len(rays),), torch.inf), torch.zeros(len(rays))
-    if len(moved):
-        chunks = [slice(i, i + method.rays_per_chunk) for i in range(0, len(moved), method.rays_per_chunk)]
-        behind = background.to(method.device)[None]
-        seen = Rendering.cat([method.render_rays(moved[c].to(method.device), behind).cpu() for c in chunks])
-        rgb[hits], depth[hits], opacity[hits] = seen.rgb, seen.depth + begin, seen.opacity
-    return Rendering(rgb, depth, opacity)
+    behind = background.to(method.device)[None]
+    chunks = [slice(i, i + method.rays_per_chunk) for i in range(0, len(moved), method.rays_per_chunk)]
+    seen = Rendering.cat([method.render_rays(moved[c].to(method.device), behind).cpu() for c in chunks])
+
+    def spread(values: Tensor) -> Tensor:
+        return kept(values.new_zeros(len(rays), *values.shape[1:]).index_put((asked,), values), hits)
+
+    return Rendering(
+        torch.where(hits[:, None], spread(seen.rgb), background),
+        torch.where(hits, spread(seen.depth + begin), torch.inf),
+        spread(seen.opacity),
+        {name: spread(values) for name, values in seen.extra.items()},
+    )

@@ -1,4 +1,4 @@
-"""Flight: a client's camera, moved from here."""
+"""Flight: a client's camera moved by the server."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ UP = np.array([0.0, 0.0, 1.0])
 
 
 class Flight:
-    """The camera of one client. A new flight ends the one before."""
+    """A mover of one client's camera. A new flight ends the one before."""
 
     def __init__(self, client: Any):
         self._client, self._number = client, 0
@@ -23,7 +23,7 @@ class Flight:
         self._number += 1
 
     def place(self, pose: Float[np.ndarray, "3 4"], distance: float, angle: float) -> None:
-        """Put it at a pose, turning about a point so far ahead, with a vertical angle of view in radians."""
+        """Set the camera: its pose, the distance to the point it turns about, its vertical angle of view in radians."""
         camera = self._client.camera
         with self._client.atomic():
             camera.up_direction = upwards(pose)
@@ -32,7 +32,7 @@ class Flight:
             camera.fov = angle
 
     def fly(self, pose: Float[np.ndarray, "3 4"], distance: float, angle: float) -> None:
-        """Go there smoothly. Returns on arrival, or when another flight begins."""
+        """Move the camera smoothly to what `place` would set. Returns on arrival, or when another flight begins."""
         self._number += 1
         number, camera = self._number, self._client.camera
         begin = np.array(camera.position), np.array(camera.look_at), np.array(camera.up_direction), camera.fov
@@ -53,7 +53,7 @@ class Flight:
         self.place(pose, distance, angle)
 
     def play(self, poses: Float[np.ndarray, "frame 3 4"], distance: float, angles: list[float], seconds: float) -> bool:
-        """Follow a path in so many seconds, leaving out what there is no time for. Says whether it came to its end."""
+        """Move the camera along a path in a time, skipping frames if need be; returns whether it came to the end."""
         self._number += 1
         number, begin = self._number, time.perf_counter()
         while (now := time.perf_counter() - begin) < seconds:
@@ -67,7 +67,7 @@ class Flight:
 
 
 def upwards(pose: Float[np.ndarray, "3 4"]) -> Float[np.ndarray, " 3"]:
-    """What the browser takes for up, so that it shows the pose's own roll: as near to the scene's up as can be."""
+    """The up direction that makes the browser show a pose's own roll: as near to the scene's up as can be."""
     right = pose[:, 0]
     up = UP - (UP @ right) * right
     if up @ -pose[:, 1] < 0.05:  # upside down, or nearly level with the axis

@@ -1,4 +1,4 @@
-"""Painter: draws for one client what it asked for last - coarse while it moves, finer once it rests."""
+"""Painter: a thread that draws what one client asked for last, coarse while its camera moves, finer once it rests."""
 
 from __future__ import annotations
 
@@ -17,18 +17,18 @@ Draw = Callable[[float, Callable[[], bool]], bool]
 
 
 class Painter:
-    """One thread. What is asked last counts; a picture at rest is abandoned when something else is asked.
+    """A thread that draws. The last request counts; a picture at rest is abandoned when another request comes.
 
     draw:  draw(seconds, wanted) shows the best picture that should take so many seconds and says whether that was the
            best there is; it raises NotWantedError as soon as wanted() is false
-    fault: told of anything that goes wrong
-    stage: says how far the method has been trained; a new one makes pictures stale
+    fault: called with whatever goes wrong
+    step:  gives the step to which the method has been trained; pictures of an earlier step are stale
     """
 
     def __init__(
-        self, draw: Draw, turns: Turns, fault: Callable[[Exception], None], stage: Callable[[], int] = lambda: 0
+        self, draw: Draw, turns: Turns, fault: Callable[[Exception], None], step: Callable[[], int] = lambda: 0
     ):
-        self._draw, self._turns, self._fault, self._stage = draw, turns, fault, stage
+        self._draw, self._turns, self._fault, self._step = draw, turns, fault, step
         self._asked, self._when, self._stopped = 0, 0.0, False
         self._wake = threading.Event()
         self.settled = threading.Event()  # the best picture of what was asked last is shown
@@ -38,7 +38,7 @@ class Painter:
         self._thread.start()
 
     def ask(self) -> None:
-        """Something is to be seen that was not; whatever is under way is out of date."""
+        """Request a new picture; what is being drawn is out of date."""
         self.settled.clear()
         self._asked, self._when = self._asked + 1, time.perf_counter()
         self._wake.set()
@@ -48,19 +48,19 @@ class Painter:
         self._wake.set()
 
     def _work(self) -> None:
-        drawn, best, stage = 0, True, self._stage()
+        drawn, best, step = 0, True, self._step()
         while not self._stopped:
             asked, now = self._asked, time.perf_counter()
             if asked != drawn:
-                stage, drawn = self._stage(), asked
+                step, drawn = self._step(), asked
                 best = self._try(MOVING, lambda: not self._stopped)
                 self._sleep(FASTEST - (time.perf_counter() - now))
             elif now < self._when + STILL:
                 self._sleep(self._when + STILL - now)
             elif not best:
                 best = self._refine(asked)
-            elif self._stage() != stage and self._turns.claim_refresh():
-                stage = self._stage()
+            elif self._step() != step and self._turns.claim_refresh():
+                step = self._step()
                 self._try(self._longest, self._while_asked(asked))
                 self._turns.refreshed(time.perf_counter() - now)
             else:
@@ -69,7 +69,7 @@ class Painter:
                 self._sleep(1.0)
 
     def _refine(self, asked: int) -> bool:
-        """Better pictures, one after the other, unless something else is asked meanwhile."""
+        """Draw better pictures one after the other; whether the best was reached before another request came."""
         for seconds in dict.fromkeys([RESTING, self._longest]):
             if self._try(seconds, self._while_asked(asked)):
                 return True
@@ -78,12 +78,12 @@ class Painter:
         return True
 
     def _while_asked(self, asked: int) -> Callable[[], bool]:
-        """Whether nothing else has been asked since."""
+        """A function that says whether no other request has come since."""
         return lambda: not self._stopped and self._asked == asked
 
     @property
     def _longest(self) -> float:
-        """What a picture at rest may cost. While training it soon is out of date, and others want the machine."""
+        """Seconds that a picture at rest may take: limited while training, when it is soon out of date."""
         return RESTING if self._turns.training and not self._turns.paused else ENDLESS
 
     def _try(self, seconds: float, wanted: Callable[[], bool]) -> bool:

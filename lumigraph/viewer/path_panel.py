@@ -6,7 +6,7 @@ import math
 import re
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
@@ -15,15 +15,13 @@ from torch import Tensor
 
 from ..camera import Camera
 from ..errors import LumigraphError
-from ..gaussians import to_quaternion
-from ..keyframes import CameraPath, Keyframe
+from ..geometry import to_quaternion
 from ..lens import Pinhole
+from ..paths.keyframes import CameraPath, Keyframe
 from ..scene import Frame
+from .cameras import pose_of
 from .flight import Flight
-from .look import pose_of
-
-if TYPE_CHECKING:
-    from .viewer import Subject
+from .subject import Subject
 
 NAME = re.compile(r"\w[\w .-]{0,80}")
 COLOUR = (200, 60, 150)
@@ -45,6 +43,7 @@ class PathPanel:
 
     size: of a frustum, in scene units
     tell: says a title and a text to the client
+    time: gives the moment of a moving scene that the client sees, which a keyframe keeps
     """
 
     def __init__(
@@ -55,7 +54,9 @@ class PathPanel:
         flight: Flight,
         size: float,
         tell: Callable[[str, str], None],
+        time: Callable[[], float | None],
     ):
+        self._time = time
         self._client, self._subject, self._flight, self._size, self._tell = client, subject, flight, size, tell
         self._stops: list[Stop] = []
         self._nodes: list[Any] = []
@@ -84,22 +85,25 @@ class PathPanel:
 
     @property
     def drawn(self) -> bool:
+        """Whether keyframes are drawn beside the scene."""
         return bool(self._nodes)
 
     @property
     def _index(self) -> int:
-        """Of the keyframe that is chosen; -1 if there is none."""
+        """Number of the chosen keyframe; -1 if there is none."""
         return list(self._chosen.options).index(self._chosen.value) if self._stops else -1
 
     def path(self) -> CameraPath:
-        """What is set now. Raises LumigraphError if there is no keyframe."""
+        """The camera path that is set now. Raises LumigraphError if it has no keyframe."""
         seconds, keys = 0.0, []
+        timed = all(stop.key.time is not None for stop in self._stops)  # keyframes of older files have no time
         for stop in self._stops:
-            keys.append(replace(stop.key, seconds=seconds))
+            keys.append(replace(stop.key, seconds=seconds, time=stop.key.time if timed else None))
             seconds += stop.leg
         return CameraPath(tuple(keys), self._loop.value, float(self._fps.value))
 
     def _here(self) -> Keyframe:
+        """A keyframe at the client's camera."""
         camera = self._client.camera
         angle = camera.fov
         if camera.aspect < 1:  # from the angle down a tall window to that across it
@@ -107,7 +111,7 @@ class PathPanel:
         pose = torch.tensor([pose_of(camera.wxyz, camera.position)], dtype=torch.double)
         (rows,) = moved(pose, source_from_scene(self._subject.frame)).tolist()
         a, b, c = (tuple(row) for row in rows)
-        return Keyframe((a, b, c), math.degrees(angle), 0.0)
+        return Keyframe((a, b, c), math.degrees(angle), 0.0, self._time())
 
     def _add(self) -> None:
         at = self._index + 1
@@ -157,7 +161,7 @@ class PathPanel:
 
     @property
     def _distance(self) -> float:
-        """From the camera to what it turns about."""
+        """Distance from the camera to the point that it turns about."""
         camera = self._client.camera
         return float(np.linalg.norm(camera.look_at - camera.position))
 
@@ -171,7 +175,7 @@ class PathPanel:
         return cameras.pose.double().numpy(), angles.tolist()
 
     def _fill(self, at: int) -> None:
-        """Show the keyframes, the one with this number chosen."""
+        """Show the keyframes in the panel, number `at` chosen."""
         self._filling = True
         try:
             seconds, names = 0.0, []

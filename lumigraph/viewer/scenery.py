@@ -1,4 +1,4 @@
-"""Scenery: what stands around the scene for all clients alike - the photographs' cameras and the sparse points."""
+"""Scenery: the photographs' cameras and the sparse points, drawn beside the scene for all clients alike."""
 
 from __future__ import annotations
 
@@ -7,18 +7,19 @@ from collections.abc import Callable
 from typing import Any
 
 import torch
-from jaxtyping import UInt8
+from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from ..camera import Camera
 from ..errors import LumigraphError
-from ..gaussians import to_quaternion
+from ..geometry import to_quaternion
 from ..scene import Scene
-from .look import angles
+from .cameras import angles
 
 CAMERAS, POINTS = "/cameras", "/points"
 MOST_CAMERAS, MOST_POINTS = 250, 200_000  # more only fill the browser
 THUMBNAIL = 96  # pixels along the longer side
+WHITE = (1.0, 1.0, 1.0)  # behind what is see-through
 TRAIN, TEST = (86, 134, 214), (232, 140, 60)
 SHARE = 0.4  # of the distance between neighbouring cameras, as the size of a frustum
 NEARBY = 4.0  # frustum sizes
@@ -26,7 +27,7 @@ NARROWEST, WIDEST = 0.03, 0.05  # of the distance to the middle of all cameras
 
 
 class Scenery:
-    """The cameras at once; thumbnails and points once the photographs have been opened, if they can be.
+    """Frusta of the cameras from the beginning; thumbnails and points once the photographs have been opened.
 
     server:   viser's
     cameras:  by split
@@ -48,7 +49,7 @@ class Scenery:
         self._positions = Camera.cat([group[::step] for group in cameras.values()]).position.cpu().double()
 
     def around(self, place: tuple[float, ...]) -> set[str]:
-        """The names of the frusta that hold a place or nearly do, and so would hide everything from there."""
+        """Names of the frusta so near to a place that they would hide the view from it."""
         distance = (self._positions - torch.tensor(place, dtype=torch.double)).norm(dim=-1)
         return {self._names[i] for i in (distance < NEARBY * self.size).nonzero()[:, 0].tolist()}
 
@@ -71,7 +72,7 @@ class Scenery:
             self._frusta[int(camera.image_index[0])] = frustum
 
     def fill(self, open_scene: Callable[[], Scene], done: Callable[[str | None], None]) -> None:
-        """Open the photographs in the background, and add what they tell. done: told what went wrong, if anything."""
+        """Open the photographs in the background and show them. done: told the fault, None if there was none."""
 
         def work() -> None:
             try:
@@ -87,11 +88,11 @@ class Scenery:
         threading.Thread(target=work, name="photographs", daemon=True).start()
 
     def stop(self) -> None:
-        """Nobody wants what is still being opened."""
+        """Drop what is still being opened."""
         self._stopped = True
 
     def show(self, scene: Scene) -> None:
-        """Thumbnails and points of a scene."""
+        """Draw thumbnails and points of a scene."""
         if scene.points is not None and len(scene.points):
             some = slice(None, None, -(-len(scene.points) // MOST_POINTS))
             colours = scene.point_colours
@@ -107,11 +108,11 @@ class Scenery:
             )
             self.has_points = True
         for number, frustum in self._frusta.items():
-            frustum.image = thumbnail(scene.images[number]).numpy()
+            frustum.image = thumbnail(scene.photograph(number).before(WHITE)).numpy()
 
 
 def frustum_size(cameras: Camera) -> float:
-    """Small enough for neighbours not to cover each other, where they stand apart."""
+    """Size of a frustum in scene units, at which neighbours do not cover each other where they stand apart."""
     position = cameras.position.cpu().double()
     distance = torch.cdist(position, position)
     spread = float((position - position.median(0).values).norm(dim=-1).median())
@@ -120,14 +121,10 @@ def frustum_size(cameras: Camera) -> float:
     return min(max(SHARE * nearest, NARROWEST * spread), WIDEST * spread)
 
 
-def thumbnail(image: UInt8[Tensor, "height width channel"]) -> UInt8[Tensor, "_ _ 3"]:
-    """A photograph made small; what is see-through is white."""
-    height, width, channels = image.shape
+def thumbnail(rgb: Float[Tensor, "height width 3"]) -> UInt8[Tensor, "_ _ 3"]:
+    """A photograph at most THUMBNAIL pixels long, as bytes."""
+    height, width, _ = rgb.shape
     share = min(1.0, THUMBNAIL / max(height, width))
     small = (max(1, round(share * height)), max(1, round(share * width)))
-    values = image.permute(2, 0, 1)[None].float()
-    rgb = values[:, :3]
-    if channels == 4:
-        alpha = values[:, 3:] / 255
-        rgb = rgb * alpha + 255 * (1 - alpha)
-    return torch.nn.functional.interpolate(rgb, small, mode="area")[0].permute(1, 2, 0).round().to(torch.uint8)
+    reduced = torch.nn.functional.interpolate(rgb.permute(2, 0, 1)[None], small, mode="area")[0]
+    return reduced.permute(1, 2, 0).mul(255).round().to(torch.uint8)

@@ -1,5 +1,5 @@
-"""Splats: a cloud of Gaussians as the browser draws it. It knows one colour for each, so colours are those towards
-one place, and are worked out anew where the eye comes to rest."""
+"""Gaussians as the browser draws them. It takes one colour for each and no spherical harmonics, so the colours are
+those seen from one place, and are computed again where the camera comes to rest."""
 
 from __future__ import annotations
 
@@ -12,8 +12,7 @@ from torch import Tensor
 
 from .. import kernels
 from ..gaussians import Gaussians
-from ..kernels.project.reference import to_matrix
-from ..paths import unit
+from ..geometry import to_matrix, unit
 
 # The browser's covariances are half-precision numbers: in units this much smaller, what is fine keeps its shape.
 ENLARGED = 16.0
@@ -21,8 +20,8 @@ LARGEST = 250.0  # standard deviation in those units; its square still is a half
 
 
 @dataclass(frozen=True)
-class Splats:
-    """What the browser is told, with lengths multiplied by ENLARGED."""
+class BrowserSplats:
+    """Arrays that viser sends to the browser, with lengths multiplied by ENLARGED."""
 
     centres: Float[np.ndarray, "gaussian 3"]
     covariances: Float[np.ndarray, "gaussian 3 3"]
@@ -31,11 +30,11 @@ class Splats:
 
 
 @torch.no_grad()
-def splats(cloud: Gaussians, eye: Float[Tensor, " 3"]) -> Splats:
-    """A cloud with its colours towards an eye, both in the scene's frame."""
+def splats(cloud: Gaussians, eye: Float[Tensor, " 3"]) -> BrowserSplats:
+    """A cloud for the browser, coloured as seen from an eye; both in the scene's frame."""
     deviations = (ENLARGED * cloud.log_scales.detach().exp()).clamp_max(LARGEST)
     axes = to_matrix(cloud.quaternions.detach()) * deviations[:, None, :]
-    return Splats(
+    return BrowserSplats(
         (ENLARGED * cloud.means.detach()).cpu().numpy(),
         (axes @ axes.mT).cpu().numpy(),
         colours(cloud, eye).cpu().numpy(),
@@ -45,7 +44,7 @@ def splats(cloud: Gaussians, eye: Float[Tensor, " 3"]) -> Splats:
 
 @torch.no_grad()
 def colours(cloud: Gaussians, eye: Float[Tensor, " 3"]) -> Float[Tensor, "gaussian 3"]:
-    """What each Gaussian looks like from one place, in [0, 1] (Kerbl 2023; the constant is that of `Gaussians`)."""
+    """Colour of each Gaussian seen from one place, in [0, 1] (Kerbl 2023; the constant is that of `Gaussians`)."""
     directions = unit(cloud.means.detach() - eye.to(cloud.means))
     values = kernels.spherical_harmonics(directions, cloud.degree + 1)
     return (0.5 + torch.einsum("nk,nkc->nc", values, cloud.harmonics.detach())).clamp(0, 1)

@@ -1,27 +1,30 @@
-"""The tab `Training`, which all clients share: how far it has come, its curve, and a button to pause it."""
+"""The tab `Training`, which all clients share: progress, a curve of the PSNR, and a button that pauses."""
 
 from __future__ import annotations
 
 import time
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Float
 
-from ..display import clock
+from ..progress import clock, short
 from .turns import Turns
 
 EVERY = 1.0  # seconds between updates
 POINTS = 200  # of the curve
 INK = "#5686d6"
+Measure = Literal["psnr", "loss"]
+TITLES: dict[Measure, str] = {"psnr": "PSNR of training batches", "loss": "Loss of training batches"}
 
 
 class TrainingPanel:
-    """Made inside the tab. rows: of metrics.jsonl, from earlier sittings."""
+    """The panel, made inside its tab. rows: of metrics.jsonl, from earlier sittings."""
 
     def __init__(self, server: Any, turns: Turns, rows: list[dict[str, Any]]):
         self._gui, self._turns = server.gui, turns
-        self._rows = [(row["seconds"], row["psnr"]) for row in rows if "psnr" in row]
+        self._measure = measure_of(rows)
+        self._rows = [(row["seconds"], row[self._measure]) for row in rows if self._measure in row]
         self._next, self._last = 0.0, ""
         last = rows[-1] if rows else None
         self._status = self._gui.add_markdown(
@@ -29,8 +32,8 @@ class TrainingPanel:
         )
         self._plot = self._gui.add_uplot(
             curve(self._rows),
-            ({"label": "seconds"}, {"label": "dB", "stroke": INK, "width": 2}),
-            title="PSNR of training batches",
+            series(self._measure),
+            title=TITLES[self._measure],
             scales={"x": {"time": False}},
             aspect=1.6,
             visible=len(self._rows) > 1,
@@ -39,10 +42,14 @@ class TrainingPanel:
         self._button.on_click(lambda _: self._toggle())
 
     def note(self, step: int, progress: float, row: dict[str, Any]) -> None:
-        """A step is done; row is its line of metrics, if it has one."""
+        """Take note of a step that is done. row: its line of metrics.jsonl, empty if it has none."""
         if not row:
             return
-        self._rows.append((row["seconds"], row["psnr"]))
+        if not self._rows and self._measure != (measure := measure_of([row])):
+            self._measure = measure
+            self._plot.title, self._plot.series = TITLES[measure], series(measure)
+        if self._measure in row:
+            self._rows.append((row["seconds"], row[self._measure]))
         self._last = describe(step, row)
         if (now := time.perf_counter()) >= self._next:
             self._next = now + EVERY
@@ -50,7 +57,7 @@ class TrainingPanel:
             self._draw()
 
     def end(self) -> None:
-        """There will be no more steps."""
+        """Show that training is over."""
         self._button.visible = False
         self._status.content = f"Done · {self._last}" if self._last else "Done"
         self._draw()
@@ -64,12 +71,23 @@ class TrainingPanel:
         self._button.label = "Resume" if self._turns.paused else "Pause"
 
 
+def measure_of(rows: list[dict[str, Any]]) -> Measure:
+    """What the curve shows: the PSNR, or of methods that have none the loss."""
+    return "psnr" if not rows or any("psnr" in row for row in rows) else "loss"
+
+
+def series(measure: Measure) -> tuple[dict[str, Any], dict[str, Any]]:
+    """The axes of the plot, as uPlot takes them."""
+    return {"label": "seconds"}, {"label": "dB" if measure == "psnr" else "loss", "stroke": INK, "width": 2}
+
+
 def describe(step: int, row: dict[str, Any]) -> str:
-    return f"step {step} · {row['psnr']:.2f} dB · {clock(row['seconds'])} trained"
+    quality = f"{row['psnr']:.2f} dB" if "psnr" in row else f"loss {short(row['loss'])}" if "loss" in row else ""
+    return " · ".join(part for part in (f"step {step}", quality, f"{clock(row['seconds'])} trained") if part)
 
 
 def curve(rows: list[tuple[float, float]]) -> tuple[Float[np.ndarray, " point"], Float[np.ndarray, " point"]]:
-    """Seconds and PSNR: means over stretches of steps, so that it is a line and not a cloud."""
+    """Seconds and PSNR or loss of the curve: means over stretches of steps, at most POINTS of them."""
     if not rows:
         return np.zeros(1), np.zeros(1)
     table = np.array(rows)

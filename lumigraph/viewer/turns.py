@@ -1,4 +1,4 @@
-"""Turns: one method, and many threads that want it."""
+"""Turns: renderings and training that share one method, one at a time."""
 
 from __future__ import annotations
 
@@ -10,16 +10,16 @@ from collections.abc import Callable, Iterator
 
 SHARE = 0.5  # of the time that renderings may take from training while someone moves
 IDLE_SHARE = 0.03  # and while nobody does
-LOOK = 0.1  # seconds between looks at whether one should stop waiting
+POLL = 0.1  # seconds between checks whether to stop waiting
 
 
 class NotWantedError(Exception):
-    """Nobody wants the turn any more."""
+    """A rendering that was waiting or under way is not wanted any more."""
 
 
 class Turns:
-    """Renderings take turns, in the order in which they asked. Training has the method by default and gives way
-    between steps, never so often that renderings take more than their share of the time.
+    """A queue of renderings, served in the order of asking. Training has the method by default and gives way between
+    steps, never so often that renderings take more than their share of the time.
 
     training: whether someone trains; `give_way` must then be called between steps, until `end_training`
     """
@@ -36,13 +36,13 @@ class Turns:
 
     @contextlib.contextmanager
     def turn(self, wanted: Callable[[], bool] = lambda: True) -> Iterator[None]:
-        """Have the method to oneself. Raises NotWantedError if it is not wanted any more before the turn has come."""
+        """Wait for the method and keep others from it. Raises NotWantedError once `wanted()` is false while waiting."""
         ticket = object()
         with self._condition:
             self._waiting.append(ticket)
             try:
                 while not self._free_for(ticket):
-                    self._condition.wait(LOOK)
+                    self._condition.wait(POLL)
                     if not wanted():
                         raise NotWantedError
                 self._busy = True
@@ -69,7 +69,7 @@ class Turns:
         return self.paused or bool(self._waiting) and time.perf_counter() >= self._own_until
 
     def give_way(self, stopping: Callable[[], object] = lambda: False) -> None:
-        """Called by training between two steps: one turn to whoever waits longest; while paused, to all who ask.
+        """Let the rendering that has waited longest have its turn; while paused, all of them. Called between two steps.
 
         stopping: whether training should not be held up any longer
         """
@@ -79,17 +79,17 @@ class Turns:
             while (self.paused or (self._served == before and self._waiting) or self._busy) and not (
                 stopping() and not self._busy
             ):
-                self._condition.wait(LOOK)
+                self._condition.wait(POLL)
             self._open = False
 
     def end_training(self) -> None:
-        """From now on nobody trains."""
+        """Leave the method to renderings from now on."""
         with self._condition:
             self.training = self.paused = False
             self._condition.notify_all()
 
     def claim_refresh(self) -> bool:
-        """Whether someone at rest may draw anew what training has changed; the others then wait for `refreshed`."""
+        """Whether a client at rest may render anew after training; other clients then wait until `refreshed`."""
         with self._condition:
             if self.training and not self.paused and time.perf_counter() < self._idle_until:
                 return False
@@ -97,6 +97,6 @@ class Turns:
             return True
 
     def refreshed(self, seconds: float) -> None:
-        """A refresh is over and took so long."""
+        """Take note of a refresh that is over, and of how long it took."""
         with self._condition:
             self._idle_until = time.perf_counter() + seconds / IDLE_SHARE

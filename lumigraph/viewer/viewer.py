@@ -1,84 +1,58 @@
-"""Viewer: a scene in everybody's browser, and what its clients share."""
+"""Viewer: a server that shows a scene to any number of browsers."""
 
 from __future__ import annotations
 
 import threading
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
-from functools import cached_property
-from pathlib import Path
 from typing import Any
 
 import rich
 import viser
 
 from ..camera import Camera
+from ..capabilities import HasGaussians, can
 from ..errors import LumigraphError
-from ..gaussians import Gaussians
 from ..method import Method
-from ..paths import Surroundings
-from ..rays import Rendering
-from ..scene import Frame, Scene
 from .address import Address
-from .crop import Box, render_inside
-from .look import angles, target
+from .cameras import angles, target
 from .scenery import Scenery
+from .shared import Shared
+from .subject import Subject
 from .training_panel import TrainingPanel
 from .turns import Turns
 from .visitor import Visitor
 
 
-@dataclass(frozen=True)
-class Subject:
-    """What is looked at.
-
-    title:   shown above the controls
-    cameras: of the photographs, by split, in the scene's frame
-    paths:   folder that camera paths are saved in
-    render_command: what makes films of it, without `--path`
-    open_scene: opens the photographs, for thumbnails and sparse points; None if there are none
-    rows:    of metrics.jsonl, as far as it has been trained
-    """
-
-    title: str
-    frame: Frame
-    cameras: dict[str, Camera]
-    paths: Path
-    render_command: str
-    open_scene: Callable[[], Scene] | None = None
-    rows: list[dict[str, Any]] = field(default_factory=list)
-
-    @cached_property
-    def around(self) -> Surroundings:
-        return Surroundings(Camera.cat(list(self.cameras.values())).to("cpu"), self.frame)
-
-    def distance(self, camera: Camera) -> float:
-        """From a camera to what it looks at."""
-        return float((target(camera, self.frame, self.around) - camera.position[0]).norm())
-
-
 class Viewer:
-    """Serves from the moment it is made until `stop`, from threads of its own.
+    """A server that answers from the moment it is made until `stop`, from threads of its own.
 
-    training: whether `fit(..., watch=viewer)` will train the method; it then shares the method with the clients
+    training: whether `fit(..., watch=viewer)` will train the method, taking turns with the clients
 
-    fit() calls `asked` and `give_way` between steps, and `note` with what a step gave. Afterwards call `end_training`.
+    fit() calls `asked` and `give_way` between steps and `note` after each; when it returns, call `end_training`.
     """
 
     def __init__(self, method: Method, subject: Subject, address: Address, training: bool = False):
         self.method, self.subject, self.address = method, subject, address
-        self.turns, self.stage = Turns(training), 0
+        self.turns = Turns(training)
         self._visitors: dict[int, Visitor] = {}
-        self._stopped = False
         self._lock = threading.Lock()  # around the visitors
         self._welcoming = threading.Lock()  # one at a time fills the tabs
-        self.is_cloud = has_gaussians(method)
+        is_cloud = can(method, HasGaussians)
         self._server = start_server(address, subject.title)
-        self._arrange()
+        self._aim()
+        tabs = self._server.gui.add_tab_group()
+        view_tab, path_tab = tabs.add_tab("View"), tabs.add_tab("Path")
+        self._panel = self._add_training_panel(tabs)
+        self._scenery = Scenery(self._server, subject.cameras, self._clicked)
+        self._shared = Shared(method, is_cloud, subject, self.turns, self._server, view_tab, path_tab, self._scenery)
+        self._server.on_client_connect(self._welcome)
+        self._server.on_client_disconnect(self._farewell)
+        if subject.open_scene is not None:
+            self._scenery.fill(subject.open_scene, self._filled)
 
-    def _arrange(self) -> None:
-        """What all clients see alike."""
+    def _aim(self) -> None:
+        """Set the look of the page, and the camera that every client begins with."""
         server, subject = self._server, self.subject
         server.gui.configure_theme(show_logo=False, show_share_button=False, control_width="medium")
         first = subject.cameras.get("test") or subject.cameras["train"]
@@ -86,35 +60,13 @@ class Viewer:
         server.initial_camera.position = camera.position[0].double().numpy()
         server.initial_camera.look_at = target(camera, subject.frame, subject.around).numpy()
         server.initial_camera.fov = angles(camera)[1]
-        tabs = server.gui.add_tab_group()
-        self.view_tab, self.path_tab = tabs.add_tab("View"), tabs.add_tab("Path")
-        if subject.rows or self.turns.training:
-            with tabs.add_tab("Training"):
-                self._panel: TrainingPanel | None = TrainingPanel(server, self.turns, subject.rows)
-        else:
-            self._panel = None
-        self.scenery = Scenery(server, subject.cameras, self._clicked)
-        server.on_client_connect(self._welcome)
-        server.on_client_disconnect(self._farewell)
-        if subject.open_scene is not None:
-            self.scenery.fill(subject.open_scene, self._filled)
 
-    # What visitors ask for
-
-    def cloud(self, box: Box | None) -> Gaussians:
-        """The method's Gaussians, those inside a box. Raises LumigraphError if it has none."""
-        cloud = self.method.gaussians()
-        return cloud if box is None else box.cropped(cloud)
-
-    def render(self, camera: Camera, box: Box | None) -> Rendering:
-        """What a camera sees, on the CPU. Only for whoever has the turn."""
-        if box is None:
-            return self.method.render(camera).cpu()
-        return render_inside(self.method, camera, box, self.is_cloud).cpu()
-
-    def knows(self, client: Any) -> bool:
-        """Whether a client is still there."""
-        return not self._stopped and client.client_id in self._server.get_clients()
+    def _add_training_panel(self, tabs: Any) -> TrainingPanel | None:
+        """The tab `Training`; None where nothing has been or will be trained."""
+        if not (self.subject.rows or self.turns.training):
+            return None
+        with tabs.add_tab("Training"):
+            return TrainingPanel(self._server, self.turns, self.subject.rows)
 
     # What fit() calls
 
@@ -124,17 +76,17 @@ class Viewer:
         return self.turns.asked
 
     def give_way(self, stopping: Callable[[], object]) -> None:
-        """Between two steps, with the method ready to render."""
+        """Let clients render. Called between two steps, with the method in evaluation mode."""
         self.turns.give_way(stopping)
 
     def note(self, step: int, progress: float, row: dict[str, Any]) -> None:
-        """A step is done. row: its line of metrics.jsonl, if it has one."""
-        self.stage = step
+        """Take note of a step that is done. row: its line of metrics.jsonl, empty if it has none."""
+        self._shared.step = step
         if self._panel is not None:
             self._panel.note(step, progress, row)
 
     def end_training(self) -> None:
-        """The method stays as it is from now on."""
+        """Take note that the method does not change any more."""
         self.turns.end_training()
         if self._panel is not None:
             self._panel.end()
@@ -149,11 +101,11 @@ class Viewer:
             time.sleep(3600)
 
     def stop(self) -> None:
-        """Send everybody away."""
-        self._stopped = True
+        """End the server and disconnect every client."""
+        self._shared.stopped = True
         for visitor in self._everyone():
             visitor.stop()
-        self.scenery.stop()
+        self._scenery.stop()
         with quiet():
             self._server.stop()
 
@@ -169,10 +121,10 @@ class Viewer:
 
     def _welcome(self, client: Any) -> None:
         with self._welcoming:
-            visitor = Visitor(self, client)
+            visitor = Visitor(self._shared, client)
         with self._lock:
             self._visitors[client.client_id] = visitor
-        if not self.knows(client):  # it left while its panel was being made
+        if not self._shared.knows(client):  # it left while its panel was being made
             self._farewell(client)
 
     def _farewell(self, client: Any) -> None:
@@ -191,16 +143,8 @@ class Viewer:
         for visitor in self._everyone():
             if fault is not None:
                 visitor.tell("Without photographs", fault)
-            elif self.scenery.has_points:
+            elif self._scenery.has_points:
                 visitor.controls.offer_points()
-
-
-def has_gaussians(method: Method) -> bool:
-    try:
-        method.gaussians()
-    except LumigraphError:
-        return False
-    return True
 
 
 def start_server(address: Address, title: str) -> Any:

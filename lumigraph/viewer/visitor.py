@@ -1,4 +1,4 @@
-"""Visitor: one client of the viewer - what it sees, where its camera is, and the painter that works for it."""
+"""Visitor: one client of the viewer, with its own camera, controls, path and painter."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import sys
 import time
 import traceback
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
@@ -18,18 +18,18 @@ from ..errors import LumigraphError
 from ..figures import to_bytes
 from ..rays import Rendering
 from ..scene import Vector
+from .cameras import angle_for, pose_of, rows
 from .controls import Controls
 from .flight import Flight
-from .look import Look, angle_for, pose_of, rows
-from .modes import along_axis, picture
+from .method_controls import MethodControls
+from .modes import along_axis, extra_modes, picture
 from .pace import Pace
 from .painter import MOVING, Painter
 from .path_panel import PathPanel
+from .shared import Shared
 from .splats import ENLARGED, colours, splats
 from .turns import NotWantedError
-
-if TYPE_CHECKING:
-    from .viewer import Viewer
+from .view_request import ViewRequest
 
 DEPTH_SIZE = 320  # pixels along the longer side of the depth that goes with a picture
 DEPTH_STEP = 256e-5  # scene units, to which that depth is rounded so that it packs well
@@ -41,24 +41,33 @@ Wanted = Callable[[], bool]
 
 
 class Visitor:
-    """Made when a client has come, stopped when it has left."""
+    """A connected client: made when it has come, stopped when it has left."""
 
-    def __init__(self, viewer: Viewer, client: Any):
-        self._viewer, self._client = viewer, client
+    def __init__(self, shared: Shared, client: Any):
+        self._shared, self._client = shared, client
         self._pace, self._bands, self._said = Pace(), Pace(), ""  # whole pictures, all waiting included; bands of them
         self._splats: Any = None
         self._sent: tuple[Any, ...] = ()  # which splats the client has
         self._eye = torch.zeros(3)  # towards which their colours are
         self._flat: Vector | None = None  # the background behind splats
         self._hidden: dict[str, Any] = {}  # frusta that are too near to the eye, and what hides each
-        self.painter = Painter(self._draw, viewer.turns, self._tell_fault, lambda: viewer.stage)
+        self.painter = Painter(self._draw, shared.turns, self._tell_fault, lambda: shared.step)
         self.flight = Flight(client)
-        self.controls = Controls(client, viewer.view_tab, viewer.subject.frame, viewer.is_cloud, self.painter.ask)
-        self.path = PathPanel(client, viewer.path_tab, viewer.subject, self.flight, viewer.scenery.size, self.tell)
+        self.controls = Controls(client, shared.view_tab, shared.subject.frame, shared.is_cloud, self.painter.ask)
+        self.method_controls = MethodControls(client, shared.view_tab, shared.method, self.painter.ask)
+        self.path = PathPanel(
+            client,
+            shared.path_tab,
+            shared.subject,
+            self.flight,
+            shared.scenery.size,
+            self.tell,
+            lambda: self.method_controls.time,
+        )
         self._seen: tuple[Any, ...] = ()
         client.camera.on_update(self._moved)
         self.controls.tell_angle(client.camera.fov)
-        if viewer.scenery.has_points:
+        if shared.scenery.has_points:
             self.controls.offer_points()
         self.painter.ask()
         self.painter.start()
@@ -68,62 +77,63 @@ class Visitor:
         self.painter.stop()
 
     def tell(self, title: str, text: str = "") -> None:
-        """Say something to the client."""
+        """Show the client a notification."""
         if self._here:
             self._client.add_notification(title, text, auto_close_seconds=8.0)
 
     def fly_to(self, camera: Camera, distance: float) -> None:
-        """Go where a photograph was taken, and see as much as it does."""
+        """Fly to where a photograph was taken, with an angle of view that shows all of it."""
         pose = camera.pose[0].double().cpu().numpy()
         self.flight.fly(pose, distance, angle_for(camera.to("cpu"), self._client.camera.aspect))
 
     @property
     def _here(self) -> bool:
-        return self._viewer.knows(self._client)
+        return self._shared.knows(self._client)
 
     async def _moved(self, camera: Any) -> None:
-        """In the server's own thread, so that this costs next to nothing."""
+        """Ask for a picture from the camera's new place. It runs in the server's thread, so it must be quick."""
         seen = *camera.wxyz, *camera.position, camera.fov, camera.image_width, camera.image_height
         if seen != self._seen:
             self._seen = seen
             self.controls.tell_angle(camera.fov)
             self.painter.ask()
 
-    def look(self) -> Look:
-        """What the client wants to see now."""
+    def request(self) -> ViewRequest:
+        """The view that the client asks for now."""
         camera, controls = self._client.camera, self.controls
-        return Look(
+        return ViewRequest(
             pose_of(camera.wxyz, camera.position),
             float(camera.fov),
             (max(1, int(camera.image_width)), max(1, int(camera.image_height))),
             controls.longest,
             controls.mode,
             controls.background,
-            controls.here,
+            controls.exact,
             controls.box,
             controls.surrounded or self.path.drawn,
+            self.method_controls.values,
         )
 
     def _draw(self, seconds: float, wanted: Wanted) -> bool:
-        """Show the best picture that should take so many seconds; says whether that is the best there is."""
-        look = self.look()
-        self._step_out(tuple(row[3] for row in look.pose))
-        if self._viewer.is_cloud and look.mode == "colour" and not look.here:
-            return self._draw_splats(look, seconds, wanted)
+        """Show the best picture that can be drawn in a time; returns whether no better one is possible."""
+        request = self.request()
+        self._step_out(tuple(row[3] for row in request.pose))
+        if self._shared.is_cloud and request.mode == "colour" and not request.exact:
+            return self._draw_splats(request, seconds, wanted)
         if self._splats is not None:
             self._splats.visible = False
-        size = look.full if seconds == float("inf") else self._pace.size(look.full, seconds)
+        size = request.full if seconds == float("inf") else self._pace.size(request.full, seconds)
         begin = time.perf_counter()
-        rendering, camera = self._render(look, size, wanted)
+        rendering, camera = self._render(request, size, wanted)
         took = time.perf_counter() - begin
         self._pace.note(size[0] * size[1], took)
-        self._show(rendering, camera, look, QUALITY_MOVING if seconds == MOVING else QUALITY)
+        self._show(rendering, camera, request, QUALITY_MOVING if seconds == MOVING else QUALITY)
         self._say(f"{size[0]} x {size[1]} in {1000 * took:.0f} ms")
-        return size == look.full
+        return size == request.full
 
-    def _render(self, look: Look, size: tuple[int, int], wanted: Wanted) -> tuple[Rendering, Camera]:
-        """A picture in bands short enough for others to have their turn, and to stop soon if nobody wants it."""
-        camera, (width, height) = look.camera(size), size
+    def _render(self, request: ViewRequest, size: tuple[int, int], wanted: Wanted) -> tuple[Rendering, Camera]:
+        """A rendering and its camera, made in bands so that others get turns and it can be abandoned soon."""
+        camera, (width, height) = request.camera(size), size
         band = max(FEWEST_ROWS, int(self._bands.pixels(MOVING)) // width)
         band = height if band >= 0.7 * height else band
         parts = []
@@ -131,17 +141,18 @@ class Visitor:
             if not wanted():
                 raise NotWantedError
             some = rows(camera, first, min(first + band, height))
-            with self._viewer.turns.turn(wanted):
+            with self._shared.turns.turn(wanted):
                 begin = time.perf_counter()
-                parts.append(self._viewer.render(some, look.box))
+                parts.append(self._shared.render(some, request))
                 self._bands.note(width * len(parts[-1].rgb), time.perf_counter() - begin)
         return Rendering.cat(parts), camera
 
-    def _show(self, rendering: Rendering, camera: Camera, look: Look, quality: int) -> None:
-        shown = picture(rendering, camera, look.mode, self._viewer.subject.frame.background, look.background)
+    def _show(self, rendering: Rendering, camera: Camera, request: ViewRequest, quality: int) -> None:
+        self.controls.offer_modes(extra_modes(rendering))
+        shown = picture(rendering, camera, request.mode, self._shared.subject.frame.background, request.background)
         depth = None
-        if look.depth:
-            step = -(-max(look.full) // DEPTH_SIZE) if max(rendering.depth.shape) > DEPTH_SIZE else 1
+        if request.depth:
+            step = -(-max(request.full) // DEPTH_SIZE) if max(rendering.depth.shape) > DEPTH_SIZE else 1
             depth = along_axis(rendering, camera).nan_to_num(1e3, 1e3)[step // 2 :: step, step // 2 :: step].numpy()
             depth = np.round(np.clip(depth, 0, 1e3) / DEPTH_STEP) * DEPTH_STEP
         self._stream(to_bytes(shown).numpy(), quality, depth)
@@ -152,25 +163,25 @@ class Visitor:
             raise NotWantedError
         self._client.scene.set_background_image(pixels, "jpeg", jpeg_quality=quality, depth=depth)
 
-    def _draw_splats(self, look: Look, seconds: float, wanted: Wanted) -> bool:
-        """See to it that the browser has what it needs to draw the cloud itself."""
-        if self._flat != look.background:
-            self._stream(np.full((2, 2, 3), np.round(255 * np.array(look.background)), np.uint8), 95, None)
-            self._flat = look.background
+    def _draw_splats(self, request: ViewRequest, seconds: float, wanted: Wanted) -> bool:
+        """Send the browser what it needs to draw the cloud itself; returns whether that is up to date."""
+        if self._flat != request.background:
+            self._stream(np.full((2, 2, 3), np.round(255 * np.array(request.background)), np.uint8), 95, None)
+            self._flat = request.background
         if self._splats is not None:
             self._splats.visible = True
-        now, eye = (self._viewer.stage, look.box), torch.tensor(look.pose)[:, 3]
+        now, eye = (self._shared.step, request.box, request.told), torch.tensor(request.pose)[:, 3]
         if self._splats is None or (seconds > MOVING and self._sent != now):
-            self._send_splats(look, eye, wanted)
+            self._send_splats(request, eye, wanted)
             self._sent, self._eye = now, eye
         elif seconds > MOVING and self._turned(eye):
-            self._recolour(look, eye, wanted)
+            self._recolour(request, eye, wanted)
             self._eye = eye
         return seconds > MOVING
 
-    def _send_splats(self, look: Look, eye: torch.Tensor, wanted: Wanted) -> None:
-        with self._viewer.turns.turn(wanted):
-            cloud = self._viewer.cloud(look.box)
+    def _send_splats(self, request: ViewRequest, eye: torch.Tensor, wanted: Wanted) -> None:
+        with self._shared.turns.turn(wanted):
+            cloud = self._shared.cloud(request)
             made = splats(cloud, eye)
         if not self._here:
             raise NotWantedError
@@ -181,10 +192,10 @@ class Visitor:
             self._splats.set_gaussians(*arrays)
         self._say(f"{len(cloud)} Gaussians, drawn by the browser")
 
-    def _recolour(self, look: Look, eye: torch.Tensor, wanted: Wanted) -> None:
-        """Colours towards where the eye rests now."""
-        with self._viewer.turns.turn(wanted):
-            cloud = self._viewer.cloud(look.box)
+    def _recolour(self, request: ViewRequest, eye: torch.Tensor, wanted: Wanted) -> None:
+        """Send the colours seen from where the eye rests now."""
+        with self._shared.turns.turn(wanted):
+            cloud = self._shared.cloud(request)
             if cloud.degree == 0 or len(cloud) > MOST_RECOLOURED:
                 return
             rgb = colours(cloud, eye).cpu().numpy()
@@ -192,19 +203,19 @@ class Visitor:
             self._splats.rgbs = rgb
 
     def _turned(self, eye: torch.Tensor) -> bool:
-        middle = torch.tensor(self._viewer.subject.frame.bounds).mean(0)
+        middle = torch.tensor(self._shared.subject.frame.bounds).mean(0)
         return float((eye - self._eye).norm()) > TURNED * max(float((self._eye - middle).norm()), 0.1)
 
     def _step_out(self, eye: tuple[float, ...]) -> None:
         """Hide frusta that the eye is in, from this client alone, by nodes of its own in the same places."""
-        near = self._viewer.scenery.around(eye) if self._here else set(self._hidden)
+        near = self._shared.scenery.around(eye) if self._here else set(self._hidden)
         for name in self._hidden.keys() - near:
             self._hidden.pop(name).remove()
         for name in near - self._hidden.keys():
             self._hidden[name] = self._client.scene.add_frame(name, show_axes=False, visible=False)
 
     def _say(self, text: str) -> None:
-        """In the panel, unless it says so already."""
+        """Set the panel's status line."""
         if text != self._said and self._here:
             self._said = self.controls.status.content = text
 

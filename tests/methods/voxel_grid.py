@@ -37,6 +37,10 @@ class VoxelGrid(RayMethod):
         self.colour = nn.Parameter(0.1 * torch.randn(1, b, n, n, n))
         self.register_buffer("steps", torch.zeros((), dtype=torch.int64))
 
+    @classmethod
+    def smallest(cls):
+        return Config(rays=128, samples=16, momentum=True, grids=Grids(cells=8))
+
     def batch(self, scene, generator):
         batch = scene.sample_rays(self.config.rays, generator)
         self.jitter = torch.rand(len(batch), 1, generator=generator)

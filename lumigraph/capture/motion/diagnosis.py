@@ -228,7 +228,7 @@ def filled(model: pycolmap.Reconstruction) -> float:
 
 
 def coverage(names: Sequence[str], poses: Float[np.ndarray, "photo 3 4"]) -> Coverage | None:
-    """Around the vertical through what the cameras look at; None where they look at no one thing.
+    """The coverage around the vertical through what the cameras look at; None where they look at no one thing.
 
     Directions nearer to each other than 30 degrees cover what lies between them.
     """

@@ -35,7 +35,7 @@ def exhaustive(count: int) -> set[Pair]:
 
 
 def sequential(count: int, neighbours: int = NEIGHBOURS) -> set[Pair]:
-    """Nearby ones all, farther ones at distances that double."""
+    """Pairs of photographs in order: nearby ones all, farther ones at distances that double."""
     steps = [*range(1, neighbours + 1), *(2**k for k in range(4, 10) if 2**k > neighbours)]
     return {(i, i + step) for step in steps for i in range(count - step)}
 

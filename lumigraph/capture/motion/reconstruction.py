@@ -37,7 +37,7 @@ SPECIFICATION = 2  # of what is written; another number has everything written a
 
 @dataclass(frozen=True)
 class Options:
-    """How cameras are looked for.
+    """Options of a reconstruction.
 
     frames:   how many to take of a video; None: by its length
     mapper:   one photograph after the other, or all at once
@@ -88,7 +88,7 @@ def check(options: Options) -> None:
 
 
 def with_safe_names(intake: Intake) -> Intake:
-    """The same with names that COLMAP can hold in its lists."""
+    """The intake with names that COLMAP can hold in its lists."""
     new: dict[str, str] = {}
     for photo in intake.photos:
         name = UNSAFE.sub("_", photo.name)
@@ -341,7 +341,7 @@ class Reconstruction:
 
 
 def read_models(folder: Path) -> list[pycolmap.Reconstruction]:
-    """The largest first."""
+    """COLMAP's models in a folder, the largest first."""
     found = [pycolmap.Reconstruction(place) for place in sorted(folder.iterdir()) if place.is_dir()]
     return sorted(found, key=lambda model: (model.num_reg_images(), model.num_points3D()), reverse=True)
 

@@ -9,16 +9,17 @@ from __future__ import annotations
 
 import json
 import os
-import sqlite3
+import subprocess
 import sys
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import pycolmap
 
-LOOKS = 0.2  # seconds between looks at the database
+COUNTER = Path(__file__).with_name("counter.py")
 BLOCK = 64  # pairs that COLMAP compares between two writes to the database
 RELIABLE = 3  # photographs that make a model, at the least
 MANY_CORES = 16  # more threads would ask for more memory than they save time
@@ -93,16 +94,6 @@ def tell(count: int) -> None:
     print(count, file=REPORT, flush=True)
 
 
-def watch(database: str, table: str, ended: threading.Event) -> None:
-    """Tell how many rows a table has, now and then."""
-    with sqlite3.connect(f"{Path(database).as_uri()}?mode=ro", uri=True) as connection:
-        while not ended.wait(LOOKS):
-            try:
-                tell(connection.execute(f"SELECT COUNT(*) FROM {table}").fetchone()[0])
-            except sqlite3.OperationalError:  # COLMAP is writing just now
-                continue
-
-
 def end_with_input() -> None:
     sys.stdin.read()
     os._exit(1)
@@ -117,14 +108,20 @@ def main() -> None:
     if table is None:
         run(job)
         return
-    ended = threading.Event()
-    watcher = threading.Thread(target=watch, args=(job["database"], table, ended))
-    watcher.start()
-    try:
+    with counting(job["database"], table):
         run(job)
-    finally:
-        ended.set()
-        watcher.join()
+
+
+@contextmanager
+def counting(database: str, table: str) -> Iterator[None]:
+    """Meanwhile another process reports how many rows a table has."""
+    command = [sys.executable, "-P", str(COUNTER), database, table]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=REPORT, stderr=subprocess.DEVNULL) as counter:
+        try:
+            yield
+        finally:
+            assert counter.stdin
+            counter.stdin.close()
 
 
 if __name__ == "__main__":

@@ -57,7 +57,7 @@ def device(tags: dict[int, Any], size: tuple[int, int]) -> str | None:
 
 
 def focal_length(tags: dict[int, Any], size: tuple[int, int]) -> float | None:
-    """In pixels of a picture of `size`, supposing that it was reduced since exposure but not cropped.
+    """The focal length in pixels of a picture of `size`, supposing that it was reduced since exposure but not cropped.
 
     From the 35 mm equivalent f35, which compares diagonals: f35 / 43.27 mm = f / diagonal. Otherwise from the focal
     length in mm and the sensor's pixels per length.
@@ -78,6 +78,19 @@ def focal_length(tags: dict[int, Any], size: tuple[int, int]) -> float | None:
     return length / sensor * max(size) if SENSORS[0] < sensor < SENSORS[1] else None
 
 
+def exposure(exif: Image.Exif) -> float | None:
+    """How much light a photograph took of the same scene, up to a factor: seconds at f/1 and ISO 100, t S / (100 N^2).
+
+    Where the aperture or the sensitivity is not said, both are taken for constant.
+    """
+    tags = exif.get_ifd(ExifTags.IFD.Exif)
+    seconds = number(tags.get(Tag.ExposureTime))
+    if seconds is None:
+        return None
+    aperture, sensitivity = number(tags.get(Tag.FNumber)) or 1.0, number(tags.get(Tag.ISOSpeedRatings)) or 100.0
+    return seconds * sensitivity / 100 / aperture**2
+
+
 def position(tags: dict[int, Any]) -> tuple[float, float, float] | None:
     latitude = degrees(tags.get(Gps.GPSLatitude), tags.get(Gps.GPSLatitudeRef))
     longitude = degrees(tags.get(Gps.GPSLongitude), tags.get(Gps.GPSLongitudeRef))
@@ -93,7 +106,7 @@ def position(tags: dict[int, Any]) -> tuple[float, float, float] | None:
 
 
 def degrees(parts: Any, side: Any) -> float | None:
-    """From degrees, minutes and seconds; south and west are negative."""
+    """Degrees from degrees, minutes and seconds; south and west are negative."""
     values = [finite(x) for x in parts] if isinstance(parts, tuple) else []
     if len(values) != 3 or values[0] is None:
         return None
@@ -102,7 +115,7 @@ def degrees(parts: Any, side: Any) -> float | None:
 
 
 def moment(tags: dict[int, Any]) -> float | None:
-    """Seconds since 1970. Where the file does not name its time zone, Greenwich's is taken."""
+    """The exposure's moment in seconds since 1970. Where the file does not name its time zone, Greenwich's is taken."""
     try:
         taken = datetime.strptime(text(tags.get(Tag.DateTimeOriginal)), "%Y:%m:%d %H:%M:%S")
     except ValueError:

@@ -17,7 +17,7 @@ from ...files import explained
 from ..pictures import describe, reductions
 from . import upright
 from .exif import read_facts
-from .judge import Look, blurred, duplicates, look
+from .judge import Judgement, blurred, duplicates, judge
 from .photo import Intake, Photo
 from .track import Track, untracked
 from .video import extract, is_video
@@ -48,7 +48,7 @@ def gather(sources: Sequence[Path], work: Path, frames: int | None = None, track
     files = named_files(list_photographs(sources, work))
     taken = examine(files, work / "upright", track)
     unreadable = {name: why for name, why in taken.items() if isinstance(why, str)}
-    seen = [one for _, one in sorted(taken.items()) if isinstance(one, Seen)]
+    seen = [one for _, one in sorted(taken.items()) if isinstance(one, Candidate)]
     if not seen:
         raise LumigraphError(nothing(source, unreadable))
     return assess(Intake(source, with_altitudes([one.photo for one in seen]), unreadable=unreadable), seen)
@@ -67,8 +67,8 @@ def of_video(path: Path, source: str, work: Path, frames: int | None, track: Tra
     return assess(Intake(source, photos, in_order=True), seen)
 
 
-def examine(files: Mapping[str, Path], copies: Path, track: Track) -> dict[str, Seen | str]:
-    """Look at all files, several at a time."""
+def examine(files: Mapping[str, Path], copies: Path, track: Track) -> dict[str, Candidate | str]:
+    """Every file as a candidate, or why it is none; several are read at a time."""
     with ThreadPoolExecutor(min(os.cpu_count() or 1, 16)) as pool:
         found = pool.map(lambda name: take(name, files[name], copies), files)
         try:
@@ -78,15 +78,15 @@ def examine(files: Mapping[str, Path], copies: Path, track: Track) -> dict[str, 
             raise
 
 
-def assess(intake: Intake, seen: Sequence[Seen]) -> Intake:
-    """The same with the blurred and the duplicates named: of two that show the same the sharper, larger one stays."""
+def assess(intake: Intake, seen: Sequence[Candidate]) -> Intake:
+    """An intake with the blurred and the duplicates named: of two that show the same the sharper, larger one stays."""
     bad = blurred({one.photo.name: one.photo.sharpness for one in seen})
     sizes = {one.photo.name: one.photo.size for one in seen}
 
-    def worth(one: Seen) -> tuple[bool, int, int, str]:
+    def worth(one: Candidate) -> tuple[bool, int, int, str]:
         return one.photo.name in bad, -math.prod(one.photo.size), -one.bytes, one.photo.name
 
-    signatures = {one.photo.name: one.look.signature for one in sorted(seen, key=worth)}
+    signatures = {one.photo.name: one.judgement.signature for one in sorted(seen, key=worth)}
     return replace(intake, blurred=bad, duplicates=dict(sorted(duplicates(signatures, sizes).items())))
 
 
@@ -143,15 +143,15 @@ def named_files(files: list[Path]) -> dict[str, Path]:
 
 
 @dataclass(frozen=True)
-class Seen:
-    """A photo, what a look at it found, and how many bytes its source has."""
+class Candidate:
+    """A photo, the judgement of its pixels, and how many bytes its source has."""
 
     photo: Photo
-    look: Look
+    judgement: Judgement
     bytes: int
 
 
-def take(name: str, path: Path, copies: Path) -> Seen | str:
+def take(name: str, path: Path, copies: Path) -> Candidate | str:
     """One photograph, copied where it has to be, and judged; or why it is none.
 
     Raises LumigraphError where the disk refuses the copy.
@@ -168,13 +168,13 @@ def take(name: str, path: Path, copies: Path) -> Seen | str:
                 if not upright.is_current(upright_file, path):
                     upright.copy(image, path, upright_file)
         with Image.open(upright_file) as image:
-            size, found = image.size, look(image)
+            size, found = image.size, judge(image)
     except LumigraphError:
         raise
     except Exception as fault:  # image libraries raise anything for a damaged file
         return unread(path, fault)
     photo = Photo(name, upright_file, size, facts.device, facts.focal, facts.gps, facts.time)
-    return Seen(replace(photo, sharpness=found.sharpness, brightness=found.brightness), found, path.stat().st_size)
+    return Candidate(replace(photo, sharpness=found.sharpness, brightness=found.brightness), found, path.stat().st_size)
 
 
 def unread(path: Path, fault: Exception) -> str:

@@ -1,4 +1,4 @@
-"""What the pixels say of a picture's worth: sharp or blurred, bright or dark, new or seen before.
+"""How good a picture is, from its pixels: sharp or blurred, bright or dark, new or like an earlier one.
 
 All is judged on the luminance at 640 pixels along the longer side, where a picture from a phone has no noise to speak
 of, and blur that can only be seen by enlarging does no harm.
@@ -43,8 +43,8 @@ SAME = 0.95  # correlation of signatures; neighbours of a walk around a subject 
 
 
 @dataclass(frozen=True)
-class Look:
-    """What a look at the pixels found.
+class Judgement:
+    """How good one picture is, from its pixels.
 
     sharpness: see above, 1 to 16
     brightness: mean log2 of the linear luminance
@@ -56,8 +56,8 @@ class Look:
     signature: Float[np.ndarray, " cell"]
 
 
-def look(image: Image.Image) -> Look:
-    """Judge a picture. A JPEG that nobody has read yet is decoded at a fraction of its size, which is quick.
+def judge(image: Image.Image) -> Judgement:
+    """The judgement of one picture. A JPEG that is not read yet is decoded at a fraction of its size, which is quick.
 
     EXIF's orientation is not looked at: only pictures that stand the same way have comparable signatures.
     Raises whatever Pillow raises for damaged files.
@@ -70,11 +70,11 @@ def look(image: Image.Image) -> Look:
             (max(round(grey.width / times), 1), max(round(grey.height / times), 1)), Image.Resampling.BOX
         )
     luminance = np.asarray(grey, np.float32)
-    return Look(sharpness(luminance), brightness(luminance), signature(grey))
+    return Judgement(sharpness(luminance), brightness(luminance), signature(grey))
 
 
 def sharpness(luminance: Float[np.ndarray, "height width"]) -> float:
-    """From 1, smooth, to 16, nothing but fine texture. luminance: 0 to 255."""
+    """A picture's sharpness, from 1, smooth, to 16, nothing but fine texture. luminance: 0 to 255."""
     pairs = zip(slopes(luminance, SHORT), slopes(luminance, LONG), strict=True)
     return min((short + ROUNDING) / (long + ROUNDING) for short, long in pairs)
 

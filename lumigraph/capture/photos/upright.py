@@ -57,7 +57,7 @@ def copy(image: Image.Image, source: Path, path: Path) -> None:
 
 
 def save(image: Image.Image, path: Path, profile: bytes | None = None) -> None:
-    """As JPEG or PNG, by the suffix. profile: of the image's colours (ICC)."""
+    """Write an image as JPEG or PNG, by the suffix. profile: of the image's colours (ICC)."""
     if path.suffix.lower() in JPEG:
         image.save(path, icc_profile=profile, quality=QUALITY, subsampling=0)
     else:

@@ -74,7 +74,7 @@ def extract(path: Path, folder: Path, frames: int | None = None, track: Track = 
 def judge(
     path: Path, frames: int | None, track: Track
 ) -> tuple[list[int], Float[np.ndarray, " frame"], Float[np.ndarray, " frame"], Float[np.ndarray, " frame"]]:
-    """Of the frames looked at: their numbers, seconds from the first on, sharpness, how far the picture had moved."""
+    """Numbers of the judged frames, their seconds from the first on, sharpness, and how far the picture had moved."""
     rows: list[tuple[int, float, float, float]] = []
     odometer, end = Odometer(), 0.0
     with opened(path) as film:

@@ -4,6 +4,7 @@
     render(stage.world, stage.cameras["test"][0])         picture, exact depth, normals, masks, albedo
     signed_distance(stage.world, points)                  exact geometry
     open_scene("procedural:still-life,size=400")          the same as any other capture
+    render(stage.world_of(camera), camera)                the same, of a scene that moves: `swing`
     write_blender(stage, folder)                          the same for other tools
 
 A new scene is a new file in `scenes/`; nothing is compiled for it.
@@ -11,13 +12,14 @@ A new scene is a new file in `scenes/`; nothing is compiled for it.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import partial
 
 import numpy as np
 
 from ...camera import Camera
 from ...errors import LumigraphError
-from ..capture import Capture, Shot
+from ..capture import Capture, Plane, Shot
 from . import scenes as scenes
 from .blender_folder import write_blender as write_blender
 from .rendering import eight_bits, photograph
@@ -70,6 +72,8 @@ def capture(stage: Stage, source: str) -> Capture:
             size=(int(cameras.size[i, 0]), int(cameras.size[i, 1])),
             image=partial(picture, stage, cameras[i]),
             split=split,
+            planes=known_planes(stage, cameras[i]),
+            time=None if cameras.time is None else float(cameras.time[i]),
         )
         for split, cameras in stage.cameras.items()
         for i in range(len(cameras))
@@ -78,6 +82,30 @@ def capture(stage: Stage, source: str) -> Capture:
     return Capture(source, shots, bounds=stage.bounds, reach=stage.reach, near=stage.near, background=background)
 
 
+def known_planes(stage: Stage, camera: Camera) -> dict[str, Plane]:
+    """The layers of one photograph, of which nothing is traced before somebody asks."""
+
+    def plane(name: str, encoding: str, dtype: type, channels: int = 1, names: Sequence[str] = ()) -> Plane:
+        values = partial(known, stage, camera, name)
+        return Plane(values, encoding, dtype=np.dtype(dtype), channels=channels, names=tuple(names))
+
+    return {
+        "depth": plane("depth", "distance", np.float32),
+        "normals": plane("normals", "direction", np.float32, 3),
+        "labels": plane("labels", "index", np.int64, names=stage.world.names),
+        "albedo": plane("albedo", "linear", np.float32, 3),
+    }
+
+
+def known(stage: Stage, camera: Camera, name: str) -> np.ndarray:
+    """What is exactly known along the rays through pixels' centres, as `render` has it."""
+    width, height = camera.size[0].tolist()
+    seen = trace(stage.world_of(camera), camera.rays(camera.pixels()), shaded=False)
+    values = {"depth": seen.depth, "normals": seen.normal, "labels": seen.identity, "albedo": seen.reflectance}[name]
+    values = values if name == "labels" else values.astype(np.float32)
+    return values.reshape(height, width, *values.shape[1:])
+
+
 def picture(stage: Stage, camera: Camera) -> np.ndarray:
     """Bytes (height, width, 3), or (height, width, 4) with straight alpha where the background is transparent."""
-    return eight_bits(*photograph(stage.world, camera), alpha=not stage.world.sky.visible)
+    return eight_bits(*photograph(stage.world_of(camera), camera), alpha=not stage.world.sky.visible)

@@ -1,6 +1,7 @@
 """A stage written out as Blender's synthetic scenes are (Mildenhall et al. 2020), for tests and other tools.
 
-FOLDER/transforms_train.json, transforms_test.json ...    poses, OpenGL convention (x right, y up, z backward)
+FOLDER/transforms_train.json, transforms_test.json ...    poses, OpenGL convention (x right, y up, z backward);
+                                                          "time" where things move, as in D-NeRF (Pumarola 2021)
 FOLDER/train/r_0000.png                                   RGBA, or RGB where the sky is visible
 FOLDER/train/r_0000_truth.npz                             depth (along the ray), normals, ids, albedo, names
 """
@@ -33,7 +34,7 @@ def write_blender(stage: Stage, folder: Path, truth: bool = True) -> None:
         (folder / split).mkdir()
         frames = []
         for i in range(len(cameras)):
-            seen = render(stage.world, cameras[i])
+            seen = render(stage.world_of(cameras[i]), cameras[i])
             path = f"{split}/r_{i:04d}"
             pixels = eight_bits(seen.rgb.numpy(), seen.opacity.numpy(), alpha=not stage.world.sky.visible)
             Image.fromarray(pixels).save(folder / f"{path}.png")
@@ -42,8 +43,11 @@ def write_blender(stage: Stage, folder: Path, truth: bool = True) -> None:
                 known["names"] = np.array(stage.world.names)
                 np.savez_compressed(folder / f"{path}_truth.npz", allow_pickle=False, **known)
             pose = np.vstack([cameras.pose[i].double().numpy(), [0, 0, 0, 1]]) @ OPENGL
-            frames.append({"file_path": f"./{path}", "transform_matrix": pose.tolist()})
-        listed = {"camera_angle_x": angle_across(cameras), "frames": frames}
+            beside = {f"{name}_file_path": f"./{path}_truth.npz" for name in ("depth", "labels", "normals") if truth}
+            when = {} if cameras.time is None else {"time": float(cameras.time[i])}
+            frames.append({"file_path": f"./{path}", **when, "transform_matrix": pose.tolist(), **beside})
+        units = {"depth_unit_scale_factor": 1.0, "is_euclidean_depth": True} if truth else {}
+        listed = {"camera_angle_x": angle_across(cameras), **units, "frames": frames}
         (folder / f"transforms_{split}.json").write_text(json.dumps(listed, indent=1))
 
 

@@ -8,6 +8,7 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
+from ... import geometry
 from ...camera import Camera
 from ...lens import Pinhole
 
@@ -16,22 +17,19 @@ GOLDEN_ANGLE = math.pi * (3 - math.sqrt(5))
 
 def look_at(eye, target, up=(0.0, 0.0, 1.0)) -> Float[np.ndarray, "3 4"]:
     """Pose of a camera at `eye` whose picture's centre is `target` and whose top points `up`."""
-    eye, target, up = (np.asarray(x, float) for x in (eye, target, up))
-    forward = (target - eye) / np.linalg.norm(target - eye)
-    right = np.cross(forward, up)
-    right /= np.linalg.norm(right)
-    return np.stack([right, np.cross(forward, right), forward, eye], -1)
+    eye, target, up = (torch.as_tensor(np.asarray(x, np.float64)) for x in (eye, target, up))
+    return geometry.look_at(eye, target - eye, up).numpy()
 
 
 def pinhole(poses: Float[np.ndarray, "camera 3 4"], size: int, field_of_view: float) -> Camera:
-    """Square pictures of `size` pixels, `field_of_view` degrees wide."""
+    """The lens of square pictures of `size` pixels, `field_of_view` degrees wide."""
     count, focal = len(poses), 0.5 * size / math.tan(math.radians(field_of_view) / 2)
     lens = Pinhole(torch.full((count, 2), focal), torch.full((count, 2), size / 2))
     return Camera(torch.from_numpy(np.asarray(poses)).float(), lens, torch.full((count, 2), size))
 
 
 def sphere_point(azimuth: float, elevation: float, radius: float = 1.0) -> np.ndarray:
-    """Angles in radians; elevation above the horizon."""
+    """A point of the unit sphere. Angles in radians; elevation above the horizon."""
     flat = radius * math.cos(elevation)
     return np.array([flat * math.cos(azimuth), flat * math.sin(azimuth), radius * math.sin(elevation)])
 

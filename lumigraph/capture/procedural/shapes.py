@@ -205,7 +205,7 @@ def gradient(kind, size, p):
 
 @njit(**INNER)
 def inverse(d):
-    """One over each component."""
+    """The reciprocal of each component."""
     x = d[0] if abs(d[0]) > TINY else math.copysign(TINY, d[0])
     y = d[1] if abs(d[1]) > TINY else math.copysign(TINY, d[1])
     z = d[2] if abs(d[2]) > TINY else math.copysign(TINY, d[2])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 from ...camera import Camera
@@ -12,10 +13,12 @@ from .world import Vector, World
 class Stage:
     """A procedural scene ready to be photographed.
 
-    cameras: by split
+    world:   at the first moment, where things move
+    cameras: by split; their `time` says when each photograph is taken, where things move
     bounds:  the box of interest, lowest and highest corner
     reach:   half-size of the cube around the origin that holds everything worth modelling
     near:    distance from every camera within which there is nothing
+    moving:  the world at a moment; None where nothing moves
     """
 
     world: World
@@ -23,3 +26,8 @@ class Stage:
     bounds: tuple[Vector, Vector]
     reach: float
     near: float
+    moving: Callable[[float], World] | None = None
+
+    def world_of(self, camera: Camera) -> World:
+        """The world at the moment when a camera (a batch of one) takes its photograph."""
+        return self.world if self.moving is None or camera.time is None else self.moving(float(camera.time))

@@ -76,7 +76,7 @@ class Pose:
 
     @staticmethod
     def at(x: float, y: float, z: float, turn: float = 0.0, tilt: float = 0.0) -> Pose:
-        """At a place, leaning by `tilt` degrees (about x), then turned by `turn` degrees (about z)."""
+        """The pose at a place, leaning by `tilt` degrees (about x), then turned by `turn` degrees (about z)."""
         rotation = rotation_about((0, 0, 1), turn) @ rotation_about((1, 0, 0), tilt)
         return Pose((x, y, z), _nested(rotation))
 
@@ -85,7 +85,7 @@ class Pose:
         return Pose(rotation=_nested(rotation_about(axis, degrees)))
 
     def __matmul__(self, inner: Pose) -> Pose:
-        """First `inner`, then this one."""
+        """The pose that moves by `inner` first, then by this one."""
         rotation, position = np.array(self.rotation), np.array(self.position)
         moved = rotation @ np.array(inner.position) + position
         return Pose(tuple(moved.tolist()), _nested(rotation @ np.array(inner.rotation)))
@@ -220,7 +220,7 @@ class World:
 
     @cached_property
     def arrays(self) -> Arrays:
-        """The same world, flat."""
+        """The world as flat arrays, for the tracer."""
         objects = np.zeros(len(self.objects), OBJECT)
         materials = list(dict.fromkeys(o.material for o in self.objects))
         for row, thing in zip(objects, self.objects, strict=True):

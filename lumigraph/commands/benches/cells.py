@@ -10,7 +10,7 @@ from typing import Annotated, Literal
 from ... import methods
 from ...errors import LumigraphError
 from ..capture import posed
-from ..common import Reader, choose_device, needed, option, say, scene_name, show
+from ..common import ReaderOption, choose_device, needed, option, say, scene_name, show
 from ..train import DEFAULT_SECONDS
 
 
@@ -32,8 +32,7 @@ class Cells:
     """Files with the weights of LPIPS, as for `lumigraph eval`."""
     downscale: Annotated[int | None, option("N", "none, or what suits the photographs")] = None
     """Shrink photographs by a whole number."""
-    reader: Annotated[Reader | None, option("NAME", "found by looking into the folder")] = None
-    """Layout of the folders: transforms, blender, colmap or llff."""
+    reader: ReaderOption = None
     scales: Annotated[int, option("N")] = 1
     """Have every photograph so many times, each half as large as the one before; the figures count them all."""
     device: Annotated[str, option("NAME")] = "auto"
@@ -50,7 +49,7 @@ class Cells:
         """Train and compare everything with everything. views: numbers of photographs by the scene's source."""
         from ...benchmark.cell import Cell, Settings
         from ...benchmark.conduct import conduct
-        from ...lpips import load_lpips, named_files
+        from ...metrics.lpips import load_lpips, named_files
         from ...train import Budget
 
         if seconds and steps:

@@ -10,7 +10,7 @@ from ..common import choose_device, option
 
 
 @dataclass(frozen=True)
-class Kernels:
+class BenchKernels:
     """Measure every kernel's throughput on every engine, and its ratio to the reference in the same run."""
 
     output: Annotated[Path | None, option("FILE.json", "the table alone")] = None

@@ -10,7 +10,7 @@ from .cells import Cells
 
 
 @dataclass(frozen=True, kw_only=True)
-class Methods(Cells):
+class BenchMethods(Cells):
     """Train methods on scenes, for several durations and from several seeds, and compare held-out views.
 
     Every cell is a run of its own in OUTPUT/runs, trained by `lumigraph train` and compared by `lumigraph eval` in

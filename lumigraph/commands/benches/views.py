@@ -11,7 +11,7 @@ from .cells import Cells
 
 
 @dataclass(frozen=True, kw_only=True)
-class Views(Cells):
+class BenchViews(Cells):
     """Train methods on fewer and fewer photographs of a scene, and compare the same held-out views.
 
     The photographs are spread evenly over the cameras, and fewer are always among more. Otherwise as `lumigraph bench

@@ -13,7 +13,7 @@ from ..common import choose_device, needed, option, scene_name, show
 
 
 @dataclass(frozen=True)
-class Encodings:
+class ExplainEncodings:
     """Fit a network to a picture behind each encoding of its pixels, and over a range of scales.
 
     Half of the pixels are held out. One page, index.html, shows their PSNR against scale, the spectrum of the neural
@@ -42,12 +42,12 @@ class Encodings:
             raise LumigraphError("A curve over scales needs two or more, all above 0; for example --scales 1 10 100")
         from dataclasses import replace
 
-        from ...capture import open_scene, picture
+        from ...capture import open_scene, single_image
         from ...explain.encodings import compare
         from ...explain.encodings_page import write_page
         from ...methods.fourier_features import FourierFeatures
 
-        if not picture.recognises(self.picture.expanduser()):
+        if not single_image.recognises(self.picture.expanduser()):
             raise LumigraphError(f"{self.picture} is no image file; name one picture, as in photograph.png")
         device = choose_device(self.device)
         scene = open_scene(self.picture, self.downscale)

@@ -10,10 +10,11 @@ from tyro.conf import Positional
 
 from ...errors import LumigraphError
 from ..common import choose_device, needed, option, say, show
+from ..controls import Set, tell
 
 
 @dataclass(frozen=True)
-class Ray:
+class ExplainRay:
     """Draw density, transmittance, weights and samples along the ray of a pixel, and the colour that they build up.
 
     One figure, which opens in a browser; its numbers lie beside it as JSON. The photograph's own colour is drawn where
@@ -32,45 +33,47 @@ class Ray:
     """The figure."""
     scene: Annotated[str | None, option("SCENE", "where they were")] = None
     """Where the photographs are now, if they have moved."""
+    told: Set = ()
     device: Annotated[str, option("NAME")] = "auto"
     """auto, cpu, cuda, cuda:1."""
 
     def run(self) -> int:
         if self.output and self.output.suffix != ".svg":
             raise LumigraphError(f"{self.output} does not say that it is a figure; give --output a name ending in .svg")
-        from ...charts import standalone
         from ...evaluate import file_name
         from ...explain.ray import along_ray
         from ...explain.ray_figure import ray_figure
+        from ...figures.charts import standalone
         from ...files import write_bytes, write_json
         from ...run import Run
 
         run = Run(self.run_folder)
-        method = run.method(choose_device(self.device))
         name, camera = find_view(run, self.split, self.view)
+        method = tell(run, run.method(choose_device(self.device)), self.told)
+        camera = method.refined(camera)
         x, y = pixel = self.pixel or tuple((camera.size[0] // 2).tolist())
         sight = along_ray(method, camera, pixel)
-        sight = sight.beside(self._photograph(run, camera))
+        sight = sight.beside(self._photograph(run, name))
         output = self.output or run.folder / "rays" / f"{file_name(name)}-{x}-{y}.svg"
         title = f"{run.method_name}: pixel ({x}, {y}) of {name}"
         write_bytes(output, standalone(ray_figure(sight, title)))
         about = {"run": str(run.folder), "method": run.method_name, "view": name, "split": self.split}
+        about |= {"controls": method.told} if method.told else {}
         write_json(output.with_suffix(".json"), about | sight.to_json())
         show(sight.rows() | {"files": f"{output}, {output.with_suffix('.json')}"})
         return 0
 
-    def _photograph(self, run: Any, camera: Any) -> Any:
-        """The camera's photograph before the run's background, or None if it is gone and nobody said where to."""
-        from ...evaluate import on_background
-
+    def _photograph(self, run: Any, name: str) -> Any:
+        """The photograph before the run's background, or None if it is gone and nobody said where to."""
         try:
-            _, image = run.scene(self.scene).view(int(camera.image_index))
+            scene = run.scene(self.scene)
+            photograph = scene.photograph(scene.names.index(name))
         except LumigraphError as error:
             if self.scene:
                 raise
             say(f"The figure does without the photograph: {error}")
             return None
-        return on_background(image, run.frame.background)
+        return photograph.before(run.frame.background)
 
 
 def find_view(run: Any, split: str, view: str) -> tuple[str, Any]:

@@ -9,12 +9,13 @@ from typing import Annotated, Literal
 from tyro.conf import Positional, arg
 
 from ...errors import LumigraphError
-from ..common import choose_device, needed, option, show
-from .points import check_pictures, opened
+from ..common import needed, option, show
+from ..controls import Set, open_method
+from .points import check_pictures
 
 
 @dataclass(frozen=True)
-class Mesh:
+class ExportMesh:
     """Triangles with colours at their corners, in the frame of the photographs.
 
     The ending says which format: .ply, .obj or .glb. Marching cubes on the density of methods that have one, fusion of
@@ -23,7 +24,7 @@ class Mesh:
     """
 
     source: Annotated[Positional[Path], needed("RUN_OR_FILE")]
-    """Folder of a run, or a splat file."""
+    """Folder of a run, a splat file, or a composition."""
     output: Annotated[Positional[Path], needed("FILE")]
     """The new file."""
     box: Annotated[float | None, option("TIMES", "1 for objects, 1.5 for the rest")] = None
@@ -49,21 +50,22 @@ class Mesh:
     """Longer side of the pictures that tell colours, and depth where it is fused; at most that of the photographs."""
     views: Annotated[int, option("N")] = 64
     """Number of these pictures at most."""
+    told: Set = ()
     device: Annotated[str, option("NAME")] = "auto"
     """auto, cpu, cuda, cuda:1."""
 
     def run(self) -> int:
         self._check()
-        from ...export.mesh import extract_mesh, scale_to_source
+        from ...export.mesh import extract_mesh
         from ...export.mesh_file import ending, write_mesh
 
         ending(self.output)
-        run, cameras = opened(self.source)
+        opened, method, cameras = open_method(self.source, self.device, self.told)
         mesh = extract_mesh(
-            run.method(choose_device(self.device)),
-            cameras,
+            method,
+            opened.survey(cameras["train"]),
             box=self.box,
-            cell=None if self.cell_size is None else self.cell_size / scale_to_source(run.frame),
+            cell=None if self.cell_size is None else self.cell_size / opened.frame.to_source.scale,
             level=self.level,
             way=self.way,
             smooth=self.smooth,
@@ -72,7 +74,7 @@ class Mesh:
             closed=None if self.unseen is None else self.unseen == "close",
             size=self.size,
             views=self.views,
-        ).in_source(run.frame)
+        ).in_source(opened.frame)
         write_mesh(self.output, mesh)
         low, high = mesh.vertices.min(0), mesh.vertices.max(0)
         show(

@@ -8,7 +8,8 @@ from typing import Annotated
 
 from tyro.conf import Positional, arg
 
-from ..common import choose_device, needed, open_run, option, show
+from ..common import needed, option, show
+from ..controls import Set, open_method
 
 Place = Annotated[
     tuple[float, float, float] | None,
@@ -21,20 +22,21 @@ Place = Annotated[
 
 
 @dataclass(frozen=True)
-class Panorama:
+class ExportPanorama:
     """All that is seen from one place, as an equirectangular picture that viewers and headsets show as a sphere.
 
     The horizon is level, the photographs' main direction in the middle. The ending says which format: .png or .jpg.
     """
 
     source: Annotated[Positional[Path], needed("RUN_OR_FILE")]
-    """Folder of a run, or a splat file."""
+    """Folder of a run, a splat file, or a composition."""
     output: Annotated[Positional[Path], needed("FILE")]
     """The new picture."""
     place: Place = None
     """Where to stand, in the frame of the photographs."""
     size: Annotated[int, option("PIXELS")] = 2048
     """Width; the height is half of it."""
+    told: Set = ()
     device: Annotated[str, option("NAME")] = "auto"
     """auto, cpu, cuda, cuda:1."""
 
@@ -43,9 +45,8 @@ class Panorama:
 
         picture_format(self.output)
         sphere_size(self.size)
-        run = open_run(self.source)
-        place, heading, where = standpoint(run.cameras()["train"], run.frame, self.place)
-        method = run.method(choose_device(self.device))
+        opened, method, cameras = open_method(self.source, self.device, self.told)
+        place, heading, where = standpoint(cameras["train"], opened.frame, self.place)
         save_sphere(self.output, panorama(method, place, heading, self.size).rgb, whole=True)
         show({"panorama": str(self.output), "size": f"{self.size}x{self.size // 2}", "from": where})
         return 0

@@ -4,23 +4,24 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 from tyro.conf import Positional
 
 from ...errors import LumigraphError
-from ..common import choose_device, needed, open_run, option, show
+from ..common import needed, option, show
+from ..controls import Set, open_method
 
 
 @dataclass(frozen=True)
-class Points:
+class ExportPoints:
     """A cloud of coloured points with normals, spread evenly over the surfaces that the photographs show.
 
     They lie in the frame of the photographs. Floaters are left out: several cameras must see each point.
     """
 
     source: Annotated[Positional[Path], needed("RUN_OR_FILE")]
-    """Folder of a run, or a splat file."""
+    """Folder of a run, a splat file, or a composition."""
     output: Annotated[Positional[Path], needed("FILE.ply")]
     """The new file."""
     count: Annotated[int, option("N")] = 200_000
@@ -29,6 +30,7 @@ class Points:
     """Longer side of the pictures that the points come from; at most that of the photographs."""
     views: Annotated[int, option("N")] = 64
     """Number of these pictures at most."""
+    told: Set = ()
     device: Annotated[str, option("NAME")] = "auto"
     """auto, cpu, cuda, cuda:1."""
 
@@ -40,9 +42,9 @@ class Points:
         check_pictures(self.size, self.views)
         from ...export.points import extract_points, write_points
 
-        run, cameras = opened(self.source)
-        method = run.method(choose_device(self.device))
-        points = extract_points(method, cameras, self.count, self.size, self.views).in_source(run.frame)
+        opened, method, cameras = open_method(self.source, self.device, self.told)
+        seers = opened.survey(cameras["train"])
+        points = extract_points(method, seers, self.count, self.size, self.views).in_source(opened.frame)
         write_points(self.output, points)
         show(
             {
@@ -52,16 +54,6 @@ class Points:
             }
         )
         return 0
-
-
-def opened(source: Path) -> tuple[Any, Any]:
-    """A run or a splat file, and the cameras that its surfaces are looked at with."""
-    from ...export.sightings import all_around
-    from ...splat_file import SplatFile
-
-    run = open_run(source)
-    cameras = run.cameras()["train"]
-    return run, all_around(cameras) if isinstance(run, SplatFile) else cameras
 
 
 def check_pictures(size: int, views: int) -> None:

@@ -8,11 +8,13 @@ from typing import Annotated
 
 from tyro.conf import Positional
 
+from ...errors import LumigraphError
 from ..common import needed, show
+from ..controls import Set, tell
 
 
 @dataclass(frozen=True)
-class Splats:
+class ExportSplats:
     """A trained cloud of Gaussians for splat viewers, or one splat format turned into another.
 
     The ending says which format: .ply (all there is), .compressed.ply, .spz, .splat (no view-dependent colour). What a
@@ -20,21 +22,26 @@ class Splats:
     """
 
     source: Annotated[Positional[Path], needed("RUN_OR_FILE")]
-    """Folder of a run, or a splat file."""
+    """Folder of a run, a splat file, or a composition."""
     output: Annotated[Positional[Path], needed("FILE")]
     """The new file."""
+    told: Set = ()
 
     def run(self) -> int:
+        from ...capabilities import HasGaussians, needs
         from ...exchange import is_splat_file, read_gaussians, write_gaussians
         from ...export.splats import export_splats
-        from ...run import Run
+        from ...run import open_any
 
         if is_splat_file(self.source):
+            if self.told:
+                raise LumigraphError(f"{self.source} is a file of Gaussians, which has no controls; leave out --set")
             written = read_gaussians(self.source)
             write_gaussians(self.output, written)
         else:
-            method = Run(self.source).method()
-            written = export_splats(method.gaussians(), method.frame, self.output)
+            opened = open_any(self.source)
+            method = tell(opened, opened.method(), self.told)
+            written = export_splats(needs(method, HasGaussians).gaussians(), method.frame, self.output)
         size = self.output.stat().st_size
         show(
             {

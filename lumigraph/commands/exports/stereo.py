@@ -9,12 +9,13 @@ from typing import Annotated
 from tyro.conf import Positional
 
 from ...errors import LumigraphError
-from ..common import choose_device, needed, open_run, option, show
+from ..common import needed, option, show
+from ..controls import Set, open_method
 from .panorama import Place
 
 
 @dataclass(frozen=True)
-class Stereo:
+class ExportStereo:
     """An omnidirectional stereo pair on one square picture, the left eye on top.
 
     The horizon is level, the photographs' main direction in the middle. The ending says which format: .png or .jpg.
@@ -23,7 +24,7 @@ class Stereo:
     """
 
     source: Annotated[Positional[Path], needed("RUN_OR_FILE")]
-    """Folder of a run, or a splat file."""
+    """Folder of a run, a splat file, or a composition."""
     output: Annotated[Positional[Path], needed("FILE")]
     """The new picture."""
     place: Place = None
@@ -32,11 +33,11 @@ class Stereo:
     """Distance between the eyes, in the units of the photographs' frame."""
     size: Annotated[int, option("PIXELS")] = 2048
     """Width, and height of both halves together."""
+    told: Set = ()
     device: Annotated[str, option("NAME")] = "auto"
     """auto, cpu, cuda, cuda:1."""
 
     def run(self) -> int:
-        from ...export.mesh import scale_to_source
         from ...export.panorama import picture_format, save_sphere, sphere_size, standpoint
         from ...export.stereo import SHARE, stereo_pair, surrounding_distances, top_bottom
 
@@ -46,10 +47,9 @@ class Stereo:
             raise LumigraphError(
                 f"Eyes cannot be {self.interpupillary:g} apart; give --interpupillary a length above 0"
             )
-        run = open_run(self.source)
-        place, heading, where = standpoint(run.cameras()["train"], run.frame, self.place)
-        method = run.method(choose_device(self.device))
-        unit = scale_to_source(run.frame)
+        opened, method, cameras = open_method(self.source, self.device, self.told)
+        place, heading, where = standpoint(cameras["train"], opened.frame, self.place)
+        unit = opened.frame.to_source.scale
         near, middle = surrounding_distances(method, place, heading)
         apart = SHARE * middle if self.interpupillary is None else self.interpupillary / unit
         if apart > near:

@@ -10,14 +10,15 @@ from typing import Annotated, Any, Literal
 from tyro.conf import Positional, arg
 
 from ...errors import LumigraphError
-from ..common import choose_device, needed, open_run, option, show
+from ..common import needed, option, show
+from ..controls import Set, open_method
 
 FACES = 300_000  # of a mesh in a page, at most: about 4 MB
 Kind = Literal["auto", "splats", "mesh", "views"]
 
 
 @dataclass(frozen=True)
-class Web:
+class ExportWeb:
     """One HTML file that opens from disk, in any browser, without a server or a network.
 
     Gaussians are drawn as splats. Other methods become pictures rendered here from all around, which dragging turns
@@ -25,7 +26,7 @@ class Web:
     """
 
     source: Annotated[Positional[Path], needed("RUN_OR_FILE")]
-    """Folder of a run, or a splat file."""
+    """Folder of a run, a splat file, or a composition."""
     output: Annotated[Positional[Path], needed("FILE.html")]
     """The page."""
     kind: Annotated[Kind, arg(name="as", help_behavior_hint="(default: splats for Gaussians, views for the rest)")] = (
@@ -40,13 +41,12 @@ class Web:
     """Pictures in a page of views."""
     size: Annotated[int, option("PIXELS")] = 640
     """Longer side of these pictures."""
+    told: Set = ()
     device: Annotated[str, option("NAME")] = "auto"
     """auto, cpu, cuda, cuda:1."""
 
     def run(self) -> int:
-        from ...export.page import look_at_scene
-        from ...report import scene_title
-        from ...run import Run
+        from ...export.page import opening_of_scene
 
         if self.output.suffix.lower() not in (".html", ".htm"):
             raise LumigraphError(f"{self.output} should end in .html, as pages do; rename it")
@@ -54,12 +54,9 @@ class Web:
             raise LumigraphError(f"A page cannot hold {self.views} views; give --views a number from 2 to 1000")
         if not 16 <= self.size <= 4096:
             raise LumigraphError(f"A view cannot be {self.size} pixels large; give --size a number from 16 to 4096")
-        run = open_run(self.source)
-        title = self.title or (scene_title(run) if isinstance(run, Run) else self.source.name.partition(".")[0])
-        cameras, frame = run.cameras()["train"], run.frame
-        look = look_at_scene(title, cameras, frame, self._background())
-        method = run.method(choose_device(self.device))
-        held = self._write(method, cameras, look)
+        opened, method, cameras = open_method(self.source, self.device, self.told)
+        opening = opening_of_scene(self.title or opened.title, cameras["train"], opened.frame, self._background())
+        held = self._write(method, cameras["train"], opening)
         show(
             {
                 "page": str(self.output),
@@ -69,24 +66,24 @@ class Web:
         )
         return 0
 
-    def _write(self, method: Any, cameras: Any, look: Any) -> str:
+    def _write(self, method: Any, cameras: Any, opening: Any) -> str:
         """Write the page, and say what it holds."""
+        from ...capabilities import HasGaussians, can, needs
         from ...export.mesh import extract_mesh
         from ...export.page import mesh_page, splats_page, views_page
-        from ...method import Method
 
         kind = self.kind
         if kind == "auto":
-            kind = "views" if type(method).gaussians is Method.gaussians else "splats"
+            kind = "splats" if can(method, HasGaussians) else "views"
         if kind == "splats":
-            gaussians = method.gaussians()
-            splats_page(self.output, gaussians, look)
+            gaussians = needs(method, HasGaussians).gaussians()
+            splats_page(self.output, gaussians, opening)
             return f"{len(gaussians):,} Gaussians, harmonics of degree {gaussians.degree}"
         if kind == "views":
-            views_page(self.output, method, cameras, look, self.views, self.size)
+            views_page(self.output, method, cameras, opening, self.views, self.size)
             return f"{self.views} views"
         mesh = extract_mesh(method, cameras, faces=FACES)
-        mesh_page(self.output, mesh, look)
+        mesh_page(self.output, mesh, opening)
         return f"{len(mesh.faces):,} triangles"
 
     def _background(self) -> tuple[float, float, float] | None:

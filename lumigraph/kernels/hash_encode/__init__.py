@@ -9,6 +9,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from .._dispatch import implementation
+from .._facts import Facts
+
+FACTS = Facts(unit="samples", outputs=1, differentiable=(0, 1), typical=2, compiled=3, smooth=(8,))
 
 PRIMES = (1, 2_654_435_761, 805_459_861)  # section 3; the first is 1 so that neighbours in x stay neighbours
 
@@ -72,6 +75,9 @@ def cases(generator: torch.Generator):
     yield _inputs(129, HashLevels(levels=2, features=4, log2_entries=12, coarsest=15, finest=2048), generator)
     _, table, levels = _inputs(0, mixed, generator)
     yield torch.cartesian_prod(*[torch.tensor([-0.5, 0.0, 0.28125, 1.0, 1.5])] * 3), table, levels
+    small = HashLevels(levels=2, features=1, log2_entries=5, coarsest=2, finest=5)
+    off_the_planes = torch.tensor([[0.1, 0.3, 0.9], [0.7, 1.2, -0.1]])  # of the grid, where the slope jumps
+    yield off_the_planes, torch.arange(float(small.offsets[-1])).sin()[:, None], small
 
 
 def benchmark_case(generator: torch.Generator, size: int = 2**18):

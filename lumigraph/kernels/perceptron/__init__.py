@@ -9,6 +9,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from .._dispatch import implementation
+from .._facts import Facts
+
+FACTS = Facts(unit="samples", outputs=1, differentiable=(0, 1, 2, 3), typical=4, compiled=4, smooth=(2, 4))
 
 
 def perceptron(x: Float[Tensor, "sample input"], *weights: Float[Tensor, "_ _"]) -> Float[Tensor, "sample last"]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from ...geometry import to_matrix
 from ...lens import bend
 from ..spherical_harmonics.reference import run as harmonics_of
 from . import FAINTEST, View
@@ -61,14 +62,3 @@ def run(
         torch.where(columns, colours, one),
         torch.where(seen, opacities, one),
     )
-
-
-def to_matrix(quaternions: Tensor) -> Tensor:
-    """Rotations (N, 3, 3) of quaternions (w, x, y, z), which need not have unit length."""
-    w, x, y, z = torch.nn.functional.normalize(quaternions, dim=-1).unbind(-1)
-    rows = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
-    return torch.stack([torch.stack(row, -1) for row in rows], -2)

@@ -14,7 +14,7 @@ from numba import get_num_threads, njit, prange
 from .._dispatch import empty
 from .._lanes import bytes_between, exp2, fetch, first_bit, highest, inverse, lowest, put, root, some, totals, where
 from ..project import FAINTEST as FAINTEST_
-from . import OPAQUEST as OPAQUEST_
+from ..project import OPAQUEST as OPAQUEST_
 
 FAST = {"cache": True, "fastmath": {"contract", "nsz", "arcp"}, "error_model": "numpy"}  # without "reassoc": see `exp2`
 LANES, BLOCKS = 16, 64  # pixels of a block; blocks of the largest tile, in eight rows of eight
@@ -101,7 +101,7 @@ def _span(n, side, first):
 
 @njit(inline="always")
 def _place(x, y, planes):
-    """Where a pixel of a tile has its first number, if each block has so many planes of sixteen."""
+    """The index of a pixel's number in plane 0 of its block, where each block holds `planes` planes of 16 numbers."""
     return (y // 4 * 8 + x // 4) * planes * LANES + y % 4 * 4 + x % 4
 
 

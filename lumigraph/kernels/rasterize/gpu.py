@@ -13,8 +13,8 @@ from torch import Tensor
 
 from .._dispatch import empty
 from ..project import FAINTEST as _FAINTEST
+from ..project import OPAQUEST as _OPAQUEST
 from ..tile import Tiles
-from . import OPAQUEST as _OPAQUEST
 
 FAINTEST, OPAQUEST = tl.constexpr(_FAINTEST), tl.constexpr(_OPAQUEST)
 SQUARE = 16  # pixels along a program's share of a tile, at most

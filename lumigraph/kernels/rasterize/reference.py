@@ -7,9 +7,8 @@ from collections.abc import Iterator
 import torch
 from torch import Tensor
 
-from ..project import FAINTEST
+from ..project import FAINTEST, OPAQUEST
 from ..tile import Tiles
-from . import OPAQUEST
 
 
 def run(

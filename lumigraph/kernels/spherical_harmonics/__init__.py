@@ -9,6 +9,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from .._dispatch import implementation
+from .._facts import Facts
+
+FACTS = Facts(unit="directions", outputs=1, differentiable=(0,), typical=4, compiled=0, smooth=(4,))
 
 # What makes each polynomial's square integrate to one over the sphere: K_lm, l the band and m the order.
 K00, K1 = sqrt(1 / (4 * pi)), sqrt(3 / (4 * pi))

@@ -7,6 +7,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from .._dispatch import implementation
+from .._facts import Facts
+
+FACTS = Facts(unit="pixels", unit_axes=2, outputs=1, differentiable=(0, 1), typical=1, compiled=4, smooth=(1,))
 
 WINDOW, DEVIATION = 11, 1.5  # pixels
 C1, C2 = 0.01**2, 0.03**2  # (K1 L)^2 and (K2 L)^2 for values up to L = 1
@@ -36,9 +39,9 @@ def ssim(a: Float[Tensor, "height width channel"], b: Float[Tensor, "height widt
 
 def cases(generator: torch.Generator):
     """Inputs that every engine must agree on: images smaller than the window, odd sizes, equal and constant images."""
-    for height, width, channels in [(1, 1, 1), (5, 7, 3), (11, 11, 1), (16, 33, 3), (40, 23, 3), (3, 90, 3)]:
+    for height, width, channels in [(1, 1, 1), (5, 7, 3), (11, 11, 1), (13, 33, 3), (18, 23, 3), (3, 90, 3)]:
         yield _inputs(height, width, channels, generator)
-    a, b = _inputs(16, 33, 3, generator)
+    a, b = _inputs(12, 13, 3, generator)
     yield a, a.clone()
     yield a, torch.rand(a.shape, generator=generator)
     yield a, torch.full_like(a, 0.25)

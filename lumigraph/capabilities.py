@@ -1,0 +1,86 @@
+"""What some methods can do beyond rendering, and one way to ask for it: `can(method, HasDensity)`."""
+
+from __future__ import annotations
+
+from typing import Any, Protocol, runtime_checkable
+
+from jaxtyping import Float
+from torch import Tensor
+
+from .errors import LumigraphError
+from .gaussians import Gaussians
+from .mesh import Mesh
+from .rays import Look, Rays
+
+
+@runtime_checkable
+class HasDensity(Protocol):
+    """Knows how dense space is."""
+
+    def density(self, points: Float[Tensor, "point 3"]) -> Float[Tensor, " point"]:
+        """Density per scene unit at points of the scene."""
+
+
+@runtime_checkable
+class HasField(Protocol):
+    """Knows density and colour at points, as baking, conversion and composition ask for them."""
+
+    def field(
+        self, points: Float[Tensor, "point 3"], directions: Float[Tensor, "point 3"]
+    ) -> tuple[Float[Tensor, " point"], Float[Tensor, "point 3"]]:
+        """Density per scene unit, and sRGB-encoded colour seen along unit directions."""
+
+
+@runtime_checkable
+class HasDistance(Protocol):
+    """Knows how far surfaces are."""
+
+    def distance(self, points: Float[Tensor, "point 3"]) -> Float[Tensor, " point"]:
+        """Signed distance to the nearest surface in scene units, negative inside."""
+
+
+@runtime_checkable
+class HasGaussians(Protocol):
+    """Is a cloud of Gaussians."""
+
+    def gaussians(self) -> Gaussians:
+        """The scene as a cloud, in the scene's frame."""
+
+
+@runtime_checkable
+class HasMesh(Protocol):
+    """Is a mesh, or makes one better than `export mesh` would."""
+
+    def mesh(self) -> Mesh:
+        """The scene as triangles, in the scene's frame."""
+
+
+@runtime_checkable
+class HasLooks(Protocol):
+    """Marches along rays."""
+
+    def looks(self, rays: Rays) -> list[Look]:
+        """What lies along rays, one entry for each pass, the one that is composited into the picture last."""
+
+
+LACKING = {
+    HasDensity: "holds no density at points; what is made of it comes from its renderings instead",
+    HasField: "holds no density and colour at points, so it can be neither baked nor converted",
+    HasDistance: "holds no distance to surfaces; a method that learns from shapes does",
+    HasGaussians: "holds no Gaussians, so no splats can be made of it; train gaussian-splatting",
+    HasMesh: "is no mesh; `lumigraph export mesh` makes one of what it renders",
+    HasLooks: "takes no samples along rays, so there is nothing to draw of one",
+}
+
+
+def can(method: object, capability: type[Any]) -> bool:
+    """Whether a method has a capability. Its class must have the functions: a network may be called `field` too."""
+    names = [name for name in vars(capability) if not name.startswith("_")]
+    return all(callable(getattr(type(method), name, None)) for name in names)
+
+
+def needs(method: object, capability: type[Any]) -> Any:
+    """The method, for whoever needs a capability of it. Raises LumigraphError, saying what it lacks, without."""
+    if not can(method, capability):
+        raise LumigraphError(f"{type(method).__name__} {LACKING[capability]}")
+    return method

@@ -1,0 +1,154 @@
+"""What lies beside photographs becomes a scene's layers: of one kind for all of them, at the size they are used in."""
+
+from __future__ import annotations
+
+import zlib
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from PIL import Image
+from torch import Tensor
+
+from ..errors import LumigraphError
+from ..images import ImageStore, Layer, LayerSource, resized
+from ..images.layer import known
+from .capture import Plane, Shot
+from .numbers import kind_of, read_numbers
+from .photos.exif import exposure
+from .pictures import Chosen, readable, same_shape, stat
+
+CAMERAS_WRITE = (".jpg", ".jpeg")  # files that say how long they were exposed
+LENGTHS = ("distance", "z-depth")
+
+
+def make_layers(
+    shots: list[Shot], chosen: list[Chosen], images: ImageStore, scene_from_source: Float[np.ndarray, "4 4"]
+) -> tuple[dict[str, Layer], list[str]]:
+    """Layers by name, nothing of which is read yet; and what the user should know, one sentence each.
+
+    Raises LumigraphError where values of one name are not of one kind, or a file's header cannot be read.
+    """
+    unit = float(np.cbrt(np.linalg.det(scene_from_source[:3, :3])))
+    turn = scene_from_source[:3, :3] / unit
+    found = [shot.planes | own_bits(c.plane) for shot, c in zip(shots, chosen, strict=True)]
+    layers, told = {}, []
+    for name in dict.fromkeys(name for planes in found for name in planes):
+        planes = [None if (plane := each.get(name)) is None else settled(plane, name) for each in found]
+        first = agreed(name, shots, planes)
+        dtype = np.result_type(*(plane.dtype for plane in planes if plane is not None and plane.dtype is not None))
+        lacking = planes.count(None)
+        if lacking and not (first.unknown or first.encoding == "index" or dtype.kind == "f"):
+            told.append(
+                f"{name} is there for {len(shots) - lacking} of {len(shots)} photographs only and cannot say that it "
+                f"is unknown, so it is left out"
+            )
+            continue
+        sources = [
+            None if plane is None else source_of(plane, name, dtype, c, turn)
+            for plane, c in zip(planes, chosen, strict=True)
+        ]
+        scale = first.scale * unit if first.encoding in LENGTHS else first.scale
+        about = first.unknown, first.empty, first.names
+        layers[name] = Layer(images, sources, dtype, first.channels, first.encoding, scale, *about)
+    return layers, told
+
+
+def own_bits(plane: Plane | None) -> dict[str, Plane]:
+    """A photograph of more than eight bits: `colours` as they are encoded, or `raw` light."""
+    return {} if plane is None else {"colours" if plane.encoding == "sRGB" else "raw": plane}
+
+
+def settled(plane: Plane, name: str) -> Plane:
+    """The plane with the type and number of channels that its values have, and what they depend on."""
+    dtype, channels, identity = plane.dtype, plane.channels, plane.identity
+    if isinstance(plane.values, np.ndarray):
+        dtype, channels = plane.values.dtype, 1 if plane.values.ndim == 2 else plane.values.shape[2]
+        identity = f"{zlib.crc32(np.ascontiguousarray(plane.values).tobytes())}"
+    elif isinstance(plane.values, Path):
+        with readable(plane.values):
+            kind = kind_of(plane.values, name)
+        dtype, channels = kind.dtype, 1 if plane.encoding in (*LENGTHS, "index") else kind.channels
+        identity = f"{plane.values.resolve()} {stat(plane.values)}"
+    assert dtype is not None, f"{name} is made when asked, so its type must be said"
+    if plane.encoding == "index":
+        dtype = np.promote_types(dtype, np.int8)  # room for a number that names nothing
+    return replace(plane, dtype=dtype, channels=channels, identity=identity)
+
+
+def agreed(name: str, shots: list[Shot], planes: list[Plane | None]) -> Plane:
+    """The first plane, to which all others are alike."""
+
+    def meaning(plane: Plane) -> tuple[Any, ...]:
+        return plane.encoding, plane.scale, plane.channels, plane.unknown, plane.empty, plane.names
+
+    (first, shot), *others = [(p, s) for p, s in zip(planes, shots, strict=True) if p is not None]
+    for plane, other in others:
+        if meaning(plane) != meaning(first):
+            raise LumigraphError(
+                f"{name} of {other.name} is of another kind than that of {shot.name}: {plane.encoding}, "
+                f"{plane.channels} channels and a unit of {plane.scale:g}, not {first.encoding}, {first.channels} and "
+                f"{first.scale:g}; store both alike"
+            )
+    return first
+
+
+def source_of(plane: Plane, name: str, dtype: np.dtype, chosen: Chosen, turn: Float[np.ndarray, "3 3"]) -> LayerSource:
+    size = chosen.picture.size
+    identity = None if plane.identity is None else f"{plane.identity} {size} {dtype.str} {plane.encoding}"
+    if identity is not None and plane.encoding == "direction":
+        identity += f" {turn.tolist()}"
+    return LayerSource(partial(read_plane, plane, name, dtype, size, turn), identity)
+
+
+def read_plane(
+    plane: Plane, name: str, dtype: np.dtype, size: tuple[int, int], turn: Float[np.ndarray, "3 3"]
+) -> np.ndarray:
+    """Stored numbers at the size of the photograph; directions turned to the scene's frame."""
+    if isinstance(plane.values, Path):
+        with readable(plane.values):
+            values = read_numbers(plane.values, name)
+            if plane.channels == 1 and values.ndim == 3:
+                if (values[..., :1] != values[..., :3]).any():
+                    raise ValueError(f"{name} is one number to a pixel, and this has colours")
+                values = values[..., 0]
+            if not same_shape((values.shape[1], values.shape[0]), size):
+                raise ValueError(
+                    f"its shape {values.shape[1]}x{values.shape[0]} is not the photograph's {size[0]}x{size[1]}"
+                )
+    else:
+        values = plane.values if isinstance(plane.values, np.ndarray) else plane.values()
+    values = values.astype(dtype)
+    if plane.encoding == "direction":
+        values = (values @ turn.T).astype(dtype)
+    return resized(values, size, plane.encoding, known(values, plane.unknown, plane.channels))
+
+
+def make_about(shots: list[Shot]) -> dict[str, Tensor]:
+    """What is known of each photograph, by name; NaN where it is not. The first axis is the photograph."""
+    found = [taken(shot) | shot.about for shot in shots]
+    about = {}
+    for name in dict.fromkeys(name for facts in found for name in facts):
+        values = [np.asarray(facts.get(name, np.nan), np.float64) for facts in found]
+        axes = max(value.ndim for value in values)
+        filled = [value.reshape((1,) * (axes - value.ndim) + value.shape) for value in values]
+        shape = [max(sizes) for sizes in zip(*(value.shape for value in filled), strict=True)]
+        table = np.full((len(shots), *shape), np.nan)
+        for image, value in enumerate(filled):
+            table[image : image + 1][(slice(1), *map(slice, value.shape))] = value
+        about[name] = torch.from_numpy(table).float()
+    return about
+
+
+def taken(shot: Shot) -> dict[str, float]:
+    """When and for how long a photograph was exposed, as far as its reader and its file say."""
+    facts = {} if shot.time is None else {"time": shot.time}
+    if isinstance(shot.image, dict) and (path := shot.image[min(shot.image)]).suffix.lower() in CAMERAS_WRITE:
+        with readable(path), Image.open(path) as image:
+            light = exposure(image.getexif())
+        facts |= {} if light is None else {"exposure": light}
+    return facts

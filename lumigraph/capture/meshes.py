@@ -1,0 +1,115 @@
+"""Meshes and clouds of points in files become Shapes."""
+
+from __future__ import annotations
+
+import warnings
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, UInt8
+from plyfile import PlyData
+
+from ..dataset import splits_of
+from ..errors import LumigraphError, LumigraphWarning
+from ..mesh import Mesh
+from ..shapes import Shape, Shapes, normalised
+
+SUFFIXES = (".obj", ".ply", ".off", ".stl", ".glb", ".gltf")
+STANDING = (".stl", ".off")  # by custom with +z up; the others have +y up
+Y_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])  # to +z
+GREY = 160  # of what has no colour
+
+
+def recognises(path: Path) -> bool:
+    """Whether a path is a mesh or a cloud of points, or a folder that holds some at its top."""
+    return is_mesh(path) or (path.is_dir() and any(is_mesh(file) for file in path.iterdir()))
+
+
+def is_mesh(path: Path) -> bool:
+    return path.is_file() and path.suffix.lower() in SUFFIXES
+
+
+def read_shapes(path: Path) -> Shapes:
+    """The shape in a file, or the shapes in a folder and in the folders below it, each normalised by itself.
+
+    Of many, every 8th by name is for testing. What the Shapes should tell its user is a LumigraphWarning too.
+    Raises LumigraphError for files that hold no surface and no points.
+    """
+    files = [path] if path.is_file() else sorted(file for file in path.rglob("*") if is_mesh(file))
+    if not files:
+        raise LumigraphError(f"{path} holds no meshes; name a file or a folder of {', '.join(SUFFIXES)}")
+    members = [read_shape(file, name_of(file, path)) for file in files]
+    shapes = Shapes(members, splits_of(len(members)), str(path))
+    for warning in shapes.warnings:
+        warnings.warn(warning, LumigraphWarning, stacklevel=3)
+    return shapes
+
+
+def read_shape(path: Path, name: str) -> Shape:
+    """All that one file holds, as one shape. Raises LumigraphError if that is nothing."""
+    import trimesh  # which takes a while
+
+    try:
+        loaded: Any = trimesh.load(path, process=False, file_type=path.suffix[1:].lower())
+        parts = loaded.dump() if isinstance(loaded, trimesh.Scene) else [loaded]
+    except Exception as error:  # readers of many formats fail in many ways
+        reason = " ".join(str(error).split()) or type(error).__name__
+        raise LumigraphError(f"{path} cannot be read as a mesh ({reason}); export it once more") from error
+    meshes = [part for part in parts if isinstance(part, trimesh.Trimesh) and len(part.faces)]
+    clouds = [part for part in parts if len(getattr(part, "vertices", ()))]
+    if not meshes and not clouds:
+        raise LumigraphError(f"{path} holds neither triangles nor points; name another file")
+    made = joined(meshes) if meshes else cloud(clouds[0])
+    if not np.isfinite(made.vertices).all() or not np.ptp(made.vertices, 0).max() > 0:
+        raise LumigraphError(f"{path} has points that are not finite, or all in one place; name another file")
+    return normalised(
+        name, made, None if meshes else normals_of(path), None if path.suffix.lower() in STANDING else Y_UP
+    )
+
+
+def joined(parts: list[Any]) -> Mesh:
+    """One mesh from several, without triangles that have no area."""
+    vertices = np.concatenate([np.asarray(part.vertices, np.float64) for part in parts])
+    starts = np.cumsum([0, *(len(part.vertices) for part in parts)])
+    faces = np.concatenate([np.asarray(part.faces) + start for part, start in zip(parts, starts, strict=False)])
+    a, b, c = vertices[faces].transpose(1, 0, 2)
+    solid = np.linalg.norm(np.cross(b - a, c - a), axis=-1) > 0
+    colours = np.concatenate([colours_of(part) for part in parts])
+    return Mesh(vertices, faces[solid].astype(np.int64), colours)
+
+
+def colours_of(part: Any) -> UInt8[np.ndarray, "vertex 3"]:
+    """A colour at each vertex: the file's, from vertices or from a material or texture; grey where it has none."""
+    try:
+        visual = part.visual if part.visual.kind in ("vertex", "face") else part.visual.to_color()
+        found = np.asarray(visual.vertex_colors)[:, :3].astype(np.uint8)
+        if part.visual.defined and len(found) == len(part.vertices):
+            return found
+    except Exception:  # a picture that is missing should keep nobody from the shape
+        pass
+    return np.full((len(part.vertices), 3), GREY, np.uint8)
+
+
+def cloud(part: Any) -> Mesh:
+    points = np.asarray(part.vertices, np.float64)
+    colours = np.asarray(getattr(part, "colors", ()))
+    known = (
+        colours[:, :3].astype(np.uint8) if len(colours) == len(points) else np.full((len(points), 3), GREY, np.uint8)
+    )
+    return Mesh(points, np.zeros((0, 3), np.int64), known)
+
+
+def normals_of(path: Path) -> Float[np.ndarray, "point 3"] | None:
+    """The normals of a cloud of points, of unit length; None where its file has none."""
+    if path.suffix.lower() != ".ply":
+        return None
+    table = PlyData.read(path)["vertex"].data
+    if not {"nx", "ny", "nz"} <= set(table.dtype.names):
+        return None
+    found = np.stack([table[axis].astype(np.float64) for axis in ("nx", "ny", "nz")], -1)
+    return found / np.maximum(np.linalg.norm(found, axis=-1, keepdims=True), 1e-12)
+
+
+def name_of(file: Path, folder: Path) -> str:
+    return file.stem if file == folder else str(file.relative_to(folder).with_suffix(""))

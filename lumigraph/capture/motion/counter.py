@@ -1,0 +1,39 @@
+"""How many rows a table of COLMAP's database has, written to standard output every now and then.
+
+A process of its own, until its standard input ends. Python and COLMAP each bring an SQLite; two of them in one process
+break each other's locks on one file, and its shared memory is then cut off under whoever still reads it.
+"""
+
+from __future__ import annotations
+
+import os
+import sqlite3
+import sys
+import threading
+import time
+from contextlib import closing
+from pathlib import Path
+
+LOOKS = 0.2  # seconds between looks at the database
+
+
+def watch(database: str, table: str) -> None:
+    """Tell the number of rows, for ever."""
+    where = f"{Path(database).as_uri()}?mode=ro"
+    while True:
+        time.sleep(LOOKS)
+        try:
+            with closing(sqlite3.connect(where, uri=True)) as connection:
+                print(connection.execute(f"SELECT COUNT(*) FROM {table}").fetchone()[0], flush=True)
+        except sqlite3.OperationalError:  # COLMAP is writing just now, or has not begun to
+            continue
+
+
+def end_with_input() -> None:
+    sys.stdin.read()
+    os._exit(0)
+
+
+if __name__ == "__main__":
+    threading.Thread(target=end_with_input, daemon=True).start()
+    watch(*sys.argv[1:])

@@ -1,0 +1,188 @@
+"""Numbers of files as they are stored: photographs of more than eight bits, depth, labels, arrays.
+
+Pillow keeps 16 bits of grey only, so colours of 16 bits and EXR go through FFmpeg (`av`), as films do.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import av
+import numpy as np
+from PIL import ExifTags, Image, TiffImagePlugin
+
+from ..srgb import srgb_from_linear
+
+Tag = ExifTags.Base
+PNG, EXR = b"\x89PNG\r\n\x1a\n", b"\x76\x2f\x31\x01"  # how these files begin
+EXR_HALF = 1  # among the types of its channels
+PNG_CHANNELS = {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}  # by PNG's colour type
+TIFF_SUFFIXES, TIFF_FLOAT = (".tif", ".tiff"), 3  # and its sample format
+PLANES = ("g", "b", "r", "a")  # in which FFmpeg keeps floating point
+ARRAYS = {"labels": ("labels", "ids", "semantics")}  # what an .npz may call them
+
+
+@dataclass(frozen=True)
+class Kind:
+    """What a file's header says of its numbers.
+
+    size:     (width, height)
+    channels: of a pixel
+    linear:   whether they are light rather than colours encoded as sRGB
+    """
+
+    size: tuple[int, int]
+    dtype: np.dtype
+    channels: int
+    linear: bool = False
+
+    @property
+    def deep(self) -> bool:
+        """Whether eight bits do not hold it, and this file can give more."""
+        return self.dtype.itemsize > 1 and self.channels in (1, 3, 4)
+
+    @property
+    def encoding(self) -> str:
+        """Of the layer that holds it; in floating point colours come multiplied by alpha."""
+        if not self.linear:
+            return "sRGB"
+        return "linear premultiplied" if self.dtype.kind == "f" and self.channels == 4 else "linear"
+
+
+def kind_of(path: Path, name: str = "") -> Kind:
+    """What a file's header says. name: of the array, in a file of several."""
+    suffix = path.suffix.lower()
+    if suffix in (".npy", ".npz"):
+        array = read_array(path, name)
+        return Kind((array.shape[1], array.shape[0]), array.dtype, 1 if array.ndim == 2 else array.shape[2])
+    if suffix == ".exr":
+        return exr_kind(path)
+    if suffix == ".png":
+        with open(path, "rb") as file:
+            header = file.read(26)
+        if header.startswith(PNG):
+            width, height, bits, colour = struct.unpack_from(">IIBB", header, 16)
+            if bits < 16:
+                return Kind((width, height), np.dtype(np.uint8), PNG_CHANNELS.get(colour, 1))
+            with Image.open(path) as image:
+                linear = image.info.get("gamma") == 1.0
+            return Kind((width, height), np.dtype(np.uint16), PNG_CHANNELS.get(colour, 1), linear)
+    if suffix in TIFF_SUFFIXES:
+        tags = tiff_tags(path)
+        bits, channels = max(tags.get(Tag.BitsPerSample, (1,))), int(tags.get(Tag.SamplesPerPixel, 1))
+        size = int(tags[Tag.ImageWidth]), int(tags[Tag.ImageLength])
+        if TIFF_FLOAT in tags.get(Tag.SampleFormat, (1,)):
+            return Kind(size, np.dtype(f"f{bits // 8}"), channels, True)
+        return Kind(size, np.dtype(f"u{max(bits // 8, 1)}"), channels)
+    with Image.open(path) as image:
+        return Kind(image.size, np.dtype(np.uint8), len(image.getbands()))
+
+
+def tiff_tags(path: Path) -> Mapping[int, Any]:
+    """A TIFF file's tags, also where its pixels are of a kind that Pillow cannot open."""
+    with open(path, "rb") as file:
+        header = file.read(8)
+        header += file.read(8) if header[2:4] in (b"\x2b\0", b"\0\x2b") else b""  # the large kind of TIFF
+        tags = TiffImagePlugin.ImageFileDirectory_v2(header)
+        file.seek(tags.next)
+        tags.load(file)
+    return tags
+
+
+def exr_kind(path: Path) -> Kind:
+    """What an OpenEXR header says: attributes as name, type, size and data, ended by an empty name."""
+    with open(path, "rb") as file:
+        data = file.read(1 << 16)
+    if not data.startswith(EXR):
+        raise ValueError("it is no OpenEXR file")
+    found, at = {}, 8
+    while data[at]:
+        name_ends = data.index(b"\0", at)
+        type_ends = data.index(b"\0", name_ends + 1)
+        (size,) = struct.unpack_from("<i", data, type_ends + 1)
+        found[data[at:name_ends].decode()] = data[type_ends + 5 : type_ends + 5 + size]
+        at = type_ends + 5 + size
+    left, top, right, bottom = struct.unpack("<4i", found["displayWindow"])
+    names, types, at = [], [], 0
+    while (channels := found["channels"])[at]:
+        name_ends = channels.index(b"\0", at)
+        names.append(channels[at:name_ends].decode())
+        types.append(struct.unpack_from("<i", channels, name_ends + 1)[0])
+        at = name_ends + 17
+    dtype = np.dtype(np.float16 if all(kind == EXR_HALF for kind in types) else np.float32)
+    return Kind((right - left + 1, bottom - top + 1), dtype, len(names) if set("RGB") <= set(names) else 1, True)
+
+
+def read_numbers(path: Path, name: str = "") -> np.ndarray:
+    """All numbers as stored, (height, width) or (height, width, channels). name: as in `kind_of`"""
+    if path.suffix.lower() in (".npy", ".npz"):
+        return read_array(path, name)
+    kind, tiff = kind_of(path), path.suffix.lower() in TIFF_SUFFIXES
+    grey_floats = tiff and kind.channels == 1 and kind.dtype.kind == "f"  # unknown to FFmpeg
+    if kind.deep and not grey_floats:
+        return decode(path).astype(kind.dtype)
+    with Image.open(path) as image:
+        image.load()  # turns a TIFF upright, which np.asarray would not notice
+        values = np.asarray(image).astype(kind.dtype)
+    orientation = tiff_tags(path).get(Tag.Orientation, 1) if tiff else 1
+    return turned(values, {6: 8, 8: 6}.get(orientation, orientation))  # back to as it is stored
+
+
+def read_array(path: Path, name: str) -> np.ndarray:
+    """The array of a NumPy file; of several the one that is called so."""
+    found = np.load(path, allow_pickle=False)
+    if isinstance(found, np.ndarray):
+        array = found
+    else:
+        with found:
+            wanted = [k for k in ARRAYS.get(name, (name,)) if k in found.files] or list(found.files)
+            if len(wanted) != 1:
+                raise ValueError(f"it holds {', '.join(found.files)}, and none is called {name}")
+            array = found[wanted[0]]
+    array = array[..., 0] if array.ndim == 3 and array.shape[2] == 1 else array
+    if array.ndim not in (2, 3):
+        raise ValueError(f"it holds an array of {array.ndim} axes, where a picture has two or three")
+    return array
+
+
+def decode(path: Path) -> np.ndarray:
+    """A picture's numbers by FFmpeg: RGB or RGBA, or one number to a pixel."""
+    with open(path, "rb") as file, av.open(file, "r") as container:
+        frame = next(container.decode(video=0))
+    if not frame.format.name.endswith(("f16le", "f16be")):
+        return frame.to_ndarray()
+    rows = [np.frombuffer(bytes(plane), np.float16).reshape(-1, plane.line_size // 2) for plane in frame.planes]
+    rows = [row[: frame.height, : frame.width] for row in rows]
+    if len(rows) == 1:
+        return rows[0].copy()
+    by_name = dict(zip(PLANES, rows, strict=False))
+    return np.stack([by_name[k] for k in "rgba" if k in by_name], -1)
+
+
+def turned(values: np.ndarray, orientation: int | None) -> np.ndarray:
+    """Upright, as EXIF's orientation says."""
+    if orientation in (5, 6, 7, 8):
+        values = values.swapaxes(0, 1)
+    if orientation in (3, 4, 7, 8):
+        values = values[::-1]
+    return values[:, ::-1] if orientation in (2, 3, 6, 7) else values
+
+
+def colours(values: np.ndarray) -> np.ndarray:
+    """Grey as RGB; RGB and RGBA as they are."""
+    return np.repeat(values[..., None], 3, -1) if values.ndim == 2 else values
+
+
+def as_bytes(values: np.ndarray, encoding: str) -> np.ndarray:
+    """RGB or RGBA of more than eight bits as sRGB-encoded bytes, colours not multiplied by alpha."""
+    found = values.astype(np.float64)
+    found = np.nan_to_num(found) if values.dtype.kind == "f" else found / np.iinfo(values.dtype).max
+    if encoding == "linear premultiplied":
+        found[..., :3] /= np.where(found[..., 3:] > 0, found[..., 3:], 1)
+    if encoding != "sRGB":
+        found[..., :3] = srgb_from_linear(found[..., :3].clip(0, 1))
+    return np.rint(found.clip(0, 1) * 255).astype(np.uint8)

@@ -1,0 +1,111 @@
+"""RGB-D captures in the layout of TUM's benchmark (Sturm et al. 2012): rgb.txt, depth.txt and groundtruth.txt.
+
+The lists have a moment in seconds and a file on each line; the trajectory has a moment, a position and a quaternion
+(x, y, z, w) of the colour camera, camera-to-world. Whose moments are nearest belong together. Depth is registered to
+the colours: 16 bits, 5000 to a metre along the optical axis, 0 where nothing was measured.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from ..errors import LumigraphError
+from ..geometry import to_matrix
+from ..lens import Lens, OpenCV, Pinhole
+from .capture import Capture, Plane, Shot
+from .depth_points import depth_points
+
+LOOKED_FOR = "rgb.txt and groundtruth.txt (TUM's RGB-D benchmark)"
+APART = 0.02  # seconds that two moments may differ by and still be one, as in the benchmark's own tools
+METRE = 5000  # in numbers of a depth picture
+SIZE = (640, 480)
+# What the benchmark publishes, with pixel centres at whole numbers, for the camera that a folder's name tells: focal
+# length, centre, k1 k2 p1 p2 k3. A folder's own camera.txt has the same nine numbers, or the first four.
+CAMERAS = {
+    "freiburg1": (517.3, 516.5, 318.6, 255.3, 0.2624, -0.9531, -0.0054, 0.0026, 1.1633),
+    "freiburg2": (520.9, 521.0, 325.1, 249.7, 0.2312, -0.7849, -0.0033, -0.0001, 0.9172),
+    "freiburg3": (535.4, 539.2, 320.1, 247.6),
+}
+ANY_CAMERA = (525.0, 525.0, 319.5, 239.5)  # what its cameras' drivers suppose
+
+
+def recognises(folder: Path) -> bool:
+    return all((folder / name).is_file() for name in ("rgb.txt", "groundtruth.txt"))
+
+
+def read(folder: Path) -> Capture:
+    """Photographs without a pose of their moment are left out. Raises LumigraphError for lists that hold no numbers."""
+    poses = read_rows(folder / "groundtruth.txt", 8)
+    moments = np.array([float(row[0]) for row in poses])
+    pictures = read_rows(folder / "rgb.txt", 2)
+    depths = read_rows(folder / "depth.txt", 2) if (folder / "depth.txt").is_file() else []
+    depth_moments = np.array([float(row[0]) for row in depths])
+    lens, shots, missing = read_lens(folder), [], []
+    for moment, name in pictures:
+        pose, depth = nearest(moments, float(moment)), nearest(depth_moments, float(moment))
+        if pose is None:
+            continue
+        if not (folder / name).is_file():
+            missing.append(name)
+            continue
+        planes = {}
+        if depth is not None:
+            path = folder / depths[depth][1]
+            if path.is_file():
+                planes["depth"] = Plane(path, "z-depth", 1 / METRE, unknown=(0, 65535))
+            else:
+                missing.append(depths[depth][1])
+        shots.append(
+            Shot(name, read_pose(poses[pose]), lens, SIZE, {1: folder / name}, time=float(moment), planes=planes)
+        )
+    points = depth_points(shots)
+    if points is None:
+        return Capture(str(folder), shots, missing=missing)
+    return Capture(str(folder), shots, points.positions, points.colours, points.sightings, missing)
+
+
+def read_rows(path: Path, columns: int) -> list[list[str]]:
+    """The words of each line that is no comment."""
+    rows = [line.split() for line in path.read_text(errors="replace").splitlines() if line.strip()[:1] not in ("", "#")]
+    try:
+        for row in rows:
+            assert len(row) >= columns
+            [float(x) for x in (row[:columns] if columns > 2 else row[:1])]
+    except (ValueError, AssertionError) as fault:
+        raise LumigraphError(
+            f"{path} holds {' '.join(row)!r}, where {columns} columns after a moment were looked for; correct that line"
+        ) from fault
+    return [row[:columns] for row in rows]
+
+
+def read_pose(row: list[str]) -> np.ndarray:
+    x, y, z, qx, qy, qz, qw = map(float, row[1:])
+    rotation = to_matrix(torch.tensor([[qw, qx, qy, qz]], dtype=torch.float64))[0].numpy()
+    return np.concatenate([rotation, [[x], [y], [z]]], -1)
+
+
+def read_lens(folder: Path) -> Lens:
+    path = folder / "camera.txt"
+    numbers: tuple[float, ...] = next((c for name, c in CAMERAS.items() if name in folder.resolve().name), ANY_CAMERA)
+    if path.is_file():
+        try:
+            numbers = tuple(float(x) for x in path.read_text().split())
+            assert len(numbers) in (4, 9)
+        except (ValueError, AssertionError) as fault:
+            raise LumigraphError(
+                f"{path} is no camera: write fx fy cx cy, and where it bends k1 k2 p1 p2 k3, as OpenCV has them"
+            ) from fault
+    fx, fy, cx, cy, *bends = numbers
+    focal, centre = torch.tensor([[fx, fy]]), torch.tensor([[cx + 0.5, cy + 0.5]])
+    return OpenCV(focal, centre, torch.tensor([[*bends, 0.0, 0.0, 0.0]])) if bends else Pinhole(focal, centre)
+
+
+def nearest(moments: np.ndarray, moment: float) -> int | None:
+    """Which moment is the nearest, if one is near enough."""
+    if not len(moments):
+        return None
+    found = int(np.abs(moments - moment).argmin())
+    return found if abs(moments[found] - moment) <= APART else None

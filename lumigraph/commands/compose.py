@@ -1,0 +1,78 @@
+"""`lumigraph compose`: one trained scene inside another."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+from tyro.conf import Positional, arg
+
+from ..errors import LumigraphError
+from .common import needed, option, show
+
+Triple = tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class Compose:
+    """Write a composition, a small JSON file: one thing that opens, and another one in it.
+
+    `view`, `render` and `export` open it like a run. Both lie as their photographs' frames say, which is right for two
+    runs of one capture. With --at, --scale or --turn the second stands upright in the first, on the spot that --at
+    names. A composition may be a part of another one, so three are two in one.
+    """
+
+    lead: Annotated[Positional[Path], needed("RUN_OR_FILE")]
+    """Whose cameras, background and vertical count: a run's folder, a splat file, or a composition."""
+    part: Annotated[Positional[Path], needed("RUN_OR_FILE")]
+    """What is put into it."""
+    output: Annotated[Path, needed("FILE.json")]
+    """The new file. It names its parts by their paths from where it lies."""
+    at: Annotated[Triple | None, arg(metavar="X Y Z", help_behavior_hint="(default: the lead's foot)")] = None
+    """Where the middle of the part's foot stands, in the frame of the lead's photographs."""
+    scale: Annotated[float | None, option("TIMES", "1")] = None
+    """Size of the part: units of the lead's photographs to one of its own."""
+    turn: Annotated[float | None, option("DEGREES", "0")] = None
+    """About the vertical, counterclockwise from above."""
+    box: Annotated[
+        tuple[Triple, Triple] | None, arg(metavar="X Y Z X Y Z", help_behavior_hint="(default: all of it)")
+    ] = None
+    """Show only what lies between two corners of the part, in its scene's frame: `lumigraph info` tells its bounds."""
+    overwrite: bool = False
+    """Replace the file if it is there."""
+
+    def run(self) -> int:
+        import torch
+
+        from ..composition import standing
+        from ..geometry import Similarity
+        from ..run import open_any
+        from ..run.composition import Part, relative, write_composition
+
+        if self.output.suffix.lower() != ".json":
+            raise LumigraphError(f"{self.output} should end in .json, as compositions do; rename it")
+        if self.output.exists() and not self.overwrite:
+            raise LumigraphError(f"{self.output} is there already; give --overwrite to replace it, or another --output")
+        if self.scale is not None and not 0 < self.scale < float("inf"):
+            raise LumigraphError(f"Nothing can be {self.scale:g} times as large; give --scale a number above 0")
+        if self.box is not None and not all(a < b for a, b in zip(*self.box, strict=True)):
+            raise LumigraphError("The box holds nothing; give --box its lower corner first, then its upper one")
+        lead, part = open_any(self.lead), open_any(self.part)
+        place = Similarity.make(1.0)
+        if any(told is not None for told in (self.at, self.scale, self.turn)):
+            spot = None if self.at is None else torch.tensor(self.at, dtype=torch.float64)
+            place = standing(part.frame, lead.frame, spot, self.scale or 1.0, self.turn or 0.0)
+        named = [Part(relative(self.lead, self.output), Similarity.make(1.0))]
+        named.append(Part(relative(self.part, self.output), place, self.box))
+        write_composition(self.output, named)
+        opened = open_any(self.output)
+        low, high = opened.frame.bounds
+        show(
+            {
+                "composition": str(self.output),
+                "bounds": f"({', '.join(f'{x:.3g}' for x in low)}) to ({', '.join(f'{x:.3g}' for x in high)})",
+                "next": f"lumigraph view {self.output}",
+            }
+        )
+        return 0

@@ -1,0 +1,150 @@
+"""What a run or a scene is, as a printed tree."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from rich.tree import Tree
+
+from ..choice import evenly
+from ..dataset import Dataset
+from ..errors import LumigraphError
+from ..gaussians import Gaussians
+from ..metrics import scores_of
+from ..run import Run
+from ..scene import Frame, Scene
+from ..shapes import Shapes
+
+MEMBERS = 12  # of many shapes, that are told of one by one
+
+
+def run_tree(run: Run) -> Tree:
+    said = run.settings
+    tree = Tree(f"[bold]{run.folder}[/bold]  a run of {run.method_name}")
+    branch(tree, "scene", {"source": said.scene.source, **said.splits, **said.scene.options})
+    branch(tree, "frame", frame_rows(run.frame))
+    branch(tree, "config", said.config)
+    if controls := control_rows(run):
+        branch(tree, "controls, by --set", controls)
+    if run.has_state:
+        state = run.state
+        rows = {"step": state.step, "seconds": state.seconds, "compiling, beside": state.compile_seconds}
+        branch(tree, "trained", rows | {"budget": said.budget, "seed": said.seed, "on": said.device})
+    if evaluation := run.evaluation():
+        figures: dict[str, Any] = {score.name: str(score) for score in scores_of(evaluation)}
+        figures["seconds per view"] = evaluation.get("seconds_per_view")
+        protocol = ("split", "views", "shapes", "members", "resolution")
+        branch(tree, "evaluated", figures | {name: evaluation["protocol"].get(name) for name in protocol})
+    found = sorted(
+        path for path in run.folder.rglob("*") if path.is_file() and path.suffix in (".mp4", ".html", ".png")
+    )
+    pages = [path for path in found if path.parent in (run.folder, run.folder / "renders")]
+    if pages:
+        branch(tree, "files", {str(path.relative_to(run.folder)): size(path) for path in pages})
+    return tree
+
+
+def control_rows(run: Run) -> dict[str, str]:
+    """What each of the method's controls can be; empty where it has none, or where it is not installed."""
+    try:
+        controls = run.new_method().controls
+    except LumigraphError:
+        return {}
+    return {x.name: f"{x.domain} (default: {x.default}). {x.about}".rstrip() for x in controls}
+
+
+def dataset_tree(data: Dataset) -> Tree:
+    """What can be learnt from, whatever kind it is."""
+    if isinstance(data, Scene):
+        return scene_tree(data)
+    return shapes_tree(data) if isinstance(data, Shapes) else collection_tree(data)
+
+
+def shapes_tree(shapes: Shapes) -> Tree:
+    tree = Tree(f"[bold]{shapes.source}[/bold]  {len(shapes)} shape{'' if len(shapes) == 1 else 's'}")
+    branch(tree, "splits", {name: len(index) for name, index in shapes.splits.items()})
+    for shape in evenly(shapes.members, MEMBERS):
+        count = f"{len(shape.mesh.vertices):,} vertices, {len(shape.mesh.faces):,} triangles"
+        surface = "points alone" if shape.is_cloud else "closed" if shape.closed else "not closed"
+        unit = f"{shape.frame.to_source.scale:.4g} of the source's"
+        branch(tree, shape.name, {"size": count, "surface": surface, "one scene unit": unit})
+    return tree
+
+
+def collection_tree(data: Dataset) -> Tree:
+    tree = Tree(f"[bold]{data.source}[/bold]  a collection of {len(data.names)}")
+    branch(tree, "members", {name: ", ".join(data.names[i] for i in index) for name, index in data.splits.items()})
+    return tree
+
+
+def scene_tree(scene: Scene) -> Tree:
+    cameras = scene.cameras
+    tree = Tree(f"[bold]{scene.source}[/bold]  a scene of {len(scene)} photographs")
+    sizes, counts = cameras.size.unique(dim=0, return_counts=True)
+    shapes = (f"{count} of {w}x{h}" for (w, h), count in zip(sizes.tolist(), counts.tolist(), strict=True))
+    photographs = {name: f"{len(index)} views" for name, index in scene.splits.items()}
+    photographs |= {"sizes": ", ".join(shapes), "lens": type(cameras.lens).__name__}
+    branch(tree, "photographs", photographs)
+    if scene.layers:
+        beside = {name: f"{layer.encoding}, {layer.dtype}, of {len(layer)}" for name, layer in scene.layers.items()}
+        branch(tree, "of each pixel", beside)
+    branch(tree, "frame", frame_rows(scene.frame))
+    if scene.points is not None:
+        branch(tree, "points", {"count": len(scene.points)})
+    return tree
+
+
+def cloud_tree(name: str, cloud: Gaussians) -> Tree:
+    tree = Tree(f"[bold]{name}[/bold]  a cloud of {len(cloud):,} Gaussians")
+    rows: dict[str, Any] = {"file": size(Path(name)), "harmonics": f"degree {cloud.degree}"}
+    rows["opacities"] = "antialiased (Mip-Splatting's 2-D filter)" if cloud.antialiased else "as in the first release"
+    if len(cloud):
+        low, high = cloud.means.amin(0), cloud.means.amax(0)
+        rows["bounds"] = f"{vector(tuple(low.tolist()))} to {vector(tuple(high.tolist()))}"
+        rows["middle"] = vector(tuple(cloud.means.median(0).values.tolist()))
+        rows["deviation"] = f"{cloud.log_scales.mean(-1).median().exp().item():.4g}, in the middle"
+        rows["opacity"] = f"{cloud.opacities.sigmoid().median().item():.3g}, in the middle"
+    branch(tree, "cloud", rows)
+    return tree
+
+
+def composition_tree(composition: Any) -> Tree:
+    tree = Tree(f"[bold]{composition.path}[/bold]  a composition of {len(composition.parts)} parts")
+    for number, (part, place) in enumerate(zip(composition.parts, composition.places, strict=True)):
+        rows = {"source": part.source, "leads": "yes" if number == composition.lead else None}
+        rows |= {"scale": place.scale, "origin": vector(tuple(place.matrix[:3, 3].tolist())) + " in the frame below"}
+        rows |= {"box": part.box and f"{vector(part.box[0])} to {vector(part.box[1])}"}
+        branch(tree, f"part {number}", rows)
+    branch(tree, "frame", frame_rows(composition.frame))
+    return tree
+
+
+def frame_rows(frame: Frame) -> dict[str, Any]:
+    low, high = frame.bounds
+    return {
+        "bounds": f"{vector(low)} to {vector(high)}",
+        "reach": frame.reach,
+        "near": frame.near,
+        "cameras": frame.forward and f"forward-facing, near plane at {frame.forward.near:.3g}",
+        "background": vector(frame.background) + (" behind alpha" if frame.has_alpha else ""),
+        "moments": frame.times and f"from {frame.times[0]:g} to {frame.times[1]:g}",
+        "one scene unit": f"{frame.to_source.scale:.4g} of the source's",
+    }
+
+
+def branch(tree: Tree, title: str, rows: dict[str, Any]) -> None:
+    node = tree.add(f"[bold]{title}[/bold]")
+    width = max(map(len, rows))
+    for name, value in rows.items():
+        if value is not None:
+            node.add(f"[dim]{name:<{width}}[/dim]  {f'{value:.4g}' if isinstance(value, float) else value}")
+
+
+def vector(numbers: tuple[float, ...]) -> str:
+    return "(" + ", ".join(f"{x:.3g}" for x in numbers) + ")"
+
+
+def size(path: Path) -> str:
+    count = path.stat().st_size
+    return f"{count / 1e6:.1f} MB" if count >= 1e5 else f"{count / 1e3:.0f} kB"

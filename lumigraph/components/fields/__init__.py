@@ -1,0 +1,1 @@
+"""What representations are made of: encodings, networks, how points turn into coordinates."""

@@ -1,0 +1,144 @@
+"""Occupancy: a grid that remembers where there is something, so that rays skip where there is nothing."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import ClassVar
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor, nn
+
+from ... import kernels
+from ...rays import Rays, Samples
+
+
+class OccupancyGrid(nn.Module):
+    """Cubes of n^3 cells around the origin, each twice as large as the last (Müller 2022, appendix E.2).
+
+    density:  the most that was seen lately in each cell, per scene unit: a maximum that decays
+    occupied: the cells worth visiting
+    It begins coarse, where a few thousand looks tell what is empty, and `refine` halves its cells.
+    """
+
+    grows: ClassVar[tuple[str, ...]] = ("density", "occupied", "possible")
+    density: Tensor
+    occupied: Tensor
+    possible: Tensor
+    box: Tensor
+
+    def __init__(self, reach: float, resolution: int):
+        super().__init__()
+        cascades = 1 + max(0, math.ceil(math.log2(reach)))
+        self.register_buffer("density", torch.zeros(cascades, resolution, resolution, resolution))
+        self.register_buffer("occupied", torch.ones(cascades, resolution, resolution, resolution, dtype=torch.bool))
+        self.register_buffer("possible", torch.ones_like(self.occupied))
+        # The box around all occupied cells: rays begin and end there.
+        self.register_buffer("box", torch.tensor([[-1.0] * 3, [1.0] * 3]) * 2.0 ** (cascades - 1))
+
+    @property
+    def resolution(self) -> int:
+        return self.density.shape[-1]
+
+    @property
+    def share(self) -> float:
+        """Share of cells that are occupied."""
+        return float(self.occupied.float().mean())
+
+    def refine(self) -> None:
+        """Halve the cells; each inherits its parent's density and state."""
+        for name in self.grows:
+            grid = getattr(self, name)
+            for axis in (1, 2, 3):
+                grid = grid.repeat_interleave(2, axis)
+            setattr(self, name, grid)
+
+    def rule_out(self, possible: Bool[Tensor, "cascade x y z"]) -> None:
+        """Mark cells as empty for good, whatever the field's density there; their grid sets the resolution."""
+        self.possible = possible.to(self.density.device)
+        self.occupied, self.density = self.possible.clone(), torch.zeros_like(self.possible, dtype=torch.float32)
+        self.box.copy_(self._box())
+
+    def sample(
+        self,
+        rays: Rays,
+        near: float,
+        step: float,
+        growth: float = 0.0,
+        stop: float = 0.0,
+        jitter: Float[Tensor, " ray"] | None = None,
+    ) -> Samples:
+        """Samples in occupied cells, until the grid's own density has used up the light (see `kernels.march`).
+
+        jitter: in [0, 1), moves each ray's lattice by that share of a step
+        """
+        enter, leave = rays.through_box(self.box)
+        # Whole steps from the near distance, so that the lattice does not follow the box.
+        enter = near + ((enter - near) / step).floor().clamp_min(0) * step if growth == 0 else enter.clamp_min(near)
+        if jitter is not None:
+            enter = enter + (jitter - 1) * (step if growth == 0 else (growth * enter).clamp_min(step))
+            enter = enter.clamp_min(0)
+        grids = self.occupied, self.density
+        return kernels.march(rays.origins, rays.directions, enter, leave, *grids, step, growth, stop)
+
+    @torch.no_grad()
+    def update(
+        self,
+        density_at: Callable[[Float[Tensor, "sample 3"]], Float[Tensor, " sample"]],
+        thickness: float,
+        generator: torch.Generator,
+        decay: float = 0.95,
+        share: float = 1.0,
+        budget: int | None = None,
+    ) -> None:
+        """Ask for the density at one random point in each of some cells, and decide anew which are occupied.
+
+        thickness: optical thickness across a cell from which on it is occupied; or the density's mean over all cells,
+                   where that is less
+        share:     below 1, only the occupied cells and that share of all cells, drawn at random, are looked at
+        budget:    looks at most, half of them at occupied cells; cells then take turns
+        """
+        flat = self.density.view(-1)
+        cells = self._choose(share, budget, generator)
+        flat[cells] *= decay
+        for part in cells.split(1 << 18):
+            seen = density_at(self._point_in(part, generator))
+            flat[part] = torch.maximum(flat[part], seen)
+        sizes = 2.0 ** torch.arange(len(self.density), device=flat.device) * 2 / self.resolution
+        enough = (thickness / sizes).clamp(max=float(self.density.mean()))
+        self.occupied = self.possible & (self.density > enough[:, None, None, None])
+        self.box.copy_(self._box())
+
+    def _choose(self, share: float, budget: int | None, generator: torch.Generator) -> Int[Tensor, " cell"]:
+        possible, occupied = self.possible.view(-1), self.occupied.view(-1)
+        if share >= 1:
+            return possible.nonzero()[:, 0]
+        probes = min(int(share * len(possible)), budget // 2 if budget else len(possible))
+        drawn = torch.randint(len(possible), (probes,), generator=generator).to(possible.device)
+        known = occupied.nonzero()[:, 0]
+        if budget and len(known) > budget // 2:
+            known = known[torch.randint(len(known), (budget // 2,), generator=generator).to(known.device)]
+        chosen = torch.zeros_like(occupied)
+        chosen[drawn] = chosen[known] = True
+        return (chosen & possible).nonzero()[:, 0]
+
+    def _point_in(self, cells: Int[Tensor, " cell"], generator: torch.Generator) -> Float[Tensor, "cell 3"]:
+        n = self.resolution
+        index = torch.stack([cells // (n * n) % n, cells // n % n, cells % n], -1)
+        inside = torch.rand(len(cells), 3, generator=generator).to(cells.device)
+        half = 2.0 ** (cells // n**3).float()
+        return ((index + inside) * (2 / n) - 1) * half[:, None]
+
+    def _box(self) -> Float[Tensor, "2 3"]:
+        """The corners of the smallest box around all occupied cells."""
+        low, high = torch.full((3,), torch.inf), torch.full((3,), -torch.inf)
+        for cascade, occupied in enumerate(self.occupied.cpu()):
+            half = 2.0**cascade
+            for axis in range(3):
+                others = [a for a in range(3) if a != axis]
+                hit = occupied.any(dim=others[1]).any(dim=others[0]).nonzero()[:, 0]
+                if len(hit):
+                    low[axis] = min(low[axis], (hit[0] * 2 / self.resolution - 1) * half)
+                    high[axis] = max(high[axis], ((hit[-1] + 1) * 2 / self.resolution - 1) * half)
+        return torch.stack([low, high]).to(self.box)

@@ -1,0 +1,88 @@
+"""OccupancyMask: where something may be, so that a coordinate network is evaluated only there."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor, nn
+from torch.nn.functional import max_pool3d
+
+from ...scene import Scene
+from .carving import visual_hull
+from .occupancy import OccupancyGrid
+
+BEGINS = 0.1  # share of the budget before the grid rules anything out: a young network is thin everywhere
+EVERY, DECAY = 16, 0.95  # steps between looks at the grid, and what it remembers of the last one
+LOOKS = 1 << 15  # at the grid, each time
+PROBES = 0.02  # share of all cells looked at again at random, in case something has grown there
+
+
+class OccupancyMask(nn.Module):
+    """A grid over the cube of coordinates, [-1, 1]^3, that remembers where a network found something.
+
+    cells:     along each axis; the hull of an object may make them finer. 0: no grid, something may be anywhere
+    thickness: optical thickness across a cell below which it is empty
+    """
+
+    known: Tensor
+
+    def __init__(self, cells: int, thickness: float):
+        super().__init__()
+        self.cells, self.thickness = cells, thickness
+        if cells:
+            self.grid = OccupancyGrid(1.0, cells)
+            self.register_buffer("known", torch.tensor(False))
+            self._coarser: tuple[Tensor, dict[int, Tensor]] = self.grid.occupied, {}
+
+    def begin(self, scene: Scene) -> None:
+        """Mark as empty for good the cells that photographs of an object see through."""
+        if self.cells and scene.images.has_alpha and scene.frame.reach <= 1:
+            self.grid.rule_out(visual_hull(scene, self.cells)[None])
+
+    def look(
+        self,
+        step: int,
+        progress: float,
+        density_at: Callable[[Float[Tensor, "point 3"]], Float[Tensor, " point"]],
+        generator: torch.Generator,
+    ) -> None:
+        """Update the grid every EVERY steps, ahead of a training step. density_at: per unit of the coordinates."""
+        if not self.cells or progress < BEGINS or step % EVERY:
+            return
+        share, looks = (PROBES, LOOKS) if self.known else (1.0, None)  # everywhere for once
+        self.grid.update(density_at, self.thickness, generator, DECAY, share, looks)
+        self.known.fill_(True)
+
+    def may_hold(
+        self, coordinates: Float[Tensor, "sample 3"], radius: Float[Tensor, " sample"] | None = None
+    ) -> Bool[Tensor, " sample"] | None:
+        """Whether something may be at or within a radius of coordinates; None without a grid. Beyond it the nearest
+        cell tells."""
+        if not self.cells:
+            return None
+        if radius is None:
+            return self.grid.occupied.view(-1).index_select(0, self._cells_of(coordinates, 1))
+        found = torch.zeros(len(coordinates), dtype=torch.bool, device=coordinates.device)
+        level = (radius * (0.5 * self.grid.resolution)).clamp_min(1).log2().ceil()
+        for k in range(int(level.max()) + 1 if len(level) else 0):
+            here = (level == k).nonzero()[:, 0]
+            found[here] = self._neighbourhood(k)[self._cells_of(coordinates[here], 2**k)]
+        return found
+
+    def _neighbourhood(self, level: int) -> Bool[Tensor, " cell"]:
+        """Cells 2^level times as large that hold something themselves or beside them; kept until the grid changes."""
+        if self._coarser[0] is not self.grid.occupied:
+            self._coarser = self.grid.occupied, {}
+        kept = self._coarser[1]
+        if level not in kept:
+            merged = max_pool3d(self.grid.occupied.float()[None], 2**level, ceil_mode=True)
+            kept[level] = (max_pool3d(merged, 3, 1, 1) > 0).flatten()
+        return kept[level]
+
+    def _cells_of(self, coordinates: Float[Tensor, "sample 3"], size: int) -> Tensor:
+        n = -(-self.grid.resolution // size)
+        half = 0.5 * self.grid.resolution / size
+        x, y, z = (coordinates * half + half).int().clamp_(0, n - 1).unbind(-1)  # 32 bits: half of what is to be moved
+        return (x * n + y) * n + z

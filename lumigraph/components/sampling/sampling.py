@@ -1,0 +1,46 @@
+"""Where along a ray to sample: evenly at first, then where the first samples found something."""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+FAINT = 1e-5  # weight that every bin has at least, so that no part of a ray is beyond reach
+
+
+def stratified(
+    rays: int, count: int, generator: torch.Generator | None = None, device: torch.device | str = "cpu"
+) -> Float[Tensor, "ray {count}"]:
+    """One number in each of `count` even bins of [0, 1], growing (Mildenhall 2020, eq. 2).
+
+    generator: draws each bin's place; None takes the middles
+    """
+    if generator is None:
+        offset = torch.full((rays, count), 0.5, device=device)
+    else:
+        offset = torch.rand(rays, count, generator=generator).to(device)
+    return (torch.arange(count, device=device) + offset) / count
+
+
+def inverse_transform(
+    edges: Float[Tensor, "ray edge"],
+    weights: Float[Tensor, "ray bin"],
+    shares: Float[Tensor, "ray count"],
+) -> Float[Tensor, "ray count"]:
+    """Numbers spread like a piecewise constant density: its inverse cumulative distribution (Mildenhall 2020, eq. 5).
+
+    edges:   of the bins, growing, one more than there are bins
+    weights: of each bin, not negative
+    shares:  in [0, 1], growing, how much of the distribution lies below each result; see `stratified`
+    """
+    density = weights + FAINT
+    below = torch.nn.functional.pad((density / density.sum(-1, keepdim=True)).cumsum(-1), (1, 0))
+    i = torch.searchsorted(below, shares.contiguous(), right=True).clamp(1, weights.shape[-1])
+    low, high = below.gather(-1, i - 1), below.gather(-1, i)
+    share = ((shares - low) / (high - low).clamp_min(1e-12)).clamp(0, 1)
+    return torch.lerp(edges.gather(-1, i - 1), edges.gather(-1, i), share)
+
+
+def midpoints(x: Float[Tensor, "ray n"]) -> Float[Tensor, "ray n_less_one"]:
+    return 0.5 * (x[:, 1:] + x[:, :-1])

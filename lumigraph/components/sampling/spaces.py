@@ -1,0 +1,225 @@
+"""Spaces: the coordinates in which a network sees a scene, and the stretch of each ray that is sampled.
+
+A network sees coordinates of about [-1, 1], evenly. An object fits as it is, a capture that looks one way fits in
+normalised device coordinates (Mildenhall 2020, appendix C), anything else is contracted into a ball (Barron 2022,
+section 3).
+"""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from ...rays import Rays, Samples
+from ...scene import Forward, Frame, Vector
+
+INFINITY = 1000.0  # times the near plane's distance: rays in normalised device coordinates end at 0.998 instead of 1
+SIDEWAYS = 1e-3  # sine of the angle to the near plane, below which a ray is said not to reach it
+
+
+def space_of(frame: Frame) -> Space:
+    """The space that suits a scene."""
+    if frame.reach <= 1:
+        return Box(frame.bounds, frame.near)
+    if frame.forward is not None:
+        return NDC(frame.forward, frame.near)
+    return Contraction(frame.near, 2 * math.sqrt(3) * frame.reach)
+
+
+class Space(ABC):
+    """A map from the scene to coordinates, and the part of each ray that it covers.
+
+    Plain numbers, so that it works on any device and in any precision.
+    """
+
+    @abstractmethod
+    def interval(self, rays: Rays) -> tuple[Float[Tensor, " ray"], Float[Tensor, " ray"]]:
+        """Where each ray's samples begin and end, in scene units: finite, and equal for rays that see nothing."""
+
+    @abstractmethod
+    def distance(
+        self, share: Float[Tensor, "ray sample"], rays: Rays, near: Float[Tensor, " ray"], far: Float[Tensor, " ray"]
+    ) -> Float[Tensor, "ray sample"]:
+        """Distances at shares of the way from near to far, as this space measures it: exact at 0 and 1, growing."""
+
+    @abstractmethod
+    def warp(self, points: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n 3"]:
+        """Coordinates of points."""
+
+    @abstractmethod
+    def jacobian(self, points: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3 3"]:
+        """Derivative of each coordinate (rows) by each axis of the scene (columns)."""
+
+    @abstractmethod
+    def stretch(self, points: Float[Tensor, "n 3"]) -> Float[Tensor, " n"]:
+        """|det J|^(1/3): the length in coordinates of a unit of the scene, whatever its direction."""
+
+    def along(self, rays: Rays, samples: Samples) -> Float[Tensor, " sample"]:
+        """Coordinates that a ray passes in a unit of the scene, averaged over each sample."""
+        ray = samples.ray_index
+        first, last = (
+            self.warp(rays.origins[ray] + t[:, None] * rays.directions[ray]) for t in (samples.t_start, samples.t_end)
+        )
+        return (last - first).norm(dim=-1) / samples.length.clamp_min(1e-9)
+
+    def warp_gaussians(
+        self,
+        means: Float[Tensor, "n 3"],
+        directions: Float[Tensor, "n 3"],
+        along: Float[Tensor, " n"],
+        across: Float[Tensor, " n"],
+    ) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"]]:
+        """Coordinates of Gaussians, and their variances along each coordinate, to first order (Barron 2022, eq. 9).
+
+        directions: unit length; variances in squared scene units along and across them
+        The diagonal of J S J^T with S = along d d^T + across (I - d d^T); with J = I it is Barron 2021, eq. 16.
+        """
+        jacobian = self.jacobian(means)
+        ray = (jacobian @ directions[:, :, None])[:, :, 0].square()
+        variances = along[:, None] * ray + across[:, None] * (jacobian.square().sum(-1) - ray).clamp_min(0)
+        return self.warp(means), variances
+
+
+@dataclass(frozen=True)
+class Box(Space):
+    """An object: the scene as it is, evenly along each ray through its bounds."""
+
+    bounds: tuple[Vector, Vector]
+    near: float
+
+    def interval(self, rays):
+        enter, leave = rays.through_box(rays.origins.new_tensor(self.bounds))
+        enter = enter.clamp_min(self.near)
+        hit = leave > enter
+        return torch.where(hit, enter, self.near), torch.where(hit, leave, self.near)
+
+    def distance(self, share, rays, near, far):
+        return torch.lerp(near[:, None], far[:, None], share)
+
+    def warp(self, points):
+        return points
+
+    def jacobian(self, points):
+        return torch.eye(3, dtype=points.dtype, device=points.device).expand(len(points), 3, 3)
+
+    def stretch(self, points):
+        return points.new_ones(len(points))
+
+    def warp_gaussians(self, means, directions, along, across):
+        ray = directions.square()
+        return means, along[:, None] * ray + across[:, None] * (1 - ray)
+
+    def along(self, rays, samples):
+        return torch.ones_like(samples.t_start)
+
+
+@dataclass(frozen=True)
+class NDC(Space):
+    """Normalised device coordinates of the mean camera: (s_x x / z, s_y y / z, 1 - 2 n / z), n the near plane.
+
+    Mildenhall 2020, appendix C, which looks along -z where we look along +z. The frustum beyond the near plane becomes
+    a cube, and lines stay lines. Samples are even in the paper's t', from the near plane, or from the frame's near
+    distance where a camera stands beyond, to nearly infinity. What lies before the plane is taken for what is on it.
+    """
+
+    forward: Forward
+    near: float
+
+    def interval(self, rays):
+        z, speed = self._depths(rays)
+        near = ((self.forward.near - z) / speed).clamp_min(self.near)
+        far = (INFINITY * self.forward.near - z) / speed
+        reaches = (rays.directions @ self._pose(rays.origins)[:, 2] > SIDEWAYS) & (far > near)
+        return torch.where(reaches, near, 0), torch.where(reaches, far, 0)
+
+    def distance(self, share, rays, near, far):
+        z, speed = self._depths(rays)
+        first, last = ((z + t * speed).clamp_min(self.forward.near) for t in (near, far))
+        return torch.lerp(near[:, None], far[:, None], even_in_inverse(share, first[:, None], last[:, None]))
+
+    def warp(self, points):
+        x, y, z = self._in_camera(points)
+        (scale_x, scale_y), near = self.forward.scale, self.forward.near
+        return torch.stack([scale_x * x / z, scale_y * y / z, 1 - 2 * near / z], -1)
+
+    def jacobian(self, points):
+        x, y, z = self._in_camera(points)
+        (scale_x, scale_y), near = self.forward.scale, self.forward.near
+        right, down, ahead = self._pose(points)[:, :3].T
+        rows = (
+            scale_x * (right - (x / z)[:, None] * ahead),
+            scale_y * (down - (y / z)[:, None] * ahead),
+            2 * near / z[:, None] * ahead,
+        )
+        return torch.stack(rows, 1) / z[:, None, None]
+
+    def stretch(self, points):
+        _, _, z = self._in_camera(points)
+        scale_x, scale_y = self.forward.scale
+        return (2 * scale_x * scale_y * self.forward.near) ** (1 / 3) * z ** (-4 / 3)
+
+    def _pose(self, like: Tensor) -> Float[Tensor, "3 4"]:
+        return like.new_tensor(self.forward.pose)
+
+    def _in_camera(self, points: Float[Tensor, "*n 3"]) -> tuple[Tensor, Tensor, Tensor]:
+        """x, y, z in the mean camera, z on or beyond the near plane."""
+        pose = self._pose(points)
+        x, y, z = ((points - pose[:, 3]) @ pose[:, :3]).unbind(-1)
+        return x, y, z.clamp_min(self.forward.near)
+
+    def _depths(self, rays: Rays) -> tuple[Float[Tensor, " ray"], Float[Tensor, " ray"]]:
+        """Depth z of each ray's origin, and how fast it grows; no less than what counts as looking ahead."""
+        pose = self._pose(rays.origins)
+        return (rays.origins - pose[:, 3]) @ pose[:, 2], (rays.directions @ pose[:, 2]).clamp_min(SIDEWAYS)
+
+
+@dataclass(frozen=True)
+class Contraction(Space):
+    """Everything in a ball of radius 1: half of contract(x), x inside the unit ball and (2 - 1 / |x|) x / |x| outside.
+
+    Barron 2022, eq. 10. Samples are even in disparity, 1 / t, which far out is even in coordinates (section 3).
+    """
+
+    near: float
+    far: float
+
+    def interval(self, rays):
+        ends = rays.origins.new_tensor([[self.near], [self.far]]).expand(2, len(rays))
+        return ends[0], ends[1]
+
+    def distance(self, share, rays, near, far):
+        return torch.lerp(near[:, None], far[:, None], even_in_inverse(share, near[:, None], far[:, None]))
+
+    def warp(self, points):
+        return points * self._across(points)[..., None]
+
+    def jacobian(self, points):
+        radial, across = self._radial(points), self._across(points)
+        out = points / self._radius(points)[:, None]
+        identity = torch.eye(3, dtype=points.dtype, device=points.device)
+        return across[:, None, None] * identity + (radial - across)[:, None, None] * out[:, :, None] * out[:, None]
+
+    def stretch(self, points):
+        return (self._radial(points) * self._across(points).square()) ** (1 / 3)
+
+    def _radius(self, points: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n"]:
+        return points.norm(dim=-1).clamp_min(1)  # with 1, what holds outside holds inside too
+
+    def _across(self, points: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n"]:
+        """Coordinates for a unit of the scene at right angles to the way out."""
+        radius = self._radius(points)
+        return 0.5 * (2 - 1 / radius) / radius
+
+    def _radial(self, points: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n"]:
+        """Coordinates for a unit of the scene on the way out."""
+        return 0.5 / self._radius(points).square()
+
+
+def even_in_inverse(share: Tensor, first: Tensor, last: Tensor) -> Tensor:
+    """How much of the way from first to last lies behind x, once 1 / x has gone a share of its own way."""
+    return share * first / (share * first + (1 - share) * last)

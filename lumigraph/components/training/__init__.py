@@ -1,0 +1,1 @@
+"""How methods learn: optimizers, schedules, losses, corrections of what photographs say."""

@@ -1,0 +1,70 @@
+"""Adam for tables of which each step touches a small part."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import torch
+from numba import njit, prange
+
+
+class LazyAdam(torch.optim.Optimizer):
+    """Adam (Kingma and Ba 2015) that leaves an element alone, moments and all, where its gradient is exactly zero.
+
+    So a hash table's entries that no sample touched do not drift (Müller 2022, section 4). Defaults are that paper's.
+    weight_decay: decoupled (Loshchilov and Hutter 2019): each step takes lr * weight_decay of what it touches
+    """
+
+    def __init__(
+        self,
+        params,
+        lr: float = 1e-2,
+        betas: tuple[float, float] = (0.9, 0.99),
+        eps: float = 1e-15,
+        weight_decay: float = 0.0,
+    ):
+        super().__init__(params, {"lr": lr, "betas": betas, "eps": eps, "weight_decay": weight_decay})
+
+    @torch.no_grad()
+    def step(self, closure=None) -> None:  # type: ignore[override]  # nobody asks for a closure
+        """Take one step with all parameters that have a gradient."""
+        for group in self.param_groups:
+            for p in group["params"]:
+                if p.grad is not None:
+                    self._update(p, group)
+
+    def _update(self, p, group):
+        state = self.state[p]
+        if not state:
+            state["step"] = torch.zeros(())
+            state["mean"], state["square"] = torch.zeros_like(p), torch.zeros_like(p)
+        state["step"] += 1
+        (b1, b2), t = group["betas"], float(state["step"])
+        # Both bias corrections in the step size; epsilon is far below anything that they could change.
+        rate = group["lr"] * math.sqrt(1 - b2**t) / (1 - b1**t)
+        keep = 1 - group["lr"] * group["weight_decay"]
+        tensors = p, p.grad, state["mean"], state["square"]
+        if p.is_cuda:
+            _touched(*tensors, rate, b1, b2, group["eps"], keep)
+        else:
+            numbers = (np.float32(x) for x in (rate, b1, b2, group["eps"], keep))
+            _touched_cpu(*(x.detach().view(-1).numpy() for x in tensors), *numbers)
+
+
+def _touched(p, grad, mean, square, rate, b1, b2, eps, keep):
+    touched = grad != 0
+    mean.copy_(torch.where(touched, b1 * mean + (1 - b1) * grad, mean))
+    square.copy_(torch.where(touched, b2 * square + (1 - b2) * grad * grad, square))
+    p.copy_(torch.where(touched, keep * p - rate * mean / (square.sqrt() + eps), p))
+
+
+@njit(parallel=True, fastmath=True, cache=True)
+def _touched_cpu(p, grad, mean, square, rate, b1, b2, eps, keep):
+    one = np.float32(1)
+    for i in prange(len(p)):
+        g = grad[i]
+        if g != 0:
+            mean[i] = b1 * mean[i] + (one - b1) * g
+            square[i] = b2 * square[i] + (one - b2) * g * g
+            p[i] = keep * p[i] - rate * mean[i] / (np.sqrt(square[i]) + eps)

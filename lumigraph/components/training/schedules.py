@@ -1,0 +1,14 @@
+"""Learning rates as functions of the share of the budget that is spent."""
+
+from __future__ import annotations
+
+FIRST_SHARE = 0.01  # of the learning rate, at the very beginning of a warm-up
+
+
+def falling(first: float, last: float, progress: float, warmup: float = 0.0) -> float:
+    """The learning rate that falls from first to last exponentially, after growing for a share `warmup` of the budget.
+
+    progress: share of the budget that is spent, in [0, 1]
+    """
+    rate = first * (last / first) ** progress
+    return rate * (FIRST_SHARE + (1 - FIRST_SHARE) * min(1.0, progress / warmup) if warmup else 1.0)

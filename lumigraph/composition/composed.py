@@ -1,0 +1,176 @@
+"""Composed: several placed methods as one, which offers what all of them offer.
+
+Parts that march give their samples, and `union` puts all samples along a ray in order. Clouds become one cloud, whose
+Gaussians the rasteriser puts in order. Where both meet, and for methods that do neither, a part is rendered first and
+stands in the picture as a thin surface at the depth that it rendered. That is exact in front of, between and behind
+opaque things. Where such a part is see-through, all of it stands at its mean depth: what lies between its near and its
+far side is hidden by all or by none of it.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any, NoReturn
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from ..camera import Camera
+from ..capabilities import HasDensity, HasGaussians, HasLooks, can
+from ..controls import Control, Value
+from ..errors import LumigraphError, LumigraphWarning
+from ..gaussians import Gaussians, splatting
+from ..method import Method, RayMethod
+from ..rays import Look, Rays, Rendering, Samples
+from ..scene import Frame
+from ..volume import composite, packed
+from .placed import Placed
+from .union import union
+
+NEAR = 0.1  # of the frame's near distance: how near to a camera Gaussians are still drawn
+THICKNESS = 1e-3  # of its distance: how thick a surface is that a rendered part stands as
+FAINT = 1e-3  # opacity below which there is no surface
+OPAQUE = 1 - 1e-6  # opacity that counts as fully so
+
+
+def compose(frame: Frame, parts: Sequence[Placed]) -> Method:
+    """Several methods in one picture, in a frame of their own. Ready to render, and nothing else.
+
+    It has Gaussians if all parts have, looks if all march, and density if all of these know theirs.
+    """
+    methods = [part.method for part in parts]
+    if all(can(method, HasGaussians) for method in methods):
+        return ComposedCloud(frame, parts)
+    if not all(can(method, HasLooks) for method in methods):
+        return ComposedMixture(frame, parts)
+    return (ComposedField if all(can(method, HasDensity) for method in methods) else ComposedRays)(frame, parts)
+
+
+class Composed(Method):
+    """What all compositions share: parts, and that they do not learn."""
+
+    def __init__(self, frame: Frame, parts: Sequence[Placed]):
+        super().__init__(frame, None)
+        self.parts = tuple(parts)
+        self.methods = nn.ModuleList(part.method for part in parts)  # so that they move to devices together
+        self.eval()
+
+    @property
+    def controls(self) -> tuple[Control, ...]:
+        """What any part can be told; those that are about photographs only of the part that leads."""
+        found: dict[str, Control] = {}
+        for part in self.parts:
+            for control in part.method.controls:
+                if part.leads or not control.of_photographs:
+                    found.setdefault(control.name, control)
+        return tuple(found.values())
+
+    def given(self, *evidence: Any, **controls: Value) -> Method:
+        """The same composition, each part told what it has a control for."""
+        told = super().given(*evidence, **controls)
+        assert isinstance(told, Composed)
+        told.parts = tuple(part.given(controls) for part in self.parts)
+        return told
+
+    def refined(self, cameras: Camera) -> Camera:
+        """Cameras as the part that leads sees them, whose they are."""
+        return next((part.method.refined(cameras) for part in self.parts if part.leads), cameras)
+
+    def batch(self, data: Any, generator: torch.Generator) -> NoReturn:
+        raise LumigraphError("A composition does not learn; train its parts, each by itself")
+
+
+class ComposedRays(Composed, RayMethod):
+    """Parts that all march."""
+
+    def looks(self, rays: Rays) -> list[Look]:
+        """The union of every part's last look."""
+        return [union([part.look(rays) for part in self.parts])]
+
+
+class ComposedField(ComposedRays):
+    """Parts that all march and know their density."""
+
+    def density(self, points: Float[Tensor, "point 3"]) -> Float[Tensor, " point"]:
+        """Density per scene unit, the sum of the parts'."""
+        return torch.stack([part.density(points) for part in self.parts]).sum(0)
+
+
+class ComposedCloud(Composed):
+    """Parts that are clouds: one cloud."""
+
+    def gaussians(self) -> Gaussians:
+        """All parts' Gaussians, in the scene's frame."""
+        return merged([part.gaussians() for part in self.parts])
+
+    @torch.no_grad()
+    def render(self, camera: Camera) -> Rendering:
+        near = NEAR * self.frame.near
+        return splatting.render(self.gaussians(), camera.to(self.device), self.frame.background, near)
+
+
+class ComposedMixture(Composed):
+    """Parts of several kinds: some march, the rest are rendered first and stand as surfaces."""
+
+    rays_per_chunk: int = RayMethod.rays_per_chunk
+
+    @torch.no_grad()
+    def render(self, camera: Camera) -> Rendering:
+        camera = camera.to(self.device)
+        width, height = camera.size[0].tolist()
+        rays = camera.rays(camera.pixels())
+        marching = [part for part in self.parts if can(part.method, HasLooks)]
+        surfaces = self._surfaces(camera)
+        seen = []
+        for begin in range(0, len(rays), self.rays_per_chunk):
+            some = slice(begin, begin + self.rays_per_chunk)
+            looks = [part.look(rays[some]) for part in marching] + [surface(*(x[some] for x in s)) for s in surfaces]
+            found = union(looks)
+            seen.append(composite(found.samples, found.density, found.rgb, self.background))
+        return Rendering.cat(seen).reshape(height, width)
+
+    def _surfaces(self, camera: Camera) -> list[tuple[Tensor, Tensor, Tensor]]:
+        """Colour over black, depth and opacity of every pixel: of all clouds at once, and of each other part."""
+        rendered = [part for part in self.parts if not can(part.method, HasLooks)]
+        clouds = [part.gaussians() for part in rendered if can(part.method, HasGaussians)]
+        seen = [part.rendering(camera) for part in rendered if not can(part.method, HasGaussians)]
+        if clouds:
+            seen.append(splatting.render(merged(clouds), camera, (0.0, 0.0, 0.0), NEAR * self.frame.near))
+        return [(x.rgb.reshape(-1, 3), x.depth.reshape(-1), x.opacity.reshape(-1)) for x in seen]
+
+
+def surface(rgb: Float[Tensor, "ray 3"], depth: Float[Tensor, " ray"], opacity: Float[Tensor, " ray"]) -> Look:
+    """A rendered part as a thin sample at its depth. rgb: over black."""
+    hit = (opacity > FAINT) & depth.isfinite()
+    rgb, depth, opacity = rgb[hit], depth[hit], opacity[hit]
+    half = 0.5 * THICKNESS * depth
+    samples = Samples(depth - half, depth + half, packed(hit.long()))
+    density = -torch.log1p(-opacity.clamp_max(OPAQUE)) / samples.length
+    return Look("surface", samples, density, rgb / opacity[:, None])
+
+
+def merged(clouds: Sequence[Gaussians]) -> Gaussians:
+    """One cloud from several. Harmonics that some lack are zero; opacities keep the meaning that most of them have."""
+    coefficients = max(cloud.harmonics.shape[1] for cloud in clouds)
+    antialiased = [cloud.antialiased for cloud in clouds for _ in range(len(cloud))]
+    majority = 2 * sum(antialiased) > len(antialiased)
+    if len({cloud.antialiased for cloud in clouds}) > 1:
+        warnings.warn(
+            "Some of these clouds were learnt with the antialiasing filter and some without; the smallest Gaussians of "
+            f"{'the latter' if majority else 'the former'} look a little too {'thin' if majority else 'thick'}",
+            LumigraphWarning,
+            2,
+        )
+    harmonics = [nn.functional.pad(x.harmonics, (0, 0, 0, coefficients - x.harmonics.shape[1])) for x in clouds]
+    return replace(
+        clouds[0],
+        means=torch.cat([x.means for x in clouds]),
+        quaternions=torch.cat([x.quaternions for x in clouds]),
+        log_scales=torch.cat([x.log_scales for x in clouds]),
+        opacities=torch.cat([x.opacities for x in clouds]),
+        harmonics=torch.cat(harmonics),
+        antialiased=majority,
+    )

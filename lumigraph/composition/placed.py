@@ -1,0 +1,104 @@
+"""Placed: a method somewhere else, turned and scaled, cut by a box."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from ..camera import Camera
+from ..capabilities import HasDensity, HasGaussians, HasLooks, needs
+from ..controls import Value
+from ..gaussians import Gaussians
+from ..geometry import Similarity
+from ..method import Method
+from ..rays import Look, Rays, Rendering, Samples
+from ..scene import Vector
+
+Box = tuple[Vector, Vector]
+
+
+@dataclass(frozen=True)
+class Placed:
+    """One part of a picture.
+
+    place:  from the frame of the method to that of the picture
+    box:    two corners in the method's own frame; nothing outside it is shown. None for all there is
+    leads:  whether the picture's cameras are this part's. They keep its `Frame.near` free, as its own did, and what it
+            learnt for each of its photographs holds for them. Cameras may come as near as they like to any other part
+    """
+
+    method: Method
+    place: Similarity
+    box: Box | None = None
+    leads: bool = False
+
+    def look(self, rays: Rays) -> Look:
+        """The last look of a method that marches: distances and density per unit of the picture, cut by the box.
+
+        A ray that does not lead begins `Frame.near` behind the eye, for the method looks at nothing that is nearer.
+        """
+        scale, behind = self.place.scale, 0.0 if self.leads else self.method.frame.near
+        local = self._inward(rays, behind)
+        found = needs(self.method, HasLooks).looks(local)[-1]
+        begin, end = found.samples.t_start, found.samples.t_end
+        if self.box is not None:
+            ray = found.samples.ray_index
+            enter, leave = local.through_box(self._corners(begin))
+            begin, end = torch.maximum(begin, enter[ray]), torch.minimum(end, leave[ray])
+        begin, end = ((t - behind).clamp_min(0) * scale for t in (begin, end))
+        keep = begin < end
+        samples = Samples(begin, end, found.samples.ray_starts).keep(keep)
+        return Look(found.name, samples, found.density[keep] / scale, found.rgb[keep])
+
+    def density(self, points: Float[Tensor, "point 3"]) -> Float[Tensor, " point"]:
+        """Density per unit of the picture, at points of the picture's frame."""
+        local = self.place.inverse.points(points)
+        return needs(self.method, HasDensity).density(local) / self.place.scale * self._holds(local)
+
+    def gaussians(self) -> Gaussians:
+        """The cloud in the picture's frame, without those Gaussians whose centres the box leaves out."""
+        cloud = needs(self.method, HasGaussians).gaussians()
+        if self.box is not None:
+            cloud = cloud[self._holds(cloud.means)]
+        return cloud.transformed(self.place.matrix)
+
+    def rendering(self, camera: Camera) -> Rendering:
+        """What a camera of the picture sees of any method, over black. A box leaves out pixels by their depth."""
+        local = self._camera(camera)
+        seen = self.method.render(local)
+        background = torch.tensor(self.method.frame.background, device=seen.rgb.device)
+        rgb = seen.rgb - (1 - seen.opacity)[..., None] * background
+        rays = local.rays(local.pixels()).to(seen.depth.device)
+        there = rays.at(seen.depth.reshape(-1).nan_to_num(0, 0, 0))
+        opacity = seen.opacity * self._holds(there).view(seen.opacity.shape)
+        return Rendering(rgb, seen.depth * self.place.scale, opacity)
+
+    def given(self, controls: dict[str, Value]) -> Placed:
+        """The same part, told those of the controls that its method has and a composition shows."""
+        mine = {x.name for x in self.method.controls if self.leads or not x.of_photographs} & controls.keys()
+        return replace(self, method=self.method.given(**{name: controls[name] for name in mine})) if mine else self
+
+    def _inward(self, rays: Rays, behind: float) -> Rays:
+        """The same rays in the method's frame, from a distance behind where they began."""
+        back = self.place.inverse
+        directions = back.directions(rays.directions)
+        origins = back.points(rays.origins) - behind * directions
+        index = rays.image_index if self.leads else None
+        return replace(rays, origins=origins, directions=directions, image_index=index)
+
+    def _camera(self, camera: Camera) -> Camera:
+        moved = camera.transformed(self.place.inverse.matrix)
+        return moved if self.leads else replace(moved, image_index=None)
+
+    def _corners(self, like: Tensor) -> Float[Tensor, "2 3"]:
+        return torch.tensor(self.box).to(like)
+
+    def _holds(self, points: Float[Tensor, "point 3"]) -> Bool[Tensor, " point"]:
+        """Whether the box holds points of the method's frame; all, where there is none."""
+        if self.box is None:
+            return torch.ones(len(points), dtype=torch.bool, device=points.device)
+        lower, upper = self._corners(points)
+        return ((points >= lower) & (points <= upper)).all(-1)

@@ -1,0 +1,102 @@
+"""A run is evaluated: the protocol that suits what it learnt from, and the files that say what came of it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, Protocol, runtime_checkable
+
+from PIL import Image
+
+from ..collection import Collection
+from ..dataset import Dataset
+from ..figures import save_picture
+from ..files import scene_name, write_json
+from ..method import Method
+from ..metrics import Score
+from ..metrics.lpips import Lpips
+from ..rays import Rendering
+from ..run import Run
+from ..scene import Scene
+from ..shapes import Shapes
+from .collection import evaluate_collection
+from .shapes import evaluate_shapes
+from .views import evaluate, file_name
+
+
+@runtime_checkable
+class Evaluated(Protocol):
+    """What every protocol gives.
+
+    scores:   means over all that was compared, the headline first
+    compared: what that was, in a few words
+    """
+
+    @property
+    def scores(self) -> list[Score]: ...
+
+    @property
+    def compared(self) -> str: ...
+
+    def to_json(self) -> dict[str, Any]: ...
+
+    def contact_sheet(self, title: str) -> Image.Image: ...
+
+
+def evaluate_on(
+    method: Method,
+    data: Dataset,
+    split: str = "test",
+    keep: Callable[[str, Rendering], object] = lambda name, rendering: None,
+    most: int | None = None,
+    lpips: Lpips | None = None,
+) -> Evaluated:
+    """A method on a dataset, under the protocol for its kind.
+
+    keep: told each view's name and rendering, where views are compared
+    most: so many views or shapes at most, evenly spread; None means all
+    """
+    if isinstance(data, Shapes):
+        return evaluate_shapes(method, data, split, most)
+    if isinstance(data, Collection):
+        return evaluate_collection(method, data, split, keep, most, lpips)
+    assert isinstance(data, Scene)
+    return evaluate(method, data, split, keep, most, lpips)
+
+
+def evaluate_run(
+    run: Run,
+    method: Method,
+    data: Dataset,
+    split: str = "test",
+    save_images: bool = False,
+    most: int | None = None,
+    lpips: Lpips | None = None,
+) -> dict[str, Any]:
+    """Evaluate a Run's Method on its dataset and write the files. Returns what eval.json says."""
+
+    def keep(name: str, rendering: Rendering) -> None:
+        if save_images:
+            save_picture(run.folder / "eval" / f"{file_name(name)}.png", rendering.rgb)
+
+    found, state = evaluate_on(method, data, split, keep, most, lpips), run.state
+    result = found.to_json() | {
+        "training_seconds": state.seconds,
+        "compile_seconds": state.compile_seconds,
+        "peak_memory": state.peak_memory,
+        "steps": state.step,
+        "method": run.method_name,
+        "scene": run.settings.scene.to_json(),
+        "trained_on": f"{run.settings.device}, {run.settings.processor}",
+        "evaluated_on": str(method.device),
+        "versions": run.settings.versions,
+    }
+    figures = [f"{score.name} {score}" for score in found.scores]
+    title = " · ".join([run.method_name, scene_name(run.settings.scene.source), found.compared, *figures])
+    save_picture(run.folder / f"{stem(split)}.png", found.contact_sheet(title))
+    write_json(run.folder / f"{stem(split)}.json", result)
+    return result
+
+
+def stem(split: str) -> str:
+    """What the files of a split are called, without their endings."""
+    return "eval" if split == "test" else f"eval-{split}"

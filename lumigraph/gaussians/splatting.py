@@ -1,0 +1,109 @@
+"""Splatting: a cloud of Gaussians, seen through a camera, becomes a picture (Kerbl 2023)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from .. import kernels
+from ..blending import over
+from ..camera import Camera
+from ..errors import LumigraphError
+from ..lens import Mixed, OpenCV, Pinhole
+from ..rays import Rendering
+from .cloud import Gaussians
+
+BLUR = 0.3  # square pixels by which every footprint is widened (Kerbl 2023; the original release)
+NEAR = 0.01  # scene units in front of a camera within which nothing is seen, where nobody knows better
+MARGIN = 0.15  # of the picture's width and height beyond its edges: how far out the lens is still followed
+EDGE_SAMPLES = 9  # pixels along each edge that tell what a lens sees
+
+
+@dataclass(frozen=True)
+class Splatted:
+    """A picture of a cloud, and the footprints that made it (see `kernels.project` and `kernels.rasterize`).
+
+    rgb:     colours over black
+    depth:   opacity-weighted sum of depths along the optical axis
+    opacity: share of light that the cloud stops
+    centres, opacities: of each Gaussian's footprint, zero for those that the picture does not show
+    """
+
+    rgb: Float[Tensor, "height width 3"]
+    depth: Float[Tensor, "height width"]
+    opacity: Float[Tensor, "height width"]
+    centres: Float[Tensor, "gaussian 2"]
+    opacities: Float[Tensor, " gaussian"]
+
+
+def splat(cloud: Gaussians, view: kernels.View, bands: int = 4, stop: float = 1e-4, blur: float = BLUR) -> Splatted:
+    """Project, tile, rasterise; differentiable in the cloud.
+
+    bands: of the harmonics in use, at most as many as there are
+    stop:  transmittance at which a pixel is finished
+    """
+    centres, conics, depths, colours, opacities = kernels.project(
+        cloud.means,
+        cloud.quaternions,
+        cloud.log_scales.exp(),
+        cloud.opacities.sigmoid(),
+        cloud.harmonics,
+        view,
+        min(bands, cloud.degree + 1),
+        blur,
+        cloud.antialiased,
+    )
+    tiles = kernels.tile(centres, conics, opacities, depths, view.size)
+    rgb, depth, opacity = kernels.rasterize(centres, conics, opacities, colours, depths, tiles, stop)
+    return Splatted(rgb, depth, opacity, centres, opacities)
+
+
+@torch.no_grad()
+def render(
+    cloud: Gaussians,
+    camera: Camera,
+    background: tuple[float, float, float],
+    near: float = NEAR,
+    bands: int = 4,
+    blur: float = BLUR,
+) -> Rendering:
+    """What one camera sees of a cloud, in front of a background colour."""
+    seen = splat(cloud, view_of(camera, near).to(cloud.means.device), bands, blur=blur)
+    rgb = over(seen.rgb, seen.opacity, torch.tensor(background, device=seen.rgb.device))
+    # Depth along the optical axis, of what is opaque, becomes distance along each pixel's ray.
+    rays = camera.rays(camera.pixels()).directions
+    along = (rays @ camera.forward[0]).view(seen.depth.shape).clamp_min(1e-3).to(seen.depth.device)
+    depth = torch.where(seen.opacity > 1e-3, seen.depth / seen.opacity.clamp_min(1e-3) / along, torch.inf)
+    return Rendering(rgb, depth, seen.opacity)
+
+
+def view_of(camera: Camera, near: float = NEAR) -> kernels.View:
+    """One camera as the kernels want it. Raises LumigraphError for lenses without a flat picture."""
+    lens = camera.lens[0] if isinstance(camera.lens, Mixed) else camera.lens
+    if not isinstance(lens, Pinhole | OpenCV):
+        raise LumigraphError(
+            f"Gaussians are seen through a flat picture, and the lens here is {type(lens).__name__}; "
+            "undistort the photographs, or train instant-ngp, which follows any lens"
+        )
+    width, height = camera.size[0].tolist()
+    distortion = lens.distortion[0] if isinstance(lens, OpenCV) else lens.focal.new_zeros(8)
+    rotation = camera.pose[0, :, :3].T
+    limits = _limits(lens, width, height)
+    return kernels.View(
+        rotation, camera.position[0], lens.focal[0], lens.centre[0], distortion, limits, (width, height), near
+    )
+
+
+def _limits(lens: Pinhole | OpenCV, width: int, height: int) -> Float[Tensor, " 4"]:
+    """The part of the plane z = 1 that the picture shows, and a margin around it."""
+    x, y = (torch.linspace(0, n, EDGE_SAMPLES, device=lens.device) for n in (width, height))
+    left, top = torch.zeros_like(y), torch.zeros_like(x)
+    edges = [torch.stack(pair, -1) for pair in ((left, y), (left + width, y), (x, top), (x, top + height))]
+    directions = lens.unproject(torch.cat(edges))
+    plane = directions[:, :2] / directions[:, 2:]
+    low, high = plane.amin(0), plane.amax(0)
+    margin = MARGIN * (high - low)
+    return torch.stack([low - margin, high + margin], -1).flatten()

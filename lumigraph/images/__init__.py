@@ -1,0 +1,18 @@
+"""Photographs as bytes, and other values that are known of every pixel: in memory, or where they are too many, in
+files."""
+
+from __future__ import annotations
+
+from .cache import cache_folder as cache_folder
+from .layer import ENCODINGS as ENCODINGS
+from .layer import UNNAMED as UNNAMED
+from .layer import Layer as Layer
+from .layer import LayerSource as LayerSource
+from .layer import cosines as cosines
+from .order import Runs as Runs
+from .order import shuffled_order as shuffled_order
+from .order import spread as spread
+from .resize import resized as resized
+from .store import ImageSource as ImageSource
+from .store import ImageStore as ImageStore
+from .store import PixelBatch as PixelBatch

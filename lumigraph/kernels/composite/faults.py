@@ -1,0 +1,17 @@
+"""Faults that the tests write into a copy of an engine, one at a time, to see their comparison turn red.
+
+By name: the engine, the function, what stands there, and what is put in its place.
+"""
+
+FAULTS = {
+    "sign": ("gpu", "_backward", " - after", " + after"),
+    "off-by-one transmittance": ("gpu", "_backward", "tl.exp(-in_front - t)", "tl.exp(-in_front)"),
+    "opacity forgotten": ("gpu", "_backward", "1) + g_opacity +", "1) +"),
+    "gradient behind the stop": ("gpu", "_backward", "tl.where(seen, ", "tl.where(i < b, "),
+    "attenuation forgotten": ("cpu", "_backward", "worth * through - behind", "worth * through"),
+}
+
+# These let an index leave its array.
+ASTRAY = {
+    "a weight of the next sample": ("cpu", "_forward", "weights[i] = w", "weights[i + 1] = w"),
+}

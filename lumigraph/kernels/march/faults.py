@@ -1,0 +1,16 @@
+"""Faults that the tests write into a copy of an engine, one at a time, to see their comparison turn red.
+
+By name: the engine, the function, what stands there, and what is put in its place.
+"""
+
+FAULTS = {
+    "empty cells counted": ("gpu", "_march", "count += kept", "count += held"),
+    "a cell too far": ("gpu", "_first_at", "- 0.02)", "+ 1.0)"),
+    "spent, yet going on": ("gpu", "_march", "alive &= thickness <= most", "pass"),
+    "spent, yet going on, on the cpu": ("cpu", "_walk", "thickness > depth_limit", "thickness > 2 * depth_limit"),
+}
+
+# These let an index leave its array.
+ASTRAY = {
+    "the ray after the next": ("cpu", "_write", "starts[r + 1] - starts[r]", "starts[r + 2] - starts[r]"),
+}

@@ -1,0 +1,20 @@
+"""Faults that the tests write into a copy of an engine, one at a time, to see their comparison turn red.
+
+By name: the engine, the function, what stands there, and what is put in its place.
+"""
+
+FAULTS = {
+    "a layer that no gate closes": ("cpu", "_backward", "layer == 0)", "True)"),
+    "the wrong gate": ("cpu", "_downwards", "gate + i", "target + i"),
+    "the last block's rest counted twice": (
+        "cpu",
+        "_fetch",
+        "block[(row + f) * BLOCK : (row + f + 1) * BLOCK] = 0",
+        "pass",
+    ),
+}
+
+# These let an index leave its array.
+ASTRAY = {
+    "a tile too many": ("cpu", "_downwards", "whole = across - across % TILE\n", "whole = across\n"),
+}

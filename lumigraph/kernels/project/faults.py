@@ -1,0 +1,22 @@
+"""Faults that the tests write into a copy of an engine, one at a time, to see their comparison turn red.
+
+By name: the engine, the function, what stands there, and what is put in its place.
+"""
+
+FAULTS = {
+    "held, yet with gradient": ("gpu", "_lens_backward", "where(x == X", "where(z > 0"),
+    "a lens's second slope": ("gpu", "_bend_backward", "6 * p2", "2 * p2"),
+    "blur in the compensation": ("gpu", "_covariance_backward", "(a + c - blur)", "(a + c)"),
+    "a quaternion's length": ("gpu", "_matrix_backward", "along * y", "0 * y"),
+    "a colour below zero": ("gpu", "_backward", "colour[1] > 0", "seen"),
+    "the direction's length": ("gpu", "_backward", "-_dot(d, d_d)", "0.0"),
+    "a lens's second slope on the cpu": ("cpu", "_curve", "6 * p2", "2 * p2"),
+    "held, yet with gradient on the cpu": ("cpu", "_backward", "g_x if over == 0 else 0", "g_x"),
+    "the direction's length on the cpu": ("cpu", "_backward", "tx - dx * inward", "tx"),
+    "the cross product's order": ("cpu", "_pulled", "turn * nT[n]", "-turn * nT[n]"),
+}
+
+# These let an index leave its array.
+ASTRAY = {
+    "a coefficient too few": ("cpu", "_forward", "np.empty(16,", "np.empty(15,"),
+}

@@ -1,0 +1,19 @@
+"""Faults that the tests write into a copy of an engine, one at a time, to see their comparison turn red.
+
+By name: the engine, the function, what stands there, and what is put in its place.
+"""
+
+FAULTS = {
+    "the wrong image": ("cpu", "_gradient", "other[x] * products", "own[x] * products"),
+    "the variance's sign": ("cpu", "_likeness", "= -S * B1 * r", "= S * B1 * r"),
+    "the other image's derivative": ("cpu", "backward", "MEAN_B if i and", "MEAN_A if i and"),
+    "the loss's gradient forgotten": ("cpu", "backward", "grad.item() / a", "1 / a"),
+    "a square's slope": ("gpu", "_gradient", "2 * mine", "mine"),
+    "a slope's sign": ("gpu", "_likeness", "(B1 - B2)", "(B2 - B1)"),
+    "the neighbouring channel": ("gpu", "_along", "(k - REACH) * C", "k - REACH"),
+}
+
+# These let an index leave its array.
+ASTRAY = {
+    "a window too long": ("cpu", "_window", "x[at + 10 * step]", "x[at + 11 * step]"),
+}

@@ -1,0 +1,18 @@
+"""Faults that the tests write into a copy of an engine, one at a time, to see their comparison turn red.
+
+By name: the engine, the function, what stands there, and what is put in its place.
+"""
+
+FAULTS = {
+    "the circle for the ellipse": ("cpu", "_span", " - ellipse[4] * y\n    y =", "\n    y ="),
+    "equal depths the other way round": ("cpu", "_near_first", "= order[k]", "= order[-1 - k]"),
+    "a column too many": ("cpu", "_hand_out", "- side + HALF", "- side - ONE"),
+    "the box for the ellipse": ("gpu", "_tile", "& (least <= reach)", ""),
+    "a tile too few": ("gpu", "_span", "last - first + 1", "last - first"),
+    "another row's tile": ("gpu", "_tile", "row * across + column", "column * down + row"),
+}
+
+# These let an index leave its array.
+ASTRAY = {
+    "room for one tile in each row": ("cpu", "_room", " * rows[k, 2]", ""),
+}

@@ -1,0 +1,134 @@
+"""LPIPS: how different two pictures look, by features that a network learnt from photographs (Zhang et al. 2018).
+
+The weights are other people's and not part of this package; they are read from files that the user has:
+
+    alexnet-owt-*.pth   AlexNet as torchvision publishes it: the backbone's convolutions
+    alex.pth            of the authors' repository (PerceptualSimilarity, folder weights/v0.1): how much channels count
+
+or from one safetensors file that holds both under the same names.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from pathlib import Path
+
+import safetensors.torch
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.nn.functional import conv2d, max_pool2d, relu
+
+from .. import files
+from ..errors import LumigraphError
+
+VARIABLE = "LUMIGRAPH_LPIPS"  # names the files where no option does
+DEFINITION = "Zhang 2018: AlexNet, linear heads v0.1, pictures in [-1, 1]; 0 is equal"
+# The convolutions of AlexNet (Krizhevsky 2014): number in torchvision's list, kernel, stride, padding, pooled before.
+LAYERS = (
+    (0, (64, 3, 11, 11), 4, 2, False),
+    (3, (192, 64, 5, 5), 1, 2, True),
+    (6, (384, 192, 3, 3), 1, 1, True),
+    (8, (256, 384, 3, 3), 1, 1, False),
+    (10, (256, 256, 3, 3), 1, 1, False),
+)
+SHIFT, SCALE = (-0.030, -0.088, -0.188), (0.458, 0.448, 0.450)  # ImageNet's mean and deviation, for values in [-1, 1]
+SMALLEST = 31  # pixels; below, AlexNet's second pooling finds nothing
+TINY = 1e-10
+
+
+class Lpips:
+    """The distance of Zhang 2018, eq. 1, over the five rectified convolutions of AlexNet."""
+
+    def __init__(self, weights: dict[str, Tensor]):
+        """weights: `features.N.weight`, `features.N.bias` and `linK.model.1.weight`; others are passed over."""
+        self.weights = {name: weights[name].detach().float() for name in SHAPES}
+
+    def __call__(self, a: Float[Tensor, "height width 3"], b: Float[Tensor, "height width 3"]) -> float:
+        """The distance between two pictures with values in [0, 1]. At least 0, and 0 for equal ones.
+
+        Raises LumigraphError for pictures of less than 31 pixels.
+        """
+        if min(a.shape[:2]) < SMALLEST:
+            raise LumigraphError(
+                f"LPIPS needs pictures of at least {SMALLEST} x {SMALLEST} pixels, not {a.shape[1]} x {a.shape[0]}; "
+                "leave --lpips out"
+            )
+        distance = 0.0
+        for layer, (x, y) in enumerate(zip(self.features(a), self.features(b), strict=True)):
+            difference = (unit(x) - unit(y)).square()
+            distance += float(conv2d(difference, self.weights[f"lin{layer}.model.1.weight"]).mean())
+        return distance
+
+    @torch.no_grad()
+    def features(self, picture: Float[Tensor, "height width 3"]) -> list[Float[Tensor, "1 channel _ _"]]:
+        """What each of the five layers finds in a picture."""
+        x = (2 * picture.float().cpu() - 1 - torch.tensor(SHIFT)) / torch.tensor(SCALE)
+        x = x.movedim(-1, 0)[None]
+        found = []
+        for number, _, stride, padding, pooled in LAYERS:
+            x = max_pool2d(x, 3, 2) if pooled else x
+            weight, bias = (self.weights[f"features.{number}.{name}"] for name in ("weight", "bias"))
+            x = relu(conv2d(x, weight, bias, stride, padding))
+            found.append(x)
+        return found
+
+
+SHAPES: dict[str, tuple[int, ...]] = {
+    **{f"features.{number}.weight": shape for number, shape, *_ in LAYERS},
+    **{f"features.{number}.bias": shape[:1] for number, shape, *_ in LAYERS},
+    **{f"lin{layer}.model.1.weight": (1, shape[0], 1, 1) for layer, (_, shape, *_) in enumerate(LAYERS)},
+}
+
+
+def unit(x: Float[Tensor, "1 channel height width"]) -> Float[Tensor, "1 channel height width"]:
+    """Features of length one at each place."""
+    return x / (x.norm(dim=1, keepdim=True) + TINY)
+
+
+def named_files(given: Sequence[Path]) -> list[Path]:
+    """The files with weights: those given, otherwise those that LUMIGRAPH_LPIPS names, as PATH names folders."""
+    return list(given) or [Path(name) for name in os.environ.get(VARIABLE, "").split(os.pathsep) if name]
+
+
+def load_lpips(paths: Sequence[Path]) -> Lpips:
+    """The distance with the weights in one or several files.
+
+    Raises LumigraphError for files that cannot be read, and for weights that are missing or of another network.
+    """
+    weights: dict[str, Tensor] = {}
+    for path in paths:
+        weights |= read_weights(path)
+    there = " and ".join(map(str, paths))
+    missing = [name for name in SHAPES if name not in weights]
+    if missing:
+        whose = "torchvision's AlexNet" if missing[0].startswith("features") else "the LPIPS repository (v0.1/alex.pth)"
+        raise LumigraphError(
+            f"{there} lacks {len(missing)} of the weights of LPIPS, such as {missing[0]}; add the file of {whose}"
+        )
+    for name, shape in SHAPES.items():
+        if tuple(weights[name].shape) != shape:
+            raise LumigraphError(
+                f"{there}: {name} has the shape {tuple(weights[name].shape)}, and AlexNet's is {shape}; "
+                "use the weights of AlexNet, not those of another network"
+            )
+    return Lpips(weights)
+
+
+def read_weights(path: Path) -> dict[str, Tensor]:
+    """Named tensors of a safetensors file or a PyTorch state dict. No code in it runs."""
+    with files.explained(path):
+        try:
+            if path.suffix == ".safetensors":
+                return safetensors.torch.load(path.read_bytes())
+            found = torch.load(path, map_location="cpu", weights_only=True)
+        except OSError:
+            raise
+        except Exception as error:  # what is no such file fails in many ways
+            raise LumigraphError(
+                f"{path} is no file of weights ({type(error).__name__}); give safetensors or a state dict"
+            ) from error
+    if not isinstance(found, dict) or not all(isinstance(value, Tensor) for value in found.values()):
+        raise LumigraphError(f"{path} holds no state dict of tensors; give safetensors or a state dict")
+    return found

@@ -1,0 +1,10 @@
+"""Camera paths: those that follow the photographs by themselves, and those that a person makes of keyframes."""
+
+from .automatic import PATHS as PATHS
+from .automatic import UP as UP
+from .automatic import Surroundings as Surroundings
+from .automatic import angle_of_view as angle_of_view
+from .automatic import camera_path as camera_path
+from .automatic import film_size as film_size
+from .film import WAYS as WAYS
+from .film import film_cameras as film_cameras

@@ -1,0 +1,43 @@
+"""The cameras of a film, one for each frame."""
+
+from __future__ import annotations
+
+from ..camera import Camera
+from ..errors import LumigraphError
+from ..scene import Frame
+from .automatic import camera_path, film_size
+from .keyframes import CameraPath
+
+LONGEST = 480  # pixels of a film, if nobody asks for more
+FRAMES = 120  # of a film along a path that does not say how long it is
+WAYS = ("orbit", "spiral", "interpolate", "held-out")
+
+
+def film_cameras(
+    cameras: dict[str, Camera],
+    frame: Frame,
+    path: str | CameraPath,
+    frames: int | None = None,
+    size: int | None = None,
+) -> Camera:
+    """The cameras of a film, one for each frame.
+
+    cameras: of the photographs by split, as `Run.cameras` gives them; frame: theirs
+    path:   one of WAYS, or a CameraPath
+    frames: as many as the path says if None: 120, every held-out view, as long as keyframes last
+    size:   longer side; None as the photographs, up to a limit
+    Raises LumigraphError for held-out views where there are none, or of several sizes.
+    """
+    if path != "held-out":
+        train = cameras["train"]
+        shape = film_size(train, size or min(LONGEST, int(train.size[0].max())))
+        if isinstance(path, str):
+            return camera_path(path, train, frame, FRAMES if frames is None else frames, shape)
+        return path.cameras(frame, shape, frames)
+    views = cameras.get("test")
+    if views is None or not len(views):
+        raise LumigraphError("There are no held-out views here; choose another --path")
+    if len(views.size.unique(dim=0)) > 1:
+        raise LumigraphError("The held-out views are of several sizes, which no film holds; choose another --path")
+    longest = size or min(LONGEST, int(views.size.max()))
+    return views[: frames or len(views)].resized(longest / int(views.size.max()))

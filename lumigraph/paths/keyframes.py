@@ -1,0 +1,252 @@
+"""Camera paths that a person made: a few keyframes with their times, and a smooth flight through them.
+
+Keyframes lie in the frame of the photographs' source, so that one path fits every run of the same capture. Between them
+position, log angle of view and quaternion follow one curve, Catmull-Rom with the keyframes' own times as its knots:
+it passes each keyframe exactly when it should, its velocity never jumps, and it stands still where two neighbouring
+keyframes are alike.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict, dataclass
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from ..camera import Camera
+from ..errors import LumigraphError
+from ..files import read_json, write_json
+from ..geometry import to_matrix, to_quaternion
+from ..lens import Lens, Pinhole
+from ..plain import from_plain
+from ..scene import Frame
+
+FORMAT = "lumigraph camera path 1"
+NARROWEST, WIDEST = 1.0, 170.0  # degrees that a flat picture can show
+RIGID = 1e-3  # how far a rotation may be from one
+LONGEST = 100_000  # frames of a film
+
+Row = tuple[float, float, float, float]
+
+
+@dataclass(frozen=True)
+class Keyframe:
+    """Where a camera is at one moment.
+
+    pose:    camera-to-world in the source's frame; +x right, +y down, +z forward
+    fov:     degrees across the picture's smaller side
+    seconds: when, from the beginning of the film
+    time:    the moment of a moving scene that is seen then; None leaves it to the method
+    """
+
+    pose: tuple[Row, Row, Row]
+    fov: float
+    seconds: float
+    time: float | None = None
+
+
+@dataclass(frozen=True)
+class CameraPath:
+    """Keyframes in the order of their times. Raises LumigraphError for what no camera can follow.
+
+    loop: whether the path goes on from the last keyframe to the first, in the mean time between two keyframes
+    fps:  frames per second of the film
+    """
+
+    keyframes: tuple[Keyframe, ...]
+    loop: bool = False
+    fps: float = 30.0
+
+    def __post_init__(self) -> None:
+        if not self.keyframes:
+            raise LumigraphError("The path has no keyframe; give it at least one")
+        if not 0 < self.fps <= 1000:
+            raise LumigraphError(f"The path asks for {self.fps:g} frames per second; give it from 1 to 1000")
+        for i, key in enumerate(self.keyframes):
+            check(key, f"Keyframe {i + 1}")
+        for i, (a, b) in enumerate(pairwise(self.keyframes)):
+            if not a.seconds < b.seconds:
+                raise LumigraphError(
+                    f"Keyframe {i + 2} is at {b.seconds:g} s, not after the one before it at {a.seconds:g} s; "
+                    "put them in the order of their times"
+                )
+        if len({key.time is None for key in self.keyframes}) > 1:
+            raise LumigraphError("Some keyframes have a time and others have none; give it to all of them or to none")
+        if self.duration * self.fps > LONGEST:
+            raise LumigraphError(
+                f"The path takes {self.duration:g} s, more than {LONGEST} frames; bring its keyframes' times closer"
+            )
+
+    @property
+    def duration(self) -> float:
+        """Seconds from the first keyframe to the last; back to the first, if it loops."""
+        count, between = len(self.keyframes), self.keyframes[-1].seconds - self.keyframes[0].seconds
+        return between * count / (count - 1) if self.loop and count > 1 else between
+
+    def save(self, path: Path) -> None:
+        """Write as JSON, whole or not at all."""
+        data = asdict(self)
+        for key in data["keyframes"]:
+            if key["time"] is None:
+                del key["time"]
+        write_json(path, {"format": FORMAT, **data})
+
+    @classmethod
+    def load(cls, path: Path) -> CameraPath:
+        """A path that `save` wrote, or the JSON beside a film that `lumigraph render` made.
+
+        Raises LumigraphError for a file that holds neither.
+        """
+        data = read_json(path)
+        try:
+            if isinstance(data, dict) and data.get("format") == FORMAT:
+                keys = tuple(from_plain(Keyframe, key) for key in data["keyframes"])
+                if not isinstance(data["loop"], bool):
+                    raise TypeError("loop must be true or false")
+                return cls(keys, data["loop"], data["fps"])
+            if isinstance(data, dict) and {"poses", "lens", "size", "source_from_scene"} <= data.keys():
+                return cls(keys_of_film(data), fps=data["fps"])
+        except LumigraphError as error:
+            raise LumigraphError(f"{path} is no camera path: {str(error)[:1].lower()}{str(error)[1:]}") from error
+        except (LookupError, TypeError, ValueError, AttributeError, ArithmeticError, RuntimeError) as error:
+            raise LumigraphError(
+                f"{path} is a damaged camera path ({type(error).__name__}: {first_line(error)}); save it again"
+            ) from error
+        raise LumigraphError(
+            f"{path} holds no camera path that this version knows; save one in the viewer, "
+            "or take the JSON beside a film"
+        )
+
+    def at(self, seconds: Float[Tensor, " time"]) -> tuple[Float[Tensor, "time 3 4"], Float[Tensor, " time"]]:
+        """Poses in the source's frame and angles of view (degrees) at some times, double precision."""
+        at = seconds.double()
+        if len(self.keyframes) == 1:
+            curve = self._knots().expand(len(at), -1)
+        else:
+            curve = through(*self._padded(), at)
+        rotation, position = to_matrix(curve[:, 4:]), curve[:, :3]
+        return torch.cat([rotation, position[:, :, None]], -1), curve[:, 3].exp()
+
+    def times_at(self, seconds: Float[Tensor, " time"]) -> Float[Tensor, " time"] | None:
+        """The moments of a moving scene that are seen then, evenly from keyframe to keyframe; None if they say none."""
+        times = [key.time for key in self.keyframes if key.time is not None]
+        if not times:
+            return None
+        knots = [key.seconds for key in self.keyframes]
+        if self.loop:
+            times, knots = [*times, times[0]], [*knots, knots[0] + self.duration]
+        return torch.from_numpy(np.interp(seconds.double().numpy(), knots, times))
+
+    def cameras(self, frame: Frame, size: tuple[int, int], frames: int | None = None) -> Camera:
+        """The cameras of a film in a scene's frame, one for each picture, behind a pinhole lens.
+
+        size:   (width, height) in pixels
+        frames: how many, evenly over the whole duration; None means `fps` each second
+        """
+        if frames is not None and frames < 1:
+            raise LumigraphError(f"A film cannot have {frames} frames; give --frames a number above 0")
+        begin, open_end = self.keyframes[0].seconds, 0 if self.loop else 1
+        if frames is None:
+            frames = max(1, round(self.duration * self.fps) + open_end)
+            step = 1 / self.fps
+        else:
+            step = self.duration / max(frames - open_end, 1)
+        last = begin + self.duration  # rounding takes nobody past it
+        seconds = (begin + step * torch.arange(frames, dtype=torch.double)).clamp_max(last)
+        (pose, fov), time = self.at(seconds), self.times_at(seconds)
+        focal = 0.5 * min(size) / torch.tan(0.5 * fov.deg2rad())
+        lens = Pinhole(focal[:, None].expand(frames, 2).float(), torch.tensor([size]).expand(frames, 2) / 2)
+        there = Camera(pose, lens, torch.tensor([size]).expand(frames, 2))
+        scene_from_source = frame.to_source.inverse.matrix
+        moved = there.transformed(scene_from_source)
+        return Camera(moved.pose.float(), lens, moved.size, None if time is None else time.float())
+
+    def _knots(self) -> Float[Tensor, "key 8"]:
+        """Position, log angle of view, quaternion of each keyframe."""
+        rows = []
+        for key in self.keyframes:
+            pose = torch.tensor(key.pose, dtype=torch.double)
+            fov = torch.tensor([math.log(key.fov)], dtype=torch.double)
+            rows.append(torch.cat([pose[:, 3], fov, to_quaternion(pose[:, :3])]))
+        return torch.stack(rows)
+
+    def _padded(self) -> tuple[Float[Tensor, " knot"], Float[Tensor, "knot 8"]]:
+        """Times and values of all knots, with one more on either side; a loop has its first two keyframes again."""
+        values = self._knots()
+        times = torch.tensor([key.seconds for key in self.keyframes], dtype=torch.double)
+        if self.loop:
+            values, period = torch.cat([values[-1:], values, values[:2]]), self.duration
+            times = torch.cat([times[-1:] - period, times, times[:2] + period])
+        # q and -q are one rotation: each takes the sign that is nearer to the one before it.
+        turned = (values[1:, 4:] * values[:-1, 4:]).sum(-1) < 0
+        sign = torch.cat([turned.new_zeros(1), turned]).cumsum(0) % 2
+        values[:, 4:] *= (1 - 2 * sign)[:, None]
+        if not self.loop:  # mirrored beyond the ends: the slope there is that of the last stretch
+            values = torch.cat([2 * values[:1] - values[1:2], values, 2 * values[-1:] - values[-2:-1]])
+            times = torch.cat([2 * times[:1] - times[1:2], times, 2 * times[-1:] - times[-2:-1]])
+        return times, values
+
+
+def through(
+    times: Float[Tensor, " knot"], values: Float[Tensor, "knot value"], at: Float[Tensor, " time"]
+) -> Float[Tensor, "time value"]:
+    """Catmull-Rom's curve with uneven knots (Barry & Goldman 1988) in Hermite's form; the first and last knot only
+    give their neighbours a slope.
+
+    A knot's slope is that of the parabola through it and its neighbours, or zero where a neighbour is where it is.
+    """
+    step = times.diff()[:, None]
+    rate = values.diff(dim=0) / step
+    slope = (rate[:-1] * step[1:] + rate[1:] * step[:-1]) / (step[:-1] + step[1:])
+    still = (rate.abs() < 1e-12).all(-1, keepdim=True)
+    slope = torch.where(still[:-1] | still[1:], 0.0, slope)
+    i = (torch.searchsorted(times[1:-1].contiguous(), at, right=True) - 1).clamp(0, len(times) - 4)
+    h, a, b = step[i + 1], values[i + 1], values[i + 2]
+    t = ((at - times[i + 1])[:, None] / h).clamp(0, 1)
+    s = 1 - t
+    return s * s * (1 + 2 * t) * a + t * t * (1 + 2 * s) * b + h * t * s * (s * slope[i] - t * slope[i + 1])
+
+
+def check(key: Keyframe, name: str) -> None:
+    """Raises LumigraphError unless a camera can be there."""
+    pose = torch.tensor(key.pose, dtype=torch.double)
+    if not (pose.isfinite().all() and all(map(math.isfinite, (key.fov, key.seconds, key.time or 0.0)))):
+        raise LumigraphError(f"{name} holds a number that is not finite; put the camera somewhere else")
+    if pose.shape != (3, 4):
+        raise LumigraphError(f"{name} has a pose of shape {tuple(pose.shape)}; a pose has 3 rows of 4 numbers")
+    rotation = pose[:, :3]
+    off = float((rotation @ rotation.T - torch.eye(3, dtype=torch.double)).abs().max())
+    if off > RIGID or float(torch.linalg.det(rotation)) < 0:
+        raise LumigraphError(
+            f"{name} has a pose that is no rotation and a place; its first three columns must be unit length, "
+            "at right angles and right-handed"
+        )
+    if not NARROWEST <= key.fov <= WIDEST:
+        raise LumigraphError(f"{name} sees {key.fov:g} degrees; a flat picture shows from {NARROWEST:g} to {WIDEST:g}")
+
+
+def keys_of_film(about: dict[str, Any]) -> tuple[Keyframe, ...]:
+    """Every frame of a film as a keyframe, from the JSON beside it."""
+    lens, size = Lens.from_json(about["lens"]), torch.tensor(about["size"]).double()
+    if not isinstance(lens, Pinhole):
+        raise LumigraphError("The film was made through a bent lens, and paths are flown behind a flat picture")
+    poses = torch.tensor(about["poses"], dtype=torch.double)
+    there = Camera(poses, lens, size.long().expand(len(poses), 2))
+    source = there.transformed(torch.tensor(about["source_from_scene"], dtype=torch.double)).pose
+    side = int(size.argmin())
+    fov = 2 * torch.atan(0.5 * size[side] / lens.focal[:, side].double()).rad2deg()
+    times = about.get("times") or [None] * len(poses)
+    return tuple(
+        from_plain(Keyframe, {"pose": pose, "fov": angle, "seconds": i / about["fps"], "time": time})
+        for i, (pose, angle, time) in enumerate(zip(source.tolist(), fov.tolist(), times, strict=True))
+    )
+
+
+def first_line(error: Exception) -> str:
+    return str(error).partition("\n")[0].rstrip(".")

@@ -1,0 +1,11 @@
+"""The layouts that are read, by the names of their files in `capture/`; help texts know them without loading PyTorch.
+
+Asked in this order what a folder holds. A transforms.json comes first because someone made it on purpose, often beside
+the model that it came from; COLMAP's lenses know more than LLFF's. `--reader` overrides the order.
+"""
+
+from __future__ import annotations
+
+READERS = ("transforms", "blender", "tum", "seven_scenes", "colmap", "llff")
+NAMES = tuple(name.replace("_", "-") for name in READERS)  # what a user types
+LISTED = f"{', '.join(NAMES[:-1])} or {NAMES[-1]}"

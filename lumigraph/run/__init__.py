@@ -1,0 +1,9 @@
+"""What opens: runs, the folders that training fills; splat files; compositions of several."""
+
+from .checkpoint import State as State
+from .folder import Run as Run
+from .folder import build as build
+from .folder import check_new as check_new
+from .folder import processor as processor
+from .opened import Opened as Opened
+from .opening import open_any as open_any

@@ -1,0 +1,181 @@
+"""Checkpoints: complete states of a run, each in a folder named after its step.
+
+    000800/     weights.safetensors · optimizer.safetensors · state.json
+
+One is written beside the one before and renamed once it is whole; only then does the older one go, by way of a name
+that whoever reads passes over. So there is a complete state whenever there was one before, however the writer ended.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+import zlib
+from collections.abc import Iterable
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+from typing import Any
+
+import safetensors.torch
+import torch
+from torch import Tensor, nn
+
+from .. import files
+from ..errors import LumigraphError
+from ..method import Method
+from ..plain import flatten, understood, unflatten
+
+FORMAT = "lumigraph checkpoint 1"
+WEIGHTS, OPTIMIZER = "weights.safetensors", "optimizer.safetensors"
+
+
+@dataclass(frozen=True)
+class State:
+    """How far training has come: completed steps, and seconds that they took; compilation is counted apart.
+
+    peak_memory: bytes at most, see `memory.peak_memory`; 0 if unknown
+    """
+
+    step: int = 0
+    seconds: float = 0.0
+    compile_seconds: float = 0.0
+    peak_memory: int = 0
+
+
+class Checkpoints:
+    """The states in a run's folder.
+
+    method: name of the run's method; a state of another one is refused
+    """
+
+    def __init__(self, run: Path, method: str):
+        self.run, self.method = run, method
+        self.folder = run / "checkpoints"
+
+    def __bool__(self) -> bool:
+        """Whether there is a complete state."""
+        return bool(self._all())
+
+    @property
+    def latest(self) -> Path:
+        """Folder of the latest complete state. Raises LumigraphError if there is none."""
+        if not self:
+            raise LumigraphError(
+                f"{self.run} has no saved state yet; `lumigraph resume {self.run}` trains it from the start"
+            )
+        return self._all()[-1]
+
+    @property
+    def state(self) -> State:
+        """How far the latest complete state has come."""
+        checkpoint = self.latest
+        about = {"peak_memory": 0} | self._about(checkpoint)  # older runs do not tell it
+        with understood(checkpoint):
+            return State(**{field.name: about[field.name] for field in fields(State)})
+
+    def save(
+        self, state: State, method: Method, optimizers: Iterable[torch.optim.Optimizer], generator: torch.Generator
+    ) -> None:
+        """Write a complete state, then delete the one before it. Does nothing if this step is there already."""
+        folder = self.folder / f"{state.step:06d}"
+        if folder.exists():
+            return
+        tensors: dict[str, Tensor] = {"generator": generator.get_state()}
+        structure = flatten([optimizer.state_dict() for optimizer in optimizers], tensors)
+        with files.replacing(folder) as partial:
+            partial.mkdir()
+            sums = {
+                name: write_tensors(partial / name, content)
+                for name, content in ((WEIGHTS, method.state_dict()), (OPTIMIZER, tensors))
+            }
+            about = {"format": FORMAT, "method": self.method, **asdict(state), "files": sums}
+            (partial / "state.json").write_text(json.dumps({**about, "optimizers": structure}), "utf-8")
+        for path in self.folder.iterdir():
+            if path != folder:
+                retire(path)
+
+    def load_weights(self, method: Method) -> None:
+        """Give a method the latest state's weights."""
+        checkpoint = self.latest
+        tensors = self._read_tensors(checkpoint, WEIGHTS)
+        tensors = renamed_weights(tensors, method.formerly_weights)
+        take_shapes(method, tensors)
+        try:
+            method.load_state_dict(tensors)
+        except RuntimeError as error:
+            reason = " ".join(str(error).split())
+            raise LumigraphError(f"{checkpoint} does not fit the method {self.method}: {reason}") from error
+
+    def load_training(self, optimizers: Iterable[torch.optim.Optimizer], generator: torch.Generator) -> None:
+        """Give optimizers and random numbers the latest state."""
+        checkpoint = self.latest
+        tensors = self._read_tensors(checkpoint, OPTIMIZER)
+        structure = self._about(checkpoint)["optimizers"]
+        with understood(checkpoint):
+            generator.set_state(tensors["generator"])
+            for optimizer, saved in zip(optimizers, unflatten(structure, tensors), strict=True):
+                fresh = [{k: v for k, v in group.items() if k != "params"} for group in optimizer.param_groups]
+                optimizer.load_state_dict(saved)
+                for group, own in zip(optimizer.param_groups, fresh, strict=True):
+                    group |= own | group  # older runs know fewer entries of a group
+
+    def _all(self) -> list[Path]:
+        found = [x for x in self.folder.iterdir() if re.fullmatch(r"\d+", x.name)] if self.folder.is_dir() else []
+        return sorted(found, key=lambda x: int(x.name))
+
+    def _about(self, checkpoint: Path) -> dict[str, Any]:
+        about = files.read_json(checkpoint / "state.json")
+        if not isinstance(about, dict) or about.get("format") != FORMAT:
+            raise LumigraphError(f"{checkpoint} is not a checkpoint that Lumigraph wrote; restore it from a copy")
+        if about["method"] != self.method:
+            raise LumigraphError(
+                f"{checkpoint} belongs to a run of {about['method']}, not of {self.method}; restore it from a copy"
+            )
+        return about
+
+    def _read_tensors(self, checkpoint: Path, name: str) -> dict[str, Tensor]:
+        path = checkpoint / name
+        expected = self._about(checkpoint)["files"].get(name)
+        with files.explained(path):
+            data = path.read_bytes()
+        if checksum(data) != expected:
+            raise LumigraphError(f"{path} is damaged: its checksum is not the one it was saved with; restore a copy")
+        return safetensors.torch.load(data)
+
+
+def renamed_weights(tensors: dict[str, Tensor], formerly: dict[str, str]) -> dict[str, Tensor]:
+    """Tensors by their present names. formerly: how names began in older runs, and how they begin now."""
+    found = {}
+    for name, value in tensors.items():
+        old = next((old for old in formerly if name.startswith(old)), "")
+        found[formerly.get(old, "") + name.removeprefix(old)] = value
+    return found
+
+
+def take_shapes(method: nn.Module, tensors: dict[str, Tensor]) -> None:
+    """Give parameters and buffers the sizes that saved ones have, where their module says that they grow."""
+    for place, module in method.named_modules():
+        for name in getattr(module, "grows", ()):
+            saved, own = tensors.get(f"{place}.{name}" if place else name), getattr(module, name)
+            if saved is not None and saved.shape != own.shape:
+                sized = own.detach().new_empty(saved.shape)
+                setattr(module, name, nn.Parameter(sized) if isinstance(own, nn.Parameter) else sized)
+
+
+def write_tensors(path: Path, tensors: dict[str, Tensor]) -> dict[str, int]:
+    """Write a safetensors file; gives its checksum."""
+    data = safetensors.torch.save({name: x.detach().cpu().contiguous().clone() for name, x in tensors.items()})
+    path.write_bytes(data)
+    return checksum(data)
+
+
+def checksum(data: bytes) -> dict[str, int]:
+    return {"bytes": len(data), "crc32": zlib.crc32(data)}
+
+
+def retire(path: Path) -> None:
+    """Delete a checkpoint so that a half-deleted one cannot be taken for a whole one."""
+    with files.explained(path):
+        if not path.name.endswith(files.PARTIAL):
+            path = path.rename(path.with_name(path.name + files.PARTIAL))
+        files.remove(path)

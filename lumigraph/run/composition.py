@@ -1,0 +1,208 @@
+"""A composition's file: which parts, where each stands, and which of them leads.
+
+    {
+      "format": "lumigraph composition 1",
+      "lead": 0,
+      "parts": [
+        {"source": "runs/courtyard-1"},
+        {"source": "toys.spz", "place": {"scale": 0.3, "rotation": 90, "translation": [0.5, 0, -0.4]}},
+        {"source": "runs/lego-1", "place": [[...], [...], [...], [0, 0, 0, 1]], "box": [[-1, -1, 0], [1, 1, 1]]}
+      ]
+    }
+
+source: of a part: anything that opens, from this file's folder or absolute
+place:  similarity from the source's frame of the part to that of the composition, both those of photographs or files,
+        where keyframes and exports lie as well. A 4 x 4 matrix, or a scale, a rotation (a quaternion w, x, y, z, or
+        degrees about +z) and a translation, in this order; what is left out changes nothing
+box:    two corners in the part's scene frame, as `lumigraph info` tells its bounds and the viewer crops it
+lead:   the part whose cameras, background and vertical the composition has; the first, unless said
+"""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from .. import files
+from ..camera import Camera
+from ..composition import Placed, compose, frame_around
+from ..composition.placed import Box
+from ..errors import LumigraphError
+from ..geometry import Similarity, to_matrix, to_quaternion
+from ..method import Method
+from ..plain import understood
+from .opened import Opened
+
+FORMAT = "lumigraph composition 1"
+PLACE = ("scale", "rotation", "translation")
+ROUNDING = 1e-3  # by which a matrix may fail to be a similarity
+
+
+@dataclass(frozen=True)
+class Part:
+    """A part as the file says it. source: a path as it stands there; place and box: see above."""
+
+    source: str
+    place: Similarity
+    box: Box | None = None
+
+
+class Composition(Opened):
+    """A composition's file, opened with all its parts. Raises LumigraphError for one that cannot be.
+
+    open_part: opens what a part names, given the files that it is a part of
+    within:    those that this one is a part of
+    """
+
+    def __init__(
+        self, path: Path | str, open_part: Callable[[Path, tuple[Path, ...]], Opened], within: tuple[Path, ...] = ()
+    ):
+        self.path = Path(path)
+        here = self.path.resolve()
+        if here in within:
+            raise LumigraphError(f"{self.path} holds itself, by way of its parts; take that part out of it")
+        self.parts, self.lead = read_composition(self.path)
+        self.opened = [open_part(self._found(part), (*within, here)) for part in self.parts]
+        first = self.opened[self.lead].frame
+        to_source = self.parts[self.lead].place @ first.to_source
+        self.places = [
+            to_source.inverse @ part.place @ opened.frame.to_source
+            for part, opened in zip(self.parts, self.opened, strict=True)
+        ]
+        self.places[self.lead] = Similarity.make(1.0)  # to the last digit
+        every = zip(self.opened, self.places, self.parts, strict=True)
+        others = [(opened.frame, place, part.box) for opened, place, part in every]
+        del others[self.lead]
+        self.frame = replace(frame_around(first, others), source_from_scene=to_source.rows)
+
+    def _found(self, part: Part) -> Path:
+        path = self.path.parent / Path(part.source).expanduser()
+        if not path.exists():
+            raise LumigraphError(f"{self.path} names {part.source} as a part, but there is no {path}; correct its path")
+        return path
+
+    def method(self, device: torch.device | str = "cpu") -> Method:
+        """All parts in one picture. A source that is named several times is held once."""
+        built: dict[Path, Method] = {}
+        placed = []
+        for i, (part, opened, place) in enumerate(zip(self.parts, self.opened, self.places, strict=True)):
+            name = opened.path.resolve()
+            if name not in built:
+                built[name] = opened.method(device)
+            placed.append(Placed(built[name], place, part.box, leads=i == self.lead))
+        return compose(self.frame, placed).to(device)
+
+    def cameras(self) -> dict[str, Camera]:
+        """Those of the part that leads."""
+        return self.opened[self.lead].cameras()
+
+    @property
+    def photographed(self) -> bool:
+        return self.opened[self.lead].photographed
+
+    def view_names(self) -> dict[str, list[str]]:
+        return self.opened[self.lead].view_names()
+
+
+def read_composition(path: Path) -> tuple[list[Part], int]:
+    """The parts that a file names, and the number of the one that leads. Opens none of them."""
+    said = files.read_json(path)
+    if not isinstance(said, dict) or said.get("format") != FORMAT:
+        raise LumigraphError(f"{path} is no composition: it does not say {FORMAT!r}; `lumigraph compose` makes one")
+    with understood(path):
+        parts, lead = [part_from_json(part) for part in said["parts"]], said.get("lead", 0)
+        if lead not in range(len(parts)):
+            raise ValueError(f"part {lead} should lead, and there are {len(parts)}")
+    return parts, lead
+
+
+def write_composition(path: Path, parts: Sequence[Part], lead: int = 0) -> None:
+    """Write a composition's file."""
+    files.write_json(path, {"format": FORMAT, "lead": lead, "parts": [part_to_json(part) for part in parts]})
+
+
+def relative(source: Path, file: Path) -> str:
+    """A part's path as the composition's file should say it: from that file's folder, where both are on one disk."""
+    try:
+        return Path(os.path.relpath(source.resolve(), file.parent.resolve())).as_posix()
+    except ValueError:  # on another drive
+        return str(source.resolve())
+
+
+def part_from_json(said: dict[str, Any]) -> Part:
+    if unknown := said.keys() - {"source", "place", "box"}:
+        raise ValueError(f"nothing is known of a part's {sorted(unknown)[0]!r}")
+    return Part(str(said["source"]), place_from_json(said.get("place", {})), box_from_json(said.get("box")))
+
+
+def part_to_json(part: Part) -> dict[str, Any]:
+    said: dict[str, Any] = {"source": part.source}
+    if place := place_to_json(part.place):
+        said["place"] = place
+    if part.box is not None:
+        said["box"] = [list(corner) for corner in part.box]
+    return said
+
+
+def box_from_json(said: Any) -> Box | None:
+    if said is None:
+        return None
+    (ax, ay, az), (bx, by, bz) = ([float(x) for x in corner] for corner in said)
+    if not (ax < bx and ay < by and az < bz):
+        raise ValueError(f"the box {said} has nothing between its lower and its upper corner")
+    return (ax, ay, az), (bx, by, bz)
+
+
+def place_from_json(said: Any) -> Similarity:
+    """A similarity from a matrix, or from what it is made of. Raises ValueError for one that shears or mirrors."""
+    if isinstance(said, dict):
+        if unknown := said.keys() - set(PLACE):
+            raise ValueError(f"nothing is known of a place's {sorted(unknown)[0]!r}; there are {', '.join(PLACE)}")
+        turn = said.get("rotation", 0.0)
+        if not isinstance(turn, list):
+            half = 0.5 * math.radians(turn)
+            turn = [math.cos(half), 0.0, 0.0, math.sin(half)]
+        if len(turn) != 4:
+            raise ValueError(f"the rotation {turn} is neither degrees nor a quaternion w, x, y, z")
+        rotation = to_matrix(torch.tensor([turn], dtype=torch.float64))[0]
+        x, y, z = (float(x) for x in said.get("translation", (0.0, 0.0, 0.0)))
+        translation = torch.tensor([x, y, z], dtype=torch.float64)
+        matrix = Similarity.make(float(said.get("scale", 1.0)), rotation, translation).matrix
+    else:
+        matrix = torch.tensor(said, dtype=torch.float64)
+    if not is_similarity(matrix):
+        raise ValueError(f"the place {said} does more than move, turn and scale")
+    return Similarity(matrix)
+
+
+def is_similarity(matrix: Tensor) -> bool:
+    """Whether a tensor is a 4 x 4 matrix that moves, turns and scales, up to rounding, and does not mirror."""
+    if matrix.shape != (4, 4) or not matrix.isfinite().all() or matrix[3].tolist() != [0.0, 0.0, 0.0, 1.0]:
+        return False
+    linear, one = matrix[:3, :3], torch.eye(3, dtype=torch.float64)
+    size = float(torch.linalg.det(linear))
+    if size <= 0:
+        return False
+    return bool((linear @ linear.T / size ** (2 / 3) - one).abs().max() <= ROUNDING)
+
+
+def rounded(number: float) -> float:
+    """A number as a person would write it: without what rounding has left in the last digits."""
+    return float(f"{number:.14g}")
+
+
+def place_to_json(place: Similarity) -> dict[str, Any]:
+    """The scale, rotation and translation of a similarity, without those that change nothing."""
+    quaternion = to_quaternion(place.rotation)
+    quaternion = quaternion * (1.0 if quaternion[0] > 0 else -1.0) + 0.0  # one of the two, without negative zeros
+    said: dict[str, Any] = {"scale": rounded(place.scale), "rotation": [rounded(x) for x in quaternion.tolist()]}
+    said["translation"] = [rounded(x) for x in place.matrix[:3, 3].tolist()]
+    nothing: dict[str, Any] = {"scale": 1.0, "rotation": [1.0, 0.0, 0.0, 0.0], "translation": [0.0] * 3}
+    return {name: value for name, value in said.items() if value != nothing[name]}

@@ -1,0 +1,320 @@
+"""A run is a folder that explains itself: what was trained on what, its latest state, and what was measured.
+
+    config.json     method and its numbers, frame, scene, seed, budget, versions: see `settings`
+    cameras.json    where the photographs were taken from, so that films need no photographs; where there are any
+    checkpoints/    the latest complete state, in a folder named after its step: see `checkpoint`
+    metrics.jsonl   one line every few steps
+    previews/       one view as it came to be
+    eval.json, eval.png, renders/, report.html: what the commands made of it
+
+Nothing in it runs code when opened.
+"""
+
+from __future__ import annotations
+
+import json
+import platform
+import re
+from collections.abc import Callable, Iterable
+from dataclasses import asdict
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from .. import files, methods
+from ..camera import Camera, ring
+from ..dataset import Dataset
+from ..errors import LumigraphError
+from ..lens import Lens
+from ..method import Method
+from ..plain import understood
+from ..scene import Frame, Scene
+from .checkpoint import WEIGHTS, Checkpoints, State
+from .opened import Opened
+from .settings import Settings, Source
+
+
+class Run(Opened):
+    """A run's folder. `Run.create` makes one, `Run(folder)` opens one; LumigraphError if it is not one of ours.
+
+    settings: what was trained on what
+    """
+
+    def __init__(self, folder: Path | str):
+        self.path = self.folder = Path(folder)
+        if not self._config.exists():
+            raise LumigraphError(f"{self.folder} is not a run: it holds no config.json; `lumigraph train` makes runs")
+        self.settings = Settings.read(self._config)
+        self.frame = self.settings.frame
+
+    @classmethod
+    def create(
+        cls,
+        folder: Path | str,
+        method: Method,
+        data: Dataset,
+        *,
+        seed: int = 0,
+        options: dict[str, Any] | None = None,
+        budget: dict[str, Any] | None = None,
+    ) -> Run:
+        """Begin a run in a new or empty folder.
+
+        options: what open_dataset was told besides the source, to open the same dataset again
+        budget:  {"steps": n} or {"seconds": s}
+        """
+        folder = Path(folder)
+        check_new(folder)
+        place = Path(data.source)
+        settings = Settings(
+            method=methods.name_of(method),
+            config=asdict(method.config),
+            frame=method.frame,
+            scene=Source(str(place.resolve()) if place.exists() else data.source, options or {}, data.kind),
+            splits={name: len(index) for name, index in data.splits.items()},
+            seed=seed,
+            budget=budget or {},
+            device=str(method.device),
+            processor=processor(method.device),
+            versions=versions(),
+        )
+        with files.explained(folder):
+            folder.mkdir(parents=True, exist_ok=True)
+        if isinstance(data, Scene):
+            files.write_json(folder / "cameras.json", cameras_to_json(data))
+        settings.write(folder / "config.json")  # last: a folder with it is a run
+        return cls(folder)
+
+    def set_budget(self, **budget: float) -> None:
+        """Remember another total of steps or seconds."""
+        self.settings = self.settings.with_budget(**budget)
+        self.settings.write(self._config)
+
+    @property
+    def _config(self) -> Path:
+        return self.folder / "config.json"
+
+    # What was trained on what
+
+    @property
+    def title(self) -> str:
+        """The scene's name."""
+        source = self.settings.scene.source
+        return source.partition(":")[2] if source.startswith("procedural:") else Path(source).name
+
+    @property
+    def renders(self) -> Path:
+        return self.folder / "renders"
+
+    @property
+    def paths(self) -> Path:
+        return self.folder / "paths"
+
+    @property
+    def method_name(self) -> str:
+        return self.settings.method
+
+    def new_method(self, device: torch.device | str = "cpu") -> Method:
+        """The run's method as it was before the first step."""
+        if self.method_name not in methods.available():
+            raise LumigraphError(
+                f"{self.folder} is a run of {self.method_name}, a method that is not installed; "
+                f"there are: {', '.join(methods.available())}"
+            )
+        kind = methods.find(self.method_name)
+        with understood(self._config):
+            config = self.settings.method_config(kind)
+        return build(kind, self.frame, config, torch.device(device), self.settings.seed)
+
+    def method(self, device: torch.device | str = "cpu") -> Method:
+        """The trained method, ready to render."""
+        method = self.new_method(device)
+        self._checkpoints.load_weights(method)
+        return method.eval()
+
+    @property
+    def kind(self) -> str:
+        """What it learnt from, in a user's words: see `Dataset.kind`."""
+        return self.settings.scene.kind
+
+    @property
+    def photographed(self) -> bool:
+        """Whether it learnt from photographs, so that there are cameras."""
+        return self.kind == Scene.kind
+
+    @property
+    def open_scene(self) -> Callable[[], Scene] | None:
+        return self.scene if self.photographed else None
+
+    def dataset(self, source: str | None = None) -> Dataset:
+        """What it learnt from again. source: where that is now, if it has moved.
+
+        Raises LumigraphError if it gives another frame than the run was trained in.
+        """
+        from ..capture import KINDS, open_dataset
+
+        source = source or self.settings.scene.source
+        options = {name: value for name, value in self.settings.scene.options.items() if value is not None}
+        data = open_dataset(source, KINDS[self.kind], **options)
+        if not self.settings.agrees(data.frame):
+            what = "cameras or bounds differ" if self.photographed else "bounds differ"
+            raise LumigraphError(f"{source} is not what {self.folder} was trained on: {what}; train a new run on it")
+        return data
+
+    def scene(self, source: str | None = None) -> Scene:
+        """The photographs again, of a run that learnt from photographs; see `dataset`."""
+        data = self.dataset(source)
+        if not isinstance(data, Scene):
+            raise LumigraphError(f"{self.folder} learnt from {self.kind}; it has no photographs")
+        return data
+
+    def cameras(self) -> dict[str, Camera]:
+        """The photographs' cameras by split, in the run's frame; a ring around the bounds where there were none."""
+        if not self.photographed:
+            return {"train": ring(self.frame.bounds)}
+        with understood(self.folder / "cameras.json"):
+            return cameras_from_json(files.read_json(self.folder / "cameras.json"), self.frame.image_count)
+
+    def view_names(self) -> dict[str, list[str]]:
+        """What the photographs are called, by split, in the order of `cameras`; nothing where there were none."""
+        if not self.photographed:
+            return {}
+        with understood(self.folder / "cameras.json"):
+            data = files.read_json(self.folder / "cameras.json")
+            return {split: [data["names"][i] for i in index] for split, index in data["splits"].items()}
+
+    # Its state
+
+    @property
+    def state(self) -> State:
+        """How far the latest complete state has come. Raises LumigraphError if there is none."""
+        return self._checkpoints.state
+
+    @property
+    def has_state(self) -> bool:
+        return bool(self._checkpoints)
+
+    @property
+    def model_bytes(self) -> int:
+        """Size of the trained weights, which are all that rendering needs."""
+        return (self._checkpoints.latest / WEIGHTS).stat().st_size
+
+    def save(
+        self, state: State, method: Method, optimizers: Iterable[torch.optim.Optimizer], generator: torch.Generator
+    ) -> None:
+        """Write a complete state, then delete the one before it. Does nothing if this step is there already."""
+        self._checkpoints.save(state, method, optimizers, generator)
+
+    def restore_weights(self, method: Method) -> State:
+        """Give a method the latest state's weights. Without any state, leaves it as it is."""
+        if not self.has_state:
+            return State()
+        self._checkpoints.load_weights(method)
+        return self.state
+
+    def restore_training(self, optimizers: Iterable[torch.optim.Optimizer], generator: torch.Generator) -> None:
+        """Give optimizers and random numbers the latest state. Without any state, leaves them as they are."""
+        if self.has_state:
+            self._checkpoints.load_training(optimizers, generator)
+
+    @property
+    def _checkpoints(self) -> Checkpoints:
+        return Checkpoints(self.folder, self.method_name)
+
+    # What was measured
+
+    def log(self, row: dict[str, Any]) -> None:
+        """Add a line to metrics.jsonl."""
+        path = self.folder / "metrics.jsonl"
+        with files.explained(path), open(path, "a", encoding="utf-8") as file:
+            file.write(json.dumps(row) + "\n")
+
+    def metrics(self) -> list[dict[str, Any]]:
+        """The lines of metrics.jsonl; one that a kill cut short is left out."""
+        path = self.folder / "metrics.jsonl"
+        rows = []
+        for line in path.read_text("utf-8", errors="replace").splitlines() if path.exists() else []:
+            try:
+                rows.append(json.loads(line))
+            except json.JSONDecodeError:
+                continue
+        return rows
+
+    def forget_after(self, step: int) -> None:
+        """Drop lines and previews of steps after the saved state: they will be taken again."""
+        rows = [json.dumps(row) for row in self.metrics() if row["step"] <= step]
+        files.write_bytes(self.folder / "metrics.jsonl", "".join(row + "\n" for row in rows).encode())
+        for preview, path in self.previews().items():
+            if preview > step:
+                files.remove(path)
+
+    def previews(self) -> dict[int, Path]:
+        """One view at the steps at which it was taken."""
+        return {int(path.stem): path for path in sorted((self.folder / "previews").glob("[0-9]*.png"))}
+
+    def evaluation(self) -> dict[str, Any] | None:
+        """What eval.json says, if the run has been evaluated."""
+        path = self.folder / "eval.json"
+        return files.read_json(path) if path.exists() else None
+
+
+def build(kind: type[Method], frame: Frame, config: Any, device: torch.device, seed: int) -> Method:
+    """A fresh method whose initial weights depend on the seed alone."""
+    with torch.random.fork_rng():
+        torch.manual_seed(seed)
+        method = kind(frame, config)
+    return method.to(device)
+
+
+def check_new(folder: Path) -> None:
+    """Raise LumigraphError unless a run may begin here, saying how to go on with one that lies here."""
+    if (folder / "config.json").exists():
+        raise LumigraphError(
+            f"{folder} already holds a run; go on with it by `lumigraph resume {folder}`, or choose another --output"
+        )
+    with files.explained(folder):
+        if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+            raise LumigraphError(f"{folder} is not an empty folder; choose another --output")
+
+
+def cameras_to_json(scene: Scene) -> dict[str, Any]:
+    camera = scene.cameras.to("cpu")
+    return {
+        "names": list(scene.names),
+        "splits": {name: index.tolist() for name, index in scene.splits.items()},
+        "pose": camera.pose.tolist(),
+        "lens": camera.lens.to_json(),
+        "size": camera.size.tolist(),
+        "time": None if camera.time is None else camera.time.tolist(),
+    }
+
+
+def cameras_from_json(data: dict[str, Any], photographs: int) -> dict[str, Camera]:
+    """Cameras by split. photographs: how many there are; further cameras took smaller copies of the same ones."""
+    time = None if data["time"] is None else torch.tensor(data["time"])
+    image_index = torch.arange(len(data["pose"])) % max(photographs, 1)
+    camera = Camera(
+        torch.tensor(data["pose"]), Lens.from_json(data["lens"]), torch.tensor(data["size"]), time, image_index
+    )
+    return {name: camera[torch.tensor(index, dtype=torch.int64)] for name, index in data["splits"].items()}
+
+
+def versions() -> dict[str, str]:
+    found = {"python": platform.python_version(), "platform": platform.platform()}
+    for package in ("lumigraph", "torch", "numba", "triton"):
+        try:
+            found[package] = version(package)
+        except PackageNotFoundError:
+            continue
+    return found
+
+
+def processor(device: torch.device) -> str:
+    """What kind of machine a device is."""
+    if device.type == "cuda":
+        return torch.cuda.get_device_name(device)
+    about = Path("/proc/cpuinfo")
+    names = re.findall(r"model name\s*:\s*(.+)", about.read_text("utf-8", errors="replace")) if about.exists() else []
+    return f"{names[0] if names else platform.machine()}, {torch.get_num_threads()} threads"

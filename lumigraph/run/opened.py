@@ -1,0 +1,71 @@
+"""Opened: whatever can be opened and looked at, a run, a splat file or a composition."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from ..camera import Camera
+from ..export.sightings import all_around
+from ..method import Method
+from ..scene import Frame, Scene
+
+
+class Opened(ABC):
+    """Something to render, where it is, and cameras that see it: all that films, the viewer and exports ask for.
+
+    path:  where it lies
+    frame: of what it renders, and of its cameras
+    """
+
+    path: Path
+    frame: Frame
+
+    @property
+    def title(self) -> str:
+        """What a page of it is called."""
+        return self.path.name.partition(".")[0]
+
+    @property
+    def renders(self) -> Path:
+        """Where films of it go: not beside a file, which may lie where nobody may write."""
+        return Path("renders") / self.title
+
+    @property
+    def paths(self) -> Path:
+        """Where camera paths that somebody saves go."""
+        return self.renders / "paths"
+
+    @abstractmethod
+    def method(self, device: torch.device | str = "cpu") -> Method:
+        """What it shows, ready to render."""
+
+    @abstractmethod
+    def cameras(self) -> dict[str, Camera]:
+        """Cameras by split, in `frame`; "train" is always among them."""
+
+    @property
+    def photographed(self) -> bool:
+        """Whether these are cameras of photographs, rather than a ring around what nobody has photographed."""
+        return False
+
+    @property
+    def open_scene(self) -> Callable[[], Scene] | None:
+        """What opens the photographs again; None where there are none."""
+        return None
+
+    def view_names(self) -> dict[str, list[str]]:
+        """What the photographs are called, by split, in the order of `cameras`; nothing where there are none."""
+        return {}
+
+    def survey(self, cameras: Camera) -> Camera:
+        """The cameras that surfaces are looked at with, for meshes and points: its own, or a dome above its ring."""
+        return cameras if self.photographed else all_around(cameras)
+
+    def metrics(self) -> list[dict[str, Any]]:
+        """What was measured while it was learnt, a row every few steps; none where that is not known."""
+        return []

@@ -1,0 +1,99 @@
+"""Settings: what a run says of itself in config.json, read and written here and nowhere else."""
+
+from __future__ import annotations
+
+import typing
+from dataclasses import asdict, dataclass, field, fields, replace
+from pathlib import Path
+from typing import Any
+
+from .. import files
+from ..errors import LumigraphError
+from ..method import Method
+from ..plain import alike, from_plain, renamed, understood
+from ..scene import Frame, Scene
+
+FORMAT = "lumigraph run 1"
+
+
+@dataclass(frozen=True)
+class Source:
+    """Where a dataset came from, what else `open_dataset` was told to open it, and of which kind it is."""
+
+    source: str
+    options: dict[str, Any] = field(default_factory=dict)
+    kind: str = Scene.kind
+
+    def to_json(self) -> dict[str, Any]:
+        """As the file says it: photographs are not mentioned."""
+        return {name: value for name, value in asdict(self).items() if (name, value) != ("kind", Scene.kind)}
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What was trained on what, and how.
+
+    method:    as the user types it
+    config:    the method's numbers by name, as the run was written with; see `method_config`
+    splits:    number of photographs or shapes by purpose
+    seed:      of all random choices
+    budget:    {"steps": n} or {"seconds": s}
+    device:    that it began on;  processor: what kind of machine that was
+    said:      the file as it was read. What a newer version has added to it is kept when it is written again
+    """
+
+    method: str
+    config: dict[str, Any]
+    frame: Frame
+    scene: Source
+    splits: dict[str, int] = field(default_factory=dict)
+    seed: int = 0
+    budget: dict[str, Any] = field(default_factory=dict)
+    device: str = "cpu"
+    processor: str = "unknown"
+    versions: dict[str, str] = field(default_factory=dict)
+    said: dict[str, Any] = field(default_factory=dict, repr=False, compare=False)
+
+    @staticmethod
+    def read(file: Path) -> Settings:
+        """What a config.json says. Raises LumigraphError, naming the file, where it is none of ours or damaged."""
+        said = files.read_json(file)
+        if not isinstance(said, dict) or said.get("format") != FORMAT:
+            raise LumigraphError(f"{file} was not written by this version of Lumigraph; open it with the one that did")
+        with understood(file):
+            typed = {"frame": Frame.from_json(said["frame"]), "scene": from_plain(Source, said["scene"]), "said": said}
+            plain = {x.name: said[x.name] for x in fields(Settings) if x.name in said and x.name not in typed}
+            check_types(plain)
+            return Settings(**plain | typed)
+
+    def write(self, file: Path) -> None:
+        files.write_json(file, self.to_json())
+
+    def to_json(self) -> dict[str, Any]:
+        """What config.json says: under the same names, and a frame as it was read if it is still that one."""
+        own: dict[str, Any] = {x.name: getattr(self, x.name) for x in fields(self) if x.name != "said"}
+        unchanged = "frame" in self.said and Frame.from_json(self.said["frame"]) == self.frame
+        frame = self.said["frame"] if unchanged else self.frame.to_json()
+        return {"format": FORMAT} | self.said | own | {"frame": frame, "scene": self.scene.to_json()}
+
+    def with_budget(self, **budget: float) -> Settings:
+        """The same with another total of steps or seconds."""
+        return replace(self, budget=budget)
+
+    def method_config(self, kind: type[Method]) -> Any:
+        """The numbers as the Config of a kind of method; those with a former name arrive under today's."""
+        return from_plain(kind.Config, renamed(self.config, kind.formerly))
+
+    def agrees(self, frame: Frame) -> bool:
+        """Whether a frame is the run's, up to rounding. Older runs know fewer numbers of a frame than newer ones."""
+        mine, other = self.to_json()["frame"], frame.to_json()
+        return alike({name: other.get(name) for name in mine}, mine)
+
+
+def check_types(said: dict[str, Any]) -> None:
+    """Raise TypeError for a value, of those that JSON says as they are, which is not of its field's type."""
+    hints = typing.get_type_hints(Settings)
+    for name, value in said.items():
+        kind = typing.get_origin(hints[name]) or hints[name]
+        if not isinstance(value, kind):
+            raise TypeError(f"{name} should be of type {kind.__name__}, and is {value!r}")

@@ -1,0 +1,57 @@
+"""A file of Gaussians, opened as if it were a run: something to render, with cameras around it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import torch
+
+from .. import methods
+from ..camera import Camera, ring
+from ..errors import LumigraphError
+from ..exchange import read_gaussians
+from ..gaussians import Gaussians
+from ..geometry import Similarity
+from ..method import Method
+from ..scene import Frame
+from .opened import Opened
+
+SHARE = 0.96  # of what is visible that the box of interest holds, along each axis
+# Splat files have y pointing down by custom, as the cameras they were learnt from; scenes stand upright.
+UPRIGHT = torch.tensor([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]], dtype=torch.float64)
+
+
+class SplatFile(Opened):
+    """A cloud in a file, with a ring of cameras around it. Raises LumigraphError for a file that is no cloud."""
+
+    def __init__(self, path: Path | str):
+        self.path = Path(path)
+        self.gaussians: Gaussians = read_gaussians(self.path)
+        if not len(self.gaussians):
+            raise LumigraphError(f"{self.path} holds no Gaussians, so there is nothing to show")
+        scene_from_file = upright_similarity(self.gaussians)
+        self.frame = Frame(reach=64.0, near=0.01, source_from_scene=scene_from_file.inverse.rows)
+        self._in_scene = self.gaussians.transformed(scene_from_file.matrix)
+
+    def method(self, device: torch.device | str = "cpu") -> Method:
+        """The cloud, ready to render."""
+        kind = methods.find("gaussian-splatting")
+        method = kind(self.frame, kind.Config(sh_degree=self.gaussians.degree, antialiased=self.gaussians.antialiased))
+        method.cloud.replace(self._in_scene)
+        return method.to(device).eval()
+
+    def cameras(self) -> dict[str, Camera]:
+        """A ring of cameras around the middle, looking at it."""
+        return {"train": ring(self.frame.bounds)}
+
+
+def upright_similarity(gaussians: Gaussians) -> Similarity:
+    """What brings most of the visible cloud into [-1, 1]^3, standing upright."""
+    means = gaussians.means.double().cpu()
+    solid = means[gaussians.opacities.sigmoid().cpu() > 0.1]
+    means = (solid if len(solid) > 10 else means) @ UPRIGHT.T
+    some = means[:: max(1, len(means) // 100_000)]
+    shares = torch.tensor([(1 - SHARE) / 2, (1 + SHARE) / 2], dtype=torch.float64)
+    low, high = torch.quantile(some, shares, dim=0)
+    scale = 2 / max(float((high - low).max()), 1e-9)
+    return Similarity.make(scale, UPRIGHT, -scale * (low + high) / 2)

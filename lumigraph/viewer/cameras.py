@@ -1,0 +1,62 @@
+"""Cameras of the house from the browser's, and where and how widely a camera looks."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from ..camera import Camera
+from ..geometry import to_matrix
+from ..lens import Pinhole
+from ..paths import Surroundings
+from ..scene import Frame
+
+WIDEST = math.radians(120)  # of a view, and of a photograph that is drawn as a frustum
+
+
+def pose_of(wxyz, position) -> tuple[tuple[float, ...], ...]:
+    """Camera-to-world matrix from a browser's quaternion and position; the axes are the same on both sides."""
+    rotation = to_matrix(torch.tensor([list(map(float, wxyz))], dtype=torch.double))[0].tolist()
+    return tuple((*row, float(x)) for row, x in zip(rotation, position, strict=True))
+
+
+def rows(camera: Camera, first: int, last: int) -> Camera:
+    """The camera of rows `first` to `last` of a picture behind a pinhole lens."""
+    lens = camera.lens
+    assert isinstance(lens, Pinhole)
+    shift = torch.tensor([[0.0, float(first)]])
+    size = torch.tensor([[int(camera.size[0, 0]), last - first]])
+    return replace(camera, size=size, lens=Pinhole(lens.focal, lens.centre - shift))
+
+
+def angles(camera: Camera) -> tuple[float, float]:
+    """Horizontal and vertical angle of view of one camera with any lens, in radians, at most WIDEST."""
+    width, height = camera.size[0].tolist()
+    x, y = width / 2, height / 2
+    edges = torch.tensor([[x, y], [0.0, y], [width, y], [x, 0.0], [x, height]])
+    middle, left, right, top, bottom = camera.to("cpu").lens.unproject(edges)
+    across, down = (angle(middle, a) + angle(middle, b) for a, b in ((left, right), (top, bottom)))
+    return min(across, WIDEST), min(down, WIDEST)
+
+
+def angle(a: Float[Tensor, " 3"], b: Float[Tensor, " 3"]) -> float:
+    """Angle between two unit vectors, in radians."""
+    return math.acos(max(-1.0, min(1.0, float(a @ b))))
+
+
+def angle_for(camera: Camera, aspect: float) -> float:
+    """Vertical angle of view, in radians, at which a window of an aspect (width / height) shows a whole photograph."""
+    across, down = angles(camera)
+    return min(WIDEST, max(down, 2 * math.atan(math.tan(across / 2) / aspect)))
+
+
+def target(camera: Camera, frame: Frame, around: Surroundings) -> Float[Tensor, " 3"]:
+    """The point that a camera turns about, on its optical axis: beside the focus of all cameras if those look inward,
+    10 near distances ahead if they look outward."""
+    position, forward = camera.position[0].double(), camera.forward[0].double()
+    towards = float((around.focus - position) @ forward) if around.inward else 0.0
+    return position + max(towards, 10 * frame.near) * forward

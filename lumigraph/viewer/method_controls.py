@@ -1,0 +1,60 @@
+"""MethodControls: sliders and lists for what the method can be told, for one client alone."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+from ..controls import Control, Value
+from ..method import Method
+
+STEPS = 200  # of a slider
+
+
+class MethodControls:
+    """The folder `Controls` in a client's tab `View`; nothing where the method has none.
+
+    client:  viser's
+    tab:     viser's, which holds the folder
+    changed: called when any of them is turned
+    """
+
+    def __init__(self, client: Any, tab: Any, method: Method, changed: Callable[[], None]):
+        controls: Sequence[Control] = method.controls
+        self._controls, self._begun = controls, {x.name: method.control(x.name) for x in controls}
+        self._handles: dict[str, Any] = {}
+        if not controls:
+            return
+        with tab, client.gui.add_folder("Controls"):
+            for control in controls:
+                handle = self._handles[control.name] = add(client.gui, control, self._begun[control.name])
+                handle.on_update(lambda _: changed())
+
+    @property
+    def values(self) -> tuple[tuple[str, Value], ...]:
+        """The names and values of those that were turned away from where they began."""
+        return tuple((name, value) for name, value in self._now().items() if value != self._begun[name])
+
+    @property
+    def time(self) -> float | None:
+        """The moment that is shown, where the method follows a moving scene."""
+        time = self._now().get("time")
+        return None if time is None else float(time)
+
+    def _now(self) -> dict[str, Value]:
+        return {control.name: value_of(control, self._handles[control.name].value) for control in self._controls}
+
+
+def add(gui: Any, control: Control, value: Value) -> Any:
+    """A slider or a list, set to a value."""
+    label = f"{control.name.replace('_', ' ').capitalize()}{f' ({control.unit})' if control.unit else ''}"
+    if control.range is None:
+        return gui.add_dropdown(label, control.choices, initial_value=value, hint=control.about or None)
+    least, most = control.range
+    step = max((most - least) / STEPS, 1e-9)
+    return gui.add_slider(label, least, most, step, float(value), hint=control.about or None)
+
+
+def value_of(control: Control, shown: Any) -> Value:
+    """What a client's slider or list says; sliders round, also beyond the ends of their range."""
+    return shown if control.range is None else min(max(float(shown), control.range[0]), control.range[1])

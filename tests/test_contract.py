@@ -1,0 +1,435 @@
+"""What every method promises to the trainer, the run, the viewer, the exports and the command line, whatever it is.
+
+A method is trained once for all of it, in its `smallest()` configuration on the smallest dataset of its kind:
+24 steps in one sitting, and the same in three. A new method needs no new test here; parameters that shall not learn
+have `requires_grad` False.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import re
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import pytest
+import tiny
+import torch
+
+import lumigraph
+from lumigraph import methods
+from lumigraph.camera import Camera
+from lumigraph.capabilities import HasDensity, HasDistance, HasField, HasGaussians, HasLooks, HasMesh, can
+from lumigraph.cli import main
+from lumigraph.errors import LumigraphError
+from lumigraph.evaluate import evaluate
+from lumigraph.exchange import read_gaussians
+from lumigraph.explain.ray import along_ray
+from lumigraph.export import points as export_points
+from lumigraph.export import sightings
+from lumigraph.export.film import film
+from lumigraph.export.mesh import extract_mesh
+from lumigraph.export.page import opening_of_scene, splats_page, views_page
+from lumigraph.export.splats import export_splats
+from lumigraph.lens import Equirectangular, Fisheye, Lens, OmnidirectionalStereo, OpenCV, Pinhole
+from lumigraph.mesh import Mesh
+from lumigraph.method import Method, RayMethod
+from lumigraph.paths import camera_path
+from lumigraph.rays import Rays, Rendering
+from lumigraph.run import Run, build
+from lumigraph.scene import Scene
+from lumigraph.train import fit
+
+STEPS, PAUSES, LATER = 24, (5, 18), 48
+SHOWN = 4  # the camera whose picture is looked at, a held-out one
+DEVICES = ["cpu", *(["cuda"] if torch.cuda.is_available() else [])]
+NAMES = methods.available()  # tiny adds the tests' own
+OWN = [name for name in NAMES if (Path(lumigraph.methods.__file__).parent / f"{name.replace('-', '_')}.py").exists()]
+# Of lenses: the house's, not those of other tests; a batch of several kinds is of no kind of its own.
+KINDS = sorted(name for name, kind in Lens.kinds.items() if kind.__module__ == Lens.__module__ and name != "mixed")
+DOCS = Path(__file__).parent.parent / "docs" / "methods"
+# A few steps leave a scene half transparent: what counts as solid there, and how well cameras must agree on it.
+HALF_SOLID, HALF_AGREED = 0.5, 0.3
+
+pytestmark = pytest.mark.filterwarnings("ignore:The cloud stops growing")
+
+
+@dataclass(frozen=True)
+class Taught:
+    """A method that was trained: `straight` in one sitting and `broken` in several, on the same data."""
+
+    name: str
+    kind: type[Method]
+    device: str
+    data: Any
+    straight: Run
+    broken: Run
+    left: dict[str, torch.Tensor]  # what the method itself held at the end of the one sitting
+
+    @cached_property
+    def method(self) -> Method:
+        return self.straight.method(self.device)
+
+    @cached_property
+    def cameras(self) -> Camera:
+        return tiny.scene().cameras
+
+    @cached_property
+    def seen(self) -> Rendering:
+        return self.method.render(self.cameras[SHOWN]).cpu()
+
+
+def begin(name: str, data: Any, folder: Path, device: str) -> Run:
+    kind = methods.find(name)
+    assert hasattr(kind, "smallest"), (
+        f"{kind.__name__} has no smallest(): give it a classmethod that returns a Config with every schedule inside "
+        f"{STEPS} steps of less than 20 ms on the tiny scene"
+    )
+    return Run.create(folder, build(kind, data.frame, kind.smallest(), torch.device(device), 0), data)
+
+
+def train(run: Run, data: Any, device: str, **options) -> Method:
+    method = run.new_method(device)
+    fit(method, data, run, **{"steps": STEPS} | options, show=False, rehearsal=False, log_every=1)
+    return method
+
+
+@pytest.fixture(scope="session", params=[f"{name}-{device}" for name in NAMES for device in DEVICES])
+def taught(request, tmp_path_factory) -> Taught:
+    name, _, device = request.param.rpartition("-")
+    folder, data = tmp_path_factory.mktemp(name), tiny.dataset(methods.find(name).learns_from)
+    straight, broken = (begin(name, data, folder / sittings, device) for sittings in ("straight", "broken"))
+    method = train(straight, data, device)
+    for pause_at in (*PAUSES, None):
+        train(Run(broken.folder), data, device, pause_at=pause_at)
+    return Taught(name, type(method), device, data, straight, Run(broken.folder), method.state_dict())
+
+
+def same(expected: dict[str, torch.Tensor], actual: dict[str, torch.Tensor]) -> None:
+    """To the bit."""
+    assert expected.keys() == actual.keys()
+    for name, value in expected.items():
+        assert torch.equal(value, actual[name]), name
+
+
+# What it says of itself
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_it_says_what_it_is(name):
+    kind = methods.find(name)
+    assert len(methods.summary(name)) > 20
+    assert dataclasses.is_dataclass(kind.Config) and kind.Config.__dataclass_params__.frozen  # type: ignore[attr-defined]
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_former_names_of_a_config_lead_to_fields_of_today(name):
+    kind = methods.find(name)
+    fields = {field.name for field in dataclasses.fields(kind.Config)}
+    assert set(kind.formerly.values()) <= fields and not fields & set(kind.formerly)
+    assert len(set(kind.formerly.values())) == len(kind.formerly)
+
+
+@pytest.mark.parametrize("name", OWN)
+def test_a_page_describes_it(name):
+    page = DOCS / f"{name.replace('-', '_')}.md"
+    assert page.is_file(), f"{page.name} is missing in docs/methods"
+    assert f"lumigraph train {name}" in page.read_text("utf-8")
+
+
+def numbers(config: Any) -> list[str]:
+    """The names of a config's fields, and of those of configs within it."""
+    values = {field.name: getattr(config, field.name) for field in dataclasses.fields(config)}
+    return [
+        x for name, value in values.items() for x in (numbers(value) if dataclasses.is_dataclass(value) else [name])
+    ]
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_help_names_its_numbers(name, capsys):
+    with pytest.raises(SystemExit) as done:
+        main(["train", name, "--help"])
+    told = capsys.readouterr().out
+    assert done.value.code == 0
+    for number in numbers(methods.find(name).Config()):
+        assert f"--{number.replace('_', '-')}" in told, number
+
+
+# Learning
+
+
+def test_it_learns(taught):
+    """Its loss falls, where it has one, and it shows held-out photographs better than one that has learnt nothing."""
+    losses = [row["loss"] for row in taught.straight.metrics() if "loss" in row]
+    if losses:
+        folder = taught.straight.folder.with_name("later")
+        run = begin(taught.name, taught.data, folder, taught.device)
+        train(run, taught.data, taught.device, steps=LATER)
+        losses = [row["loss"] for row in run.metrics()]
+        assert sum(losses[-8:]) < 0.95 * sum(losses[:8]), losses
+    else:
+        assert taught.method.complete or taught.straight.state.step == STEPS
+    if isinstance(taught.data, Scene):
+        fresh = taught.straight.new_method(taught.device).eval()
+        assert evaluate(taught.method, taught.data).psnr > evaluate(fresh, taught.data).psnr + 0.5
+
+
+def test_every_parameter_gets_a_finite_gradient(taught):
+    method = taught.straight.new_method(taught.device)
+    optimizers = method.optimizers()
+    method.train().begin(taught.data)
+    descents = []
+
+    def descend(terms, chosen=None):
+        torch.stack(list(terms.values())).sum().backward()
+        descents.append(terms)
+
+    learns = {name for name, parameter in method.named_parameters() if parameter.requires_grad}
+    method.before_step(0, 0.0)
+    method.step(method.batch(taught.data, torch.Generator().manual_seed(0)), 0, descend)
+    method.after_step(0)
+    assert bool(learns) == bool(optimizers) == bool(descents)
+    gradients = {name: parameter.grad for name, parameter in method.named_parameters() if name in learns}
+    for name, gradient in gradients.items():
+        assert gradient is not None and gradient.isfinite().all() and gradient.any(), name
+
+
+def test_resuming_equals_never_having_stopped(taught):
+    same(taught.straight.method(taught.device).state_dict(), taught.broken.method(taught.device).state_dict())
+    assert taught.straight.state.step == taught.broken.state.step
+    once, again = ([{**row, "seconds": 0} for row in run.metrics()] for run in (taught.straight, taught.broken))
+    assert once == again
+
+
+def test_looking_changes_nothing(taught, monkeypatch):
+    """Renderings between steps, as previews and viewers ask for them, leave training as it was."""
+    after_step, camera, looks = taught.kind.after_step, taught.cameras[3], []
+
+    def after(self, number):
+        after_step(self, number)
+        self.eval()
+        looks.append(self.render(camera))
+        self.train()
+
+    monkeypatch.setattr(taught.kind, "after_step", after)
+    method = taught.straight.new_method(taught.device)
+    fit(method, taught.data, steps=STEPS, show=False, rehearsal=False)
+    assert len(looks) == taught.straight.state.step
+    same(taught.left, method.state_dict())
+
+
+# Being kept
+
+
+def test_its_config_and_frame_survive_the_folder(taught):
+    fresh = Run(taught.straight.folder).new_method(taught.device)
+    assert fresh.config == taught.kind.smallest() and fresh.frame == taught.data.frame
+    assert methods.name_of(fresh) == taught.name and fresh.device.type == taught.device
+
+
+def test_what_is_saved_is_what_was_trained(taught):
+    same(taught.left, taught.method.state_dict())
+    again = taught.broken.method(taught.device).render(taught.cameras[SHOWN]).cpu()
+    for name in ("rgb", "depth", "opacity"):
+        assert torch.equal(getattr(taught.seen, name), getattr(again, name)), name
+
+
+# Being seen
+
+
+def sound(seen: Rendering, size: tuple[int, int]) -> None:
+    width, height = size
+    assert seen.rgb.shape == (height, width, 3) and seen.depth.shape == seen.opacity.shape == (height, width)
+    assert seen.rgb.isfinite().all() and not seen.rgb.requires_grad
+    assert (seen.depth > 0).all() and (seen.opacity >= -1e-6).all() and (seen.opacity <= 1 + 1e-5).all()
+    assert all(value.shape[:2] == (height, width) for value in seen.extra.values())
+
+
+def test_a_picture_is_sound(taught):
+    sound(taught.seen, (tiny.SIZE, tiny.SIZE))
+    assert taught.seen.opacity.max() > 0.05
+
+
+def lens_of(kind: str) -> tuple[Lens, tuple[int, int]]:
+    """The smallest lens of a kind, and the size of its picture."""
+    focal, centre, whole = torch.tensor([[12.0, 12.0]]), torch.tensor([[8.0, 6.0]]), torch.tensor([[16.0, 8.0]])
+    lenses = {
+        "pinhole": Pinhole(focal, centre),
+        "opencv": OpenCV(focal, centre, torch.tensor([[-0.1, 0.02, 1e-3, -1e-3, 0, 0, 0, 0]])),
+        "fisheye": Fisheye(focal / 3, centre, torch.tensor([[0.05, 0, 0, 0]])),
+        "equirectangular": Equirectangular(whole),
+        "omnidirectionalstereo": OmnidirectionalStereo(whole, offset=torch.tensor([[0.03]])),
+    }
+    return lenses[kind], (16, 8) if kind in ("equirectangular", "omnidirectionalstereo") else (16, 12)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_it_sees_through_every_lens_that_it_claims(taught, kind):
+    if not taught.method.any_lens and kind not in ("pinhole", "opencv"):
+        return
+    lens, size = lens_of(kind)
+    camera = Camera(taught.cameras[1].pose, lens, torch.tensor([size]))
+    sound(taught.method.render(camera).cpu(), size)
+
+
+def test_two_halves_are_the_whole(taught):
+    if not isinstance(taught.method, RayMethod):
+        return
+    camera = taught.cameras[2]
+    rays, background = camera.rays(camera.pixels()).to(taught.device), taught.method.background
+    with torch.no_grad():
+        whole = taught.method.render_rays(rays, background)
+        halves = Rendering.cat(
+            [taught.method.render_rays(rays[half], background) for half in (slice(250), slice(250, None))]
+        )
+    for name in ("rgb", "depth", "opacity"):
+        torch.testing.assert_close(getattr(halves, name), getattr(whole, name), atol=1e-3, rtol=1e-3)
+
+
+def test_depth_is_distance_from_the_camera_whichever_way_it_turns(taught):
+    """From one place, straight ahead and at the edge of a wide picture: along the axis they would be a fifth apart.
+    The places that depth gives lie on their pixels in either picture."""
+    ahead = taught.cameras[SHOWN]
+    angle = torch.tensor(math.radians(35))
+    turn = torch.tensor([[angle.cos(), 0, angle.sin()], [0, 1, 0], [-angle.sin(), 0, angle.cos()]])
+    pose = torch.cat([ahead.pose[:, :, :3] @ turn, ahead.pose[:, :, 3:]], -1)
+    lens = Pinhole(torch.full((1, 2), 32.0), torch.full((1, 2), 32.0))
+    aside = Camera(pose, lens, torch.tensor([[64, 64]]))
+    one, other = (taught.method.render(camera).cpu() for camera in (ahead, aside))
+    pixels = ahead.pixels()
+    depth, opacity = one.depth.flatten(), one.opacity.flatten()
+    there = depth.isfinite() & (opacity > 0.7 * opacity.max())
+    points = ahead.rays(pixels).at(depth.nan_to_num(posinf=1.0))[there]
+    again, visible = ahead.project(points)
+    assert len(points) and visible.all()
+    torch.testing.assert_close(again, pixels[there], atol=0.01, rtol=0)
+    found, visible = aside.project(points)
+    inside = visible & (found > 0).all(-1) & (found < 64).all(-1)
+    x, y = found[inside].long().unbind(-1)
+    ratio = other.depth[y, x] / depth[there][inside]
+    assert ratio.isfinite().float().mean() > 0.9
+    assert float(ratio[ratio.isfinite()].median()) == pytest.approx(1, abs=0.05)
+
+
+def test_it_can_be_told_what_it_says(taught):
+    """Each control's default is what holds untold, and one of its ends shows."""
+    method, camera = taught.method, taught.cameras[SHOWN]
+    with pytest.raises(LumigraphError):
+        method.given(object())
+    with pytest.raises(LumigraphError, match="no-such-thing"):
+        method.given(**{"no-such-thing": 1.0})
+    for control in method.controls:
+        untold = method.given(**{control.name: control.default}).render(camera).cpu()
+        torch.testing.assert_close(untold.rgb, taught.seen.rgb)
+        shown = [method.given(**{control.name: end}).render(camera).cpu() for end in control.choices or control.range]
+        for seen in shown:
+            sound(seen, (tiny.SIZE, tiny.SIZE))
+        assert any((seen.rgb != taught.seen.rgb).any() for seen in shown), control.name
+
+
+# What is made of it
+
+
+@pytest.fixture
+def lenient(taught, monkeypatch) -> Taught:
+    """A method whose scene is but half solid counts as solid to exports."""
+    monkeypatch.setattr(sightings, "SOLID", HALF_SOLID * float(taught.seen.opacity.max()))
+    monkeypatch.setattr(export_points, "SQUARELY", 0.0)
+    monkeypatch.setattr(export_points, "TOLERANCE", HALF_AGREED)
+    monkeypatch.setattr(export_points, "WITNESSES", 1)
+    return taught
+
+
+def around(points: torch.Tensor) -> None:
+    assert len(points) > 3 and points.isfinite().all() and (points.abs() <= 1.5).all()
+
+
+def test_what_it_knows_of_places(taught):
+    method = taught.method
+    points = torch.rand(200, 3, generator=torch.Generator().manual_seed(0)).to(taught.device) * 2 - 1
+    directions = torch.nn.functional.normalize(points.flip(0), dim=-1)
+    with torch.no_grad():
+        if can(method, HasDensity):
+            density = method.density(points)
+            assert density.shape == (200,) and density.isfinite().all() and (density >= 0).all() and density.any()
+        if can(method, HasDistance):
+            distance = method.distance(points)
+            assert distance.shape == (200,) and distance.isfinite().all() and distance.any()
+        if can(method, HasField):
+            density, rgb = method.field(points, directions)
+            assert density.shape == (200,) and (density >= 0).all() and rgb.shape == (200, 3) and rgb.isfinite().all()
+            if can(method, HasDensity):
+                torch.testing.assert_close(density, method.density(points), atol=1e-3, rtol=1e-2)
+
+
+def test_a_ray_is_explained(taught):
+    if not can(taught.method, HasLooks):
+        return
+    y, x = divmod(int(taught.seen.opacity.argmax()), tiny.SIZE)
+    sight = along_ray(taught.method, taught.cameras[SHOWN], (x, y))
+    torch.testing.assert_close(sight.rgb, taught.seen.rgb[y, x], atol=2e-3, rtol=0)
+    assert sight.opacity == pytest.approx(float(taught.seen.opacity[y, x]), abs=2e-3)
+    for each in sight.passes:
+        assert (each.density >= 0).all() and (each.end >= each.start).all()
+
+
+def test_it_becomes_points_and_a_mesh(lenient):
+    points = export_points.extract_points(lenient.method, lenient.cameras, 200, views=6)
+    around(torch.from_numpy(points.positions))
+    if can(lenient.method, HasMesh):
+        mesh = lenient.method.mesh()
+        assert isinstance(mesh, Mesh)
+    else:
+        mesh = extract_mesh(lenient.method, lenient.cameras, cell=1 / 8, way="depth", views=6)
+    around(torch.from_numpy(mesh.vertices))
+    assert len(mesh.faces) > 3 and mesh.faces.max() < len(mesh.vertices) == len(mesh.colours)
+
+
+def test_its_density_becomes_a_mesh(lenient):
+    if not can(lenient.method, HasDensity):
+        return
+    grid = torch.linspace(-1, 1, 12, device=lenient.device)
+    with torch.no_grad():
+        density = lenient.method.density(torch.cartesian_prod(grid, grid, grid))
+    level = float(density.max()) / 4
+    mesh = extract_mesh(lenient.method, lenient.cameras, cell=1 / 8, way="density", level=level, views=6, smooth=0)
+    around(torch.from_numpy(mesh.vertices))
+
+
+def test_it_becomes_a_film(taught, tmp_path):
+    cameras = camera_path("orbit", taught.cameras, taught.method.frame, 2, (16, 16)).to(taught.device)
+    about = film(taught.method, cameras, tmp_path / "orbit.mp4")
+    assert about["frames"] == 2 and len(list((tmp_path / "orbit").glob("*.png"))) == 4
+    assert (tmp_path / "orbit.mp4").stat().st_size > 0
+
+
+def test_it_becomes_a_page(taught, tmp_path):
+    page, opening = tmp_path / "page.html", opening_of_scene("tiny", taught.cameras, taught.method.frame)
+    views_page(page, taught.method, taught.cameras, opening, 2, 16)
+    assert len(re.findall("<title>tiny</title>", page.read_text("utf-8"))) == 1
+
+
+def test_its_gaussians_become_splats(taught, tmp_path):
+    if not can(taught.method, HasGaussians):
+        return
+    cloud = taught.method.gaussians()
+    export_splats(cloud, taught.method.frame, tmp_path / "cloud.ply")
+    back = read_gaussians(tmp_path / "cloud.ply").transformed(taught.method.frame.to_source.inverse.matrix)
+    for field in dataclasses.fields(cloud):
+        if isinstance(value := getattr(cloud, field.name), torch.Tensor) and field.name != "quaternions":
+            torch.testing.assert_close(getattr(back, field.name), value.detach().cpu(), atol=1e-4, rtol=1e-4)
+    splats_page(tmp_path / "page.html", cloud, opening_of_scene("tiny", taught.cameras, taught.method.frame))
+    assert (tmp_path / "page.html").stat().st_size > 1000
+
+
+def test_rays_that_meet_nothing_show_the_background(taught):
+    if not isinstance(taught.method, RayMethod):
+        return
+    away = torch.eye(3, device=taught.device)
+    rays = Rays(3 + away, away, torch.full((3,), 0.01, device=taught.device))
+    with torch.no_grad():
+        seen = taught.method.render_rays(rays, taught.method.background)
+    assert seen.rgb.isfinite().all() and seen.opacity.isfinite().all() and not seen.depth.isnan().any()
