@@ -2,7 +2,8 @@
 
 What counts is the lesser of a test's seconds and its processors' seconds, without what Numba compiled for the first
 time: so neither a busy machine nor a fresh clone makes a file costly. It is divided by how slow the machine proves to
-be. `pytest_terminal_summary` prints the table; a file beyond 1.5 times its share ends the session with code 1.
+be. `pytest_terminal_summary` prints the table and the files beyond their shares. A file beyond three times its share ends
+the session with code 1: less than that is within what one machine differs from another.
 """
 
 from __future__ import annotations
@@ -38,7 +39,7 @@ SHARES: dict[str, tuple[str, float]] = {
     "test_viewer_page": ("exports, viewer, web", 20),
     "test_viewer": ("exports, viewer, web", 10),
     "test_panorama": ("exports, viewer, web", 8),
-    "test_benchmark": ("runs, commands, benchmark", 15),
+    "test_benchmark": ("runs, commands, benchmark", 20),
     "test_cli": ("runs, commands, benchmark", 12),
     "test_run": ("runs, commands, benchmark", 8),
     "test_train": ("runs, commands, benchmark", 8),
@@ -59,7 +60,7 @@ GROUPS: dict[str, str] = {
     **dict.fromkeys("test_coordinate_network test_density_control test_gaussians test_encodings".split(), "methods"),
     **dict.fromkeys("test_house test_budgets".split(), "house"),
 }  # the others are of nouns and capture
-TOO_MUCH = 1.5  # times its share
+MUCH, TOO_MUCH = 1.5, 3.0  # times its share: what is told, and what fails
 CALIBRATION = 0.021  # processor seconds that `probe` takes on the machine that the budgets were set on
 
 
@@ -158,12 +159,12 @@ class Ledger:
             for file, cost in other["files"].items():
                 self.files[file] += Cost(*cost)
 
-    def excessive(self) -> list[str]:
-        """A sentence for each file that took too much."""
+    def excessive(self, times: float = TOO_MUCH) -> list[str]:
+        """A sentence for each file that took more than so many times its share."""
         found = []
         for file, cost in sorted(self.files.items()):
             taken, (_, share) = cost.counted / self.slowness, share_of(file, self.methods)
-            if taken > TOO_MUCH * share:
+            if taken > times * share:
                 found.append(f"{file}.py took {taken:.0f} s of its {share:.0f} s; see tests/budgets.py")
         return found
 

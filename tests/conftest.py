@@ -21,7 +21,7 @@ import lumigraph  # isort: skip
 import pytest  # isort: skip
 import torch  # isort: skip
 from browser import chromium, faults, page  # noqa: F401  # isort: skip
-from budgets import Ledger, busy  # isort: skip
+from budgets import MUCH, Ledger, busy  # isort: skip
 from jaxtyping import install_import_hook  # isort: skip
 from numba.core import event  # isort: skip
 
@@ -125,7 +125,7 @@ def pytest_sessionfinish(session: pytest.Session, exitstatus: int) -> None:
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
     terminalreporter.section("what the tests cost")
-    for line in [*LEDGER.table(), *LEDGER.excessive()]:
+    for line in [*LEDGER.table(), *LEDGER.excessive(MUCH)]:
         terminalreporter.write_line(line)
     if LEDGER.excessive() and busy():
         terminalreporter.write_line("which may be for other programs are running; it counts where the machine is idle")
