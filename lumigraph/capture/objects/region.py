@@ -15,7 +15,7 @@ from .view import View
 CELLS = 56  # along each side of the cube that is searched
 SEEN = 0.7  # share of the views whose picture holds a cell of the object
 LEVEL = 0.9  # cosine between a table's normal and up, at the least
-TABLE = 0.12  # share of the points nearby that lie on a table, at the least
+TABLE = 0.06  # share of the points nearby that lie on a table, at the least
 BELOW = 0.1  # share of them that may lie below it
 THICK = 0.015  # of the cube's half-size: how far a table's points stray
 TRIALS = 500  # of three points each (RANSAC, Fischler and Bolles 1981)

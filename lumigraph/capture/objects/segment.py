@@ -25,6 +25,7 @@ from .view import View
 
 SLACKS = (0.35, 0.3, 0.25, 0.2, 0.15, 0.15)  # share of the views that may see past a cell, round by round
 CORE = 0.35  # of the region's radius around its middle: where colours are first learnt, without sparse points
+SHADED, DARKEST = 0.25, 0.35  # share of surrounding colours that count as shaded too, and what shadows leave of light
 PRIOR = 2.5  # logarithm of likelihood by which a body speaks for the pixels that it covers
 SURE = 4.0  # the largest that colours alone may speak with
 FEWEST = 20  # cells that make a body
@@ -65,7 +66,9 @@ def segment(
     """
     region = find_region(views, points)
     if len(region.cells) < FEWEST:
-        raise LumigraphError("The photographs do not look at one thing together, so no object can be told from the rest")
+        raise LumigraphError(
+            "The photographs do not look at one thing together, so no object can be told from the rest"
+        )
     allowed = [view.mean((view.shadow(region.cells, region.size) > 0.5).astype(float)) > 0.5 for view in views]
     body = first_guess(region, points)
     shares = [view.mean(view.shadow(body, region.size)) for view in views]
@@ -106,7 +109,16 @@ def learn_colours(
     around = np.concatenate([view.colours[~i] for view, i in zip(views, inside, strict=True)])
     if min(len(own), len(around)) < FEWEST:
         raise LumigraphError("No object stands out from what is around it; take photographs that show it whole")
-    return Mixture.of(own), Mixture.of(around)
+    return Mixture.of(own), Mixture.of(np.concatenate([around, shaded(around)]))
+
+
+def shaded(colours: Float[np.ndarray, "patch 3"]) -> Float[np.ndarray, "shaded 3"]:
+    """Some colours as they are in a shadow, which the object throws on what is around it and which is seen nowhere else.
+
+    Of CIELAB all three numbers shrink together when light does.
+    """
+    some = colours[:: round(1 / SHADED)]
+    return some * np.random.default_rng(0).uniform(DARKEST, 1, (len(some), 1))
 
 
 def carved(

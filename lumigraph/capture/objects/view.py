@@ -41,7 +41,9 @@ class View:
     def __post_init__(self) -> None:
         # SLIC scales what it is given to [0, 1]; compactness is meant for CIELAB's own units.
         compact = COMPACT / float(np.ptp(self.lab))
-        self.patches = slic(self.lab, PATCHES, compact, max_num_iter=5, start_label=0, convert2lab=False, channel_axis=2)
+        self.patches = slic(
+            self.lab, PATCHES, compact, max_num_iter=5, start_label=0, convert2lab=False, channel_axis=2
+        )
         count = int(self.patches.max()) + 1
         self.sizes = np.bincount(self.patches.ravel(), minlength=count).astype(np.float64)
         self.colours = np.stack([self.mean(self.lab[..., k]) for k in range(3)], -1)
@@ -58,16 +60,18 @@ class View:
         share = min(1.0, SIDE / max(rgb.shape[:2]))
         small = camera.resized(share)
         width, height = small.size[0].tolist()
-        shrunk = torch.nn.functional.interpolate(
-            rgb.permute(2, 0, 1)[None].float(), (height, width), mode="area"
-        )[0].permute(1, 2, 0)
+        shrunk = torch.nn.functional.interpolate(rgb.permute(2, 0, 1)[None].float(), (height, width), mode="area")[
+            0
+        ].permute(1, 2, 0)
         return View(name, small, rgb2lab(shrunk.clamp(0, 1).numpy()))
 
     def mean(self, values: Float[np.ndarray, "height width"]) -> Float[np.ndarray, " patch"]:
         """The mean of pixels' values in each superpixel."""
         return np.bincount(self.patches.ravel(), values.ravel(), len(self.sizes)) / self.sizes
 
-    def at(self, points: Float[torch.Tensor, "point 3"]) -> tuple[Int[np.ndarray, "point 2"], Bool[np.ndarray, " point"]]:
+    def at(
+        self, points: Float[torch.Tensor, "point 3"]
+    ) -> tuple[Int[np.ndarray, "point 2"], Bool[np.ndarray, " point"]]:
         """The (row, column) at which points are seen, clamped to the picture, and whether they are in it."""
         pixels, valid = self.camera.project(points)
         height, width = self.lab.shape[:2]
