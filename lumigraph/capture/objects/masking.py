@@ -28,6 +28,7 @@ SHEET = "object.png"
 SHOWN, ROW = 16, 4  # photographs on the sheet, and on a line of it
 EDGE = 0.006  # of a photograph's longer side: how far an outline may move to the edge that it means
 SHARPER = 2.0  # times, that the filter's soft outline is made steeper
+ALIKE = 0.8  # share of superpixels that colours tell apart, below which they are said not to
 WHOLE = 0.6  # share of the region that a body may fill before it is no object
 DIM = 0.2  # of the light of what is outside, on the sheet
 
@@ -93,6 +94,8 @@ def doubts(found: Segmentation) -> list[str]:
         told.append("no table or floor was found below the object, so shadows at its foot may belong to it")
     if len(found.body) > WHOLE * len(found.region.cells):
         told.append("what was found fills nearly all that the photographs look at, so it may be no object at all")
+    if found.distinct < ALIKE:
+        told.append("the object has nearly the colours of what is around it, so the outlines are guesses")
     if names := found.doubtful:
         some = ", ".join(names[:5]) + (" ..." if len(names) > 5 else "")
         told.append(f"the outlines of {len(names)} photographs do not agree with the others' ({some})")

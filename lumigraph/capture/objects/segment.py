@@ -32,6 +32,9 @@ FEWEST = 20  # cells that make a body
 DOUBTFUL = 0.75  # overlap of a cut with the body below which a photograph is named
 
 
+Patches = np.ndarray  # bool: which superpixels of one picture; each picture has a number of its own
+
+
 @dataclass(frozen=True)
 class Segmentation:
     """What was found.
@@ -40,13 +43,15 @@ class Segmentation:
     inside:   which superpixels of each belong to the object
     body:     cells of space that the object fills
     overlaps: intersection over union of each cut and the body as it is seen there
+    distinct: share of superpixels whose colour alone says on which side they are; 0.5 is as good as chance
     """
 
     views: list[View]
-    inside: list[Bool[np.ndarray, " patch"]]
+    inside: list[Patches]
     body: Float[Tensor, "cell 3"]
     region: Region
     overlaps: Float[np.ndarray, " view"]
+    distinct: float
 
     @property
     def doubtful(self) -> list[str]:
@@ -66,16 +71,14 @@ def segment(
     """
     region = find_region(views, points)
     if len(region.cells) < FEWEST:
-        raise LumigraphError(
-            "The photographs do not look at one thing together, so no object can be told from the rest"
-        )
+        raise LumigraphError("The photographs do not look at one thing together, so there is no object to find")
     allowed = [view.mean((view.shadow(region.cells, region.size) > 0.5).astype(float)) > 0.5 for view in views]
     body = first_guess(region, points)
     shares = [view.mean(view.shadow(body, region.size)) for view in views]
     inside = [share > 0.5 for share in shares]
     strength = 0.0  # at first the body is a guess, and only colours speak
     for slack in track(SLACKS, "Cutting the object out", len(SLACKS)):
-        own, around = learn_colours(views, inside, allowed)
+        own, around = learn_colours(views, inside)
         inside = []
         for view, share, may in zip(views, shares, allowed, strict=True):
             colour = around.log_likelihood(view.colours) - own.log_likelihood(view.colours)
@@ -85,7 +88,14 @@ def segment(
         shares = [view.mean(view.shadow(body, region.size)) for view in views]
         strength = PRIOR
     overlaps = np.array([overlap(view, a, b > 0.5) for view, a, b in zip(views, inside, shares, strict=True)])
-    return Segmentation(list(views), inside, body, region, overlaps)
+    return Segmentation(list(views), inside, body, region, overlaps, distinctness(views, inside, own, around))
+
+
+def distinctness(views: Sequence[View], inside: Sequence[Patches], own: Mixture, around: Mixture) -> float:
+    """The share of superpixels that colour alone puts on their side, the object's and the others counted alike."""
+    likely = [own.log_likelihood(view.colours) > around.log_likelihood(view.colours) for view in views]
+    told, true = np.concatenate(likely), np.concatenate(list(inside))
+    return 0.5 * float(told[true].mean() + (~told[~true]).mean())
 
 
 def first_guess(region: Region, points: Float[Tensor, "point 3"] | None) -> Float[Tensor, "cell 3"]:
@@ -101,9 +111,7 @@ def first_guess(region: Region, points: Float[Tensor, "point 3"] | None) -> Floa
     return region.cells[away <= CORE * away.max()]
 
 
-def learn_colours(
-    views: Sequence[View], inside: Sequence[Bool[np.ndarray, " patch"]], allowed: Sequence[Bool[np.ndarray, " patch"]]
-) -> tuple[Mixture, Mixture]:
+def learn_colours(views: Sequence[View], inside: Sequence[Patches]) -> tuple[Mixture, Mixture]:
     """The colours of the object, and of what is around it: all that is not inside."""
     own = np.concatenate([view.colours[i] for view, i in zip(views, inside, strict=True)])
     around = np.concatenate([view.colours[~i] for view, i in zip(views, inside, strict=True)])
@@ -113,7 +121,7 @@ def learn_colours(
 
 
 def shaded(colours: Float[np.ndarray, "patch 3"]) -> Float[np.ndarray, "shaded 3"]:
-    """Some colours as they are in a shadow, which the object throws on what is around it and which is seen nowhere else.
+    """Some colours as they are in the object's own shadow, which is seen nowhere else.
 
     Of CIELAB all three numbers shrink together when light does.
     """
@@ -121,9 +129,7 @@ def shaded(colours: Float[np.ndarray, "patch 3"]) -> Float[np.ndarray, "shaded 3
     return some * np.random.default_rng(0).uniform(DARKEST, 1, (len(some), 1))
 
 
-def carved(
-    region: Region, views: Sequence[View], inside: Sequence[Bool[np.ndarray, " patch"]], slack: float
-) -> Float[Tensor, "cell 3"]:
+def carved(region: Region, views: Sequence[View], inside: Sequence[Patches], slack: float) -> Float[Tensor, "cell 3"]:
     """The cells that all but a share of the pictures that hold them show inside the object; the largest piece."""
     past, seen = np.zeros(len(region.cells)), np.zeros(len(region.cells))
     for view, patches in zip(views, inside, strict=True):
