@@ -32,7 +32,7 @@ class Keeping:
     """Leave out Gaussians that are fainter."""
     max_scale: Annotated[float | None, option("SHARE", "any, with --clean 1")] = None
     """Leave out Gaussians whose standard deviation is larger, in extents of the cloud."""
-    isolation: Annotated[float | None, option("DEVIATIONS", "any, with --clean 4")] = None
+    isolation: Annotated[float | None, option("DEVIATIONS", "any, with --clean 3")] = None
     """Leave out Gaussians that are farther from their neighbours than most, by so many standard deviations."""
 
     @property

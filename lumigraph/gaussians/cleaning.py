@@ -17,7 +17,7 @@ SOLID = 0.1  # opacity from which on a Gaussian tells how large the cloud is
 MIDDLE = 0.9  # of the solid ones are within the extent, along each axis
 
 # What most captures gain from and few lose by; the command line's `--clean`.
-MIN_OPACITY, MAX_SCALE, ISOLATION = 0.02, 1.0, 4.0
+MIN_OPACITY, MAX_SCALE, ISOLATION = 0.02, 1.0, 3.0
 
 
 def cleaned(
