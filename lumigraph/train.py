@@ -5,8 +5,6 @@ from __future__ import annotations
 import contextlib
 import copy
 import math
-import signal
-import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
@@ -23,6 +21,7 @@ from .figures import save_picture
 from .memory import peak_memory
 from .method import Lesson, Method
 from .run import Run, State
+from .signals import Interrupt
 
 FIRST_SAVE = 10.0  # seconds of training; a fault or a kill in the first minute should not cost all of it
 PREVIEWS = (0.01, 0.03, 0.1, 0.3, 1.0)  # shares of the budget at which a view is kept
@@ -249,28 +248,6 @@ class Clock:
         yield
         pause = time.perf_counter() - begin
         self._begin, self.pauses = self._begin + pause, self.pauses + pause
-
-
-class Interrupt:
-    """Inside this block the first Ctrl-C or SIGTERM only leaves its number; the second acts as usual."""
-
-    def __init__(self) -> None:
-        self.signal: int | None = None
-        self._previous: dict[int, object] = {}
-
-    def __enter__(self) -> Interrupt:
-        if threading.current_thread() is threading.main_thread():  # only there may handlers be set
-            for number in (signal.SIGINT, signal.SIGTERM):
-                self._previous[number] = signal.signal(number, self._note)
-        return self
-
-    def __exit__(self, *fault: object) -> None:
-        for number, handler in self._previous.items():
-            signal.signal(number, handler)  # type: ignore[arg-type]
-
-    def _note(self, number: int, frame: object) -> None:
-        self.signal = number
-        self.__exit__()
 
 
 class Previews:

@@ -9,7 +9,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from .. import files
-from ..train import Interrupt
+from ..signals import Interrupt
 
 Launch = Callable[[Sequence[str], Path], int]
 STOPPED = (130, 143)  # after Ctrl-C and SIGTERM

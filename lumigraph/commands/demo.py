@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
+from ..console import bold
 from .common import budget_of, check_film, choose_device, exit_code, next_free, option, say, show
 
 FRAMES = 90
@@ -63,7 +64,7 @@ class Demo:
         headline, what = scores_of(result)[0], "views" if "views" in result["protocol"] else "shapes"
         show(
             {
-                f"held-out {headline.name}": f"[bold]{headline}[/bold] over {result['protocol'][what]} {what}",
+                f"held-out {headline.name}": bold(headline) + f" over {result['protocol'][what]} {what}",
                 "film": str(orbit),
                 "report": str(report),
                 "run": str(run.folder),

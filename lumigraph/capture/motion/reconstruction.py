@@ -11,10 +11,10 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-import pycolmap
 
 from ...errors import LumigraphError
 from ...files import read_json, remove, replacing, write_bytes, write_json
+from ..library import pycolmap
 from ..photos import Intake, Photo, gather
 from ..photos.track import Track, untracked
 from .diagnosis import FEW_FEATURES, Diagnosis, Matches, counted, diagnose, folds, read_matches
