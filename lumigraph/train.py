@@ -88,13 +88,13 @@ def fit(
     Seconds count what training needs; compiling kernels ahead of it, saving, and giving way to who looks on are
     counted apart.
     Ctrl-C and SIGTERM end the step at hand, save and return; a second one breaks off.
-    Raises LumigraphError for a dataset of another kind than the method learns from, and when a loss or gradient is not
-    finite, with the last good state saved.
+    Raises LumigraphError for a dataset of another kind than the method learns from, for a run that another process
+    trains, and when a loss or gradient is not finite, with the last good state saved.
     """
     budget = Budget(steps, seconds)
     check_kind(methods.name_of(method), method.learns_from, type(data), data.source)
-    state = run.restore_weights(method) if run else State()
-    with Interrupt() as interrupt, TrainingDisplay(show) as display:
+    with run.held() if run else contextlib.nullcontext(), Interrupt() as interrupt, TrainingDisplay(show) as display:
+        state = run.restore_weights(method) if run else State()
         display.say("Compiling kernels")
         compile_seconds = state.compile_seconds + (rehearse(method, data, state.step) if rehearsal else 0.0)
         optimizers, generator = method.optimizers(), torch.Generator().manual_seed(seed)

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from .. import files
 from ..errors import LumigraphError
-from ..progress import clock
+from ..progress import clock, counting
 from .cell import Cell, Settings, claim, evaluation, training
 from .launch import STOPPED, Launch, launch, reason
 from .pictures import draw_charts, draw_views
@@ -34,7 +34,9 @@ def conduct(
         todo = [one for one in cells[number - 1 :] if unfinished(one, output, settings)]
         if cell in todo:
             tell(f"{number} of {len(cells)}: {cell.title}; {patience.left(todo)}")
-        begin, (code, failure) = time.monotonic(), carry_out(cell, output, settings, launch)
+        begin = time.monotonic()
+        with counting(cell.title):
+            code, failure = carry_out(cell, output, settings, launch)
         if code in STOPPED:
             return code
         if cell in todo and not failure:
