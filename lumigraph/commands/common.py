@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import shlex
 import sys
 from collections.abc import Mapping
 from pathlib import Path
@@ -87,6 +88,11 @@ def show(rows: Mapping[str, str | Text]) -> None:
     out, width = console(soft_wrap=True), max(map(len, rows))
     for name, value in rows.items():
         out.print(dim(f"{name:<{width}}") + "  " + value)
+
+
+def typed(*words: object) -> str:
+    """A command to go on with, as a shell understands it whatever names are in it."""
+    return shlex.join(["lumigraph", *map(str, words)])
 
 
 def next_free(prefix: str) -> Path:

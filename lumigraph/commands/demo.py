@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Annotated
 
 from ..console import bold
-from .common import budget_of, check_film, choose_device, exit_code, next_free, option, say, show
+from .common import budget_of, check_film, choose_device, exit_code, next_free, option, say, show, typed
 
 FRAMES = 90
 
@@ -55,7 +55,7 @@ class Demo:
         run = Run.create(output, method, data, budget=budget)
         outcome = fit(method, data, run, **budget)
         if outcome.signal is not None:
-            say(f"Stopped and saved after step {outcome.state.step}; go on with: lumigraph resume {run.folder}")
+            say(f"Stopped and saved after step {outcome.state.step}; go on with: {typed('resume', run.folder)}")
             return exit_code(outcome.signal)
         result = evaluate_run(run, method, data)
         orbit = run.folder / "renders" / "orbit.mp4"
