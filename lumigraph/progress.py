@@ -69,7 +69,7 @@ class Stage:
         self._over.set()
         self._watcher.join()
         if self._told and well:
-            tell(f"{self.description}: done in {clock(self.seconds)}")
+            tell(f"{self.description}: took {clock(self.seconds)}")
 
     @property
     def seconds(self) -> float:

@@ -31,7 +31,7 @@ def test_a_log_hears_of_work_before_its_first_item_is_done(hurried, capsys):
     lines = capsys.readouterr().err.splitlines()
     assert lines[0] == "Comparing [views] {x}: 0 of 2"
     assert re.fullmatch(r"Comparing \[views\] \{x\}: 1 of 2, 50 %, about 0:0\d left", lines[-2])
-    assert lines[-1] == "Comparing [views] {x}: done in 0:00"
+    assert lines[-1] == "Comparing [views] {x}: took 0:00"
     assert 4 <= len(lines) <= 12  # ever more rarely
 
 

@@ -8,6 +8,7 @@ from pathlib import Path
 
 from .. import files
 from ..errors import LumigraphError
+from ..locks import held
 from ..progress import clock, counting
 from .cell import Cell, Settings, claim, evaluation, training
 from .launch import STOPPED, Launch, launch, reason
@@ -29,6 +30,14 @@ def conduct(
     says why. tell: hears which cell is next. Returns the signal's exit code if one stopped it, otherwise 0.
     """
     claim(output, cells, settings)
+    with held(output, "worked in"):
+        return carry_on(cells, settings, output, tell, launch)
+
+
+def carry_on(
+    cells: Sequence[Cell], settings: Settings, output: Path, tell: Callable[[str], object], launch: Launch
+) -> int:
+    """All cells, one after the other, in a folder that is ours alone."""
     rows, patience = read_rows(output), Patience()
     for number, cell in enumerate(cells, 1):
         todo = [one for one in cells[number - 1 :] if unfinished(one, output, settings)]
