@@ -91,7 +91,7 @@ class Stage:
         columns = counts if self.total else (TimeElapsedColumn(),)
         name = TextColumn("{task.description}", "bold", markup=False)
         with Progress(name, *columns, console=console(True), transient=True) as bar:
-            task = bar.add_task(self.description, total=self.total)
+            task = bar.add_task(self.description, total=self.total, completed=self.count)
             while not self._over.wait(0.1):
                 bar.update(task, completed=self.count)
 

@@ -82,9 +82,10 @@ def test_a_run_begins_where_only_a_dead_lock_lies(tmp_path):
     assert tiny.new_run(tmp_path).folder == tmp_path
 
 
-def test_two_captures_into_one_folder(ball_folder, tmp_path):
-    photographs = ball_folder / "train"
-    (tmp_path / "work").mkdir()
-    (tmp_path / "work" / "sources.json").write_text(f'["{photographs.resolve()}"]')
-    with somebody(tmp_path / "work"), pytest.raises(LumigraphError, match="is being worked in by process"):
-        reconstruct([photographs], tmp_path)
+def test_two_captures_into_one_folder(tmp_path):
+    photographs, scene = tmp_path / "photographs", tmp_path / "scene"
+    photographs.mkdir()
+    (scene / "work").mkdir(parents=True)
+    (scene / "work" / "sources.json").write_text(f'["{photographs.resolve()}"]')
+    with somebody(scene / "work"), pytest.raises(LumigraphError, match="is being worked in by process"):
+        reconstruct([photographs], scene)
