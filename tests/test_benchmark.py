@@ -23,7 +23,7 @@ from lumigraph.benchmark.published import FIGURES, published
 from lumigraph.cli import main
 from lumigraph.errors import LumigraphError
 from lumigraph.run import Run
-from lumigraph.train import Budget
+from lumigraph.budget import Budget
 
 SETTINGS = Settings(device="cpu", eval_views=2)
 

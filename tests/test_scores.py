@@ -14,6 +14,7 @@ import tiny_shapes
 import torch
 
 from lumigraph import methods
+from lumigraph.budget import Budget
 from lumigraph.benchmark.cell import Cell, Settings
 from lumigraph.benchmark.conduct import conduct
 from lumigraph.benchmark.table import markdown
@@ -25,7 +26,7 @@ from lumigraph.metrics.surfaces import chamfer_distance, intersection_over_union
 from lumigraph.report import write_report
 from lumigraph.run import Run, build
 from lumigraph.shapes import Shapes
-from lumigraph.train import Budget, fit
+from lumigraph.train import fit
 from lumigraph.viewer.training_panel import describe, measure_of
 
 CPU = torch.device("cpu")

@@ -13,6 +13,9 @@ from .common import choose_device, needed, option, show
 from .controls import Set, tell
 
 
+MEMORISED = 4.0  # dB by which photographs learnt from are better than held-out ones, from which on they are remembered
+
+
 @dataclass(frozen=True)
 class Eval:
     """Compare a run with photographs that it has not seen, or its surface with the shapes that it learnt.
@@ -43,6 +46,8 @@ class Eval:
         from ..evaluate import evaluate_run, stem
         from ..metrics import scores_of
         from ..run import Run
+        from ..verdict import psnr_trend
+        from .outcome import next_commands
 
         run, lpips = Run(self.run_folder), chosen_lpips(self.lpips)
         method = tell(run, run.method(choose_device(self.device)), self.told)
@@ -52,8 +57,22 @@ class Eval:
         for size, part in result.get("by_resolution", {}).items():
             rows[size] = f"{', '.join(f'{x.name} {x}' for x in scores_of(part))}, {part['views']} views"
         name = run.folder / stem(self.split)
-        show(rows | compared(result) | {"files": f"{name}.json, {name}.png"})
+        rows |= compared(result) | {"files": f"{name}.json, {name}.png"}
+        trend = psnr_trend(run.metrics())
+        if trend and self.split != "train" and "psnr" in result:
+            rows["photographs learnt from"] = beside_training(trend, result["psnr"])
+        show(rows | next_commands(run, "eval"))
         return 0
+
+
+def beside_training(trend: Any, psnr: float) -> str:
+    """The PSNR of the photographs learnt from, beside that of others, and what a gap means."""
+    told = f"{trend.last:.2f} dB while training"
+    if trend.last - psnr > MEMORISED:
+        told += (
+            f", {trend.last - psnr:.1f} dB better: it knows them by heart; more photographs would help more than time"
+        )
+    return told
 
 
 def chosen_lpips(given: Sequence[Path]) -> Any:

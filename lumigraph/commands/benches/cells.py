@@ -48,9 +48,9 @@ class Cells:
     ) -> int:
         """Train and compare everything with everything. views: numbers of photographs by the scene's source."""
         from ...benchmark.cell import Cell, Settings
+        from ...budget import Budget
         from ...benchmark.conduct import conduct
         from ...metrics.lpips import load_lpips, named_files
-        from ...train import Budget
 
         if seconds and steps:
             raise LumigraphError("--steps and --seconds are two ways to say how long; give one of them")
