@@ -1,4 +1,4 @@
-"""What is said ahead of the first step: what there is to learn from, what begins to learn, on which machine, how long."""
+"""What is said ahead of the first step: what is learnt from, what learns, on which machine, and how long."""
 
 from __future__ import annotations
 

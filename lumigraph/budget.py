@@ -8,8 +8,8 @@ from typing import Any
 
 from .errors import LumigraphError
 
-# Where schedules go on, at the earliest, once a run is extended. Coarse beginnings (small photographs, few cells, warm-up)
-# lie before it in every method, and are not repeated on what has become fine.
+# Where schedules go on, at the earliest, once a run is extended. Coarse beginnings (small photographs, few cells,
+# warm-up) lie before it in every method, and are not repeated on what has become fine.
 REJOIN = 0.3
 
 

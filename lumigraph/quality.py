@@ -27,7 +27,7 @@ class Effort:
     at_least: int
 
     def steps(self, steps_per_pass: float) -> int:
-        """Steps in all. steps_per_pass: after how many of them everything was seen once; see `Method.steps_per_pass`."""
+        """Steps in all. steps_per_pass: after how many everything was seen once, see `Method.steps_per_pass`."""
         return max(self.at_least, round(self.passes * steps_per_pass))
 
 

@@ -107,7 +107,7 @@ def fit(
             run.restore_training(optimizers, generator)
             run.forget_after(state.step)
         method.train()
-        share_seen, passes = shares_seen(data), state.passes
+        share_seen, passes, losses = shares_seen(data), state.passes, list[float]()
         clock, step, watched = Clock(state.seconds), state.step, 0.0
         if step == 0:
             method.begin(data)
@@ -146,10 +146,13 @@ def fit(
             method.after_step(step)
             step += 1
             passes += share_seen(batch)
-            row = record(step, clock.seconds, terms, method) if logged or display.due else {}
+            losses.append(sum(value.item() for value in terms.values()))
+            row = record(step, clock.seconds, terms, method, losses, passes) if logged or display.due else {}
             display.update(step, clock.seconds, budget, batch, row)
             if watch:
                 watch.note(step, progress, row)
+            if logged:
+                losses.clear()
             if run and logged:
                 run.log(row | {"learning_rate": [g["lr"] for o in optimizers for g in o.param_groups if "lr" in g]})
             if clock.seconds >= next_save and spent() < 1:  # the last save comes after
@@ -198,17 +201,20 @@ class Descent:
             optimizer.step()
 
 
-def record(step: int, seconds: float, terms: dict[str, Tensor], method: Method) -> dict[str, Any]:
+def record(
+    step: int, seconds: float, terms: dict[str, Tensor], method: Method, losses: Sequence[float], passes: float
+) -> dict[str, Any]:
     """A line of metrics.jsonl: the loss and its terms, the method's figures, and the PSNR of what the step learnt from
-    where the method reports a squared error of colours."""
-    losses = {name: value.item() for name, value in terms.items()}
+    where the method reports a squared error of colours; the mean loss since the line before, and how often everything
+    was learnt from by now."""
+    own = {name: value.item() for name, value in terms.items()}
     statistics = {name: float(value) for name, value in method.statistics().items()}
     row: dict[str, Any] = {"step": step, "seconds": round(seconds, 4)}
-    if losses:
-        row["loss"] = sum(losses.values())
+    if own:
+        row |= {"loss": sum(own.values()), "mean_loss": sum(losses) / len(losses), "passes": round(passes, 6)}
     if "mse" in statistics:
         row["psnr"] = -10 * math.log10(max(statistics["mse"], DARKEST_ERROR))
-    return row | {"terms": losses, "statistics": statistics}
+    return row | {"terms": own, "statistics": statistics}
 
 
 def set_learning_rate(optimizers: Iterable[torch.optim.Optimizer], rate: float | dict[str, float] | None) -> None:

@@ -1,4 +1,4 @@
-"""Verdict: what training has come to, measured, and what would help most now."""
+"""Verdict: what training has come to, measured: how often everything was seen, and whether it still got better."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from .dataset import Dataset
 from .method import Lesson
 from .scene import Photograph, Scene
 
-FEW = 8  # lines of metrics.jsonl in a third of training, below which nothing is said of its trend
-RISING = 0.3  # dB over the last third of training from which on it is still rising
-DEVIATIONS = 2.0  # of its own error that a rise must exceed
+STRETCHES = 4, 30  # at least and at most, that the second half of training is divided into; fewer tell nothing
+FALLING = 0.05  # share of the loss, over the second half, from which on it still falls
+DEVIATIONS = 2.0  # of its own error that a fall must exceed
 
 
 def shares_seen(data: Dataset) -> Callable[[Lesson], float]:
@@ -27,36 +27,48 @@ def shares_seen(data: Dataset) -> Callable[[Lesson], float]:
 
 @dataclass(frozen=True)
 class Trend:
-    """How a figure moved over the last third of training.
+    """How the loss moved over the second half of training.
 
-    last:  its mean there
-    rise:  from the third's beginning to its end, along the straight line that fits it best
-    error: one standard deviation of that rise
+    fall:  from the half's beginning to its end, as a share of the loss; negative where it rose
+    error: one standard deviation of that
     """
 
-    last: float
-    rise: float
+    fall: float
     error: float
 
     @property
-    def rising(self) -> bool:
-        return self.rise > max(RISING, DEVIATIONS * self.error)
+    def falling(self) -> bool:
+        return self.fall > max(FALLING, DEVIATIONS * self.error)
 
 
-def psnr_trend(rows: Sequence[dict[str, Any]]) -> Trend | None:
-    """How the PSNR of training photographs moved, in dB, by the lines of metrics.jsonl; None where there are too few.
+def loss_trend(rows: Sequence[dict[str, Any]], by_photograph: bool) -> Trend | None:
+    """How the loss moved, by the lines of metrics.jsonl; None where they are too few to tell.
 
-    Over steps, by least squares. Neighbouring lines show other photographs, so their scatter around the line is taken
-    for noise, from which the error of its slope follows.
+    A straight line through its logarithm, by least squares; the scatter around it tells the error. Some photographs are
+    harder than others: where a step learns from one (by_photograph), points on the line are means over at least a whole
+    pass, in which each photograph has its turn once, so that only what was learnt is left.
     """
-    found = [(row["step"], row["psnr"]) for row in rows if "psnr" in row]
-    last = found and [(step, psnr) for step, psnr in found if step > 2 / 3 * found[-1][0]]
-    if not last or len(last) < FEW:
+    found = [row for row in rows if "mean_loss" in row]
+    half = [row for row in found if row["step"] > found[-1]["step"] / 2]
+    least, most = STRETCHES
+    passes = int(half[-1]["passes"] - half[0]["passes"]) if half and by_photograph else most
+    stretches = min(len(half), passes, most)
+    if stretches < least:
         return None
-    step, psnr = np.array(last, np.float64).T
-    length = step[-1] - step[0]
-    offset = step - step.mean()
-    slope = (offset @ psnr) / (offset @ offset)
-    scatter = psnr - psnr.mean() - slope * offset
-    variance = (scatter @ scatter) / (len(step) - 2) / (offset @ offset)
-    return Trend(float(psnr.mean()), float(slope * length), float(math.sqrt(variance) * length))
+    parts = np.array_split(np.array([(row["step"], row["mean_loss"]) for row in half], np.float64), stretches)
+    step, loss = np.array([part.mean(0) for part in parts]).T
+    if not (loss > 0).all():
+        return None
+    log, offset, length = np.log(loss), step - step.mean(), half[-1]["step"] - half[0]["step"]
+    slope = (offset @ log) / (offset @ offset)
+    scatter = log - log.mean() - slope * offset
+    deviation = math.sqrt((scatter @ scatter) / (stretches - 2) / (offset @ offset))
+    return Trend(1 - math.exp(slope * length), deviation * length)
+
+
+def last_psnr(rows: Sequence[dict[str, Any]]) -> float | None:
+    """The PSNR of training photographs at the end, in dB: of the mean squared error over the last quarter of training.
+    None where nothing was recorded."""
+    found = [(row["step"], row["psnr"]) for row in rows if "psnr" in row]
+    last = [10 ** (-psnr / 10) for step, psnr in found if step > 3 / 4 * found[-1][0]]
+    return -10 * math.log10(sum(last) / len(last)) if last else None

@@ -14,10 +14,10 @@ import tiny_shapes
 import torch
 
 from lumigraph import methods
-from lumigraph.budget import Budget
 from lumigraph.benchmark.cell import Cell, Settings
 from lumigraph.benchmark.conduct import conduct
 from lumigraph.benchmark.table import markdown
+from lumigraph.budget import Budget
 from lumigraph.cli import main
 from lumigraph.errors import LumigraphError
 from lumigraph.evaluate import evaluate, evaluate_collection, evaluate_on, evaluate_run, evaluate_shapes

@@ -210,7 +210,7 @@ def test_lines_and_previews_tell_the_steps_once(tmp_path):
     train(Run(run.folder), steps=40)
     rows = run.metrics()
     assert [row["step"] for row in rows] == [10, 20, 30, 40]
-    assert {"seconds", "loss", "terms", "psnr", "statistics", "learning_rate"} <= rows[-1].keys()
+    assert {"seconds", "loss", "terms", "psnr", "statistics", "learning_rate", "mean_loss", "passes"} <= rows[-1].keys()
     assert set(rows[-1]["terms"]) == {"colour", "thin"}
     assert [row["seconds"] for row in rows] == sorted(row["seconds"] for row in rows)
     assert rows[-1]["learning_rate"][0] == pytest.approx(0.1 * 0.1 ** (39 / 40))

@@ -13,49 +13,63 @@ from lumigraph.commands.eval import beside_training
 from lumigraph.commands.outcome import advice, more_time, next_commands, photographed, seen
 from lumigraph.run import Run, build
 from lumigraph.train import fit
-from lumigraph.verdict import Trend, psnr_trend
+from lumigraph.verdict import Trend, last_psnr, loss_trend
 
-FLAT = Trend(25.0, 0.05, 0.01)
-RISING = Trend(25.0, 1.5, 0.2)
-
-
-def rows(psnr):
-    return [{"step": 10 * (i + 1), "psnr": float(x)} for i, x in enumerate(psnr)]
+FLAT, FALLING = Trend(0.01, 0.01), Trend(0.3, 0.02)
 
 
-def noisy(rise: float, deviation: float, count: int = 300) -> list[dict]:
-    """Lines whose PSNR rises by so much over their last third, scattered as photographs of one capture are."""
-    noise = np.random.default_rng(0).normal(0, deviation, count)
-    return rows(20 + 3 * rise * np.arange(count) / (count - 1) + noise)
+def lines(fall: float, scatter: float, photographs: int = 20, passes: int = 40) -> list[dict]:
+    """Lines of ten steps, each from one photograph. The loss falls by such a share over the second half of them; some
+    photographs are harder than others by `scatter`, and each has its turn once in every pass."""
+    random = np.random.default_rng(0)
+    hard = np.exp(random.normal(0, scatter, photographs))
+    order = np.concatenate([random.permutation(photographs) for _ in range(passes)])
+    steps = len(order)
+    loss = hard[order] * (1 - fall) ** (2 * np.arange(steps) / steps) * 0.1
+    return [
+        {"step": step, "mean_loss": float(loss[step - 10 : step].mean()), "passes": step / photographs}
+        for step in range(10, steps + 1, 10)
+    ]
 
 
 def test_a_line_is_measured_exactly():
-    trend = psnr_trend(noisy(1.5, 0.0, 301))
-    assert trend.rise == pytest.approx(1.5, rel=0.02) and trend.error < 1e-9 and trend.rising
-    assert trend.last == pytest.approx(20 + 4.5 * 5 / 6, rel=0.01)
+    trend = loss_trend(lines(0.2, 0.0), by_photograph=False)
+    assert trend.fall == pytest.approx(0.2, abs=0.01) and trend.error < 1e-3 and trend.falling
 
 
 @pytest.mark.parametrize(
-    ("rise", "deviation", "rising"), [(2.0, 1.5, True), (0.0, 1.5, False), (0.1, 0.0, False), (-2.0, 1.5, False)]
+    ("fall", "falling"), [(0.15, True), (0.0, False), (0.02, False), (-0.2, False)], ids=["much", "no", "little", "up"]
 )
-def test_noise_is_not_taken_for_a_trend_nor_a_trend_for_noise(rise, deviation, rising):
-    trend = psnr_trend(noisy(rise, deviation))
-    assert trend.rising is rising and trend.rise == pytest.approx(rise, abs=3 * trend.error + 0.02)
+def test_hard_photographs_are_not_taken_for_a_trend_nor_hide_one(fall, falling):
+    trend = loss_trend(lines(fall, scatter=0.5), by_photograph=True)
+    assert trend.falling is falling and trend.fall == pytest.approx(fall, abs=0.03)
+
+
+def test_noise_of_rays_is_not_taken_for_a_trend():
+    trend = loss_trend(lines(0.06, scatter=1.5, photographs=800, passes=1), by_photograph=False)
+    assert trend.error > 0.06 and not trend.falling
 
 
 def test_too_few_lines_say_nothing():
-    assert psnr_trend([]) is None and psnr_trend(rows([20.0] * 20)) is None
-    assert psnr_trend([{"step": step, "loss": 1.0} for step in range(99)]) is None
+    assert loss_trend([], False) is None and loss_trend(lines(0.2, 0.0)[:6], False) is None
+    assert loss_trend(lines(0.2, 0.5, passes=7), by_photograph=True) is None  # three whole passes
+    assert loss_trend([{"step": step, "loss": 1.0} for step in range(99)], False) is None  # as older runs have them
 
 
-def test_a_run_cut_short_rises_and_one_that_had_its_time_has_settled(tmp_path):
-    """Of one method on one scene: a few steps at a low rate, and many that end where nothing is left to learn."""
+def test_the_last_psnr_is_that_of_the_mean_error():
+    rows = [{"step": step, "psnr": 20.0 if step % 2 else 10.0} for step in range(81)]
+    assert last_psnr(rows) == pytest.approx(-10 * np.log10((0.1 + 0.01) / 2), abs=0.2)
+    assert last_psnr([{"step": 10, "loss": 1.0}]) is None
+
+
+def test_a_run_cut_short_was_falling_and_one_that_learns_nothing_has_settled(tmp_path):
+    """Of one method on one scene, which is cut short at a tenth of its budget or hardly moves."""
     found = []
-    for steps, rate in ((60, 0.004), (400, 0.1)):
-        run = tiny.new_run(tmp_path / str(steps), learning_rate=rate)
-        fit(run.new_method(), tiny.scene(), run, steps=steps, log_every=1, show=False)
-        found.append(psnr_trend(run.metrics()))
-    assert [trend.rising for trend in found] == [True, False] and found[1].last > found[0].last + 5
+    for rate in (0.02, 1e-6):
+        run = tiny.new_run(tmp_path / str(rate), learning_rate=rate, rays=1024)
+        fit(run.new_method(), tiny.scene(), run, steps=600, pause_at=60, log_every=2, show=False, rehearsal=False)
+        found.append(loss_trend(run.metrics(), by_photograph=False).falling)
+    assert found == [True, False]
 
 
 def test_how_often_everything_was_seen_is_counted_over_all_sittings(tmp_path):
@@ -76,7 +90,7 @@ def test_how_often_in_words():
 
 def test_advice_follows_what_was_measured():
     more = "lumigraph resume runs/x --seconds 600"
-    assert advice(RISING, True, more, True) == f"it was still getting better, so more time will help: {more}"
+    assert advice(FALLING, True, more, True) == f"it was still getting better, so more time will help: {more}"
     assert "fewer steps than a draft" in advice(FLAT, False, more, True) and more in advice(None, False, more, True)
     assert advice(FLAT, True, more, True) == "it has settled; more photographs would help more than time"
     assert "photographs" not in advice(FLAT, True, more, False) and more not in advice(FLAT, True, more, False)
@@ -110,5 +124,4 @@ def test_next_commands_name_the_run(tmp_path):
 
 
 def test_what_is_known_by_heart_is_said():
-    assert "by heart" in beside_training(FLAT, 19.0) and "by heart" not in beside_training(FLAT, 24.0)
-    assert beside_training(FLAT, 24.0) == "25.00 dB while training"
+    assert "by heart" in beside_training(25.0, 19.0) and beside_training(25.0, 24.0) == "25.00 dB while training"

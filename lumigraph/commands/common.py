@@ -24,7 +24,7 @@ else:
 
 
 def option(metavar: str, default: str | None = None, about: str | None = None) -> Any:
-    """How an option looks in --help: what to put there, what happens without it, and a text other than its docstring."""
+    """How an option looks in --help: what to put there, what happens without it, what it is about."""
     return tyro.conf.arg(metavar=metavar, help_behavior_hint=default and f"(default: {default})", help=about)
 
 

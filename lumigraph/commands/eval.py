@@ -12,7 +12,6 @@ from tyro.conf import Positional
 from .common import choose_device, needed, option, show
 from .controls import Set, tell
 
-
 MEMORISED = 4.0  # dB by which photographs learnt from are better than held-out ones, from which on they are remembered
 
 
@@ -46,7 +45,7 @@ class Eval:
         from ..evaluate import evaluate_run, stem
         from ..metrics import scores_of
         from ..run import Run
-        from ..verdict import psnr_trend
+        from ..verdict import last_psnr
         from .outcome import next_commands
 
         run, lpips = Run(self.run_folder), chosen_lpips(self.lpips)
@@ -58,20 +57,18 @@ class Eval:
             rows[size] = f"{', '.join(f'{x.name} {x}' for x in scores_of(part))}, {part['views']} views"
         name = run.folder / stem(self.split)
         rows |= compared(result) | {"files": f"{name}.json, {name}.png"}
-        trend = psnr_trend(run.metrics())
-        if trend and self.split != "train" and "psnr" in result:
-            rows["photographs learnt from"] = beside_training(trend, result["psnr"])
+        learnt = last_psnr(run.metrics())
+        if learnt is not None and self.split != "train" and "psnr" in result:
+            rows["photographs learnt from"] = beside_training(learnt, result["psnr"])
         show(rows | next_commands(run, "eval"))
         return 0
 
 
-def beside_training(trend: Any, psnr: float) -> str:
+def beside_training(learnt: float, psnr: float) -> str:
     """The PSNR of the photographs learnt from, beside that of others, and what a gap means."""
-    told = f"{trend.last:.2f} dB while training"
-    if trend.last - psnr > MEMORISED:
-        told += (
-            f", {trend.last - psnr:.1f} dB better: it knows them by heart; more photographs would help more than time"
-        )
+    told, better = f"{learnt:.2f} dB while training", learnt - psnr
+    if better > MEMORISED:
+        told += f", {better:.1f} dB better: it knows them by heart, so more photographs would help more than time"
     return told
 
 

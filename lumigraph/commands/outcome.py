@@ -22,21 +22,25 @@ NEXT = {
 
 def tell_outcome(run: Any, outcome: Any, method: Method, data: Any) -> None:
     """Where a Run is after an Outcome, and how to go on."""
-    from ..verdict import psnr_trend
+    from ..verdict import last_psnr, loss_trend
 
     state, budget = outcome.state, Budget.from_json(run.settings.budget)
     besides = f"{state.compile_seconds:.1f} s compiling, {outcome.saving_seconds:.1f} s saving"
     rows = {"run": str(run.folder), "training": f"{state.step} steps in {state.seconds:.1f} s (besides: {besides})"}
+    by_photograph = not isinstance(method, RayMethod)
     if state.passes:
-        rows["seen"] = seen(state.passes, "pixel" if isinstance(method, RayMethod) else "photograph")
+        rows["seen"] = seen(state.passes, "photograph" if by_photograph else "pixel")
     if not outcome.finished:
         say(f"Stopped and saved after step {state.step}; go on with: lumigraph resume {run.folder}")
         show(rows)
         return
-    trend = psnr_trend(run.metrics())
+    metrics = run.metrics()
+    trend, psnr = loss_trend(metrics, by_photograph), last_psnr(metrics)
+    if psnr is not None:
+        rows["PSNR of training photographs"] = f"{psnr:.2f} dB"
     if trend:
-        how = f"rose by {trend.rise:.1f} dB" if trend.rising else "did not rise any more"
-        rows["PSNR of training photographs"] = f"{trend.last:.2f} dB in the last third, over which it {how}"
+        how = f"fell by {100 * trend.fall:.0f} %" if trend.falling else "did not fall any more"
+        rows["loss"] = f"{how} over the second half of training"
     enough = state.step >= method.steps_for("draft", data)
     rows["advice"] = advice(trend, enough, more_time(run.folder, budget), photographed(run, data))
     show(rows | next_commands(run))
@@ -52,18 +56,20 @@ def seen(passes: float, what: str) -> str:
 def advice(trend: Any, enough: bool, more: str, photographed: bool) -> str:
     """What would help most, in one sentence.
 
-    trend:  of the PSNR of training photographs, see `verdict.psnr_trend`
+    trend:  of the loss, see `verdict.loss_trend`
     enough: whether there were as many steps as a draft has
     more:   the command that trains for longer
     photographed: whether photographs could be added
     """
-    if trend and trend.rising:
+    if trend and trend.falling:
         return f"it was still getting better, so more time will help: {more}"
     if not enough:
         return f"it has had fewer steps than a draft needs, so more time will help: {more}"
     if trend is None:
         return f"whether more time would help cannot be told; to try: {more}"
-    return f"it has settled; {'more photographs would help more than time' if photographed else 'more time will change little'}"
+    return "it has settled; " + (
+        "more photographs would help more than time" if photographed else "time changes little"
+    )
 
 
 def photographed(run: Any, data: Any) -> bool:

@@ -21,9 +21,7 @@ from .common import (
     next_free,
     option,
     quality_budget,
-    say,
     scene_name,
-    show,
     told_budget,
 )
 

@@ -87,8 +87,8 @@ class Run(Opened):
         settings.write(folder / "config.json")  # last: a folder with it is a run
         return cls(folder)
 
-    def set_budget(self, **budget: float) -> None:
-        """Remember another total of steps or seconds."""
+    def set_budget(self, **budget: Any) -> None:
+        """Remember another budget, as `Budget.to_json` says it."""
         self.settings = self.settings.with_budget(**budget)
         self.settings.write(self._config)
 

@@ -48,8 +48,8 @@ class Cells:
     ) -> int:
         """Train and compare everything with everything. views: numbers of photographs by the scene's source."""
         from ...benchmark.cell import Cell, Settings
-        from ...budget import Budget
         from ...benchmark.conduct import conduct
+        from ...budget import Budget
         from ...metrics.lpips import load_lpips, named_files
 
         if seconds and steps:
