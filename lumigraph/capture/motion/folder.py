@@ -10,11 +10,11 @@ from typing import Any
 
 import numpy as np
 import plyfile
-import pycolmap
 from PIL import Image
 
 from ...errors import LumigraphError
 from ...files import PARTIAL, read_json, remove, replacing, write_json
+from ..library import pycolmap
 from ..masks import MASKS as MASKS
 from ..photos import Photo
 from ..photos.track import Track
