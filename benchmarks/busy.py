@@ -5,7 +5,8 @@
 Starts and ends the busy programs itself. Ways of waiting take turns, so that whatever else happens on the machine meets
 all of them: ours; OpenMP's own, which looks for work for milliseconds; and sleeping at once. `--before` measures
 another checkout of the package too. Training is steps a second at a fixed share of the budget, of clouds that do not
-grow; commands are seconds from start to end, with Python's and PyTorch's own start; of the demo, seconds beside its training.
+grow; commands are seconds from start to end, with Python's and PyTorch's own start; of the demo, those beside its
+training.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ import contextlib
 import dataclasses
 import json
 import os
+import signal
 import statistics
 import subprocess
 import sys
@@ -56,6 +58,7 @@ Measure = Callable[[str], float]
 
 
 def main(options: Options) -> None:
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # ends what was started
     if options.quick:
         options = dataclasses.replace(options, rounds=1, work=tuple(w for w in options.work if w != "demo"))
     ways = environments(options)
@@ -69,7 +72,7 @@ def main(options: Options) -> None:
                     )
         runs = {m: trained(m, options.scene, Path(folder)) for m in WARM_UP if {"eval", "mesh"} & {*options.work}}
         commands = {
-            "eval": lambda: ["eval", runs["instant-ngp"], "--views", "8"],
+            "eval": lambda: ["eval", runs["instant-ngp"], "--views", "4"],
             "mesh": lambda: ["export", "mesh", runs["gaussian-splatting"], f"{folder}/{time.time_ns()}.ply"],
             "demo": lambda: [
                 "demo",
@@ -108,14 +111,16 @@ def in_turn(options: Options, ways: dict[str, dict[str, str]], measure: Measure)
         for busy in (0, options.beside):
             with busy_programs(busy):
                 for way in list(ways)[:: 1 if turn % 2 == 0 else -1]:
-                    (found[way].beside if busy else found[way].alone).append(measure(way))
+                    (found[way].beside if busy else found[way].alone).append(figure := measure(way))
+                    print(f"round {turn + 1}, beside {busy}, {way}: {figure:.1f}", file=sys.stderr, flush=True)
     return found
 
 
 @contextlib.contextmanager
 def busy_programs(count: int) -> Iterator[None]:
-    """So many processes that do nothing but keep a processor busy, of the same priority as this one."""
-    programs = [subprocess.Popen([sys.executable, "-S", "-c", "while True: pass"]) for _ in range(count)]
+    """So many processes that keep a processor busy for as long as this one lives, with the same priority."""
+    program = f"import os\nwhile os.getppid() == {os.getpid()}: pass"
+    programs = [subprocess.Popen([sys.executable, "-S", "-c", program]) for _ in range(count)]
     try:
         yield
     finally:

@@ -1,9 +1,9 @@
 """Threads: how those that share a loop wait for each other. Settled before PyTorch and Numba load what runs them.
 
-GNU's OpenMP lets a thread that has nothing to do look for work 300 000 times before it sleeps: some milliseconds. Alone on
-the machine that saves waking it, of which a training step has dozens. Beside other programs a thread that looks keeps
-the processor from the one that it waits for. Waiting for about as long as the gaps between the loops of one step last
-is nearly best in both (`benchmarks/busy.py`).
+GNU's OpenMP lets a thread that has nothing to do look for work 300 000 times before it sleeps: some milliseconds. Alone
+on the machine that saves waking it, which a training step would do dozens of times. Beside other programs a thread that
+looks keeps the processor from the one that it waits for. Looking for about as long as the gaps between the loops of a
+step last is nearly best in both (`benchmarks/busy.py`).
 """
 
 from __future__ import annotations
@@ -31,8 +31,8 @@ def settle(environment: MutableMapping[str, str] = os.environ) -> None:
 def share_one_pool() -> None:
     """Have PyTorch and Numba use the same threads, where both run theirs by GNU's OpenMP.
 
-    PyTorch brings a copy of the library, and Numba takes the system's. Two copies keep a set of threads each, which wait
-    beside one another for the same processors. The copy that is loaded first serves both.
+    PyTorch brings a copy of the library, and Numba takes the system's. Each copy keeps threads of its own, and those of
+    one look for work on the processors that the other's need. The copy that is loaded first serves both.
     """
     if sys.platform == "linux" and "torch" not in sys.modules:
         with contextlib.suppress(OSError):  # a system without it: Numba then has threads of another kind
@@ -40,7 +40,7 @@ def share_one_pool() -> None:
 
 
 def told() -> str:
-    """How many threads share the work, and the machine's load in the last minute where others had it too."""
+    """How many threads share the work; and the load of the last minute, where it is more than the processors can do."""
     import torch
 
     count = torch.get_num_threads()
