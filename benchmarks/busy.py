@@ -152,9 +152,9 @@ def learners(method: str, scene: str, ways: dict[str, dict[str, str]]) -> Iterat
 
 def learner(method: str, scene: str) -> None:
     """Train for as many seconds as each line of stdin says, and print steps a second."""
+    from lumigraph import methods  # ahead of PyTorch, as the command line does; isort: skip
     import torch
 
-    from lumigraph import methods
     from lumigraph.capture import open_scene
     from lumigraph.run import build
     from lumigraph.train import Descent, set_learning_rate
