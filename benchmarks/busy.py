@@ -178,11 +178,21 @@ def learner(method: str, scene: str) -> None:
 
     for _ in range(WARM_UP[method]):
         one()
-    for line in sys.stdin:
-        begin, before = time.perf_counter(), step
-        while (passed := time.perf_counter() - begin) < float(line):
-            one()
-        print((step - before) / passed, flush=True)
+    with courtesy():
+        for line in sys.stdin:
+            begin, before = time.perf_counter(), step
+            while (passed := time.perf_counter() - begin) < float(line):
+                one()
+            print((step - before) / passed, flush=True)
+
+
+def courtesy() -> contextlib.AbstractContextManager[None]:
+    """What the command line runs every command in; nothing in a checkout that has none."""
+    try:
+        from lumigraph.threads import considerate
+    except ImportError:
+        return contextlib.nullcontext()
+    return considerate()
 
 
 def trained(method: str, scene: str, folder: Path) -> str:

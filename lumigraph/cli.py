@@ -33,6 +33,7 @@ from .commands.train import Train, with_options_of
 from .commands.view import ViewCommand
 from .errors import LumigraphError, LumigraphWarning
 from .files import refusal
+from .threads import considerate
 
 COMMANDS: dict[str, type] = {
     "demo": Demo,
@@ -65,7 +66,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"lumigraph {__version__}")
         return 0
     try:
-        with told_warnings():
+        with told_warnings(), considerate():
             return parse(arguments).run()
     except LumigraphError as error:
         return refuse(str(error))
