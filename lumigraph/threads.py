@@ -13,15 +13,14 @@ import ctypes
 import os
 import sys
 import threading
-import time
 from collections.abc import Callable, Iterator, MutableMapping
 from pathlib import Path
 
 LOOKS = 40_000  # for work, before a thread sleeps: 0.2 to 2 ms, by processor
 OWN = "OMP_WAIT_POLICY", "GOMP_SPINCOUNT"  # by which users say how threads wait
-EVERY = 0.5  # seconds between looks at what others do
-TAKEN = 0.3  # processors that others may use of those that our threads need
-ALL = Path("/proc/stat")
+EVERY = 0.5  # seconds between looks at how much others hold us up
+MUCH, LITTLE = 0.15, 0.05  # of the time that our threads could run: others have it from here on, and no longer
+TASKS = Path("/proc/self/task")
 
 
 def settle(environment: MutableMapping[str, str] = os.environ) -> None:
@@ -47,15 +46,15 @@ def share_one_pool() -> None:
 
 @contextlib.contextmanager
 def considerate() -> Iterator[None]:
-    """Inside this block threads hardly look for work while other programs use the processors that they need.
+    """Inside this block threads hardly look for work while other programs hold them up.
 
-    Only where Linux tells what others use; a user's own way of waiting stays, which `settle` has not set.
+    Only where Linux tells so; a user's own way of waiting stays.
     """
-    if not ALL.exists() or os.environ.get("GOMP_SPINCOUNT") != str(LOOKS):
+    if not (TASKS / str(os.getpid()) / "schedstat").exists() or os.environ.get("GOMP_SPINCOUNT") != str(LOOKS):
         yield
         return
     over = threading.Event()
-    watch = threading.Thread(target=make_way, args=(over, Others()), name="others", daemon=True)
+    watch = threading.Thread(target=make_way, args=(over, Held()), name="considerate", daemon=True)
     watch.start()
     try:
         yield
@@ -64,42 +63,43 @@ def considerate() -> Iterator[None]:
         watch.join()
 
 
-class Others:
-    """Calling it tells how many processors other processes used since the last call, or since it was made."""
+class Held:
+    """Calling it tells the share of the time that our threads could have run, since the last call or since it was made,
+    in which others had the processor."""
 
     def __init__(self) -> None:
         self._before = self._now()
 
     def __call__(self) -> float:
         now = self._now()
-        clock, all_of_us, ours = (b - a for a, b in zip(self._before, now, strict=True))
+        pairs = [(before, now[name]) for name, before in self._before.items() if name in now]
         self._before = now
-        return max(0.0, all_of_us - ours) / max(clock, 1e-3)
+        ran, waited = (sum(after[i] - before[i] for before, after in pairs) for i in (0, 1))
+        return waited / max(ran + waited, 1)
 
     @staticmethod
-    def _now() -> tuple[float, float, float]:
-        """Seconds: of the clock, of all processors at work, of this process at work."""
-        spent = [int(x) for x in ALL.read_text().partition("\n")[0].split()[1:9]]
-        idle = spent[3] + spent[4]  # waiting for a disk is idle
-        return time.monotonic(), (sum(spent) - idle) / os.sysconf("SC_CLK_TCK"), time.process_time()
+    def _now() -> dict[str, list[int]]:
+        """Nanoseconds that each thread has run, and has waited for a processor."""
+        found = {}
+        for thread in TASKS.iterdir():
+            with contextlib.suppress(OSError):  # a thread that has just ended
+                found[thread.name] = [int(x) for x in (thread / "schedstat").read_text().split()[:2]]
+        return found
 
 
-def make_way(over: threading.Event, others: Callable[[], float]) -> None:
-    """Until it is over: crowd our threads while others use the processors that they need."""
-    stay: threading.Event | None = None
+def make_way(over: threading.Event, held: Callable[[], float]) -> None:
+    """Until it is over: crowd our threads while others hold them up."""
+    leave: threading.Event | None = None
     while not over.wait(EVERY):
-        used, torch = others(), sys.modules.get("torch")
-        if torch is None or not hasattr(torch, "get_num_threads"):  # not loaded yet
-            continue
-        crowded = used > (os.cpu_count() or 1) - torch.get_num_threads() + TAKEN
-        if crowded and stay is None:
-            stay = threading.Event()
-            threading.Thread(target=crowd, args=(stay,), name="crowd", daemon=True).start()
-        elif not crowded and stay is not None:
-            stay.set()
-            stay = None
-    if stay is not None:
-        stay.set()
+        share = held()
+        if leave is None and share > MUCH and "torch" in sys.modules:
+            leave = threading.Event()
+            threading.Thread(target=crowd, args=(leave,), name="crowd", daemon=True).start()
+        elif leave is not None and share < LITTLE:
+            leave.set()
+            leave = None
+    if leave is not None:
+        leave.set()
 
 
 def crowd(leave: threading.Event) -> None:
