@@ -114,7 +114,7 @@ def crowd(leave: threading.Event) -> None:
     thread looks for work a hundred times only (GOMP_SPINCOUNT in the manual of GNU's libgomp)."""
     import torch
 
-    torch.ones(1 << 18).exp_()
+    torch.ones(torch.get_num_threads() << 16).exp_()  # large enough for every thread to have a share
     leave.wait()
 
 
