@@ -7,67 +7,72 @@ from numba import njit, prange
 from .._dispatch import empty
 from . import BEHIND, VARIANCE
 
+BORDER = 3  # zeros around a neighbour: one pixel before, two behind, where two are looked up beside each other
 QUANTITIES = 6  # sums over a window of w, w a, w b, w a a, w b b, w a b
 E, LEAST = np.float32(VARIANCE), np.float32(BEHIND)
 ZERO, HALF, ONE, TINY = np.float32(0), np.float32(0.5), np.float32(1), np.float32(1e-12)
 
 
-@njit(inline="always")
-def _between(flat, at, stride, right, down):
-    """The value between four neighbouring pixels."""
-    above = (ONE - right) * flat[at] + right * flat[at + 1]
-    below = (ONE - right) * flat[at + stride] + right * flat[at + stride + 1]
-    return (ONE - down) * above + down * below
-
-
 @njit(fastmath=True, error_model="numpy")
-def _look_up(a, trust, weights, weighted, rows, stride, warp, h, y, line, margin, length):
-    """What is to be added up along row y. Pictures have a border of zeros: one pixel before, two behind."""
-    width = len(a)
+def _place(warp, h, y, rows, columns, u, v):
+    """Where row y is seen, counted from the centre of a border's first pixel; on the border if nowhere."""
     y = np.float32(y) + HALF
     u0 = warp[0, 1] * y + warp[0, 2] + h * warp[0, 3]
     v0 = warp[1, 1] * y + warp[1, 2] + h * warp[1, 3]
     s0 = warp[2, 1] * y + warp[2, 2] + h * warp[2, 3]
-    right_most, lowest = np.float32(stride - 3), np.float32(rows)
-    for x in range(width):
+    right, bottom = np.float32(columns + 1), np.float32(rows + 1)
+    for x in range(len(u)):
         centre = np.float32(x) + HALF
         s = warp[2, 0] * centre + s0
-        inverse = ONE / (s if s > LEAST else ONE)
-        u = (warp[0, 0] * centre + u0) * inverse + HALF
-        v = (warp[1, 0] * centre + v0) * inverse + HALF
-        u = min(max(u, ZERO), right_most + ONE) if s > LEAST else ZERO
-        v = min(max(v, ZERO), lowest + ONE)
-        column, row = np.int32(u), np.int32(v)
-        at = row * stride + column
-        right, down = u - np.float32(column), v - np.float32(row)
-        seen = _between(weights, at, stride, right, down)
-        its = _between(weighted, at, stride, right, down)  # W b
-        i, t = margin + x, trust[x]
-        line[i] = t * seen
-        line[length + i] = t * seen * a[x]
-        line[2 * length + i] = t * its
-        line[3 * length + i] = t * seen * a[x] * a[x]
-        line[4 * length + i] = t * its * its / max(seen, TINY)
-        line[5 * length + i] = t * its * a[x]
+        inverse = ONE / s if s > LEAST else ZERO
+        u[x] = min(max((warp[0, 0] * centre + u0) * inverse + HALF, ZERO), right) if s > LEAST else ZERO
+        v[x] = min(max((warp[1, 0] * centre + v0) * inverse + HALF, ZERO), bottom)
+
+
+@njit(fastmath=True, error_model="numpy")
+def _look_up(pixels, stride, u, v, seen, its):
+    """Trust, and trusted values, between four neighbouring pixels. Here the compiler finds no vectors."""
+    for x in range(len(u)):
+        column, row = np.int32(u[x]), np.int32(v[x])
+        right, down = u[x] - np.float32(column), v[x] - np.float32(row)
+        a, b = np.uint32(2 * (row * stride + column)), np.uint32(2 * ((row + 1) * stride + column))
+        above, below = (ONE - right) * (ONE - down), (ONE - right) * down
+        above_right, below_right = right * (ONE - down), right * down
+        seen[x] = above * pixels[a] + above_right * pixels[a + 2] + below * pixels[b] + below_right * pixels[b + 2]
+        its[x] = (
+            above * pixels[a + 1] + above_right * pixels[a + 3] + below * pixels[b + 1] + below_right * pixels[b + 3]
+        )
+
+
+@njit(fastmath=True, error_model="numpy")
+def _products(a, trust, seen, its, line, margin, length):
+    for x in range(len(a)):
+        w, wb = trust[x] * seen[x], trust[x] * its[x]
+        line[margin + x] = w
+        line[length + margin + x] = w * a[x]
+        line[2 * length + margin + x] = wb
+        line[3 * length + margin + x] = w * a[x] * a[x]
+        line[4 * length + margin + x] = wb * its[x] / max(seen[x], TINY)
+        line[5 * length + margin + x] = wb * a[x]
 
 
 @njit(fastmath=True, error_model="numpy")
 def _along(line, length, window, sums, width):
     for q in range(QUANTITIES):
         for x in range(width):
-            sums[q * width + x] = line[q * length + x]
-        for k in range(1, window):
-            for x in range(width):
-                sums[q * width + x] += line[q * length + x + k]
+            total = line[q * length + x]
+            for k in range(1, len(window)):
+                total += line[q * length + x + k]
+            sums[q * width + x] = total
 
 
 @njit(fastmath=True, error_model="numpy")
-def _across(ring, total):
+def _across(rings, window, total):
     for i in range(len(total)):
-        total[i] = ring[0, i]
-    for k in range(1, len(ring)):
-        for i in range(len(total)):
-            total[i] += ring[k, i]
+        added = rings[i]
+        for k in range(1, len(window)):
+            added += rings[k * len(total) + i]
+        total[i] = added
 
 
 @njit(fastmath=True, error_model="numpy")
@@ -92,60 +97,54 @@ def _keep_least(cost, least):
             cost[x] = max(c, lower)
 
 
+@njit(fastmath=True, error_model="numpy")
+def _mean(least, out):
+    for x in range(len(out)):
+        total = least[0, x]
+        for k in range(1, len(least)):
+            total += least[k, x]
+        out[x] = total / np.float32(len(least))
+
+
 @njit(parallel=True, fastmath=True, error_model="numpy", cache=True)
-def _sweep(reference, trust, weights, weighted, rows, stride, warps, hypotheses, window, best, out):
+def _sweep(reference, trust, pixels, rows, columns, warps, hypotheses, window, best, out):
     height, width = reference.shape
-    count, margin = len(warps), window // 2
+    count, margin, stride = len(warps), len(window) // 2, columns + BORDER
     length = width + 2 * margin
+    share = ONE / np.float32(len(window) ** 2)
     for plane in prange(len(hypotheses)):
+        u, v, seen, its, cost = np.empty((5, width), np.float32)
         line = np.zeros(QUANTITIES * length, np.float32)
-        rings = np.zeros((count, window, QUANTITIES * width), np.float32)
+        rings = np.zeros((count, len(window) * QUANTITIES * width), np.float32)
         total = np.empty(QUANTITIES * width, np.float32)
-        cost = np.empty(width, np.float32)
         least = np.empty((best, width), np.float32)
         for y in range(height + margin):
             middle = y - margin
             least[:] = np.float32(np.inf)
             for n in range(count):
-                sums = rings[n, y % window]
+                sums = rings[n, y % len(window) * QUANTITIES * width :][: QUANTITIES * width]
                 if y < height:
-                    _look_up(
-                        reference[y],
-                        trust[y],
-                        weights[n],
-                        weighted[n],
-                        rows,
-                        stride,
-                        warps[n],
-                        hypotheses[plane],
-                        y,
-                        line,
-                        margin,
-                        length,
-                    )
+                    _place(warps[n], hypotheses[plane], y, rows, columns, u, v)
+                    _look_up(pixels[n], stride, u, v, seen, its)
+                    _products(reference[y], trust[y], seen, its, line, margin, length)
                     _along(line, length, window, sums, width)
                 else:
                     sums[:] = ZERO
                 if middle >= 0:
-                    _across(rings[n], total)
-                    _cost(total, ONE / np.float32(window * window), cost)
+                    _across(rings[n], window, total)
+                    _cost(total, share, cost)
                     _keep_least(cost, least)
             if middle >= 0:
-                for x in range(width):
-                    added = ZERO
-                    for k in range(best):
-                        added += least[k, x]
-                    out[plane, middle, x] = added / np.float32(best)
+                _mean(least, out[plane, middle])
 
 
 def run(reference, trust, neighbours, neighbour_trust, warps, hypotheses, window, best):
     count, rows, columns = neighbours.shape
-    weights, weighted = (np.zeros((count, rows + 3, columns + 3), np.float32) for _ in range(2))
-    weights[:, 1:-2, 1:-2] = neighbour_trust.numpy()
-    weighted[:, 1:-2, 1:-2] = (neighbour_trust * neighbours).numpy()
+    pixels = np.zeros((count, rows + BORDER, columns + BORDER, 2), np.float32)
+    pixels[:, 1 : rows + 1, 1 : columns + 1, 0] = neighbour_trust.numpy()
+    pixels[:, 1 : rows + 1, 1 : columns + 1, 1] = (neighbour_trust * neighbours).numpy()
     out = empty(len(hypotheses), *reference.shape)
     given = (x.contiguous().numpy() for x in (reference, trust))
-    pictures = (x.reshape(count, -1) for x in (weights, weighted))
     placed = (x.contiguous().numpy() for x in (warps, hypotheses))
-    _sweep(*given, *pictures, rows, columns + 3, *placed, window, best, out.numpy())
+    _sweep(*given, pixels.reshape(count, -1), rows, columns, *placed, (0,) * window, best, out.numpy())
     return out

@@ -4,9 +4,9 @@ By name: the engine, the function, what stands there, and what is put in its pla
 """
 
 FAULTS = {
-    "half a pixel aside": ("cpu", "_look_up", "v0) * inverse + HALF", "v0) * inverse"),
-    "what lies behind is seen": ("cpu", "_look_up", "+ ONE) if s > LEAST else ZERO", "+ ONE)"),
-    "trust forgotten": ("cpu", "_look_up", "t * its * its /", "its * its /"),
+    "half a pixel aside": ("cpu", "_place", "v0) * inverse + HALF", "v0) * inverse"),
+    "what lies behind is seen": ("cpu", "_place", "right) if s > LEAST else ZERO", "right)"),
+    "trust forgotten": ("cpu", "_products", "w, wb = trust[x] * seen[x], trust[x]", "w, wb = trust[x] * seen[x], ONE"),
     "the most instead of the least": ("cpu", "_keep_least", "= max(c, lower)", "= min(c, lower)"),
     "a row of long ago": ("cpu", "_sweep", "sums[:] = ZERO", "pass"),
     "a mean forgotten": ("gpu", "_costs", "- mean_a * mean_b", "- mean_a"),
@@ -16,5 +16,5 @@ FAULTS = {
 
 # These let an index leave its array.
 ASTRAY = {
-    "no border behind": ("cpu", "_look_up", "lowest + ONE)", "lowest + ONE + ONE)"),
+    "no border behind": ("cpu", "_place", "np.float32(rows + 1)", "np.float32(rows + 2)"),
 }
