@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 import sys
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 from rich.console import Console
@@ -49,6 +51,15 @@ class TrainingDisplay:
     def __exit__(self, *fault: object) -> None:
         if self._live:
             self.bar.stop()
+
+    @contextmanager
+    def aside(self) -> Iterator[None]:
+        """Inside this block the bar makes room for that of a stage ahead of the first step."""
+        if self._live:
+            self.bar.stop()
+        yield
+        if self._live:
+            self.bar.start()
 
     def say(self, text: str) -> None:
         """What is going on, ahead of the first step."""

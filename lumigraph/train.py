@@ -104,7 +104,8 @@ def fit(
         method.train()
         clock, step, watched = Clock(state.seconds), state.step, 0.0
         if step == 0:
-            method.begin(data)
+            with display.aside():
+                method.begin(data)
         next_save = clock.seconds + min(FIRST_SAVE, save_every)
 
         def spent(seconds: float | None = None) -> float:
@@ -287,6 +288,8 @@ def rehearse(method: Method, data: Dataset, step: int) -> float:
     begin = time.perf_counter()
     double = copy.deepcopy(method).train()
     optimizers = double.optimizers()
+    if step == 0:
+        double.rehearse_begin()
     set_learning_rate(optimizers, double.learning_rate(step, 0.0))
     double.before_step(step, 0.0)
     batch = double.batch(data, torch.Generator().manual_seed(0))

@@ -14,6 +14,7 @@ from ..blending import over
 from ..camera import Camera
 from ..components.clouds.cloud import Cloud, CloudAdam
 from ..components.clouds.density_control import AdaptiveDensity, MarkovChain
+from ..components.clouds.dense_points import compile_sweep
 from ..components.clouds.initial_cloud import Initialization, initial_cloud, random_cloud
 from ..components.clouds.smoothing import sampling_interval, smoothed
 from ..errors import LumigraphWarning
@@ -142,6 +143,10 @@ class GaussianSplatting(Method):
             densify_grad_threshold=1e-6,
             opacity_reset_interval=5,
         )
+
+    def rehearse_begin(self) -> None:
+        if self.config.initialization == "dense":
+            compile_sweep()
 
     def begin(self, scene: Scene) -> None:
         config = self.config

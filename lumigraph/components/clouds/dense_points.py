@@ -20,11 +20,11 @@ from ...progress import track
 from ...scene import Scene
 from .flat_view import FlatView, flat_view
 
-VIEWS, LONGEST, COARSE = 60, 192, 96  # photographs asked at most; pixels of their longer side, and where none know depth
+VIEWS, LONGEST, COARSE = 48, 160, 80  # photographs asked at most; pixels of their longer side, and where none know depth
 NEIGHBOURS, BEST = 4, 2  # of each photograph, and how many of them must see a place
 ANGLE, NARROWER, WIDER = (math.radians(x) for x in (8.0, 4.0, 8.0))  # at which rays should meet; deviations around it
 ANCHORS = 200  # places by which two views are asked whether they see the same
-FEWEST, MOST = 16, 128  # hypotheses
+FEWEST, MOST = 16, 80  # hypotheses
 NEARER, FARTHER = 0.7, 2.0  # times the depths of known points: the range that is searched
 COST = 0.4  # at most: a correlation of 0.6
 AGREEMENT = 0.02  # of its depth: how far apart two views may find a place
@@ -54,6 +54,12 @@ def dense_points(scene: Scene) -> Points:
         known = swept(small, [everywhere(view, scene) for view in small], "Looking for depth").positions
     ranges = [around(view, known) or everywhere(view, scene) for view in views]
     return thinned(swept(views, ranges, "Sweeping for points"))
+
+
+def compile_sweep() -> None:
+    """Make the kernel ready, on one dark pixel, so that it takes no time of who calls `dense_points`."""
+    dark, warp = torch.zeros(1, 1, 1), torch.eye(3, 4)[None]
+    kernels.plane_sweep(dark[0], dark[0], dark, dark, warp, torch.ones(1), WINDOW, 1)
 
 
 def everywhere(view: FlatView, scene: Scene) -> tuple[float, float]:

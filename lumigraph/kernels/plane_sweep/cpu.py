@@ -20,13 +20,14 @@ def _place(warp, h, y, rows, columns, u, v):
     u0 = warp[0, 1] * y + warp[0, 2] + h * warp[0, 3]
     v0 = warp[1, 1] * y + warp[1, 2] + h * warp[1, 3]
     s0 = warp[2, 1] * y + warp[2, 2] + h * warp[2, 3]
+    across_u, across_v, across_s = warp[0, 0], warp[1, 0], warp[2, 0]
     right, bottom = np.float32(columns + 1), np.float32(rows + 1)
     for x in range(len(u)):
         centre = np.float32(x) + HALF
-        s = warp[2, 0] * centre + s0
+        s = across_s * centre + s0
         inverse = ONE / s if s > LEAST else ZERO
-        u[x] = min(max((warp[0, 0] * centre + u0) * inverse + HALF, ZERO), right) if s > LEAST else ZERO
-        v[x] = min(max((warp[1, 0] * centre + v0) * inverse + HALF, ZERO), bottom)
+        u[x] = min(max((across_u * centre + u0) * inverse + HALF, ZERO), right) if s > LEAST else ZERO
+        v[x] = min(max((across_v * centre + v0) * inverse + HALF, ZERO), bottom)
 
 
 @njit(fastmath=True, error_model="numpy")
@@ -45,46 +46,51 @@ def _look_up(pixels, stride, u, v, seen, its):
 
 
 @njit(fastmath=True, error_model="numpy")
-def _products(a, trust, seen, its, line, margin, length):
+def _products(a, trust, seen, its, line):
+    """What is to be added up: w, w a, w b, w a a, w b b, w a b."""
+    ones, of_a, of_b, of_aa, of_bb, of_ab = line[0], line[1], line[2], line[3], line[4], line[5]
     for x in range(len(a)):
         w, wb = trust[x] * seen[x], trust[x] * its[x]
-        line[margin + x] = w
-        line[length + margin + x] = w * a[x]
-        line[2 * length + margin + x] = wb
-        line[3 * length + margin + x] = w * a[x] * a[x]
-        line[4 * length + margin + x] = wb * its[x] / max(seen[x], TINY)
-        line[5 * length + margin + x] = wb * a[x]
+        ones[x] = w
+        of_a[x] = w * a[x]
+        of_b[x] = wb
+        of_aa[x] = w * a[x] * a[x]
+        of_bb[x] = wb * its[x] / max(seen[x], TINY)
+        of_ab[x] = wb * a[x]
 
 
 @njit(fastmath=True, error_model="numpy")
-def _along(line, length, window, sums, width):
+def _along(line, window, sums):
     for q in range(QUANTITIES):
-        for x in range(width):
-            total = line[q * length + x]
+        values, out = line[q], sums[q]
+        for x in range(len(out)):
+            total = values[x]
             for k in range(1, len(window)):
-                total += line[q * length + x + k]
-            sums[q * width + x] = total
+                total += values[x + k]
+            out[x] = total
 
 
 @njit(fastmath=True, error_model="numpy")
-def _across(rings, window, total):
-    for i in range(len(total)):
-        added = rings[i]
-        for k in range(1, len(window)):
-            added += rings[k * len(total) + i]
-        total[i] = added
+def _across(ring, window, total):
+    for q in range(QUANTITIES):
+        out = total[q]
+        for x in range(len(out)):
+            added = ring[0, q, x]
+            for k in range(1, len(window)):
+                added += ring[k, q, x]
+            out[x] = added
 
 
 @njit(fastmath=True, error_model="numpy")
-def _cost(total, area, cost):
-    width = len(cost)
-    for x in range(width):
-        n = ONE / max(total[x], TINY)
-        mean_a, mean_b = total[width + x] * n, total[2 * width + x] * n
-        variance_a = max(total[3 * width + x] * n - mean_a * mean_a, ZERO) + E
-        variance_b = max(total[4 * width + x] * n - mean_b * mean_b, ZERO) + E
-        covariance = total[5 * width + x] * n - mean_a * mean_b
-        cost[x] = ONE - total[x] * area * covariance / np.sqrt(variance_a * variance_b)
+def _cost(total, share, cost):
+    ones, of_a, of_b, of_aa, of_bb, of_ab = total[0], total[1], total[2], total[3], total[4], total[5]
+    for x in range(len(cost)):
+        n = ONE / max(ones[x], TINY)
+        mean_a, mean_b = of_a[x] * n, of_b[x] * n
+        variance_a = max(of_aa[x] * n - mean_a * mean_a, ZERO) + E
+        variance_b = max(of_bb[x] * n - mean_b * mean_b, ZERO) + E
+        covariance = of_ab[x] * n - mean_a * mean_b
+        cost[x] = ONE - ones[x] * share * covariance / np.sqrt(variance_a * variance_b)
 
 
 @njit(fastmath=True, error_model="numpy")
@@ -110,24 +116,24 @@ def _mean(least, out):
 def _sweep(reference, trust, pixels, rows, columns, warps, hypotheses, window, best, out):
     height, width = reference.shape
     count, margin, stride = len(warps), len(window) // 2, columns + BORDER
-    length = width + 2 * margin
     share = ONE / np.float32(len(window) ** 2)
     for plane in prange(len(hypotheses)):
         u, v, seen, its, cost = np.empty((5, width), np.float32)
-        line = np.zeros(QUANTITIES * length, np.float32)
-        rings = np.zeros((count, len(window) * QUANTITIES * width), np.float32)
-        total = np.empty(QUANTITIES * width, np.float32)
+        line = np.zeros((QUANTITIES, width + 2 * margin), np.float32)
+        inner = line[:, margin:]
+        rings = np.zeros((count, len(window), QUANTITIES, width), np.float32)
+        total = np.empty((QUANTITIES, width), np.float32)
         least = np.empty((best, width), np.float32)
         for y in range(height + margin):
             middle = y - margin
             least[:] = np.float32(np.inf)
             for n in range(count):
-                sums = rings[n, y % len(window) * QUANTITIES * width :][: QUANTITIES * width]
+                sums = rings[n, y % len(window)]
                 if y < height:
                     _place(warps[n], hypotheses[plane], y, rows, columns, u, v)
                     _look_up(pixels[n], stride, u, v, seen, its)
-                    _products(reference[y], trust[y], seen, its, line, margin, length)
-                    _along(line, length, window, sums, width)
+                    _products(reference[y], trust[y], seen, its, inner)
+                    _along(line, window, sums)
                 else:
                     sums[:] = ZERO
                 if middle >= 0:
