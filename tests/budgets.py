@@ -2,8 +2,8 @@
 
 What counts is the lesser of a test's seconds and its processors' seconds, without what Numba compiled for the first
 time: so neither a busy machine nor a fresh clone makes a file costly. It is divided by how slow the machine proves to
-be. `pytest_terminal_summary` prints the table and the files beyond their shares. A file beyond three times its share ends
-the session with code 1: less than that is within what one machine differs from another.
+be. `pytest_terminal_summary` prints the table and the files beyond their shares. A file beyond three times its share
+ends the session with code 1: less than that is within what one machine differs from another.
 """
 
 from __future__ import annotations

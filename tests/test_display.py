@@ -9,12 +9,12 @@ from dataclasses import replace
 import pytest
 import tiny
 import torch
-from rich.console import Console
 
 from lumigraph import methods
 from lumigraph.announce import how_long, learner, learnt_from, machine
 from lumigraph.budget import Budget
 from lumigraph.capture import open_scene
+from lumigraph.console import console
 from lumigraph.display import TrainingDisplay, sizes, time_left
 from lumigraph.run import build
 from lumigraph.scene import Batch
@@ -100,7 +100,7 @@ def test_a_log_has_some_lines_of_any_training(clock, capsys, seconds, most):
 def test_a_terminal_has_a_bar_and_figures_below(clock, monkeypatch):
     screen = io.StringIO()
     display = TrainingDisplay()
-    display.console = display.bar.live.console = Console(file=screen, force_terminal=True, width=100)
+    display.console = display.bar.live.console = console(file=screen, force_terminal=True, width=100)
     display.terminal = True
     learn(display, clock, 5)
     display.console.print(display.bar.get_renderable())
