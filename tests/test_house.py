@@ -18,7 +18,7 @@ FLOORS: list[set[str]] = [
     {"console", "errors", "processes", "quality", "signals"},
     {"blending", "budget", "choice", "controls", "geometry", "loops", "memory", "progress", "readers", "srgb"},
     {"files", "plain", "lens", "rays"},
-    {"camera", "images", "kernels", "figures", "locks", "metrics"},
+    {"camera", "crop", "images", "kernels", "figures", "locks", "metrics"},
     {"volume", "scene"},
     {"dataset", "gaussians", "mesh"},
     {"capabilities", "collection", "shapes"},
