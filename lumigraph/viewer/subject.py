@@ -9,9 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from ..camera import Camera
-from ..paths import Surroundings
+from ..paths import Surroundings, best_centred, pivot
 from ..scene import Frame, Scene
-from .cameras import target
 
 
 @dataclass(frozen=True)
@@ -39,6 +38,12 @@ class Subject:
         """Where all the cameras stand and look."""
         return Surroundings(Camera.cat(list(self.cameras.values())).to("cpu"), self.frame)
 
+    @cached_property
+    def first(self) -> Camera:
+        """The photograph's camera that every client begins with."""
+        return self.around.cameras[best_centred(self.around)]
+
     def distance(self, camera: Camera) -> float:
         """Distance from a camera to the point that it turns about, in scene units."""
-        return float((target(camera, self.frame, self.around) - camera.position[0]).norm())
+        position, forward = camera.position[0].double().cpu(), camera.forward[0].double().cpu()
+        return float((pivot(self.around, position, forward) - position).norm())
