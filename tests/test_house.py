@@ -18,7 +18,7 @@ FLOORS: list[set[str]] = [
     {"errors"},
     {"blending", "choice", "controls", "geometry", "loops", "memory", "progress", "readers", "srgb"},
     {"files", "plain", "lens", "rays"},
-    {"camera", "images", "kernels", "figures", "metrics"},
+    {"camera", "crop", "images", "kernels", "figures", "metrics"},
     {"volume", "scene"},
     {"dataset", "gaussians", "mesh"},
     {"capabilities", "collection", "shapes"},

@@ -10,8 +10,8 @@ from typing import Any, cast
 import numpy as np
 from jaxtyping import Float
 
+from ..crop import Box
 from ..scene import Frame, Vector
-from .crop import CropBox
 from .modes import MODES
 from .scenery import CAMERAS, POINTS
 
@@ -83,13 +83,13 @@ class Controls:
         return own if chosen == to_bytes(own) else (chosen[0] / 255, chosen[1] / 255, chosen[2] / 255)
 
     @property
-    def box(self) -> CropBox | None:
-        """The crop box; None while nothing is cropped."""
+    def crop(self) -> Box | None:
+        """The box of what is shown; None while nothing is cropped."""
         if not self._crop.value:
             return None
         a, b = self._lower.value, self._upper.value
         lower, upper = (tuple(float(x) for x in pick(a, b)) for pick in (np.minimum, np.maximum))
-        return CropBox(cast(Vector, lower), cast(Vector, upper))
+        return Box(cast(Vector, lower), cast(Vector, upper))
 
     @property
     def surrounded(self) -> bool:
@@ -130,14 +130,14 @@ class Controls:
         if self._box is not None:
             self._box.remove()
             self._box = None
-        box = self.box
+        box = self.crop
         if box is not None:
             self._box = self._client.scene.add_line_segments(
                 "/crop", edges(box), (240, 190, 80), thickness=2.0, thickness_units="screen"
             )
 
 
-def edges(box: CropBox) -> Float[np.ndarray, "12 2 3"]:
+def edges(box: Box) -> Float[np.ndarray, "12 2 3"]:
     """The two ends of each of a box's twelve edges."""
     corners = np.array(list(itertools.product((0, 1), repeat=3)))
     ends = [(a, b) for a, b in itertools.combinations(corners, 2) if abs(a - b).sum() == 1]

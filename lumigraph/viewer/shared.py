@@ -8,6 +8,7 @@ from typing import Any
 from ..camera import Camera
 from ..capabilities import HasGaussians, needs
 from ..gaussians import Gaussians
+from ..gaussians.cleaning import cleaned
 from ..method import Method
 from ..rays import Rendering
 from .crop import render_inside
@@ -40,17 +41,17 @@ class Shared:
     stopped: bool = False
 
     def cloud(self, request: ViewRequest) -> Gaussians:
-        """The Gaussians of the method as a client told it, those inside its box. Raises LumigraphError if it has none.
+        """The Gaussians of the method as a client told it, those inside its crop. Raises LumigraphError if it has none.
         Call it inside `turns.turn`."""
         cloud = needs(self._given(request), HasGaussians).gaussians()
-        return cloud if request.box is None else request.box.cropped(cloud)
+        return cleaned(cloud, request.crop)
 
     def render(self, camera: Camera, request: ViewRequest) -> Rendering:
         """What a camera sees of the method as a client told it, on the CPU. Call it inside `turns.turn`."""
         method = self._given(request)
-        if request.box is None:
+        if request.crop is None:
             return method.render(camera).cpu()
-        return render_inside(method, camera, request.box, self.is_cloud).cpu()
+        return render_inside(method, camera, request.crop, self.is_cloud).cpu()
 
     def _given(self, request: ViewRequest) -> Method:
         return self.method.given(**dict(request.told)) if request.told else self.method

@@ -109,7 +109,7 @@ class Visitor:
             controls.mode,
             controls.background,
             controls.exact,
-            controls.box,
+            controls.crop,
             controls.surrounded or self.path.drawn,
             self.method_controls.values,
         )
@@ -170,7 +170,7 @@ class Visitor:
             self._flat = request.background
         if self._splats is not None:
             self._splats.visible = True
-        now, eye = (self._shared.step, request.box, request.told), torch.tensor(request.pose)[:, 3]
+        now, eye = (self._shared.step, request.crop, request.told), torch.tensor(request.pose)[:, 3]
         if self._splats is None or (seconds > MOVING and self._sent != now):
             self._send_splats(request, eye, wanted)
             self._sent, self._eye = now, eye
