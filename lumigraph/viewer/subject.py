@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 from ..camera import Camera
+from ..crop import Crop
 from ..paths import Surroundings, best_centred, pivot
 from ..scene import Frame, Scene
+
+Keep = Callable[[str, Crop | None, Mapping[str, float]], str]
 
 
 @dataclass(frozen=True)
@@ -23,6 +26,7 @@ class Subject:
     render_command: command line that renders films of the scene, without `--path`
     open_scene:     opens the photographs, for thumbnails and sparse points; None if there are none
     rows:           of metrics.jsonl, as far as the method has been trained
+    keep:           saves what a crop and cleaning leave of the cloud, under a name, and says where; None where it cannot
     """
 
     title: str
@@ -32,6 +36,7 @@ class Subject:
     render_command: str
     open_scene: Callable[[], Scene] | None = None
     rows: list[dict[str, Any]] = field(default_factory=list)
+    keep: Keep | None = None
 
     @cached_property
     def around(self) -> Surroundings:

@@ -43,10 +43,10 @@ class Viewer:
         self._server = start_server(address, subject.title)
         self._aim()
         tabs = self._server.gui.add_tab_group()
-        view_tab, path_tab = tabs.add_tab("View"), tabs.add_tab("Path")
+        own_tabs = tabs.add_tab("View"), tabs.add_tab("Crop"), tabs.add_tab("Path")
         self._panel = self._add_training_panel(tabs)
         self._scenery = Scenery(self._server, subject.cameras, self._clicked)
-        self._shared = Shared(method, is_cloud, subject, self.turns, self._server, view_tab, path_tab, self._scenery)
+        self._shared = Shared(method, is_cloud, subject, self.turns, self._server, own_tabs, self._scenery)
         self._server.on_client_connect(self._welcome)
         self._server.on_client_disconnect(self._farewell)
         if subject.open_scene is not None:

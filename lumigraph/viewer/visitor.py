@@ -6,7 +6,7 @@ import os
 import sys
 import time
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
@@ -14,12 +14,14 @@ import torch
 from jaxtyping import UInt8
 
 from ..camera import Camera
+from ..crop import Crop
 from ..errors import LumigraphError
 from ..figures import to_bytes
 from ..rays import Rendering
 from ..scene import Vector
 from .cameras import angle_for, pose_of, rows
 from .controls import Controls
+from .crop_panel import CropPanel
 from .flight import Flight
 from .method_controls import MethodControls
 from .modes import along_axis, extra_modes, picture
@@ -53,16 +55,28 @@ class Visitor:
         self._hidden: dict[str, Any] = {}  # frusta that are too near to the eye, and what hides each
         self.painter = Painter(self._draw, shared.turns, self._tell_fault, lambda: shared.step)
         self.flight = Flight(client)
-        self.controls = Controls(client, shared.view_tab, shared.subject.frame, shared.is_cloud, self.painter.ask)
-        self.method_controls = MethodControls(client, shared.view_tab, shared.method, self.painter.ask)
+        view_tab, crop_tab, path_tab = shared.tabs
+        self.controls = Controls(client, view_tab, shared.subject.frame, shared.is_cloud, self.painter.ask)
+        self.method_controls = MethodControls(client, view_tab, shared.method, self.painter.ask)
+        self.crop = CropPanel(
+            client,
+            crop_tab,
+            shared.subject.frame,
+            shared.is_cloud,
+            self.painter.ask,
+            self._keep if shared.is_cloud and shared.subject.keep is not None else None,
+            shared.subject.title,
+            self.tell,
+        )
         self.path = PathPanel(
             client,
-            shared.path_tab,
+            path_tab,
             shared.subject,
             self.flight,
             shared.scenery.size,
             self.tell,
             lambda: self.method_controls.time,
+            self.method_controls.show_time,
         )
         self._seen: tuple[Any, ...] = ()
         client.camera.on_update(self._moved)
@@ -85,6 +99,12 @@ class Visitor:
         """Fly to where a photograph was taken, with an angle of view that shows all of it."""
         pose = camera.pose[0].double().cpu().numpy()
         self.flight.fly(pose, distance, angle_for(camera.to("cpu"), self._client.camera.aspect))
+
+    def _keep(self, name: str, crop: Crop | None, floaters: Mapping[str, float]) -> str:
+        """Save what is left of the cloud. Raises LumigraphError if it cannot be."""
+        assert self._shared.subject.keep is not None
+        with self._shared.turns.turn():
+            return self._shared.subject.keep(name, crop, floaters)
 
     @property
     def _here(self) -> bool:
@@ -109,9 +129,10 @@ class Visitor:
             controls.mode,
             controls.background,
             controls.exact,
-            controls.crop,
-            controls.surrounded or self.path.drawn,
+            self.crop.crop,
+            controls.surrounded or self.path.drawn or self.crop.drawn,
             self.method_controls.values,
+            self.crop.floaters,
         )
 
     def _draw(self, seconds: float, wanted: Wanted) -> bool:
@@ -170,7 +191,7 @@ class Visitor:
             self._flat = request.background
         if self._splats is not None:
             self._splats.visible = True
-        now, eye = (self._shared.step, request.crop, request.told), torch.tensor(request.pose)[:, 3]
+        now, eye = (self._shared.step, request.crop, request.told, request.floaters), torch.tensor(request.pose)[:, 3]
         if self._splats is None or (seconds > MOVING and self._sent != now):
             self._send_splats(request, eye, wanted)
             self._sent, self._eye = now, eye
