@@ -71,21 +71,26 @@ def dragged(viewer: Viewer, chromium: Any, size: tuple[int, int], output: Path) 
     visitor = wait(lambda: next((v for v in viewer._everyone() if id(v) not in known), None))
     things = around_focus(viewer.method, viewer.subject)
     result: dict[str, Any] = {"distance": round(viewer.subject.distance(viewer.subject.first), 3)}
-    for moment in ("before", "after"):
-        if moment == "after":
-            start = visitor.request().pose
-            page.mouse.move(size[0] // 3, size[1] // 2)
-            page.mouse.down()
-            page.mouse.move(size[0] // 3 + DRAG, size[1] // 2, steps=6)
-            page.mouse.up()
-            wait(lambda: visitor.request().pose != start)
+
+    def note(moment: str) -> None:
         wait(visitor.painter.settled.is_set)
         time.sleep(REST)
         page.screenshot(path=f"{output}-{moment}.png")
         camera = visitor.request().camera(size)
-        place, _ = seen(camera, viewer.subject.around.focus[None].float())
+        (place,), _ = seen(camera, viewer.subject.around.focus[None].float())
         _, share = seen(camera, things)
-        result |= {f"focus {moment}": [round(x, 2) for x in place[0].tolist()], f"in window {moment}": round(share, 3)}
+        result.update(
+            {f"focus {moment}": [round(x, 2) for x in place.tolist()], f"in window {moment}": round(share, 3)}
+        )
+
+    note("before")
+    start = visitor.request().pose
+    page.mouse.move(size[0] // 3, size[1] // 2)
+    page.mouse.down()
+    page.mouse.move(size[0] // 3 + DRAG, size[1] // 2, steps=6)
+    page.mouse.up()
+    wait(lambda: visitor.request().pose != start)
+    note("after")
     context.close()
     return result
 

@@ -2,7 +2,8 @@
 
 Cameras that look at something are described by where they stand around it: azimuth, elevation and distance about the
 point that they look at. Photographs taken all around it give a full circle; those from one side, a sway to and fro.
-Cameras that look outward give a turn on the spot, where one of them stood. All paths but `held_out` close upon themselves or end smoothly.
+Cameras that look outward give a turn on the spot, where one of them stood. All paths but `held_out` close upon
+themselves or end smoothly.
 """
 
 from __future__ import annotations
@@ -98,7 +99,7 @@ class Surroundings:
 
     @cached_property
     def middle(self) -> int:
-        """Number of the camera nearest to the middle of all. Its place is free for certain, and was photographed from."""
+        """Number of the camera nearest to the middle of all: its place is free for certain."""
         return int((self.position - self.position.median(0).values).norm(dim=-1).argmin())
 
     @cached_property
@@ -122,8 +123,8 @@ class Surroundings:
 
     @cached_property
     def polar(self) -> Float[Tensor, "camera 3"]:
-        """Azimuth, elevation and log distance about the focus of each camera that looks at it; of the directions of all,
-        if they look outward."""
+        """Azimuth, elevation and log distance about the focus of each camera that looks at it; of the directions of
+        all, if they look outward."""
         x, y, z = (self._offset @ self.axes.T).unbind(-1)
         distance = self._offset.norm(dim=-1).clamp_min(1e-9)
         return torch.stack([torch.atan2(y, x), torch.asin((z / distance).clamp(-1, 1)), distance.log()], -1)

@@ -1,8 +1,7 @@
-"""How somebody begins to look at a scene, in the viewer as on a page: where the camera stands and what it turns about."""
+"""How somebody begins to look at a scene, in the viewer as on a page, and what the camera then turns about."""
 
 from __future__ import annotations
 
-import torch
 from jaxtyping import Float
 from torch import Tensor
 

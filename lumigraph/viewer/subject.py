@@ -26,7 +26,8 @@ class Subject:
     render_command: command line that renders films of the scene, without `--path`
     open_scene:     opens the photographs, for thumbnails and sparse points; None if there are none
     rows:           of metrics.jsonl, as far as the method has been trained
-    keep:           saves what a crop and cleaning leave of the cloud, under a name, and says where; None where it cannot
+    keep:           saves what a crop and cleaning leave of the cloud under a name, and says where; None where nothing
+                    can be saved
     """
 
     title: str

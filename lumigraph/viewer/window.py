@@ -18,7 +18,8 @@ document.title = {title};
 const sheet = this.closest(".mantine-Paper-root");
 if (innerWidth <= {narrow} && sheet && !window.sheetFolded) {{
   window.sheetFolded = true;
-  [...sheet.querySelectorAll("*")].find((part) => part.childElementCount === 0 && part.textContent === {title})?.click();
+  const texts = [...sheet.querySelectorAll("*")].filter((part) => part.childElementCount === 0);
+  texts.find((part) => part.textContent === {title})?.click();
 }}
 """
 
