@@ -18,6 +18,7 @@ import tyro
 from . import __version__, methods
 from .commands.bench import Bench
 from .commands.capture import CaptureCommand
+from .commands.clean import Clean
 from .commands.common import say
 from .commands.compose import Compose
 from .commands.demo import Demo
@@ -42,6 +43,7 @@ COMMANDS: dict[str, type] = {
     "eval": Eval,
     "render": Render,
     "view": ViewCommand,
+    "clean": Clean,
     "compose": Compose,
     "export": Export,
     "report": Report,

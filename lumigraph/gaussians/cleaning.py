@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
 from jaxtyping import Bool, Float
 from scipy.spatial import cKDTree
@@ -26,10 +28,12 @@ def cleaned(
     isolation: float | None = None,
 ) -> Gaussians:
     """The Gaussians that a crop holds, without floaters; see `unwanted`."""
-    keep = torch.ones(len(gaussians), dtype=torch.bool, device=gaussians.means.device)
-    for which in unwanted(gaussians, crop, min_opacity, max_scale, isolation).values():
-        keep &= ~which
-    return gaussians[keep]
+    return gaussians[~gone(unwanted(gaussians, crop, min_opacity, max_scale, isolation))]
+
+
+def gone(reasons: dict[str, Bool[Tensor, " gaussian"]]) -> Bool[Tensor, " gaussian"]:
+    """Which Gaussians go, for whatever reason."""
+    return torch.stack(list(reasons.values())).any(0)
 
 
 @torch.no_grad()
@@ -55,17 +59,15 @@ def unwanted(
         reasons[reason] = keep & which
         keep = keep & ~which
 
-    if crop is not None:
-        drop("outside the crop", ~crop.holds(gaussians.means))
-    if min_opacity > 0:
-        drop("too faint", gaussians.opacities.sigmoid() < min_opacity)
-    if max_scale is not None:
-        drop("too large", gaussians.log_scales.exp().amax(-1) > max_scale * extent(gaussians))
+    drop("outside the crop", ~keep if crop is None else ~crop.holds(gaussians.means))
+    drop("too faint", gaussians.opacities.sigmoid() < min_opacity)
+    largest = math.inf if max_scale is None or not keep.any() else max_scale * extent(gaussians[keep])
+    drop("too large", gaussians.log_scales.exp().amax(-1) > largest)
+    alone = ~keep
     if isolation is not None and int(keep.sum()) > NEIGHBOURS:
         logs = gaps(gaussians[keep]).log()
-        alone = keep.clone()
         alone[keep] = logs > logs.mean() + isolation * logs.std()
-        drop("isolated", alone)
+    drop("isolated", alone)
     return reasons
 
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any, ClassVar, Literal
 
 import torch
+from jaxtyping import Bool
 from torch import Tensor
 
 from .. import kernels
@@ -273,6 +274,16 @@ class GaussianSplatting(Method):
             told = len(self.cloud) >= 0.95 * self.config.max_gaussians
             why = "--max-gaussians says so" if told else "memory is short"
             warnings.warn(f"The cloud stops growing at {len(self.cloud):,} Gaussians, for {why}", LumigraphWarning, 2)
+
+    @torch.no_grad()
+    def prune(self, keep: Bool[Tensor, " gaussian"]) -> None:
+        """Leave those Gaussians that a mask picks, with their moments in the optimizer."""
+        assert self._optimizer is not None
+        source = keep.nonzero()[:, 0]
+        self.cloud.rebuild(self._optimizer, source, torch.zeros_like(source, dtype=torch.bool))
+        self.density_control.prune(keep)
+        if self.config.filter_3d:
+            self.interval = self.interval[keep]
 
     def gaussians(self) -> Gaussians:
         """The cloud, in the scene's frame; with the 3-D filter in it, where that is used."""
