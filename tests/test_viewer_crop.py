@@ -94,7 +94,7 @@ def test_a_box_is_dragged_by_its_corners(cloud_viewer):
     until(lambda: {"lower", "upper", "outline"} <= panel._nodes.keys())
     lower, upper = visitor._shared.subject.frame.bounds
     assert visitor.request().crop == Box(lower, upper) and visitor.request().depth
-    client.drag("/crop/upper", (0.25, 0.0, 0.5))
+    client.drag(panel._nodes["upper"], (0.25, 0.0, 0.5))
     until(lambda: visitor.request().crop == Box(lower, (0.25, 0.0, 0.5)))
     assert panel._upper.value == (0.25, 0.0, 0.5)
     assert np.allclose(panel._nodes["outline"].points.reshape(-1, 3).max(0), (0.25, 0.0, 0.5))

@@ -52,16 +52,16 @@ class Client:
         message = {"type": "GuiUpdateMessage", "uuid": handle._impl.uuid, "updates": {"value": value}}
         self.socket.send(msgspec.msgpack.encode(message))
 
-    def drag(self, name: str, position) -> None:
-        """Drag a handle in the scene to a place, as its browser would."""
-        for phase in ("start", "update", "end"):
-            message = {
-                "type": "TransformControlsUpdateMessage" if phase == "update" else f"TransformControlsDrag{phase.title()}Message",
-                "name": name,
-            }
-            if phase == "update":
-                message |= {"wxyz": (1.0, 0.0, 0.0, 0.0), "position": position}
-            self.socket.send(msgspec.msgpack.encode(message))
+    def drag(self, handle, position) -> None:
+        """Drag arrows in the scene to a place, as its browser would."""
+        message = {
+            "type": "TransformControlsUpdateMessage",
+            "name": handle.name,
+            "owner": handle._impl.api._owner_id,
+            "wxyz": (1.0, 0.0, 0.0, 0.0),
+            "position": position,
+        }
+        self.socket.send(msgspec.msgpack.encode(message))
 
     def messages(self, seconds: float):
         """What comes within so many seconds, each a dict."""

@@ -14,7 +14,7 @@ from ..crop import Box, Crop, Sphere
 from ..errors import LumigraphError
 from ..gaussians.cleaning import ISOLATION, MAX_SCALE, MIN_OPACITY
 from ..scene import Frame, Vector
-from .subject import Keep
+from .subject import NAME, NAMING, Keep
 
 ALL, BOX, SPHERE = "Everything", "Inside a box", "Inside a sphere"
 COLOUR = (240, 190, 80)
@@ -169,8 +169,12 @@ class CropPanel:
 
     def _save(self) -> None:
         assert self._keep is not None
+        name = self._name.value.strip()
+        if not NAME.fullmatch(name):
+            self._tell("Not saved", NAMING)
+            return
         try:
-            where = self._keep(self._name.value.strip(), self.crop, dict(self.floaters))
+            where = self._keep(name, self.crop, dict(self.floaters))
         except LumigraphError as error:
             self._tell("Not saved", str(error))
             return

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
@@ -21,9 +20,8 @@ from ..paths.keyframes import CameraPath, Keyframe
 from ..scene import Frame
 from .cameras import pose_of
 from .flight import Flight
-from .subject import Subject
+from .subject import NAME, NAMING, Subject
 
-NAME = re.compile(r"\w[\w .-]{0,80}")
 COLOUR = (200, 60, 150)
 FINENESS = 24  # points of the drawn path between two keyframes
 LEG = 2.0  # seconds from one keyframe to the next, unless something else is set
@@ -241,7 +239,7 @@ class PathPanel:
     def _save(self) -> None:
         name = self._name.value.strip()
         if not NAME.fullmatch(name):
-            self._tell("Not saved", "A path's name is made of letters, digits, spaces, dots and dashes")
+            self._tell("Not saved", NAMING)
             return
         file = self._subject.paths / f"{name}.json"
         try:

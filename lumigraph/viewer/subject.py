@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -13,6 +14,8 @@ from ..crop import Crop
 from ..paths import Surroundings, best_centred, pivot
 from ..scene import Frame, Scene
 
+NAME = re.compile(r"\w[\w .-]{0,80}")  # of what somebody saves
+NAMING = "A name is made of letters, digits, spaces, dots and dashes"
 Keep = Callable[[str, Crop | None, Mapping[str, float]], str]
 
 
