@@ -38,6 +38,7 @@ DEPTH_STEP = 256e-5  # scene units, to which that depth is rounded so that it pa
 FEWEST_ROWS = 16  # of a band
 QUALITY, QUALITY_MOVING = 90, 70  # of JPEG
 MOST_RECOLOURED = 500_000  # Gaussians; more are too many to send again whenever the camera rests
+WIDER = 0.01  # radians: a difference of angles of view that is worth setting
 TURNED = 0.03  # how far the eye must move, as a share of its distance to the middle, for colours to change
 Wanted = Callable[[], bool]
 
@@ -80,6 +81,9 @@ class Visitor:
         )
         self._seen: tuple[Any, ...] = ()
         client.camera.on_update(self._moved)
+        wide = angle_for(shared.subject.first, client.camera.aspect)
+        if wide > client.camera.fov + WIDER:  # a narrow window shows the whole photograph too
+            client.camera.fov = wide
         self.controls.tell_angle(client.camera.fov)
         if shared.scenery.has_points:
             self.controls.offer_points()
