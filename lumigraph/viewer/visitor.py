@@ -66,7 +66,7 @@ class Visitor:
             shared.is_cloud,
             self.painter.ask,
             self._keep if shared.is_cloud and shared.subject.keep is not None else None,
-            shared.subject.title,
+            f"{shared.subject.title.partition('.')[0]}-part.ply",
             self.tell,
         )
         self.path = PathPanel(
