@@ -35,6 +35,7 @@ from lumigraph.viewer import Subject, Viewer, choose_address
 SIZES = {"desktop": (1280, 800), "phone": (390, 844)}
 DRAG = 60  # pixels
 REST = 3.0  # seconds that the browser is given to draw
+PATIENCE = 180.0  # seconds that it may take for anything, on a busy machine
 NEAR_FOCUS = 1 / 3  # of the typical distance to the focus: what belongs to what was photographed
 WEBGL = ("--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist")
 
@@ -65,6 +66,7 @@ def main(options: Options) -> None:
 def dragged(viewer: Viewer, chromium: Any, size: tuple[int, int], output: Path) -> dict[str, Any]:
     """What is in a window of (width, height) before and after a drag."""
     context = chromium.new_context(viewport={"width": size[0], "height": size[1]})
+    context.set_default_timeout(1000 * PATIENCE)
     page = context.new_page()
     known = set(map(id, viewer._everyone()))
     page.goto(viewer.address.url)
@@ -118,7 +120,7 @@ def around_focus(method: Method, subject: Subject) -> Float[Tensor, "point 3"]:
     return near if len(near) else focus[None]
 
 
-def wait(told: Callable[[], Any], seconds: float = 120.0) -> Any:
+def wait(told: Callable[[], Any], seconds: float = PATIENCE) -> Any:
     """What a function gives as soon as it gives anything."""
     end = time.monotonic() + seconds
     while not (found := told()):
