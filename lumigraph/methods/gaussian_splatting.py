@@ -16,6 +16,7 @@ from ..components.clouds.cloud import Cloud, CloudAdam
 from ..components.clouds.density_control import AdaptiveDensity, MarkovChain
 from ..components.clouds.initial_cloud import initial_cloud, random_cloud
 from ..components.clouds.smoothing import sampling_interval, smoothed
+from ..components.training.rhythm import Rhythm, intervals
 from ..errors import LumigraphWarning
 from ..gaussians import Gaussians
 from ..gaussians.splatting import Splatted, render, splat, view_of
@@ -37,8 +38,10 @@ class Config:
     max_gaussians: int = 1_000_000  # cap of the cloud's size, under either strategy
     initial_gaussians: int = 100_000  # at random places, where a capture has no points, section 7.1
     half_resolution_until: float = 0.0  # share of the budget at half size; the first quarter of it at a quarter
-    refine_every: int = 100  # steps between changes of the cloud, section 5.2
-    refine_from: int = 500  # step
+    refine_every: int = 100  # steps between changes of the cloud, section 5.2; or the share, if that is sooner
+    refine_every_share: float = 1 / 60
+    refine_from: int = 500  # step; or the share of the budget, if that is sooner
+    refine_from_share: float = 1 / 20
     refine_until: float = 0.5  # share of the budget; section 7.1: 15 000 of 30 000 steps
     densify_grad_threshold: float = 2e-4  # gradient of a footprint's centre that asks for more Gaussians, section 5.2
     opacity_reset_interval: int = 3000  # steps, section 5.2
@@ -103,6 +106,7 @@ class GaussianSplatting(Method):
         self.cloud.antialiased = config.antialiased
         self.density_control = AdaptiveDensity(len(self.cloud), config.densify_grad_threshold)
         self.exploration = MarkovChain()
+        self.rhythm = Rhythm(config.refine_every, config.refine_every_share)
         self.register_buffer("extent", torch.tensor(1.0))
         self.register_buffer("drawn", torch.tensor(0))
         self.register_buffer("began", torch.tensor(len(self.cloud)))
@@ -216,15 +220,15 @@ class GaussianSplatting(Method):
 
     def before_step(self, step: int, progress: float) -> None:
         config, self._progress = self.config, progress
-        raised = max(step // config.sh_degree_interval, int(progress / config.sh_degree_interval_share))
-        self._bands = 1 + min(raised, config.sh_degree)
+        raised = intervals(step, progress, config.sh_degree_interval, config.sh_degree_interval_share)
+        self._bands = 1 + min(int(raised), config.sh_degree)
 
     @torch.no_grad()
     def after_step(self, step: int) -> None:
         config, seen, optimizer = self.config, self._seen, self._optimizer
         assert seen is not None and optimizer is not None
         self._seen, size = None, len(self.cloud)
-        due = step >= config.refine_from and step % config.refine_every == 0
+        due = self.due(step)
         if config.strategy == "mcmc":
             self._sample(due, optimizer, self.random(step))
         elif self._progress < config.refine_until:
@@ -232,6 +236,11 @@ class GaussianSplatting(Method):
         if config.filter_3d and (due or len(self.cloud) != size):
             assert self._cameras is not None
             self.interval = sampling_interval(self.cloud.means, self._cameras, self._near)
+
+    def due(self, step: int) -> bool:
+        """Whether the cloud may change after this step."""
+        first, share = self.config.refine_from, self.config.refine_from_share
+        return self.rhythm.due(step, self._progress) and intervals(step, self._progress, first, share) >= 1
 
     def _densify(self, step: int, due: bool, seen: Splatted, optimizer: CloudAdam) -> None:
         height, width = seen.opacity.shape
@@ -243,8 +252,8 @@ class GaussianSplatting(Method):
             wanted_more = control.refine(self.cloud, optimizer, float(self.extent), most, chance)
             if wanted_more and len(self.cloud) >= 0.99 * self._most():
                 self._tell_full()
-        every = self.config.opacity_reset_interval
-        if step and step % every == 0 and step / max(self._progress, 1e-6) - step >= RECOVERY * every:
+        every, whole = self.config.opacity_reset_interval, self._progress >= self.config.half_resolution_until
+        if step and step % every == 0 and whole and step / max(self._progress, 1e-6) - step >= RECOVERY * every:
             control.reset_opacity(self.cloud, optimizer)
 
     def _sample(self, due: bool, optimizer: CloudAdam, chance: torch.Generator) -> None:
