@@ -10,7 +10,7 @@ import torch
 
 from lumigraph import methods, train
 from lumigraph.components.clouds.density_control import AdaptiveDensity, MarkovChain
-from lumigraph.components.training.rhythm import Rhythm
+from lumigraph.components.training.rhythm import Rhythm, haste
 from lumigraph.run import build
 from lumigraph.train import fit
 
@@ -60,8 +60,8 @@ def test_a_minute_on_a_slow_machine_grows(strategy, events, monkeypatch):
     method = new(strategy=strategy)
     fit(method, tiny.scene(), seconds=60.0, show=False, rehearsal=False)
     refined = [progress for what, progress in events if what == "refine"]
-    assert len(taken) == 120 and len(refined) >= 10
-    assert refined[0] < 0.15 and 0.4 < refined[-1] < 0.95  # early enough to matter, late enough to settle
+    assert len(taken) == 120 and len(refined) >= 3
+    assert refined[0] <= 0.2 and 0.35 < refined[-1] < 0.95  # early enough to matter, late enough to settle
     assert "reset" not in dict(events)  # there is no time to recover
     assert len(method.cloud) > 200
     assert method.cloud.harmonics[:, 9:].abs().max() > 0  # the last degree has learnt
@@ -74,15 +74,15 @@ def test_resets_leave_time_to_recover(events):
     assert resets and max(resets) <= 45
 
 
-@pytest.mark.parametrize("budget, interval", [(PAPER, 100), (6000, 100), (600, 10), (60, 1)])
+@pytest.mark.parametrize("budget, interval", [(PAPER, 100), (1000, 100), (600, 60), (60, 6)])
 def test_intervals_are_the_papers_or_a_share_of_the_budget(budget, interval):
-    rhythm = Rhythm(100, 1 / 60)
+    rhythm = Rhythm(100, 1 / 10)
     due = [step for step in range(1000) if rhythm.due(step, min(1.0, (step + 1e-3) / budget))]
     assert due == [*range(interval, min(budget + 1, 1000), interval)]
 
 
 def test_the_papers_steps_hold_for_the_papers_budget():
-    """Of 30 000 steps: the cloud changes every 100 steps from step 500 on, harmonics rise every 1000."""
+    """Of 30 000 steps: the cloud changes every 100 steps from step 500 on, harmonics rise every 1000, nothing hurries."""
     method = new()
     method.config = type(method.config)()
     raised, changed = [], []
@@ -92,6 +92,7 @@ def test_the_papers_steps_hold_for_the_papers_budget():
             raised.append(method._bands)
         if method.due(step):
             changed.append(step)
+    assert method.learning_rate(4000, 4000 / PAPER)["scales"] == method.config.scales_lr
     assert raised == [1, 2, 3, 4, 4] and changed == [*range(500, 4001, 100)]
 
 
@@ -103,3 +104,9 @@ def test_counting_goes_on_where_a_run_was_stopped():
     older = Rhythm(10, 1.0)
     older.load_state_dict({})  # of a run that did not count
     assert not older.due(27, 0.0) and older.due(30, 0.0)
+
+
+def test_a_run_of_few_steps_hurries():
+    assert haste(0, 0.0, 2400, 4.0) == 1.0  # nothing is known yet
+    for budget, times in [(30_000, 1.0), (2400, 1.0), (600, 2.0), (150, 4.0), (15, 4.0)]:
+        assert haste(10, 10 / budget, 2400, 4.0) == pytest.approx(times)

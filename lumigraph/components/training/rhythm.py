@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import torch
@@ -16,6 +17,16 @@ def intervals(step: int, progress: float, steps: int, share: float) -> float:
     progress: share of the budget that is spent, in [0, 1]
     """
     return max(step / steps, progress / share)
+
+
+def haste(step: int, progress: float, enough: int, most: float) -> float:
+    """How many times faster to learn where the budget allows few steps: (enough / steps)^(1/2), from 1 to `most`.
+
+    A parameter then comes as far in n steps as a random walk would in `enough`. How many steps the budget allows is
+    told by those that are done; before the first, nothing is known and the answer is 1.
+    enough: steps from which on there is no need to hurry
+    """
+    return min(most, max(1.0, math.sqrt(enough * progress / step))) if step else 1.0
 
 
 class Rhythm(nn.Module):
