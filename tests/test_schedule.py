@@ -82,7 +82,7 @@ def test_intervals_are_the_papers_or_a_share_of_the_budget(budget, interval):
 
 
 def test_the_papers_steps_hold_for_the_papers_budget():
-    """Of 30 000 steps: the cloud changes every 100 steps from step 500 on, harmonics rise every 1000, nothing hurries."""
+    """The cloud changes every 100 of 30 000 steps, from step 500 on, harmonics rise every 1000. Nothing hurries."""
     method = new()
     method.config = type(method.config)()
     raised, changed = [], []
