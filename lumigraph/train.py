@@ -5,8 +5,6 @@ from __future__ import annotations
 import contextlib
 import copy
 import math
-import signal
-import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
@@ -23,6 +21,7 @@ from .figures import save_picture
 from .memory import peak_memory
 from .method import Lesson, Method
 from .run import Run, State
+from .signals import Interrupt
 
 FIRST_SAVE = 10.0  # seconds of training; a fault or a kill in the first minute should not cost all of it
 PREVIEWS = (0.01, 0.03, 0.1, 0.3, 1.0)  # shares of the budget at which a view is kept
@@ -89,13 +88,13 @@ def fit(
     Seconds count what training needs; compiling kernels ahead of it, saving, and giving way to who looks on are
     counted apart.
     Ctrl-C and SIGTERM end the step at hand, save and return; a second one breaks off.
-    Raises LumigraphError for a dataset of another kind than the method learns from, and when a loss or gradient is not
-    finite, with the last good state saved.
+    Raises LumigraphError for a dataset of another kind than the method learns from, for a run that another process
+    trains, and when a loss or gradient is not finite, with the last good state saved.
     """
     budget = Budget(steps, seconds)
     check_kind(methods.name_of(method), method.learns_from, type(data), data.source)
-    state = run.restore_weights(method) if run else State()
-    with Interrupt() as interrupt, TrainingDisplay(show) as display:
+    with run.held() if run else contextlib.nullcontext(), Interrupt() as interrupt, TrainingDisplay(show) as display:
+        state = run.restore_weights(method) if run else State()
         display.say("Compiling kernels")
         compile_seconds = state.compile_seconds + (rehearse(method, data, state.step) if rehearsal else 0.0)
         optimizers, generator = method.optimizers(), torch.Generator().manual_seed(seed)
@@ -249,28 +248,6 @@ class Clock:
         yield
         pause = time.perf_counter() - begin
         self._begin, self.pauses = self._begin + pause, self.pauses + pause
-
-
-class Interrupt:
-    """Inside this block the first Ctrl-C or SIGTERM only leaves its number; the second acts as usual."""
-
-    def __init__(self) -> None:
-        self.signal: int | None = None
-        self._previous: dict[int, object] = {}
-
-    def __enter__(self) -> Interrupt:
-        if threading.current_thread() is threading.main_thread():  # only there may handlers be set
-            for number in (signal.SIGINT, signal.SIGTERM):
-                self._previous[number] = signal.signal(number, self._note)
-        return self
-
-    def __exit__(self, *fault: object) -> None:
-        for number, handler in self._previous.items():
-            signal.signal(number, handler)  # type: ignore[arg-type]
-
-    def _note(self, number: int, frame: object) -> None:
-        self.signal = number
-        self.__exit__()
 
 
 class Previews:

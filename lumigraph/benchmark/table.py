@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import statistics
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -81,8 +82,13 @@ def full_table(rows: Sequence[Row]) -> str:
 def table(names: Sequence[str], lines: Sequence[Sequence[str]]) -> str:
     """A Markdown table. Columns that say nothing anywhere are left out."""
     kept = [i for i in range(len(names)) if any(line[i] != NONE for line in lines)]
-    shown = [[line[i].replace("|", "/") for i in kept] for line in (names, ["---"] * len(names), *lines)]
+    shown = [[literal(line[i]) for i in kept] for line in (names, ["---"] * len(names), *lines)]
     return "\n".join(f"| {' | '.join(line)} |" for line in shown) if lines else ""
+
+
+def literal(text: str) -> str:
+    """Text that Markdown shows as it is."""
+    return re.sub(r"([\\`*\[\]<>|])", r"\\\1", text)
 
 
 def in_order(rows: Sequence[Row]) -> list[Row]:

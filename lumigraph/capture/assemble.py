@@ -15,7 +15,7 @@ from ..camera import Camera
 from ..errors import LumigraphError, LumigraphWarning
 from ..images import ImageSource, ImageStore
 from ..lens import Equirectangular, Lens, Pinhole
-from ..progress import counting
+from ..progress import counting, track
 from ..scene import Forward, Frame, Scene
 from .beside import make_about, make_layers
 from .capture import Capture, Shot
@@ -47,7 +47,7 @@ def assemble(
         )
     splits = split(capture.source, shots)
     poses = np.stack([checked_pose(shot, capture.source) for shot in shots])
-    chosen = [choose(shot, downscale) for shot in shots]
+    chosen = [choose(shot, downscale) for shot in track(shots, "Looking at photographs", len(shots))]
     told += about_small(capture.source, chosen) if downscale else []
     for warning in told:
         warnings.warn(warning, LumigraphWarning, stacklevel=3)
@@ -63,7 +63,8 @@ def assemble(
     # Single precision is for what is near the origin: maps may put a capture hundreds of kilometres away.
     away = poses[:, :, 3].mean(0)
     cameras = make_cameras(shots, moved(poses, translation(-away)), lenses, images.sizes)
-    place = find_place(shifted(capture, -away), cameras, images, splits["train"].tolist())
+    with counting("Looking for what the cameras look at"):
+        place = find_place(shifted(capture, -away), cameras, images, splits["train"].tolist())
     matrix = place.scene_from_source @ translation(-away)
     cameras = make_cameras(shots, moved(poses, matrix), lenses, images.sizes)
     forward = None

@@ -13,6 +13,7 @@ from plyfile import PlyData
 from ..dataset import splits_of
 from ..errors import LumigraphError, LumigraphWarning
 from ..mesh import Mesh
+from ..progress import track
 from ..shapes import Shape, Shapes, normalised
 
 SUFFIXES = (".obj", ".ply", ".off", ".stl", ".glb", ".gltf")
@@ -39,7 +40,7 @@ def read_shapes(path: Path) -> Shapes:
     files = [path] if path.is_file() else sorted(file for file in path.rglob("*") if is_mesh(file))
     if not files:
         raise LumigraphError(f"{path} holds no meshes; name a file or a folder of {', '.join(SUFFIXES)}")
-    members = [read_shape(file, name_of(file, path)) for file in files]
+    members = [read_shape(file, name_of(file, path)) for file in track(files, "Reading meshes", len(files))]
     shapes = Shapes(members, splits_of(len(members)), str(path))
     for warning in shapes.warnings:
         warnings.warn(warning, LumigraphWarning, stacklevel=3)

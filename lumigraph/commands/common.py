@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import itertools
+import shlex
 import sys
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
-from rich.console import Console
+from rich.text import Text
 
+from ..console import console, dim
 from ..errors import LumigraphError
 from ..files import scene_name as scene_name
 from ..readers import LISTED, NAMES
@@ -81,11 +83,16 @@ def say(text: str) -> None:
     print(text, file=sys.stderr, flush=True)
 
 
-def show(rows: Mapping[str, str]) -> None:
+def show(rows: Mapping[str, str | Text]) -> None:
     """Results, one to a line, names aligned."""
-    console, width = Console(highlight=False, soft_wrap=True), max(map(len, rows))
+    out, width = console(soft_wrap=True), max(map(len, rows))
     for name, value in rows.items():
-        console.print(f"[dim]{name:<{width}}[/dim]  {value}")
+        out.print(dim(f"{name:<{width}}") + "  " + value)
+
+
+def typed(*words: object) -> str:
+    """A command to go on with, as a shell understands it whatever names are in it."""
+    return shlex.join(["lumigraph", *map(str, words)])
 
 
 def next_free(prefix: str) -> Path:
@@ -94,5 +101,5 @@ def next_free(prefix: str) -> Path:
 
 
 def exit_code(signal: int | None) -> int:
-    """As shells count: 130 after Ctrl-C."""
+    """As shells count: 130 after Ctrl-C, 143 after SIGTERM."""
     return 0 if signal is None else 128 + signal

@@ -6,7 +6,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
-from .common import budget_of, check_film, choose_device, exit_code, next_free, option, say, show
+from ..console import bold
+from .common import budget_of, check_film, choose_device, exit_code, next_free, option, say, show, typed
 
 FRAMES = 90
 
@@ -54,7 +55,7 @@ class Demo:
         run = Run.create(output, method, data, budget=budget)
         outcome = fit(method, data, run, **budget)
         if outcome.signal is not None:
-            say(f"Stopped and saved after step {outcome.state.step}; go on with: lumigraph resume {run.folder}")
+            say(f"Stopped and saved after step {outcome.state.step}; go on with: {typed('resume', run.folder)}")
             return exit_code(outcome.signal)
         result = evaluate_run(run, method, data)
         orbit = run.folder / "renders" / "orbit.mp4"
@@ -63,7 +64,7 @@ class Demo:
         headline, what = scores_of(result)[0], "views" if "views" in result["protocol"] else "shapes"
         show(
             {
-                f"held-out {headline.name}": f"[bold]{headline}[/bold] over {result['protocol'][what]} {what}",
+                f"held-out {headline.name}": bold(headline) + f" over {result['protocol'][what]} {what}",
                 "film": str(orbit),
                 "report": str(report),
                 "run": str(run.folder),

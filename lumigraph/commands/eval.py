@@ -9,6 +9,7 @@ from typing import Annotated, Any, Literal
 
 from tyro.conf import Positional
 
+from ..console import bold
 from .common import choose_device, needed, option, show
 from .controls import Set, tell
 
@@ -48,7 +49,7 @@ class Eval:
         method = tell(run, run.method(choose_device(self.device)), self.told)
         data = run.dataset(self.scene)
         result = evaluate_run(run, method, data, self.split, self.save_images, self.views, lpips)
-        rows = {score.name: f"[bold]{score}[/bold]" for score in scores_of(result)}
+        rows: dict[str, Any] = {score.name: bold(score) for score in scores_of(result)}
         for size, part in result.get("by_resolution", {}).items():
             rows[size] = f"{', '.join(f'{x.name} {x}' for x in scores_of(part))}, {part['views']} views"
         name = run.folder / stem(self.split)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 from tyro.conf import Positional
 
@@ -37,11 +37,16 @@ class Resume:
 
     def run(self) -> int:
         from ..run import Run
+
+        run = Run(self.run_folder)
+        with run.held():
+            return self._go_on(run)
+
+    def _go_on(self, run: Any) -> int:
         from ..train import Budget, fit
         from .train import tell_outcome
         from .view import keep_showing, watching
 
-        run = Run(self.run_folder)
         budget = budget_of(self.steps, self.seconds) or run.settings.budget
         state = run.state if run.has_state else None
         if state and Budget(budget.get("steps"), budget.get("seconds")).progress(state.step, state.seconds) >= 1:

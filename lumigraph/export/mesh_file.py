@@ -12,6 +12,7 @@ import trimesh
 from ..errors import LumigraphError
 from ..files import write_bytes
 from ..mesh import Mesh
+from ..progress import counting
 from ..srgb import linear_from_srgb
 from .surface import vertex_normals
 
@@ -27,7 +28,9 @@ def write_mesh(path: Path, mesh: Mesh) -> None:
     .glb: linear colours, float32, and an unlit material, for the light is in the colours already
     Raises LumigraphError for any other ending.
     """
-    write_bytes(path, ENCODERS[ending(path)](mesh))
+    encode = ENCODERS[ending(path)]
+    with counting(f"Writing {path.name}"):
+        write_bytes(path, encode(mesh))
 
 
 def ending(path: Path) -> str:

@@ -8,10 +8,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-import pycolmap
 from jaxtyping import Float
 from scipy.spatial import ConvexHull, QhullError
 
+from ..library import pycolmap
 from ..normalise import where_axes_meet
 from ..photos import Intake, Photo
 
