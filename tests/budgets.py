@@ -57,10 +57,12 @@ GROUPS: dict[str, str] = {
         "exports, viewer, web",
     ),
     **dict.fromkeys(
-        "test_locks test_old_runs test_opened test_composed test_scores".split(), "runs, commands, benchmark"
+        "test_locks test_old_runs test_opened test_composed test_scores test_memory test_progress".split(),
+        "runs, commands, benchmark",
     ),
     **dict.fromkeys(
-        "test_memory test_progress test_charts test_multiscale test_fewer_views".split(), "runs, commands, benchmark"
+        "test_charts test_multiscale test_fewer_views test_budget test_verdict test_display".split(),
+        "runs, commands, benchmark",
     ),
     **dict.fromkeys(
         "test_coordinate_network test_density_control test_schedule test_gaussians test_encodings".split(), "methods"

@@ -7,6 +7,7 @@ from typing import Any
 
 from rich.tree import Tree
 
+from ..budget import Budget
 from ..choice import evenly
 from ..console import bold, dim
 from ..dataset import Dataset
@@ -31,7 +32,11 @@ def run_tree(run: Run) -> Tree:
     if run.has_state:
         state = run.state
         rows = {"step": state.step, "seconds": state.seconds, "compiling, beside": state.compile_seconds}
-        branch(tree, "trained", rows | {"budget": said.budget, "seed": said.seed, "on": said.device})
+        branch(
+            tree,
+            "trained",
+            rows | {"budget": said.budget and str(Budget.from_json(said.budget)), "seed": said.seed, "on": said.device},
+        )
     if evaluation := run.evaluation():
         figures: dict[str, Any] = {score.name: str(score) for score in scores_of(evaluation)}
         figures["seconds per view"] = evaluation.get("seconds_per_view")
