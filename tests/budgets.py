@@ -64,7 +64,9 @@ GROUPS: dict[str, str] = {
         "test_charts test_multiscale test_fewer_views test_budget test_verdict test_display".split(),
         "runs, commands, benchmark",
     ),
-    **dict.fromkeys("test_coordinate_network test_density_control test_gaussians test_encodings".split(), "methods"),
+    **dict.fromkeys(
+        "test_coordinate_network test_density_control test_schedule test_gaussians test_encodings".split(), "methods"
+    ),
     **dict.fromkeys("test_house test_budgets".split(), "house"),
 }  # the others are of nouns and capture
 MUCH, TOO_MUCH = 1.5, 3.0  # times its share: what is told, and what fails
