@@ -53,9 +53,10 @@ A_METHOD = 6.0  # by contract, of each method, beside what its own file takes
 GROUPS: dict[str, str] = {
     **dict.fromkeys("test_bench_kernels test_lanes".split(), "kernels"),
     **dict.fromkeys(
-        "test_export test_viewer_controls test_viewer_crop test_exchange test_explain_ray test_keyframes test_browser".split(),
+        "test_export test_viewer_controls test_viewer_crop test_exchange test_explain_ray test_keyframes".split(),
         "exports, viewer, web",
     ),
+    **dict.fromkeys("test_browser".split(), "exports, viewer, web"),
     **dict.fromkeys(
         "test_locks test_old_runs test_opened test_composed test_scores test_memory test_progress".split(),
         "runs, commands, benchmark",
