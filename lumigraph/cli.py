@@ -19,6 +19,7 @@ import tyro
 from . import __version__, methods
 from .commands.bench import Bench
 from .commands.capture import CaptureCommand
+from .commands.clean import Clean
 from .commands.common import exit_code, say
 from .commands.compose import Compose
 from .commands.demo import Demo
@@ -44,6 +45,7 @@ COMMANDS: dict[str, type] = {
     "eval": Eval,
     "render": Render,
     "view": ViewCommand,
+    "clean": Clean,
     "compose": Compose,
     "export": Export,
     "report": Report,

@@ -8,8 +8,9 @@ from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any
 
+from ..budget import Budget
 from ..metrics import named, scores_of
-from .cell import budget_of, duration
+from .cell import duration
 from .results import Row
 
 NONE = "–"
@@ -99,7 +100,7 @@ def in_order(rows: Sequence[Row]) -> list[Row]:
 
 
 def trained_for(row: Row) -> str:
-    return duration(budget_of(row["budget"]))
+    return duration(Budget.from_json(row["budget"]))
 
 
 def resolution(row: Row) -> str:

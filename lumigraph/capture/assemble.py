@@ -87,6 +87,7 @@ def assemble(
         told + lost,
         layers,
         make_about(shots),
+        torch.tensor([c.calibrated for c in chosen]),
     )
 
 

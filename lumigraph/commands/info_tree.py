@@ -7,6 +7,7 @@ from typing import Any
 
 from rich.tree import Tree
 
+from ..budget import Budget
 from ..choice import evenly
 from ..console import bold, dim
 from ..dataset import Dataset
@@ -31,7 +32,11 @@ def run_tree(run: Run) -> Tree:
     if run.has_state:
         state = run.state
         rows = {"step": state.step, "seconds": state.seconds, "compiling, beside": state.compile_seconds}
-        branch(tree, "trained", rows | {"budget": said.budget, "seed": said.seed, "on": said.device})
+        branch(
+            tree,
+            "trained",
+            rows | {"budget": said.budget and str(Budget.from_json(said.budget)), "seed": said.seed, "on": said.device},
+        )
     if evaluation := run.evaluation():
         figures: dict[str, Any] = {score.name: str(score) for score in scores_of(evaluation)}
         figures["seconds per view"] = evaluation.get("seconds_per_view")
@@ -115,7 +120,7 @@ def composition_tree(composition: Any) -> Tree:
     for number, (part, place) in enumerate(zip(composition.parts, composition.places, strict=True)):
         rows = {"source": part.source, "leads": "yes" if number == composition.lead else None}
         rows |= {"scale": place.scale, "origin": vector(tuple(place.matrix[:3, 3].tolist())) + " in the frame below"}
-        rows |= {"box": part.box and f"{vector(part.box[0])} to {vector(part.box[1])}"}
+        rows |= {"box": part.box and f"{vector(part.box.lower)} to {vector(part.box.upper)}"}
         branch(tree, f"part {number}", rows)
     branch(tree, "frame", frame_rows(composition.frame))
     return tree

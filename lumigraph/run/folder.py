@@ -96,8 +96,8 @@ class Run(Opened):
         """A block in which no other process trains this run. Raises LumigraphError that says who does."""
         return held(self.folder, "trained")
 
-    def set_budget(self, **budget: float) -> None:
-        """Remember another total of steps or seconds."""
+    def set_budget(self, **budget: Any) -> None:
+        """Remember another budget, as `Budget.to_json` says it."""
         self.settings = self.settings.with_budget(**budget)
         self.settings.write(self._config)
 
