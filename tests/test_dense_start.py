@@ -112,7 +112,7 @@ def test_a_cloud_begins_at_known_points_dense_ones_and_far_out(generator, monkey
     monkeypatch.setattr(initial_cloud, "dense_points", lambda scene: dense(alpha=False))
     known = RADIUS * normalize(torch.randn(300, 3, generator=generator), dim=-1)
     begun = initial_cloud.initial_cloud(replace(scene, points=known), "dense", 200, 2000, 1, generator)
-    assert 800 < len(begun) <= 2000
+    assert len(begun) == 667  # a third
     assert {tuple(p) for p in known.tolist()} <= {tuple(p) for p in begun.means.tolist()}
     begun = initial_cloud.initial_cloud(scene, "dense", 200, 5000, 1, generator)
     assert (begun.means[-40:].norm(dim=-1) > 1.7).all()  # a fifth of 200, outside the box
@@ -122,7 +122,7 @@ def test_a_cloud_begins_at_known_points_dense_ones_and_far_out(generator, monkey
 def test_the_same_photographs_give_the_same_cloud():
     begun = initial_cloud.initial_cloud(ball(), "dense", 9, 300, 1, torch.Generator().manual_seed(3))
     positions = dense().positions
-    chosen = torch.randperm(len(positions), generator=torch.Generator().manual_seed(3))[:300]
+    chosen = torch.randperm(len(positions), generator=torch.Generator().manual_seed(3))[:100]
     assert torch.equal(begun.means, positions[chosen])
 
 

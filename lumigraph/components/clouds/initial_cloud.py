@@ -21,6 +21,7 @@ OPACITY = 0.1  # of each Gaussian at first (Kerbl 2023; the original release)
 HULL_CELLS = 64  # along an axis
 NEIGHBOURS = 3
 FEW = 100  # points that are too few to begin at
+CROWD = 1 / 3  # of all Gaussians that may be: how many points a cloud begins with at most, as each makes steps slower
 BACKDROP = 0.2  # of the random Gaussians: how many lie far out behind dense points, where nothing else is known
 
 
@@ -36,8 +37,8 @@ def initial_cloud(
     means, colours = torch.zeros(0, 3), torch.zeros(0, 3)
     if initialization != "random":
         means, colours = sparse_points(scene, most, generator)
-    if initialization == "dense" and len(means) < most:
-        means, colours = with_dense_points(scene, means, colours, count, most, generator)
+    if initialization == "dense" and len(means) < (crowd := math.ceil(CROWD * most)):
+        means, colours = with_dense_points(scene, means, colours, count, crowd, generator)
     if len(means) < 2:
         means = random_points(scene, min(count, most), generator)
         colours = torch.rand(len(means), 3, generator=generator)
