@@ -14,8 +14,8 @@ from .. import kernels
 from ..blending import over
 from ..camera import Camera
 from ..components.clouds.cloud import Cloud, CloudAdam
-from ..components.clouds.density_control import AdaptiveDensity, MarkovChain
 from ..components.clouds.dense_points import compile_sweep
+from ..components.clouds.density_control import AdaptiveDensity, MarkovChain
 from ..components.clouds.initial_cloud import Initialization, initial_cloud, random_cloud
 from ..components.clouds.smoothing import sampling_interval, smoothed
 from ..components.training.rhythm import Rhythm, haste, intervals
@@ -39,7 +39,7 @@ class Config:
     ssim_weight: float = 0.2  # share of D-SSIM in the loss, eq. 7
     strategy: Literal["adaptive", "mcmc"] = "adaptive"  # density control: section 5, or Kheradmand 2024
     max_gaussians: int = 1_000_000  # cap of the cloud's size, under either strategy
-    initialization: Initialization = "dense"  # sparse points and plane sweeps, sparse points as section 5, or random
+    initialization: Initialization = "sparse"  # points of structure from motion, "dense" with plane sweeps' beside them
     initial_gaussians: int = 100_000  # at random places, where nothing else is known, section 7.1
     half_resolution_until: float = 0.0  # share of the budget at half size; the first quarter of it at a quarter
     refine_every: int = 100  # steps between changes of the cloud, section 5.2; or the share, if that is sooner

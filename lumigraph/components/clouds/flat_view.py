@@ -60,7 +60,7 @@ class FlatView:
         return seen, row.clamp(0, height - 1), column.clamp(0, width - 1), depth
 
     def warp_to(self, other: FlatView) -> Float[Tensor, "3 4"]:
-        """(A | b) of `kernels.plane_sweep`: from a pixel here and one over its depth along the axis to a pixel there."""
+        """(A | b) of `kernels.plane_sweep`: from a pixel here and its inverse depth along the axis to a pixel there."""
         rotation, towards = other.pose[:, :3].T @ self.pose[:, :3], self.pose[:, 3] - other.pose[:, 3]
         along = other.intrinsics @ rotation @ self.intrinsics.inverse()
         return torch.cat([along, (other.intrinsics @ other.pose[:, :3].T @ towards)[:, None]], 1)
@@ -92,7 +92,7 @@ def flat_view(photograph: Photograph, longest: int) -> FlatView:
     intrinsics[:2, 2] = centre[0] - first
     columns, rows = (last - first).int().tolist()
     flat = FlatView(pose, intrinsics, torch.empty(rows, columns, 3), torch.empty(rows, columns))
-    pixels, valid = lens.project((flat.rays.reshape(-1, 3) @ pose[:, :3]))
+    pixels, valid = lens.project(flat.rays.reshape(-1, 3) @ pose[:, :3])
     at = torch.where(valid[:, None], pixels / size * 2 - 1, -4).view(1, rows, columns, 2)
     known = torch.cat([small.rgb, trust[..., None]], -1).movedim(-1, 0)[None]
     rgb, trust = grid_sample(known, at, align_corners=False)[0].split([3, 1])

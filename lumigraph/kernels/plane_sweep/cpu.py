@@ -10,6 +10,7 @@ from . import BEHIND, VARIANCE
 BORDER = 3  # zeros around a neighbour: one pixel before, two behind, where two are looked up beside each other
 QUANTITIES = 6  # sums over a window of w, w a, w b, w a a, w b b, w a b
 E, LEAST = np.float32(VARIANCE), np.float32(BEHIND)
+BEYOND = np.float32(4)  # more than any cost
 ZERO, HALF, ONE, TINY = np.float32(0), np.float32(0.5), np.float32(1), np.float32(1e-12)
 
 
@@ -126,7 +127,7 @@ def _sweep(reference, trust, pixels, rows, columns, warps, hypotheses, window, b
         least = np.empty((best, width), np.float32)
         for y in range(height + margin):
             middle = y - margin
-            least[:] = np.float32(np.inf)
+            least[:] = BEYOND
             for n in range(count):
                 sums = rings[n, y % len(window)]
                 if y < height:
