@@ -36,6 +36,7 @@ from .commands.view import ViewCommand
 from .errors import LumigraphError, LumigraphWarning
 from .files import refusal
 from .signals import exit_code, listening, number_of
+from .threads import considerate
 
 COMMANDS: dict[str, type] = {
     "demo": Demo,
@@ -69,7 +70,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"lumigraph {__version__}")
         return 0
     try:
-        with listening(), told_warnings():
+        with listening(), told_warnings(), considerate():
             return parse(arguments).run()
     except LumigraphError as error:
         return refuse(str(error))
