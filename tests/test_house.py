@@ -16,7 +16,7 @@ import lumigraph
 # A new room is a new name here, on the floor where it belongs.
 FLOORS: list[set[str]] = [
     {"errors"},
-    {"blending", "choice", "controls", "geometry", "loops", "memory", "progress", "readers", "srgb"},
+    {"blending", "choice", "controls", "geometry", "loops", "memory", "names", "progress", "readers", "srgb"},
     {"files", "plain", "lens", "rays"},
     {"camera", "images", "kernels", "figures", "metrics"},
     {"volume", "scene"},

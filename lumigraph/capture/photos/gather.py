@@ -14,6 +14,7 @@ from PIL import Image, UnidentifiedImageError
 
 from ...errors import LumigraphError
 from ...files import explained
+from ...names import natural
 from ..pictures import describe, reductions
 from . import upright
 from .exif import read_facts
@@ -48,7 +49,8 @@ def gather(sources: Sequence[Path], work: Path, frames: int | None = None, track
     files = named_files(list_photographs(sources, work))
     taken = examine(files, work / "upright", track)
     unreadable = {name: why for name, why in taken.items() if isinstance(why, str)}
-    seen = [one for _, one in sorted(taken.items()) if isinstance(one, Candidate)]
+    seen = [taken[name] for name in sorted(taken, key=natural)]
+    seen = [one for one in seen if isinstance(one, Candidate)]
     if not seen:
         raise LumigraphError(nothing(source, unreadable))
     return assess(Intake(source, with_altitudes([one.photo for one in seen]), unreadable=unreadable), seen)
@@ -121,7 +123,7 @@ def list_photographs(sources: Sequence[Path], work: Path) -> list[Path]:
 def walk(folder: Path, work: Path | None = None) -> Iterator[Path]:
     """Photographs below a folder, sorted: no hidden ones, none that a program reduced or rendered."""
     with explained(folder):
-        entries = sorted(folder.iterdir())
+        entries = sorted(folder.iterdir(), key=lambda path: natural(path.name))
     folders = [entry for entry in entries if entry.is_dir()]
     reduced = {path for folder in folders for times, path in reductions(folder).items() if times > 1}
     for entry in entries:
