@@ -9,6 +9,7 @@ import torch
 from jaxtyping import Float
 
 from ..camera import Camera
+from ..geometry import turning
 
 UPRIGHT = math.cos(math.radians(15))  # a source axis nearer to up than this is up
 LEVEL = 0.03  # mean square of what pictures' rows have along up, at most, where cameras are held level: 10 degrees
@@ -109,9 +110,5 @@ def unit(vector: Float[np.ndarray, " 3"]) -> Float[np.ndarray, " 3"]:
 
 
 def turn_onto_z(up: Float[np.ndarray, " 3"]) -> Float[np.ndarray, "3 3"]:
-    """The smallest rotation that takes a unit vector to +z (Rodrigues)."""
-    x, y, z = up
-    if z < -1 + 1e-9:
-        return np.diag([1.0, -1.0, -1.0])
-    cross = np.array([[0, 0, -x], [0, 0, -y], [x, y, 0]])
-    return np.eye(3) + cross + cross @ cross / (1 + z)
+    """The smallest rotation that takes a direction to +z."""
+    return turning(torch.from_numpy(np.asarray(up)), torch.tensor([0.0, 0.0, 1.0])).numpy()
