@@ -198,6 +198,7 @@ class Scene:
     warnings: what the user should know about the capture, one sentence each
     layers:  what else is known of every pixel, by name: depth, labels ...; read when asked for
     about:   what else is known of each photograph, by name: exposure, boxes ...; the first axis is the image
+    full_sizes: width and height of the photographs before they were reduced, where they come from files
     """
 
     kind: ClassVar[str] = "photographs"
@@ -213,9 +214,14 @@ class Scene:
     warnings: list[str] = field(default_factory=list)
     layers: dict[str, Layer] = field(default_factory=dict)
     about: dict[str, Tensor] = field(default_factory=dict)
+    full_sizes: Int[Tensor, "photograph 2"] | None = None
 
     def __len__(self) -> int:
         return len(self.names)
+
+    def pixels(self, split: str) -> int:
+        """How many pixels there are to learn from, or to compare."""
+        return int(self.images.trusted_pixels[self.splits[split]].sum())
 
     def layer(self, name: str) -> Layer:
         """A layer by its name. Raises LumigraphError, naming those that there are, if there is none."""

@@ -43,6 +43,7 @@ SHARES: dict[str, tuple[str, float]] = {
     "test_cli": ("runs, commands, benchmark", 12),
     "test_run": ("runs, commands, benchmark", 8),
     "test_train": ("runs, commands, benchmark", 8),
+    "test_signals": ("runs, commands, benchmark", 8),
     "test_nerf": ("methods", 16),
     "test_instant_ngp": ("methods", 10),
     "test_gaussian_splatting": ("methods", 10),
@@ -55,8 +56,14 @@ GROUPS: dict[str, str] = {
         "test_export test_viewer_controls test_exchange test_explain_ray test_keyframes test_browser".split(),
         "exports, viewer, web",
     ),
-    **dict.fromkeys("test_old_runs test_opened test_composed test_scores".split(), "runs, commands, benchmark"),
-    **dict.fromkeys("test_memory test_charts test_multiscale test_fewer_views".split(), "runs, commands, benchmark"),
+    **dict.fromkeys(
+        "test_locks test_old_runs test_opened test_composed test_scores test_memory test_progress".split(),
+        "runs, commands, benchmark",
+    ),
+    **dict.fromkeys(
+        "test_charts test_multiscale test_fewer_views test_budget test_verdict test_display".split(),
+        "runs, commands, benchmark",
+    ),
     **dict.fromkeys("test_coordinate_network test_density_control test_gaussians test_encodings".split(), "methods"),
     **dict.fromkeys("test_house test_budgets".split(), "house"),
 }  # the others are of nouns and capture

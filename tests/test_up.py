@@ -22,7 +22,7 @@ Z = np.array([0.0, 0.0, 1.0])
 
 
 def survey(rows: int, heading, pitch: float) -> np.ndarray:
-    """A drone's grid of places 5 above the ground, one apart. heading: radians, of a row; pitch: degrees below level."""
+    """A drone's grid of places, 5 above the ground. heading: radians, of a row; pitch: degrees below level."""
     poses = []
     for row in range(rows):
         ahead = np.array([math.cos(heading(row)), math.sin(heading(row)), 0])

@@ -17,7 +17,7 @@ from ..errors import LumigraphError, LumigraphWarning
 from ..images import ImageSource, ImageStore
 from ..lens import Equirectangular, Lens, Pinhole
 from ..names import natural
-from ..progress import counting
+from ..progress import counting, track
 from ..scene import Forward, Frame, Scene
 from .beside import make_about, make_layers
 from .capture import Capture, Shot
@@ -66,7 +66,7 @@ def assemble(
         )
     splits = split(capture.source, shots)
     poses = np.stack([checked_pose(shot, capture.source) for shot in shots])
-    chosen = [choose(shot, downscale) for shot in shots]
+    chosen = [choose(shot, downscale) for shot in track(shots, "Looking at photographs", len(shots))]
     told += about_small(capture.source, chosen) if downscale else []
     for warning in told:
         warnings.warn(warning, LumigraphWarning, stacklevel=3)
@@ -83,7 +83,8 @@ def assemble(
     away = poses[:, :, 3].mean(0)
     cameras = make_cameras(shots, moved(poses, translation(-away)), lenses, images.sizes)
     upright = None if before is None else in_four(before.upright)
-    place = find_place(shifted(capture, -away), cameras, images, splits["train"].tolist(), upright)
+    with counting("Looking for what the cameras look at"):
+        place = find_place(shifted(capture, -away), cameras, images, splits["train"].tolist(), upright)
     matrix = place.scene_from_source @ translation(-away)
     cameras = make_cameras(shots, moved(poses, matrix), lenses, images.sizes)
     forward = None
@@ -106,6 +107,7 @@ def assemble(
         told + lost,
         layers,
         make_about(shots),
+        torch.tensor([c.calibrated for c in chosen]),
     )
 
 

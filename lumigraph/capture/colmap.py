@@ -6,13 +6,13 @@ import struct
 from pathlib import Path
 
 import numpy as np
-import pycolmap
 import torch
 
 from ..errors import LumigraphError
 from ..lens import Equirectangular, Fisheye, Lens, OpenCV, Pinhole
 from ..names import natural
 from .capture import Capture, Shot
+from .library import pycolmap
 from .pictures import reductions, versions
 from .points import SparsePoints, read_points3d
 

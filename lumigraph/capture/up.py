@@ -16,7 +16,9 @@ LEVEL = 0.03  # mean square of what pictures' rows have along up, at most, where
 TURNING = 0.02, 4  # and across their main direction at least, if they turn about up: 8 degrees, and times the former
 ALONG = 0.9  # cosine from which on a camera looks along a direction
 OBLIQUE = 0.1  # share of the cameras that must look elsewhere than the rest
-CANCELLING = 0.5  # length of the pictures' mean up below which cameras were turned about their axes: nobody does by hand
+CANCELLING = (
+    0.5  # length of the pictures' mean up below which cameras were turned about their axes: nobody does by hand
+)
 HELD = 0.2  # below which it says nothing
 AGREEING = 0.7  # cosine between the pictures' mean up and the direction at right angles to rows, if that is up
 WIDE = 0.4  # times the distance to what is seen: deviation of the places both ways from which on they are a map's
@@ -24,9 +26,7 @@ PLANE = 0.2, 0.2  # of the places' extent: the smallest deviation at most, and t
 FACING = 0.5  # cosine between a map's plane and the view: drones look no flatter than that
 
 
-def find_upright(
-    cameras: Camera, points: Float[np.ndarray, "point 3"] | None = None
-) -> Float[np.ndarray, "4 4"]:
+def find_upright(cameras: Camera, points: Float[np.ndarray, "point 3"] | None = None) -> Float[np.ndarray, "4 4"]:
     """The rotation that brings the cameras' common up to +z; none if the source already has an axis there."""
     up = common_up(cameras, points)
     return np.eye(4) if up is None else upright_by(up)
@@ -44,9 +44,7 @@ def upright_by(up: Float[np.ndarray, " 3"]) -> Float[np.ndarray, "4 4"]:
     return matrix
 
 
-def common_up(
-    cameras: Camera, points: Float[np.ndarray, "point 3"] | None = None
-) -> Float[np.ndarray, " 3"] | None:
+def common_up(cameras: Camera, points: Float[np.ndarray, "point 3"] | None = None) -> Float[np.ndarray, " 3"] | None:
     """The direction that was up where the photographs were taken, unit length; None if nothing tells.
 
     Cameras are held level rather than straight ahead, by hand as by a drone's gimbal: up is the direction most at right
@@ -78,10 +76,10 @@ def from_above(
     gaze: Float[np.ndarray, " 3"],
     points: Float[np.ndarray, "point 3"] | None,
 ) -> Float[np.ndarray, " 3"] | None:
-    """Up, unit length, of cameras that look one way, at a ground from above; None if they look at something before them.
+    """Up, unit length, of cameras that look one way, at a ground from above; None if they look at things ahead.
 
-    They were above if they were turned about their axes, as a drone is that flies to and fro; or if they are spread over
-    what they look at as for a map, which nobody walks. Then the plane of their places is level.
+    They were above if they were turned about their axes, as a drone is that flies to and fro; or if they are spread
+    over what they look at as for a map, which nobody walks. Then the plane of their places is level.
     own, gaze: mean of the pictures' own up, and of the viewing directions
     """
     if np.linalg.norm(gaze) < ALONG:

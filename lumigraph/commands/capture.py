@@ -10,7 +10,7 @@ from typing import Annotated, Any, Literal
 from tyro.conf import Positional
 
 from ..errors import LumigraphError
-from .common import needed, option, say, scene_name, show
+from .common import needed, option, say, scene_name, show, typed
 
 NAMELESS = ("images", "photos", "photographs", "pictures", "input", "frames")  # folders named after what is in them
 NAMED = 12  # photographs at most that a list names; all are in capture.json and photographs.png
@@ -47,7 +47,7 @@ class CaptureCommand:
             raise LumigraphError("Nothing to capture; name a folder of photographs, image files or a video")
         options = Options(self.frames, self.mapper, self.matching, self.camera, self.max_size)
         folder = self.output or scene_folder(self.what)
-        tell(folder, find_cameras(self.what, folder, options), f"lumigraph train gaussian-splatting {folder}")
+        tell(folder, find_cameras(self.what, folder, options), typed("train", "gaussian-splatting", folder))
         return 0
 
 

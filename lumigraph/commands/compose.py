@@ -9,7 +9,7 @@ from typing import Annotated
 from tyro.conf import Positional, arg
 
 from ..errors import LumigraphError
-from .common import needed, option, show
+from .common import needed, option, show, typed
 
 Triple = tuple[float, float, float]
 
@@ -72,7 +72,7 @@ class Compose:
             {
                 "composition": str(self.output),
                 "bounds": f"({', '.join(f'{x:.3g}' for x in low)}) to ({', '.join(f'{x:.3g}' for x in high)})",
-                "next": f"lumigraph view {self.output}",
+                "next": typed("view", self.output),
             }
         )
         return 0

@@ -10,6 +10,7 @@ from typing import Annotated, Any
 
 from tyro.conf import Positional
 
+from ..signals import until_interrupted
 from .common import needed, option, show
 from .controls import Set, open_method
 
@@ -38,7 +39,7 @@ class ViewCommand:
         opened, method, cameras = open_method(self.source, self.device, self.told)
         subject = subject_of(opened, cameras)
         address = choose_address(self.host, self.port)
-        with contextlib.suppress(KeyboardInterrupt), Viewer(method, subject, address) as viewer:
+        with until_interrupted(), Viewer(method, subject, address) as viewer:
             tell(viewer)
             viewer.serve()
         return 0
@@ -81,7 +82,7 @@ def keep_showing(viewer: Any, signal: int | None) -> None:
     """After training: go on until Ctrl-C, unless that is what ended it."""
     if viewer is not None and signal is None:
         viewer.end_training()
-        with contextlib.suppress(KeyboardInterrupt):
+        with until_interrupted():
             viewer.serve()
 
 

@@ -1,4 +1,4 @@
-"""What lies behind a scene under the open sky where no photograph looked: its own colours, and a floor to stay above."""
+"""What lies behind an open scene where no photograph looked: its own colours; and a floor to stay above."""
 
 from __future__ import annotations
 

@@ -18,7 +18,7 @@ from ..capabilities import HasDensity, can, needs
 from ..errors import LumigraphError
 from ..mesh import Mesh
 from ..method import Method
-from ..progress import track
+from ..progress import counting, track
 from ..scene import Frame
 from .fusion import Fusion
 from .polygons import BLOCK, Grid, zero_level
@@ -92,9 +92,10 @@ def extract_mesh(
             "Nothing inside the box is solid at this density, so there is no surface; train for longer, or "
             "try a lower --level"
         )
-    vertices = smoothed(vertices, triangles, smooth)
-    if faces is not None:
-        vertices, triangles = simplified(vertices, triangles, faces)
+    with counting("Smoothing the surface"):
+        vertices = smoothed(vertices, triangles, smooth)
+        if faces is not None:
+            vertices, triangles = simplified(vertices, triangles, faces)
     points, normals = (torch.from_numpy(x).float() for x in (vertices, vertex_normals(vertices, triangles)))
     rgb = colours(points, normals, sightings, 3 * grid.cell)
     return Mesh(vertices, triangles, (rgb * 255).round().to(torch.uint8).numpy())

@@ -15,6 +15,7 @@ from ..errors import LumigraphError
 from ..files import write_bytes
 from ..geometry import to_quaternion, turning
 from ..mesh import Mesh
+from ..progress import counting
 from ..srgb import linear_from_srgb
 from .surface import vertex_normals
 from .usdz import usdz
@@ -27,8 +28,8 @@ VERTICES, INDICES = 34962, 34963  # glTF 2.0, 5.11.5
 def write_mesh(path: Path, mesh: Mesh, up: Float[np.ndarray, " 3"] = Z) -> None:
     """Write in the format that the ending names, whole or not at all.
 
-    .ply and .obj, which have no custom of what is up, are in the frame that the mesh is in. The other two stand upright,
-    +y up; a .glb by a node that turns the vertices, which are in the mesh's own frame there too.
+    .ply and .obj, which have no custom of what is up, are in the frame that the mesh is in. The other two stand
+    upright, +y up; a .glb by a node that turns the vertices, which are in the mesh's own frame there too.
 
     up: in the mesh's frame
     .ply: binary, float32, sRGB-encoded bytes at each vertex
@@ -37,8 +38,10 @@ def write_mesh(path: Path, mesh: Mesh, up: Float[np.ndarray, " 3"] = Z) -> None:
     .usdz: a picture of the colours, as `usdz` has it
     Raises LumigraphError for any other ending.
     """
+    encode = ENCODERS[ending(path)]
     upright = turning(torch.from_numpy(np.asarray(up)), torch.tensor([0.0, 1.0, 0.0])).numpy()
-    write_bytes(path, ENCODERS[ending(path)](mesh, upright))
+    with counting(f"Writing {path.name}"):
+        write_bytes(path, encode(mesh, upright))
 
 
 def ending(path: Path) -> str:

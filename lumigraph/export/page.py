@@ -32,7 +32,7 @@ from ..gaussians import Gaussians
 from ..mesh import Mesh
 from ..method import Method
 from ..paths import Surroundings, angle_of_view, camera_path, film_size
-from ..progress import track
+from ..progress import counting, track
 from ..scene import Frame, Vector
 from .backdrop import Backdrop
 
@@ -125,7 +125,9 @@ def opening_of_scene(
 def splats_page(path: Path, gaussians: Gaussians, opening: Opening) -> None:
     """Write a page that draws a cloud in the scene's frame as splats with harmonics, held as .spz, with its loss."""
     settings = asdict(opening) | {"webgl": True, "packed": False, "antialiased": gaussians.antialiased}
-    write_page(path, "splats", settings, spz.encode(gaussians, steps=FINE))
+    with counting(f"Packing {len(gaussians):,} Gaussians"):
+        packed = spz.encode(gaussians, steps=FINE)
+    write_page(path, "splats", settings, packed)
 
 
 def mesh_page(path: Path, mesh: Mesh, opening: Opening) -> None:

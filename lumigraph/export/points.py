@@ -15,7 +15,7 @@ from ..camera import Camera
 from ..errors import LumigraphError
 from ..files import replacing
 from ..method import Method
-from ..progress import track
+from ..progress import counting, track
 from ..scene import Frame
 from .sightings import FAR, Sighting, compare, look_around
 
@@ -71,7 +71,8 @@ def extract_points(
         raise LumigraphError(
             "No two cameras agree on where anything solid is, so there are no points; train for longer and try again"
         )
-    columns = thinned(kept, count)
+    with counting("Thinning points"):
+        columns = thinned(kept, count)
     normals = columns[:, 3:6] / np.maximum(np.linalg.norm(columns[:, 3:6], axis=-1, keepdims=True), 1e-30)
     return PointCloud(columns[:, :3], normals, (columns[:, 6:] * 255).round().astype(np.uint8))
 

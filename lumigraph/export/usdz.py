@@ -23,7 +23,7 @@ ALIGNED = 64  # bytes: every file's data begins at a multiple of it (Usdz File F
 PADDING = b"\x19\x86"  # who an extra field belongs to; nobody reads it
 PICTURE = "colours.png"
 
-# Light of its own and no other: the light of the scene is in its colours already. sRGB is what phones take emission for.
+# Light of its own and no other: the light of the scene is in its colours already. Phones take emission for sRGB.
 LAYER = Template("""#usda 1.0
 (
     customLayerData = {

@@ -41,9 +41,7 @@ def contact_sheet(title: str, columns: Sequence[str], rows: Sequence[Row], cell:
     Where they would make a tower, as upright pictures do, rows go side by side in blocks, in order down each block, so
     that the sheet comes near to the shape of a screen. What is larger than a screen is made of smaller pictures.
     """
-    layouts = [
-        Layout(columns, rows, size, count) for size in sizes(cell) for count in range(1, max(len(rows), 1) + 1)
-    ]
+    layouts = [Layout(columns, rows, size, count) for size in sizes(cell) for count in range(1, max(len(rows), 1) + 1)]
     fitting = [layout for layout in layouts if layout.fits]
     largest = max((layout.cell for layout in fitting), default=min(layout.cell for layout in layouts))
     return min((x for x in fitting or layouts if x.cell == largest), key=lambda x: x.oddness).drawn(title)

@@ -239,7 +239,7 @@ class PathPanel:
             return
         self._saved.options = self._names()
         self._saved.value = name
-        self._about.content = f"Saved. A film of it: `{self._subject.render_command} --path {file}`"
+        self._about.content = f"Saved. A film of it: {code(f'{self._subject.render_command} --path {file}')}"
 
     def _open(self) -> None:
         self._saved.options, name = self._names(), self._saved.value
@@ -259,6 +259,12 @@ class PathPanel:
         self._loop.value, self._fps.value, self._name.value = path.loop, round(path.fps), name
         self._filling = False
         self._fill(0)
+
+
+def code(text: str) -> str:
+    """Text that Markdown shows as it is: between more backticks than it has in a row itself."""
+    fence = "`" * (1 + max(map(len, re.findall("`+", text)), default=0))
+    return f"{fence} {text} {fence}" if "`" in text else f"`{text}`"
 
 
 def source_from_scene(frame: Frame) -> Float[Tensor, "4 4"]:

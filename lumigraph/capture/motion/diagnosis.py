@@ -8,11 +8,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-import pycolmap
 from jaxtyping import Float
 from scipy.spatial import ConvexHull, QhullError
 
 from ...names import natural
+from ..library import pycolmap
 from ..normalise import where_axes_meet
 from ..photos import Intake, Photo
 

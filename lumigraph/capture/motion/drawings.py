@@ -7,12 +7,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import pycolmap
 from jaxtyping import Float, UInt8
 from PIL import Image, ImageDraw, ImageFont
 
 from ...figures import RAMP, fit_into, save_picture
 from ...names import natural
+from ..library import pycolmap
 from ..photos import Intake
 from .diagnosis import Diagnosis
 

@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 import plyfile
-import pycolmap
 
 from ...errors import LumigraphError
 from ...files import PARTIAL, read_json, remove, replacing, write_json
+from ..library import pycolmap
 from ..photos import Photo
 from ..photos.track import Track
 from ..pictures import list_images

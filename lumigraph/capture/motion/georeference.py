@@ -6,12 +6,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import pycolmap
 import torch
 from jaxtyping import Float
 
 from ...camera import Camera
 from ...lens import Pinhole
+from ..library import pycolmap
 from ..photos import Photo
 from ..up import common_up, turn_onto_z
 

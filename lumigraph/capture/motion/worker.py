@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 import os
+import signal
 import subprocess
 import sys
 import threading
@@ -100,6 +101,7 @@ def end_with_input() -> None:
 
 
 def main() -> None:
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)  # COLMAP's logging library has taken it
     job = json.loads(sys.argv[1])
     job["threads"] = min(os.cpu_count() or 1, MANY_CORES)
     job["seed"] = 0

@@ -89,7 +89,8 @@ def assess(intake: Intake, seen: Sequence[Candidate]) -> Intake:
         return one.photo.name in bad, -math.prod(one.photo.size), -one.bytes, one.photo.name
 
     signatures = {one.photo.name: one.judgement.signature for one in sorted(seen, key=worth)}
-    return replace(intake, blurred=bad, duplicates=dict(sorted(duplicates(signatures, sizes).items())))
+    same = duplicates(signatures, sizes)
+    return replace(intake, blurred=bad, duplicates={name: same[name] for name in sorted(same, key=natural)})
 
 
 def nothing(source: str, unreadable: Mapping[str, str]) -> str:

@@ -13,7 +13,6 @@ from ..common import needed, option, show
 from ..controls import Set, open_method
 from .points import check_pictures
 
-
 FOR_PHONES = 100_000  # triangles that a phone shows with ease
 
 
@@ -21,9 +20,9 @@ FOR_PHONES = 100_000  # triangles that a phone shows with ease
 class ExportMesh:
     """Triangles with colours at their corners, in the frame of the photographs or upright.
 
-    The ending says which format: .ply and .obj, in that frame; .glb, upright; .usdz, upright, for phones. Marching cubes on the density of methods that have one, fusion of
-    the depth that others render. Only the middle of a scene is meshed. What no camera sees is closed up (objects) or
-    left out (rooms and the open).
+    The ending says which format: .ply and .obj, in that frame; .glb, upright; .usdz, upright and for phones. Marching
+    cubes on the density of methods that have one, fusion of the depth that others render. Only the middle of a scene is
+    meshed. What no camera sees is closed up (objects) or left out (rooms and the open).
     """
 
     source: Annotated[Positional[Path], needed("RUN_OR_FILE")]

@@ -35,7 +35,9 @@ class ExportWeb:
     """What the page holds."""
     title: Annotated[str | None, option("TEXT", "the scene's name")] = None
     """What the page is called."""
-    background: Annotated[str | None, option("#RRGGBB", "the one it was trained with; outdoors the colours of its sky and ground")] = None
+    background: Annotated[
+        str | None, option("#RRGGBB", "the one it was trained with; outdoors the colours of its sky and ground")
+    ] = None
     """Colour behind splats or the mesh."""
     views: Annotated[int, option("N")] = 72
     """Pictures in a page of views."""
