@@ -20,6 +20,7 @@ from ..exchange.morton import morton_order
 from ..mesh import Mesh
 
 ALIGNED = 64  # bytes: every file's data begins at a multiple of it (Usdz File Format Specification 1.3, "Layout")
+HEADER = 30  # bytes of a zip file's header before the name
 PADDING = b"\x19\x86"  # who an extra field belongs to; nobody reads it
 PICTURE = "colours.png"
 
@@ -154,7 +155,7 @@ def archive(parts: Mapping[str, bytes]) -> bytes:
     with zipfile.ZipFile(held, "w", zipfile.ZIP_STORED) as packed:
         for name, data in parts.items():
             about = zipfile.ZipInfo(name)
-            header = held.tell() + zipfile.sizeFileHeader + len(name.encode()) + 4
+            header = held.tell() + HEADER + len(name.encode()) + 4
             room = -header % ALIGNED
             about.extra = PADDING + room.to_bytes(2, "little") + bytes(room)
             packed.writestr(about, data)

@@ -67,7 +67,8 @@ class Layout:
     @cached_property
     def shapes(self) -> list[list[tuple[int, int]]]:
         """Width and height of each picture; nothing is made smaller before the layout is chosen."""
-        return [[fitted(*p.shape[1::-1], self.cell, self.cell * 5 // 4) for p in row.pictures] for row in self.rows]
+        most = self.cell, self.cell * 5 // 4
+        return [[fitted(picture.shape[1], picture.shape[0], *most) for picture in row.pictures] for row in self.rows]
 
     @cached_property
     def heights(self) -> list[int]:
