@@ -11,6 +11,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+Vector = tuple[float, float, float]
 Rows = tuple[tuple[float, float, float, float], ...]  # of a 4x4 matrix, as plain numbers
 
 

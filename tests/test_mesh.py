@@ -18,6 +18,7 @@ from solids import SOLID, Seen, Solid, around, ball, painted, shell, together, t
 
 from lumigraph.camera import Camera
 from lumigraph.cli import main
+from lumigraph.crop import Box
 from lumigraph.errors import LumigraphError
 from lumigraph.exchange import write_gaussians
 from lumigraph.export.mesh import extract_mesh, meshed_box
@@ -125,10 +126,10 @@ def test_a_surface_that_leaves_the_box_is_closed_there_or_open():
 
 def test_the_box_may_be_larger_or_smaller_and_grows_in_the_open():
     frame = Frame(bounds=((-0.4,) * 3, (0.4,) * 3), near=0.1, reach=4.0)
-    assert meshed_box(frame, None).tolist() == [[pytest.approx(-0.6)] * 3, [pytest.approx(0.6)] * 3]
-    assert meshed_box(frame, 100.0).tolist() == [[-4.0] * 3, [4.0] * 3]
-    assert meshed_box(replace(frame, reach=1.0), None)[1].tolist() == [pytest.approx(0.4)] * 3
-    mesh = extract_mesh(Seen(ball(), frame), around(), cell=CELL, box=2.0)
+    assert meshed_box(frame, None) == Box((pytest.approx(-0.6),) * 3, (pytest.approx(0.6),) * 3)
+    assert meshed_box(frame, 100.0) == Box((-4.0,) * 3, (4.0,) * 3)
+    assert meshed_box(replace(frame, reach=1.0), None).upper == (pytest.approx(0.4),) * 3
+    mesh = extract_mesh(Seen(ball(), frame), around(), cell=CELL, extent=2.0)
     assert as_trimesh(mesh).is_watertight and as_trimesh(mesh).extents.min() > 1.1
 
 
@@ -383,7 +384,8 @@ def test_an_empty_scene(make):
 BAD = {
     "ending": ["mesh", "RUN", "ball.stl"],
     "cell size": ["mesh", "RUN", "ball.ply", "--cell-size", "-1"],
-    "box": ["mesh", "RUN", "ball.ply", "--box", "0"],
+    "extent": ["mesh", "RUN", "ball.ply", "--extent", "0"],
+    "empty box": ["mesh", "RUN", "ball.ply", "--box", *"0 0 0 1 1 -1".split()],
     "faces": ["mesh", "RUN", "ball.ply", "--faces", "0"],
     "share": ["mesh", "RUN", "ball.ply", "--keep", "2"],
     "no run": ["mesh", "RUN", "ball.ply"],

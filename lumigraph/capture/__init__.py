@@ -22,6 +22,7 @@ from .assemble import assemble as assemble
 from .capture import Capture as Capture
 from .capture import Shot as Shot
 from .fewer import with_fewer_views
+from .masks import with_masks
 from .multiscale import multiscale as multiscale
 from .pictures import list_images
 
@@ -114,7 +115,7 @@ def open_scene(
     elif single_image.recognises(path := Path(source).expanduser()):
         capture, downscale = single_image.read(path, downscale), 1  # it is reduced by now
     else:
-        capture = choose_reader(path, reader).read(path)
+        capture = with_masks(choose_reader(path, reader).read(path), path)
     scene = assemble(capture, downscale, memory, cache, before)
     if views is not None:
         scene = with_fewer_views(scene, views)

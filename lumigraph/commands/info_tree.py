@@ -120,7 +120,7 @@ def composition_tree(composition: Any) -> Tree:
     for number, (part, place) in enumerate(zip(composition.parts, composition.places, strict=True)):
         rows = {"source": part.source, "leads": "yes" if number == composition.lead else None}
         rows |= {"scale": place.scale, "origin": vector(tuple(place.matrix[:3, 3].tolist())) + " in the frame below"}
-        rows |= {"box": part.box and f"{vector(part.box[0])} to {vector(part.box[1])}"}
+        rows |= {"box": part.box and f"{vector(part.box.lower)} to {vector(part.box.upper)}"}
         branch(tree, f"part {number}", rows)
     branch(tree, "frame", frame_rows(composition.frame))
     return tree

@@ -31,7 +31,7 @@ from ..files import write_bytes
 from ..gaussians import Gaussians
 from ..mesh import Mesh
 from ..method import Method
-from ..paths import Surroundings, angle_of_view, camera_path, film_size
+from ..paths import Surroundings, angle_of_view, camera_path, film_size, pivot
 from ..progress import counting, track
 from ..scene import Frame, Vector
 from .backdrop import Backdrop
@@ -41,7 +41,6 @@ NEAREST, FARTHEST = 0.1, 3.0  # times the first distance to what is looked at: h
 FARTHEST_OPEN = 1.5  # likewise, where the ground ends somewhere: from far outside it would be an island
 BELOW, BELOW_OPEN = 20.0, 5.0  # degrees below the lowest photograph that the camera may go, also under the open sky
 ARC = 0.8  # of the arc that photographs cover is shown
-AHEAD = 0.02  # scene units: of what a camera turns about that looks outward from the middle
 FINE = 2, 4  # of 1/128: steps of the harmonics, a quarter of those that .spz files have by custom
 CROP = 1.45  # times larger than fits, at most, is a picture without a plain background, to fill the window
 QUALITY = 90  # of the pictures, as WebP
@@ -98,7 +97,7 @@ def opening_of_scene(
     around = Surroundings(cameras, frame)
     pose = camera_path("orbit", cameras, frame, 1, (2, 2)).pose[0].double()
     position, forward = pose[:, 3], pose[:, 2]
-    target = around.focus if around.inward else position + AHEAD * forward
+    target = pivot(around, position, forward)
     distance = float((position - target).norm())
     elevation = math.degrees(float(around.polar[:, 1].min()))
     alone = frame.reach == 1

@@ -22,7 +22,7 @@ from ..photos import Intake, Photo, gather
 from ..photos.track import Track, untracked
 from .diagnosis import FEW_FEATURES, Diagnosis, Matches, counted, diagnose, folds, read_matches
 from .drawings import draw_capture, draw_photographs
-from .folder import RESULT, claim, copy_photographs, stamp, write_model
+from .folder import MASKS, RESULT, claim, copy_masks, copy_photographs, stamp, write_model
 from .georeference import Georeference, georeference, gps_positions, upright
 from .lenses import Sharing, group_by_lens, model_for, prior, write_database
 from .pairs import NEIGHBOURS, Matching, choose_matching, choose_pairs
@@ -143,6 +143,7 @@ class Reconstruction:
             self.work / "models",
         )
         self.unfolded = self.work / "unfolded"
+        self.masks: Path | None = None
         self.names = [photo.name for photo in self.photos]
         self.groups = group_by_lens(self.photos, self.intake.in_order, self.options.camera)
         chosen = choose_matching(len(self.photos), self.intake.in_order)
@@ -154,7 +155,7 @@ class Reconstruction:
         """For each stage a name of everything that its result depends on."""
         features = key_of(
             pycolmap.__version__,
-            [[p.name, *stamp(p.path)] for p in self.photos],
+            [[p.name, *stamp(p.path), *(stamp(p.mask) if p.mask else ())] for p in self.photos],
             [[prior(group), model_for(group), [p.name for p in group]] for group in self.groups],
             self.options.max_size,
             self.count_features(),
@@ -167,6 +168,7 @@ class Reconstruction:
 
     def run(self) -> dict[str, Any]:
         copy_photographs(self.photos, self.images, self.track)
+        self.masks = copy_masks(self.photos, self.folder / MASKS, self.track)
         self.find_features(self.keys["features"])
         self.compare(self.keys["matching"])
         self.place(self.keys["mapping"])
@@ -193,6 +195,7 @@ class Reconstruction:
                 stage="features",
                 names=self.names,
                 images=str(self.images),
+                masks=self.masks and str(self.masks),
                 max_size=self.options.max_size,
                 features=self.count_features(),
             )

@@ -6,11 +6,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
-from tyro.conf import Positional, arg
+from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from ...errors import LumigraphError
 from ..common import needed, option, show
 from ..controls import Set, open_method
+from ..keeping import Keeping
 from .points import check_pictures
 
 FOR_PHONES = 100_000  # triangles that a phone shows with ease
@@ -29,8 +30,8 @@ class ExportMesh:
     """Folder of a run, a splat file, or a composition."""
     output: Annotated[Positional[Path], needed("FILE")]
     """The new file."""
-    box: Annotated[float | None, option("TIMES", "1 for objects, 1.5 for the rest")] = None
-    """Size of what is meshed, times the box of interest that `lumigraph info` tells."""
+    extent: Annotated[float | None, option("TIMES", "1 for objects, 1.5 for the rest")] = None
+    """Size of what is meshed, times the box of interest that `lumigraph info` tells; or give --box or --sphere."""
     cell_size: Annotated[float | None, option("LENGTH", "1/256 of the box")] = None
     """Side of the cubes marched through, in the units of the photographs' frame: details are twice as large."""
     way: Annotated[
@@ -52,6 +53,7 @@ class ExportMesh:
     """Longer side of the pictures that tell colours, and depth where it is fused; at most that of the photographs."""
     views: Annotated[int, option("N")] = 64
     """Number of these pictures at most."""
+    part: OmitArgPrefixes[Keeping] = Keeping()
     told: Set = ()
     device: Annotated[str, option("NAME")] = "auto"
     """auto, cpu, cuda, cuda:1."""
@@ -64,9 +66,10 @@ class ExportMesh:
         for_phones = ending(self.output) == ".usdz"
         opened, method, cameras = open_method(self.source, self.device, self.told)
         mesh = extract_mesh(
-            method,
+            self.part.without_floaters(method),
             opened.survey(cameras["train"]),
-            box=self.box,
+            extent=self.extent,
+            crop=self.part.crop(opened.frame),
             cell=None if self.cell_size is None else self.cell_size / opened.frame.to_source.scale,
             level=self.level,
             way=self.way,
@@ -93,8 +96,11 @@ class ExportMesh:
         """Raises LumigraphError for numbers that make no sense, before anything is opened."""
         if self.cell_size is not None and not self.cell_size > 0:
             raise LumigraphError(f"Cells cannot be {self.cell_size:g} large; give --cell-size a length above 0")
-        if self.box is not None and not self.box > 0:
-            raise LumigraphError(f"A box cannot be {self.box:g} times as large; give --box a number above 0")
+        if self.extent is not None and not self.extent > 0:
+            raise LumigraphError(f"A box cannot be {self.extent:g} times as large; give --extent a number above 0")
+        if self.extent is not None and self.part.crops:
+            raise LumigraphError("--extent and a crop both say how much is meshed; give one of them")
+        self.part.check()
         if self.level is not None and not self.level > 0:
             raise LumigraphError(f"A density of {self.level:g} is nowhere a surface; give --level a number above 0")
         if not 0 <= self.smooth <= 1000:
