@@ -38,7 +38,7 @@ Work = Literal["train", "eval", "mesh", "demo"]
 class Options:
     scene: str = "procedural:still-life"
     beside: int = 2  # busy programs
-    seconds: float = 3.0  # of training each time
+    seconds: float = 5.0  # of training each time
     rounds: int = 3
     quick: bool = False  # one round of our way and OpenMP's own, without the demo
     before: Path | None = None  # another checkout
