@@ -16,11 +16,11 @@ from .blending import before
 from .camera import Camera
 from .errors import LumigraphError
 from .geometry import Similarity
+from .geometry import Vector as Vector
 from .images import UNNAMED, ImageStore, Layer, cosines, resized
 from .plain import from_plain
 from .rays import Rays
 
-Vector = tuple[float, float, float]
 # How values of a layer are reduced, by its name (see `resized`); all others are picked, not averaged.
 AVERAGED = {"colours": "sRGB", "raw": "linear", "albedo": "linear", "flow": "pixels"}
 

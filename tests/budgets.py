@@ -2,8 +2,8 @@
 
 What counts is the lesser of a test's seconds and its processors' seconds, without what Numba compiled for the first
 time: so neither a busy machine nor a fresh clone makes a file costly. It is divided by how slow the machine proves to
-be. `pytest_terminal_summary` prints the table and the files beyond their shares. A file beyond three times its share ends
-the session with code 1: less than that is within what one machine differs from another.
+be. `pytest_terminal_summary` prints the table and the files beyond their shares. A file beyond three times its share
+ends the session with code 1: less than that is within what one machine differs from another.
 """
 
 from __future__ import annotations
@@ -53,9 +53,10 @@ A_METHOD = 6.0  # by contract, of each method, beside what its own file takes
 GROUPS: dict[str, str] = {
     **dict.fromkeys("test_bench_kernels test_lanes".split(), "kernels"),
     **dict.fromkeys(
-        "test_export test_viewer_controls test_exchange test_explain_ray test_keyframes test_browser".split(),
+        "test_export test_viewer_controls test_viewer_crop test_exchange test_explain_ray test_keyframes".split(),
         "exports, viewer, web",
     ),
+    **dict.fromkeys("test_browser".split(), "exports, viewer, web"),
     **dict.fromkeys(
         "test_locks test_old_runs test_opened test_composed test_scores test_memory test_progress".split(),
         "runs, commands, benchmark",

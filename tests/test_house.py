@@ -16,9 +16,12 @@ import lumigraph
 # A new room is a new name here, on the floor where it belongs.
 FLOORS: list[set[str]] = [
     {"console", "errors", "processes", "quality", "signals"},
-    {"blending", "budget", "choice", "controls", "geometry", "loops", "memory", "progress", "readers", "srgb"},
+    {
+        *("blending", "budget", "choice", "controls", "geometry", "loops"),
+        *("memory", "names", "progress", "readers", "srgb", "threads"),
+    },
     {"files", "plain", "lens", "rays"},
-    {"camera", "images", "kernels", "figures", "locks", "metrics"},
+    {"camera", "crop", "images", "kernels", "figures", "locks", "metrics"},
     {"volume", "scene"},
     {"dataset", "gaussians", "mesh"},
     {"capabilities", "collection", "shapes"},

@@ -14,6 +14,7 @@ from ..dataset import Dataset
 from ..errors import LumigraphError
 from ..gaussians import Gaussians
 from ..metrics import scores_of
+from ..names import natural
 from ..run import Run
 from ..scene import Frame, Scene
 from ..shapes import Shapes
@@ -42,9 +43,8 @@ def run_tree(run: Run) -> Tree:
         figures["seconds per view"] = evaluation.get("seconds_per_view")
         protocol = ("split", "views", "shapes", "members", "resolution")
         branch(tree, "evaluated", figures | {name: evaluation["protocol"].get(name) for name in protocol})
-    found = sorted(
-        path for path in run.folder.rglob("*") if path.is_file() and path.suffix in (".mp4", ".html", ".png")
-    )
+    found = [path for path in run.folder.rglob("*") if path.is_file() and path.suffix in (".mp4", ".html", ".png")]
+    found.sort(key=lambda path: natural(path.as_posix()))
     pages = [path for path in found if path.parent in (run.folder, run.folder / "renders")]
     if pages:
         branch(tree, "files", {str(path.relative_to(run.folder)): size(path) for path in pages})
@@ -120,7 +120,7 @@ def composition_tree(composition: Any) -> Tree:
     for number, (part, place) in enumerate(zip(composition.parts, composition.places, strict=True)):
         rows = {"source": part.source, "leads": "yes" if number == composition.lead else None}
         rows |= {"scale": place.scale, "origin": vector(tuple(place.matrix[:3, 3].tolist())) + " in the frame below"}
-        rows |= {"box": part.box and f"{vector(part.box[0])} to {vector(part.box[1])}"}
+        rows |= {"box": part.box and f"{vector(part.box.lower)} to {vector(part.box.upper)}"}
         branch(tree, f"part {number}", rows)
     branch(tree, "frame", frame_rows(composition.frame))
     return tree

@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial import ConvexHull, QhullError
 
+from ...names import natural
 from ..library import pycolmap
 from ..normalise import where_axes_meet
 from ..photos import Intake, Photo
@@ -164,7 +165,7 @@ def diagnose(
         given=len(intake.photos) + len(intake.unreadable),
         used=len(used),
         registered=registered,
-        left_out=dict(sorted(left_out.items())),
+        left_out={name: left_out[name] for name in sorted(left_out, key=natural)},
         blurred=dict(intake.blurred),
         duplicates=dict(intake.duplicates),
         other_models=others,

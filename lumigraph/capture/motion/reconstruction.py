@@ -15,13 +15,14 @@ import numpy as np
 from ...errors import LumigraphError
 from ...files import read_json, remove, replacing, write_bytes, write_json
 from ...locks import held
+from ...names import natural
 from ...progress import counting
 from ..library import pycolmap
 from ..photos import Intake, Photo, gather
 from ..photos.track import Track, untracked
 from .diagnosis import FEW_FEATURES, Diagnosis, Matches, counted, diagnose, folds, read_matches
 from .drawings import draw_capture, draw_photographs
-from .folder import RESULT, claim, copy_photographs, stamp, write_model
+from .folder import MASKS, RESULT, claim, copy_masks, copy_photographs, stamp, write_model
 from .georeference import Georeference, georeference, gps_positions, upright
 from .lenses import Sharing, group_by_lens, model_for, prior, write_database
 from .pairs import NEIGHBOURS, Matching, choose_matching, choose_pairs
@@ -142,6 +143,7 @@ class Reconstruction:
             self.work / "models",
         )
         self.unfolded = self.work / "unfolded"
+        self.masks: Path | None = None
         self.names = [photo.name for photo in self.photos]
         self.groups = group_by_lens(self.photos, self.intake.in_order, self.options.camera)
         chosen = choose_matching(len(self.photos), self.intake.in_order)
@@ -153,7 +155,7 @@ class Reconstruction:
         """For each stage a name of everything that its result depends on."""
         features = key_of(
             pycolmap.__version__,
-            [[p.name, *stamp(p.path)] for p in self.photos],
+            [[p.name, *stamp(p.path), *(stamp(p.mask) if p.mask else ())] for p in self.photos],
             [[prior(group), model_for(group), [p.name for p in group]] for group in self.groups],
             self.options.max_size,
             self.count_features(),
@@ -166,6 +168,7 @@ class Reconstruction:
 
     def run(self) -> dict[str, Any]:
         copy_photographs(self.photos, self.images, self.track)
+        self.masks = copy_masks(self.photos, self.folder / MASKS, self.track)
         self.find_features(self.keys["features"])
         self.compare(self.keys["matching"])
         self.place(self.keys["mapping"])
@@ -192,6 +195,7 @@ class Reconstruction:
                 stage="features",
                 names=self.names,
                 images=str(self.images),
+                masks=self.masks and str(self.masks),
                 max_size=self.options.max_size,
                 features=self.count_features(),
             )
@@ -287,14 +291,18 @@ class Reconstruction:
             remove(self.folder / name)
         model = found[0]
         place = self.turn_upright(model)
-        others = [sorted(image.name for image in other.images.values() if image.has_pose) for other in found[1:]]
+        others = [
+            sorted((image.name for image in other.images.values() if image.has_pose), key=natural)
+            for other in found[1:]
+        ]
         taken = {image.name for image in model.images.values() if image.has_pose}
         others = [left for names in others if len(left := [name for name in names if name not in taken]) > 1]
         diagnosis = diagnose(self.intake, self.photos, model, others, matches)
         if place is not None and place.new_from_old is None:
             told.append(place.say)
         diagnosis = replace(diagnosis, warnings=[*diagnosis.warnings, *told])
-        write_model(self.folder, model, self.photos)
+        known = place is not None and place.new_from_old is not None
+        write_model(self.folder, model, self.photos, z_up=known)
         draw_capture(
             self.folder / "capture.png", model, diagnosis, place is not None and place.new_from_old is not None
         )
@@ -310,7 +318,8 @@ class Reconstruction:
         stacked = np.stack([poses[photo.name] for photo in photos])
         place = georeference(stacked[:, :, 3], photos)
         known = place is not None and place.new_from_old is not None
-        model.transform(place.new_from_old if place is not None and known else upright(stacked))
+        points = np.array([point.xyz for point in model.points3D.values()]).reshape(-1, 3)
+        model.transform(place.new_from_old if place is not None and known else upright(stacked, points))
         return place
 
     def summary(

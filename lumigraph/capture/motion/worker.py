@@ -27,12 +27,21 @@ MANY_CORES = 16  # more threads would ask for more memory than they save time
 
 
 def find_features(job: dict[str, Any]) -> None:
-    """Scale-invariant features (Lowe 2004), as root-SIFT; photographs that have theirs are passed over."""
+    """Scale-invariant features (Lowe 2004), as root-SIFT, where masks allow them; photographs that have theirs are
+    passed over."""
     options = pycolmap.FeatureExtractionOptions()
     options.max_image_size, options.num_threads = job["max_size"], job["threads"]
     options.sift.max_num_features = job["features"]
+    reading = pycolmap.ImageReaderOptions()
+    if job["masks"]:
+        reading.mask_path = job["masks"]
     pycolmap.extract_features(
-        job["database"], job["images"], image_names=job["names"], extraction_options=options, device=pycolmap.Device.cpu
+        job["database"],
+        job["images"],
+        image_names=job["names"],
+        reader_options=reading,
+        extraction_options=options,
+        device=pycolmap.Device.cpu,
     )
 
 
