@@ -5,7 +5,8 @@ from __future__ import annotations
 import math
 import sys
 import time
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from typing import Any
 
 from rich.console import RenderableType
@@ -50,9 +51,9 @@ class TrainingDisplay:
         self.show, self.terminal = show, is_live()
         columns = (
             SpinnerColumn(),
-            TextColumn("[bold]{task.description}"),
+            TextColumn("{task.description}", "bold", markup=False),
             BarColumn(24),
-            TextColumn("{task.fields[told]}"),
+            TextColumn("{task.fields[told]}", markup=False),
         )
         self.bar = Bar(*columns, console=self.console, refresh_per_second=1 / REFRESH)
         self.task = self.bar.add_task("Starting", total=1.0, told="")
@@ -76,6 +77,18 @@ class TrainingDisplay:
     def __exit__(self, *fault: object) -> None:
         if self._live:
             self.bar.stop()
+
+    @contextmanager
+    def aside(self) -> Iterator[None]:
+        """Inside this block the bar makes room for that of a stage ahead of the first step."""
+        if not self._live:
+            yield
+            return
+        self.bar.live.transient = True
+        self.bar.stop()
+        yield
+        self.bar.live.transient = False
+        self.bar.start()
 
     def begin(self, data: Dataset) -> None:
         """What there is to learn from, and that kernels are compiled before anything is learnt."""

@@ -19,7 +19,9 @@ from pathlib import Path
 LOOKS = 40_000  # for work, before a thread sleeps: 0.2 to 2 ms, by processor
 OWN = "OMP_WAIT_POLICY", "GOMP_SPINCOUNT"  # by which users say how threads wait
 EVERY = 0.5  # seconds between looks at how much others hold us up
-MUCH, LITTLE = 0.15, 0.05  # of the time that our threads could run: others have it from here on, and no longer
+WHILE = 20  # such looks that threads then sleep for
+MUCH = 0.15  # of the time that our threads could run: from here on it matters that others have it
+IDLE = 0.1  # of the time: what runs less than that has nothing to wait for
 TASKS = Path("/proc/self/task")
 
 
@@ -75,7 +77,7 @@ class Held:
         pairs = [(before, now[name]) for name, before in self._before.items() if name in now]
         self._before = now
         ran, waited = (sum(after[i] - before[i] for before, after in pairs) for i in (0, 1))
-        return waited / max(ran + waited, 1)
+        return waited / max(ran + waited, IDLE * EVERY * 1e9)
 
     @staticmethod
     def _now() -> dict[str, list[int]]:
@@ -88,14 +90,19 @@ class Held:
 
 
 def make_way(over: threading.Event, held: Callable[[], float]) -> None:
-    """Until it is over: crowd our threads while others hold them up."""
+    """Until it is over: crowd our threads for a while whenever others hold them up.
+
+    Whether others are still there shows best once threads look for work again: those that sleep may be woken on one
+    processor, where they hold up each other.
+    """
     leave: threading.Event | None = None
+    looks = 0
     while not over.wait(EVERY):
-        share = held()
+        looks, share = looks + 1, held()
         if leave is None and share > MUCH and "torch" in sys.modules:
-            leave = threading.Event()
+            leave, looks = threading.Event(), 0
             threading.Thread(target=crowd, args=(leave,), name="crowd", daemon=True).start()
-        elif leave is not None and share < LITTLE:
+        elif leave is not None and looks >= WHILE:
             leave.set()
             leave = None
     if leave is not None:

@@ -5,6 +5,8 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+import threading
+import time
 from pathlib import Path
 
 import pytest
@@ -18,6 +20,27 @@ from lumigraph.loops import unbend
 none = numpy.zeros((0, 2), numpy.float32)
 unbend(none, numpy.zeros(0, int), none, none, none, none, 1, 0.1, numpy.zeros((0, 3), numpy.float32))
 print(torch.ones(1 << 18).exp().sum())
+"""
+
+LOOKING = """
+import threading, time
+from lumigraph import threads
+import torch
+numbers = torch.ones(1 << 18)
+def looking():
+    spent = 0.0
+    for _ in range(10):
+        numbers.exp()
+        begin = time.process_time()
+        time.sleep(0.02)
+        spent += time.process_time() - begin
+    return spent
+looking()
+alone, leave = looking(), threading.Event()
+threading.Thread(target=threads.crowd, args=(leave,), daemon=True).start()
+time.sleep(0.2)
+print(alone, looking())
+leave.set()
 """
 
 
@@ -45,3 +68,56 @@ def test_a_busy_machine_is_told(monkeypatch):
     assert threads.told() == "2 threads"
     monkeypatch.setattr(os, "getloadavg", lambda: (3.25, 0.0, 0.0))
     assert threads.told() == "2 threads, on a machine that is busy (load 3.2)"
+
+
+def test_threads_sleep_for_a_while_when_others_hold_them_up(monkeypatch):
+    monkeypatch.setattr(threads, "EVERY", 0.0)
+    monkeypatch.setattr(threads, "WHILE", 3)
+    shares, log, over = iter([0.0, 0.1, 0.9, 0.0, 0.9, 0.9, 0.0, 0.5]), [], threading.Event()
+
+    def held() -> float:
+        share = next(shares, None)
+        if share is None:
+            over.set()
+        return share or 0.0
+
+    def crowd(leave: threading.Event) -> None:
+        log.append(leave)
+
+    monkeypatch.setattr(threads, "crowd", crowd)
+    threads.make_way(over, held)
+    assert len(log) == 2  # at 0.9 until three looks later, and at 0.5
+    assert all(leave.is_set() for leave in log)
+
+
+@pytest.mark.skipif(not threads.TASKS.exists(), reason="tells what threads wait for by /proc")
+def test_who_waits_behind_another_thread_is_held_up():
+    held, end = threads.Held(), time.monotonic() + 0.3
+    before = os.sched_getaffinity(0)
+    os.sched_setaffinity(0, {min(before)})
+    program = f"import os\nwhile os.getppid() == {os.getpid()}: pass"
+    other = subprocess.Popen([sys.executable, "-S", "-c", program])
+    try:
+        while time.monotonic() < end:
+            pass
+        assert held() > 0.1
+    finally:
+        other.kill()
+        other.wait()
+        os.sched_setaffinity(0, before)
+
+
+def test_who_does_nothing_is_not():
+    held = threads.Held()
+    time.sleep(0.1)
+    assert held() < threads.MUCH
+
+
+@pytest.mark.skipif(threads.processors() < 2, reason="one thread waits for nobody")
+@pytest.mark.skipif(sys.platform != "linux", reason="GNU's OpenMP")
+def test_crowded_threads_hardly_look_for_work():
+    environment = {name: value for name, value in os.environ.items() if name not in threads.OWN}
+    environment |= {"PYTHONPATH": str(Path(__file__).parent.parent), "OMP_NUM_THREADS": f"{threads.processors()}"}
+    told = subprocess.run([sys.executable, "-c", LOOKING], env=environment, capture_output=True, text=True, check=True)
+    alone, crowded = map(float, told.stdout.split())
+    assert crowded < 0.5 * alone

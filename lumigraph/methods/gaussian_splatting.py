@@ -15,7 +15,8 @@ from ..blending import over
 from ..camera import Camera
 from ..components.clouds.cloud import Cloud, CloudAdam
 from ..components.clouds.density_control import AdaptiveDensity, MarkovChain
-from ..components.clouds.initial_cloud import initial_cloud, random_cloud
+from ..components.clouds.dense_points import compile_sweep
+from ..components.clouds.initial_cloud import Initialization, initial_cloud, random_cloud
 from ..components.clouds.smoothing import sampling_interval, smoothed
 from ..components.training.rhythm import Rhythm, haste, intervals
 from ..components.training.schedules import falling
@@ -38,7 +39,8 @@ class Config:
     ssim_weight: float = 0.2  # share of D-SSIM in the loss, eq. 7
     strategy: Literal["adaptive", "mcmc"] = "adaptive"  # density control: section 5, or Kheradmand 2024
     max_gaussians: int = 1_000_000  # cap of the cloud's size, under either strategy
-    initial_gaussians: int = 100_000  # at random places, where a capture has no points, section 7.1
+    initialization: Initialization = "dense"  # sparse points and plane sweeps, sparse points as section 5, or random
+    initial_gaussians: int = 100_000  # at random places, where nothing else is known, section 7.1
     half_resolution_until: float = 0.0  # share of the budget at half size; the first quarter of it at a quarter
     refine_every: int = 100  # steps between changes of the cloud, section 5.2; or the share, if that is sooner
     refine_every_share: float = 0.1
@@ -157,9 +159,14 @@ class GaussianSplatting(Method):
             opacity_reset_interval=5,
         )
 
+    def rehearse_begin(self) -> None:
+        if self.config.initialization == "dense":
+            compile_sweep()
+
     def begin(self, scene: Scene) -> None:
         config = self.config
-        found = initial_cloud(scene, config.initial_gaussians, config.max_gaussians, config.sh_degree, self.random(1))
+        counts = config.initial_gaussians, config.max_gaussians
+        found = initial_cloud(scene, config.initialization, *counts, config.sh_degree, self.random(1))
         self.cloud.replace(found, self._optimizer)
         self.density_control.begin(len(found))
         self.began.fill_(len(found))
