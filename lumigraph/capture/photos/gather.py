@@ -51,8 +51,8 @@ def gather(sources: Sequence[Path], work: Path, frames: int | None = None, track
     files = named_files(list_photographs(sources, work))
     taken = examine(files, work / "upright", track)
     unreadable = {name: why for name, why in taken.items() if isinstance(why, str)}
-    seen = [taken[name] for name in sorted(taken, key=natural)]
-    seen = [one for one in seen if isinstance(one, Candidate)]
+    readable = {name: one for name, one in taken.items() if isinstance(one, Candidate)}
+    seen = [readable[name] for name in sorted(readable, key=natural)]
     if not seen:
         raise LumigraphError(nothing(source, unreadable))
     return assess(Intake(source, with_altitudes([one.photo for one in seen]), unreadable=unreadable), seen)
