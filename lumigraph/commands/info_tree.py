@@ -130,7 +130,7 @@ def frame_rows(frame: Frame) -> dict[str, Any]:
     low, high = frame.bounds
     return {
         "bounds": f"{vector(low)} to {vector(high)}",
-        "reach": frame.reach,
+        "half-extent": f"{frame.reach:g} scene units, from the middle to each side",
         "near": frame.near,
         "cameras": frame.forward and f"forward-facing, near plane at {frame.forward.near:.3g}",
         "background": vector(frame.background) + (" behind alpha" if frame.has_alpha else ""),

@@ -14,8 +14,8 @@ from .. import kernels
 from ..blending import over
 from ..camera import Camera
 from ..components.clouds.cloud import Cloud, CloudAdam
-from ..components.clouds.density_control import AdaptiveDensity, MarkovChain
 from ..components.clouds.dense_points import compile_sweep
+from ..components.clouds.density_control import AdaptiveDensity, MarkovChain
 from ..components.clouds.initial_cloud import Initialization, initial_cloud, random_cloud
 from ..components.clouds.smoothing import sampling_interval, smoothed
 from ..components.training.rhythm import Rhythm, haste, intervals

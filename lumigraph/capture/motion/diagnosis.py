@@ -316,8 +316,8 @@ def about_rotation(angle: float, matches: Matches) -> list[str]:
     if angle >= SMALL_ANGLE and not turned:
         return []
     return [
-        f"the photographs were taken from nearly one place (rays to a point differ by {angle:.1f} degrees), so depth "
-        f"is uncertain; walk sideways instead of turning on the spot"
+        f"the photographs were taken from nearly one place (the outermost views of a point are {angle:.1f} degrees "
+        f"apart), so depth is uncertain; walk sideways instead of turning on the spot"
     ]
 
 

@@ -20,7 +20,11 @@ from ...progress import track
 from ...scene import Scene
 from .flat_view import FlatView, flat_view
 
-VIEWS, LONGEST, COARSE = 48, 160, 80  # photographs asked at most; pixels of their longer side, and where none know depth
+VIEWS, LONGEST, COARSE = (
+    48,
+    160,
+    80,
+)  # photographs asked at most; pixels of their longer side, and where none know depth
 NEIGHBOURS, BEST = 4, 2  # of each photograph, and how many of them must see a place
 ANGLE, NARROWER, WIDER = (math.radians(x) for x in (8.0, 4.0, 8.0))  # at which rays should meet; deviations around it
 ANCHORS = 200  # places by which two views are asked whether they see the same

@@ -92,7 +92,7 @@ def flat_view(photograph: Photograph, longest: int) -> FlatView:
     intrinsics[:2, 2] = centre[0] - first
     columns, rows = (last - first).int().tolist()
     flat = FlatView(pose, intrinsics, torch.empty(rows, columns, 3), torch.empty(rows, columns))
-    pixels, valid = lens.project((flat.rays.reshape(-1, 3) @ pose[:, :3]))
+    pixels, valid = lens.project(flat.rays.reshape(-1, 3) @ pose[:, :3])
     at = torch.where(valid[:, None], pixels / size * 2 - 1, -4).view(1, rows, columns, 2)
     known = torch.cat([small.rgb, trust[..., None]], -1).movedim(-1, 0)[None]
     rgb, trust = grid_sample(known, at, align_corners=False)[0].split([3, 1])

@@ -48,4 +48,6 @@ def look_up(pictures: Tensor, places: Tensor) -> Tensor:
     behind = places[..., 2:] <= BEHIND
     at = places[..., :2] / torch.where(behind, 1, places[..., 2:]) * (2 / places.new_tensor([columns, rows])) - 1
     at = torch.where(behind, -4, at)  # from -1 to 1 is inside
-    return grid_sample(pictures[:, None].expand(-1, planes, -1, -1).transpose(0, 1), at, align_corners=False).movedim(1, 0)
+    return grid_sample(pictures[:, None].expand(-1, planes, -1, -1).transpose(0, 1), at, align_corners=False).movedim(
+        1, 0
+    )
