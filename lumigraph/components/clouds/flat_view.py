@@ -60,7 +60,7 @@ class FlatView:
         return seen, row.clamp(0, height - 1), column.clamp(0, width - 1), depth
 
     def warp_to(self, other: FlatView) -> Float[Tensor, "3 4"]:
-        """(A | b) of `kernels.plane_sweep`: from a pixel here and one over its depth along the axis to a pixel there."""
+        """(A | b) of `kernels.plane_sweep`: from a pixel here and one over its depth to a pixel there."""
         rotation, towards = other.pose[:, :3].T @ self.pose[:, :3], self.pose[:, 3] - other.pose[:, 3]
         along = other.intrinsics @ rotation @ self.intrinsics.inverse()
         return torch.cat([along, (other.intrinsics @ other.pose[:, :3].T @ towards)[:, None]], 1)
