@@ -51,9 +51,9 @@ class TrainingDisplay:
         self.show, self.terminal = show, is_live()
         columns = (
             SpinnerColumn(),
-            TextColumn("[bold]{task.description}"),
+            TextColumn("{task.description}", "bold", markup=False),
             BarColumn(24),
-            TextColumn("{task.fields[told]}"),
+            TextColumn("{task.fields[told]}", markup=False),
         )
         self.bar = Bar(*columns, console=self.console, refresh_per_second=1 / REFRESH)
         self.task = self.bar.add_task("Starting", total=1.0, told="")

@@ -15,7 +15,7 @@ from viewer_client import Client
 import lumigraph.methods
 from lumigraph.crop import Box, Sphere
 from lumigraph.errors import LumigraphError
-from lumigraph.gaussians.cleaning import cleaned
+from lumigraph.gaussians.cleaning import ISOLATION, MAX_SCALE, cleaned
 from lumigraph.viewer import Viewer, choose_address
 from lumigraph.viewer.crop_panel import BOX, SPHERE, circles, edges
 
@@ -68,7 +68,7 @@ def test_a_cloud_is_cropped_cleaned_and_saved(cloud_viewer):
 
     client.turn(panel._floaters["min_opacity"], 0.7)
     client.turn(panel._clean, True)
-    floaters = {"min_opacity": 0.7, "max_scale": 1.0, "isolation": 4.0}
+    floaters = {"min_opacity": 0.7, "max_scale": MAX_SCALE, "isolation": ISOLATION}
     until(lambda: dict(visitor.request().floaters) == floaters)
     solid = cleaned(cloud, visitor.request().crop, **floaters)
     assert 0 < len(solid) < len(inside)

@@ -36,7 +36,7 @@ class Controls:
                 "Angle of view", NARROWEST, WIDEST, 1.0, 50.0, hint="Degrees, from top to bottom"
             )
             self._sharpest = gui.add_slider(
-                "Sharpest", 240, 2048, 16, SHARPEST, hint="Pixels along the longer side, once the camera rests"
+                "Resolution", 240, 2048, 16, SHARPEST, hint="Pixels along the longer side, once the camera rests"
             )
             self._background = gui.add_rgb("Background", to_bytes(frame.background))
             self._cameras = gui.add_checkbox("Cameras", True, hint="Click on one to fly there")

@@ -14,6 +14,7 @@ from ..crop import Box, Crop, Sphere
 from ..errors import LumigraphError
 from ..gaussians.cleaning import ISOLATION, MAX_SCALE, MIN_OPACITY
 from ..scene import Frame, Vector
+from .path_panel import code
 from .subject import NAME, NAMING, Keep
 
 ALL, BOX, SPHERE = "Everything", "Inside a box", "Inside a sphere"
@@ -178,7 +179,7 @@ class CropPanel:
         except LumigraphError as error:
             self._tell("Not saved", str(error))
             return
-        self._about.content = f"Saved as `{where}`"
+        self._about.content = f"Saved as {code(where)}"
 
 
 def vector(values: Any) -> Vector:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
@@ -16,6 +17,7 @@ from ..camera import Camera
 from ..errors import LumigraphError
 from ..geometry import to_quaternion
 from ..lens import Pinhole
+from ..names import natural
 from ..paths.keyframes import CameraPath, Keyframe
 from ..scene import Frame
 from .cameras import pose_of
@@ -233,7 +235,7 @@ class PathPanel:
 
     def _names(self) -> tuple[str, ...]:
         folder = self._subject.paths
-        names = sorted(path.stem for path in folder.glob("*.json")) if folder.is_dir() else []
+        names = sorted((path.stem for path in folder.glob("*.json")), key=natural) if folder.is_dir() else []
         return tuple(names) or (NONE,)
 
     def _save(self) -> None:
