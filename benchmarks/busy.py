@@ -214,8 +214,9 @@ def lasted(arguments: list[str], environment: dict[str, str]) -> float:
 
 def show(result: dict[str, dict[str, Figures]], busy: int) -> None:
     """Medians; and speed beside the busy programs as a share of that alone when threads wait as OpenMP has it."""
-    from rich.console import Console
     from rich.table import Table
+
+    from lumigraph.console import console
 
     table = Table("work", "threads wait", "alone", f"beside {busy}", "of OpenMP's own, alone", f"beside {busy}")
     for work, rows in result.items():
@@ -224,7 +225,7 @@ def show(result: dict[str, dict[str, Figures]], busy: int) -> None:
             alone, beside = statistics.median(figures.alone), statistics.median(figures.beside)
             shares = [x / yardstick if work.endswith("steps/s") else yardstick / x for x in (alone, beside)]
             table.add_row(work, way, f"{alone:.1f}", f"{beside:.1f}", *(f"{share:.0%}" for share in shares))
-    Console().print(table)
+    console().print(table)
 
 
 if __name__ == "__main__":

@@ -24,12 +24,12 @@ import numpy as np
 import torch
 import trimesh
 import tyro
-from rich.console import Console
 from rich.table import Table
 from scipy.spatial import cKDTree
 
 from lumigraph.capture import open_scene
 from lumigraph.capture.procedural import scenes, signed_distance, trace
+from lumigraph.console import console
 from lumigraph.export.mesh import extract_mesh
 from lumigraph.export.points import extract_points
 from lumigraph.files import write_json
@@ -144,7 +144,7 @@ def show(title: str, rows: list[dict]) -> None:
     table = Table(*names, title=title)
     for row in rows:
         table.add_row(*(f"{x:.4g}" if isinstance(x, float) else str(x) for x in (row.get(n, "") for n in names)))
-    Console(width=160).print(table)
+    console(width=160).print(table)
 
 
 if __name__ == "__main__":

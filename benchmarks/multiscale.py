@@ -14,16 +14,17 @@ from pathlib import Path
 
 import torch
 import tyro
-from rich.console import Console
 from rich.table import Table
 
 from lumigraph import methods
 from lumigraph.capture import open_scene
+from lumigraph.console import console
 from lumigraph.evaluate import evaluate
 from lumigraph.figures import save_picture
 from lumigraph.files import write_json
 from lumigraph.run import build
 from lumigraph.scene import Scene
+from lumigraph.signals import go_on_unless
 from lumigraph.train import fit
 
 
@@ -53,8 +54,7 @@ def trained(name: str, scene: Scene, options: Options) -> dict:
     device, kind = torch.device(options.device), methods.find(name)
     method = build(kind, scene.frame, kind.preset(device), device, options.seed)
     outcome = fit(method, scene, seconds=options.seconds, seed=options.seed)
-    if outcome.signal is not None:
-        raise KeyboardInterrupt
+    go_on_unless(outcome.signal)
     evaluation = evaluate(method, scene)
     if options.sheets:
         save_picture(options.sheets / f"{name}.png", evaluation.contact_sheet(f"{name} · {evaluation.psnr:.2f} dB"))
@@ -76,7 +76,7 @@ def show(title: str, result: list[dict]) -> None:
     for row in result:
         cells = [*(row["by_resolution"][size] for size in sizes), row]
         table.add_row(row["method"], str(row["steps"]), *(f"{x['psnr']:.2f} ({x['ssim']:.3f})" for x in cells))
-    Console(width=160).print(table)
+    console(width=160).print(table)
 
 
 if __name__ == "__main__":

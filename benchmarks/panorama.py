@@ -17,7 +17,6 @@ from pathlib import Path
 
 import torch
 import tyro
-from rich.console import Console
 from rich.table import Table
 from torch import Tensor
 
@@ -25,12 +24,14 @@ from lumigraph import methods
 from lumigraph.camera import Camera
 from lumigraph.capture import open_scene
 from lumigraph.capture.procedural import render, scenes, trace
+from lumigraph.console import console
 from lumigraph.export.panorama import level_camera, panorama, save_sphere, sphere_size
 from lumigraph.export.stereo import stereo_pair, surrounding_distances, top_bottom
 from lumigraph.files import write_json
 from lumigraph.lens import Equirectangular, OmnidirectionalStereo
 from lumigraph.metrics import psnr
 from lumigraph.run import Run, build
+from lumigraph.signals import go_on_unless
 from lumigraph.train import fit
 
 PLACE, HEADING = torch.zeros(3), torch.tensor([1.0, 0.0, 0.0])
@@ -98,7 +99,7 @@ def main(options: Options) -> None:
         table.add_row(
             row["method"], *(f"{x:.2f}" for x in figures), f"{100 * wrong.max():.2f} %", f"{100 * wrong.median():.2f} %"
         )
-    Console().print(table)
+    console().print(table)
     write_json(options.output / "panorama.json", {"options": str(options), "rows": rows})
 
 
@@ -113,7 +114,7 @@ def trained(options: Options):
     for name in options.methods:
         kind, device = methods.find(name), torch.device("cuda" if torch.cuda.is_available() else "cpu")
         method = build(kind, scene.frame, kind.preset(device), device, 0)
-        fit(method, scene, seconds=options.seconds)
+        go_on_unless(fit(method, scene, seconds=options.seconds).signal)
         yield name, method.eval()
 
 

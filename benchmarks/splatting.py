@@ -17,11 +17,11 @@ from pathlib import Path
 
 import torch
 import tyro
-from rich.console import Console
 from rich.table import Table
 
 from lumigraph import kernels, methods
 from lumigraph.capture import open_scene
+from lumigraph.console import console
 from lumigraph.files import write_json
 from lumigraph.gaussians import Gaussians, splatting
 from lumigraph.run import build
@@ -50,7 +50,7 @@ def main(options: Options) -> None:
         result["frames"] = frames(options, device)
     if device.type == "cuda":
         result["gpu"] = beside_gsplat(options, device)
-        Console().print(result["gpu"])
+        console().print(result["gpu"])
     if options.output:
         write_json(options.output, result)
 
@@ -100,7 +100,7 @@ def steps(options: Options, device: torch.device) -> list[dict]:
         whole = statistics.median(sum(row) for row in times)
         rows.append({"gaussians": len(method.cloud), **dict(zip(PARTS, medians, strict=True)), "all": whole})
         table.add_row(f"{len(method.cloud):,}", *(f"{x:.1f}" for x in [*medians, whole]))
-    Console().print(table)
+    console().print(table)
     return rows
 
 
@@ -129,7 +129,7 @@ def frames(options: Options, device: torch.device) -> list[dict]:
     table = Table("Gaussians", *names, title=f"A frame of {file.path.name} at 800 x 800: median milliseconds")
     medians = {name: statistics.median(x) for name, x in times.items()}
     table.add_row(f"{len(cloud):,}", *(f"{x:.1f}" for x in medians.values()))
-    Console().print(table)
+    console().print(table)
     return [{"gaussians": len(cloud), **medians}]
 
 

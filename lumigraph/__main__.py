@@ -1,5 +1,18 @@
 """`python -m lumigraph` is `lumigraph`."""
 
-from .cli import main
+from .signals import exit_code, listening, number_of
 
-raise SystemExit(main())
+
+def main() -> int:
+    """Run a command. Returns the exit code; signals are heard from the first moment on."""
+    try:
+        with listening():
+            from .cli import main as run
+
+            return run()
+    except KeyboardInterrupt as stopped:
+        return exit_code(number_of(stopped))
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any, Protocol, runtime_checkable
 
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from .errors import LumigraphError
@@ -48,6 +48,14 @@ class HasGaussians(Protocol):
 
 
 @runtime_checkable
+class CanPrune(Protocol):
+    """Is a cloud of Gaussians that can lose some and go on learning."""
+
+    def prune(self, keep: Bool[Tensor, " gaussian"]) -> None:
+        """Leave those of `gaussians()` that a mask picks, and of the optimizers' states what belongs to them."""
+
+
+@runtime_checkable
 class HasMesh(Protocol):
     """Is a mesh, or makes one better than `export mesh` would."""
 
@@ -68,6 +76,7 @@ LACKING = {
     HasField: "holds no density and colour at points, so it can be neither baked nor converted",
     HasDistance: "holds no distance to surfaces; a method that learns from shapes does",
     HasGaussians: "holds no Gaussians, so no splats can be made of it; train gaussian-splatting",
+    CanPrune: "cannot learn on with fewer Gaussians; write a splat file instead, by an --output that ends in .ply",
     HasMesh: "is no mesh; `lumigraph export mesh` makes one of what it renders",
     HasLooks: "takes no samples along rays, so there is nothing to draw of one",
 }

@@ -1,4 +1,5 @@
 """The command line. Exit code 0 means done, 2 that the input was at fault: one sentence on stderr says how to mend it.
+130 and 143 say that Ctrl-C or SIGTERM ended the command.
 
 LUMIGRAPH_DEBUG=1 shows where in the code a fault was noticed.
 """
@@ -18,6 +19,7 @@ import tyro
 from . import __version__, methods
 from .commands.bench import Bench
 from .commands.capture import CaptureCommand
+from .commands.clean import Clean
 from .commands.common import say
 from .commands.compose import Compose
 from .commands.demo import Demo
@@ -33,6 +35,7 @@ from .commands.train import Train, with_options_of
 from .commands.view import ViewCommand
 from .errors import LumigraphError, LumigraphWarning
 from .files import refusal
+from .signals import exit_code, listening, number_of
 from .threads import considerate
 
 COMMANDS: dict[str, type] = {
@@ -43,6 +46,7 @@ COMMANDS: dict[str, type] = {
     "eval": Eval,
     "render": Render,
     "view": ViewCommand,
+    "clean": Clean,
     "compose": Compose,
     "export": Export,
     "report": Report,
@@ -66,12 +70,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"lumigraph {__version__}")
         return 0
     try:
-        with told_warnings(), considerate():
+        with listening(), told_warnings(), considerate():
             return parse(arguments).run()
     except LumigraphError as error:
         return refuse(str(error))
-    except KeyboardInterrupt:
-        return refuse("Stopped", code=130)
+    except KeyboardInterrupt as stopped:
+        code = exit_code(number_of(stopped))
+        return refuse("Stopped", code) if code == 130 else code  # whoever sends SIGTERM does not wait for an answer
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # whoever read our output has left
         return 0

@@ -15,6 +15,7 @@ from .camera import Camera
 from .capabilities import HasLooks, needs
 from .controls import Control, Value
 from .errors import LumigraphError
+from .quality import BY_PHOTOGRAPH, BY_RAY, Efforts, Quality
 from .rays import Rays, Rendering
 from .scene import Batch, Frame, Scene
 from .volume import composite
@@ -57,6 +58,7 @@ class Method(nn.Module, ABC):
     any_lens: ClassVar[bool] = False  # whether `render` follows every lens, or flat pictures alone
     formerly_weights: ClassVar[dict[str, str]] = {}  # beginnings of their names in older runs, and those they have now
     formerly: ClassVar[dict[str, str]] = {}  # names that Config's fields had in older runs, and those they have now
+    efforts: ClassVar[Efforts] = BY_PHOTOGRAPH  # what each --quality asks for
     _place: Tensor
 
     def __init__(self, frame: Frame, config: Any):
@@ -72,6 +74,15 @@ class Method(nn.Module, ABC):
         return cls.Config()
 
     # Learning
+
+    def steps_per_pass(self, data: Any) -> float:
+        """Steps after which everything in the "train" split was learnt from once, on average; one photograph, shape or
+        member a step by default."""
+        return len(data.splits["train"])
+
+    def steps_for(self, quality: Quality, data: Any) -> int:
+        """Steps that a quality asks for on these data: a budget that is the same on every machine."""
+        return self.efforts[quality].steps(self.steps_per_pass(data))
 
     @abstractmethod
     def batch(self, data: Any, generator: torch.Generator) -> Lesson:
@@ -107,6 +118,9 @@ class Method(nn.Module, ABC):
 
     def begin(self, data: Any) -> None:
         """Called once, ahead of the first step of a new run: what the data tell without any learning."""
+
+    def rehearse_begin(self) -> None:
+        """Called on a copy before the clock starts: compile what `begin` needs and no step does."""
 
     def before_step(self, step: int, progress: float) -> None:
         """Called ahead of each step. progress is the share of the budget (steps or seconds) spent, in [0, 1]."""
@@ -198,7 +212,18 @@ class RayMethod(Method):
     """A Method that sees one ray at a time: write `looks` or `render_rays`, inherit the rest."""
 
     any_lens: ClassVar[bool] = True
+    efforts: ClassVar[Efforts] = BY_RAY
     rays_per_chunk: int = 16_384
+
+    def steps_per_pass(self, data: Any) -> float:
+        """Steps after which as many rays were seen as the training photographs have pixels to learn from."""
+        if not isinstance(data, Scene):
+            return super().steps_per_pass(data)
+        return data.pixels("train") / self.rays_in_a_step(data)
+
+    def rays_in_a_step(self, data: Scene) -> float:
+        """Rays that a step learns from, about: those of a first one, which a copy draws."""
+        return len(copy.deepcopy(self).batch(data, torch.Generator().manual_seed(0)))
 
     def batch(self, data: Scene, generator: torch.Generator) -> Batch:
         return data.sample_rays(self.config.rays_per_step, generator).to(self.device)

@@ -1,51 +1,114 @@
-"""Progress of long work on stderr: bars on a terminal, plain lines elsewhere; numbers and times in few digits."""
+"""Progress of long work on stderr: a bar on a terminal, plain lines in a log; numbers and times in few digits."""
 
 from __future__ import annotations
 
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from typing import TypeVar
 
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+from .console import console, is_live
 
 PATIENCE = 1.0  # seconds before a bar appears
+FIRST = 3.0  # seconds before the first line in a log
+RARER = 1.5  # from one line of a log to the next, times as long as before
+RAREST = 60.0  # seconds between two lines, at most
 
 T = TypeVar("T")
 
 
 def track(items: Iterable[T], description: str, total: int) -> Iterator[T]:
-    """The items one by one, with a bar on a terminal."""
-    console = Console(stderr=True)
-    if not console.is_terminal:
-        print(f"{description} ({total})", file=sys.stderr, flush=True)
-        yield from items
-        return
-    columns = (TextColumn("[bold]{task.description}"), BarColumn(24), MofNCompleteColumn(), TimeRemainingColumn(True))
-    with Progress(*columns, console=console, transient=True) as bar:
-        yield from bar.track(items, total=total, description=description)
+    """The items one by one; what takes longer than a moment is seen."""
+    with counting(description, total) as done:
+        for number, item in enumerate(items, 1):
+            yield item
+            done(number)
 
 
 @contextmanager
-def counting(label: str, total: int) -> Iterator[Callable[[int], None]]:
-    """A function to be told how many of `total` are done; a bar appears on a terminal once the work takes a second."""
-    console = Console(stderr=True)
-    columns = (TextColumn(label), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    bar = Progress(*columns, console=console, transient=True)
-    task, begin = bar.add_task(label, total=total), time.monotonic()
+def counting(description: str, total: int | None = None) -> Iterator[Callable[[int], None]]:
+    """A function to be told how many of `total` are done; None if nobody knows how much there is to do.
 
-    def done(count: int) -> None:
-        if console.is_terminal and not bar.live.is_started and time.monotonic() - begin > PATIENCE:
-            bar.start()
-        bar.update(task, completed=count)
-
+    What takes longer than a moment is seen: as a bar on a terminal, in a log as a line now and then. A stage within
+    another one is not shown.
+    """
+    stage = Stage(description, total)
     try:
-        yield done
-    finally:
-        if bar.live.is_started:  # otherwise stop() would print an empty line
-            bar.stop()
+        yield stage.done
+    except BaseException:
+        stage.end(well=False)
+        raise
+    stage.end(well=True)
+
+
+class Stage:
+    """One piece of work, watched by a thread of its own: so it is seen even where its first item takes long."""
+
+    _shown: Stage | None = None  # one at a time
+
+    def __init__(self, description: str, total: int | None):
+        self.description, self.total, self.count = description, total, 0
+        self._begin, self._over, self._told = time.monotonic(), threading.Event(), False
+        self._watcher = threading.Thread(target=self._watch, name="progress", daemon=True)
+        if Stage._shown is None:
+            Stage._shown = self
+            self._watcher.start()
+
+    def done(self, count: int) -> None:
+        self.count = count
+
+    def end(self, well: bool) -> None:
+        """Stop watching. well: whether the work came to its end"""
+        if Stage._shown is not self:
+            return
+        Stage._shown = None
+        self._over.set()
+        self._watcher.join()
+        if self._told and well:
+            tell(f"{self.description}: took {clock(self.seconds)}")
+
+    @property
+    def seconds(self) -> float:
+        return time.monotonic() - self._begin
+
+    def _watch(self) -> None:
+        if is_live():
+            if not self._over.wait(PATIENCE):
+                self._draw()
+            return
+        pause = FIRST
+        while not self._over.wait(pause):
+            tell(self.line())
+            self._told, pause = True, min(RARER * pause, RAREST)
+
+    def _draw(self) -> None:
+        """A bar until the work is over."""
+        counts = (BarColumn(24), MofNCompleteColumn(), TimeRemainingColumn(True))
+        columns = counts if self.total else (TimeElapsedColumn(),)
+        name = TextColumn("{task.description}", "bold", markup=False)
+        with Progress(name, *columns, console=console(True), transient=True) as bar:
+            task = bar.add_task(self.description, total=self.total, completed=self.count)
+            while not self._over.wait(0.1):
+                bar.update(task, completed=self.count)
+
+    def line(self) -> str:
+        """What a log says: how many, which share, how long still."""
+        if self.total is None:
+            return f"{self.description}: {clock(self.seconds)} so far"
+        told = f"{self.description}: {self.count} of {self.total}"
+        if not self.count or not self.total:
+            return told
+        left = self.seconds * (self.total - self.count) / self.count
+        return f"{told}, {100 * self.count / self.total:.0f} %, about {clock(left)} left"
+
+
+def tell(line: str) -> None:
+    """A line to stderr."""
+    print(line, file=sys.stderr, flush=True)
 
 
 def short(number: float) -> str:

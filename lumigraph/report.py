@@ -14,6 +14,7 @@ from typing import Any
 from PIL import Image
 
 from . import __version__
+from .budget import Budget
 from .figures.charts import STYLE as CHARTS
 from .figures.charts import Series, bar_chart, line_chart
 from .files import write_bytes
@@ -175,10 +176,10 @@ def settings(run: Run, evaluation: dict[str, Any] | None) -> str:
         ),
         **{name: value for name, value in said.scene.options.items() if value is not None},
         "bounds": " to ".join("(" + ", ".join(f"{x:.3g}" for x in corner) + ")" for corner in frame.bounds),
-        "reach": f"{frame.reach:g}",
+        "half-extent": f"{frame.reach:g} scene units",
         "near": f"{frame.near:.3g}",
         "background": ", ".join(f"{x:g}" for x in frame.background),
-        "budget": ", ".join(f"{value:g} {name}" for name, value in said.budget.items()),
+        "budget": str(Budget.from_json(said.budget)) if said.budget else "unknown",
         "seed": said.seed,
     }
     tables = [table("Scene", about), table(said.method, said.config)]

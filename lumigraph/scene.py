@@ -16,11 +16,11 @@ from .blending import before
 from .camera import Camera
 from .errors import LumigraphError
 from .geometry import Similarity
+from .geometry import Vector as Vector
 from .images import UNNAMED, ImageStore, Layer, cosines, resized
 from .plain import from_plain
 from .rays import Rays
 
-Vector = tuple[float, float, float]
 # How values of a layer are reduced, by its name (see `resized`); all others are picked, not averaged.
 AVERAGED = {"colours": "sRGB", "raw": "linear", "albedo": "linear", "flow": "pixels"}
 
@@ -198,6 +198,7 @@ class Scene:
     warnings: what the user should know about the capture, one sentence each
     layers:  what else is known of every pixel, by name: depth, labels ...; read when asked for
     about:   what else is known of each photograph, by name: exposure, boxes ...; the first axis is the image
+    full_sizes: width and height of the photographs before they were reduced, where they come from files
     """
 
     kind: ClassVar[str] = "photographs"
@@ -213,9 +214,14 @@ class Scene:
     warnings: list[str] = field(default_factory=list)
     layers: dict[str, Layer] = field(default_factory=dict)
     about: dict[str, Tensor] = field(default_factory=dict)
+    full_sizes: Int[Tensor, "photograph 2"] | None = None
 
     def __len__(self) -> int:
         return len(self.names)
+
+    def pixels(self, split: str) -> int:
+        """How many pixels there are to learn from, or to compare."""
+        return int(self.images.trusted_pixels[self.splits[split]].sum())
 
     def layer(self, name: str) -> Layer:
         """A layer by its name. Raises LumigraphError, naming those that there are, if there is none."""

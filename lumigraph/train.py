@@ -5,8 +5,6 @@ from __future__ import annotations
 import contextlib
 import copy
 import math
-import signal
-import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
@@ -16,6 +14,7 @@ import torch
 from torch import Tensor
 
 from . import methods
+from .budget import Budget
 from .dataset import Dataset, check_kind
 from .display import TrainingDisplay
 from .errors import LumigraphError
@@ -23,6 +22,8 @@ from .figures import save_picture
 from .memory import peak_memory
 from .method import Lesson, Method
 from .run import Run, State
+from .signals import Interrupt
+from .verdict import shares_seen
 
 FIRST_SAVE = 10.0  # seconds of training; a fault or a kill in the first minute should not cost all of it
 PREVIEWS = (0.01, 0.03, 0.1, 0.3, 1.0)  # shares of the budget at which a view is kept
@@ -69,6 +70,7 @@ def fit(
     *,
     steps: int | None = None,
     seconds: float | None = None,
+    budget: Budget | None = None,
     seed: int = 0,
     pause_at: int | None = None,
     save_every: float = 60.0,
@@ -80,7 +82,8 @@ def fit(
     """Train a method on a dataset until its steps are done or its seconds are spent.
 
     run:        where the state is kept; training goes on from the state it holds. None keeps nothing
-    steps, seconds: the whole budget, earlier sittings included; exactly one of them
+    steps, seconds: the whole budget, earlier sittings included; exactly one of them, or
+    budget:     one that says more, such as that of a run that was extended
     seed:       of all random choices
     pause_at:   stop at this step as if interrupted; the schedule still follows the whole budget
     save_every: seconds of training between states
@@ -89,23 +92,26 @@ def fit(
     Seconds count what training needs; compiling kernels ahead of it, saving, and giving way to who looks on are
     counted apart.
     Ctrl-C and SIGTERM end the step at hand, save and return; a second one breaks off.
-    Raises LumigraphError for a dataset of another kind than the method learns from, and when a loss or gradient is not
-    finite, with the last good state saved.
+    Raises LumigraphError for a dataset of another kind than the method learns from, for a run that another process
+    trains, and when a loss or gradient is not finite, with the last good state saved.
     """
-    budget = Budget(steps, seconds)
+    budget = budget or Budget(steps, seconds)
     check_kind(methods.name_of(method), method.learns_from, type(data), data.source)
-    state = run.restore_weights(method) if run else State()
-    with Interrupt() as interrupt, TrainingDisplay(show) as display:
-        display.say("Compiling kernels")
+    with run.held() if run else contextlib.nullcontext(), Interrupt() as interrupt, TrainingDisplay(show) as display:
+        state = run.restore_weights(method) if run else State()
+        display.begin(data)
         compile_seconds = state.compile_seconds + (rehearse(method, data, state.step) if rehearsal else 0.0)
         optimizers, generator = method.optimizers(), torch.Generator().manual_seed(seed)
         if run:
             run.restore_training(optimizers, generator)
             run.forget_after(state.step)
         method.train()
+        share_seen, passes, losses = shares_seen(data), state.passes, list[float]()
         clock, step, watched = Clock(state.seconds), state.step, 0.0
         if step == 0:
-            method.begin(data)
+            with display.aside():
+                method.begin(data)
+        display.ready(methods.name_of(method), method, budget, step, clock.seconds)
         next_save = clock.seconds + min(FIRST_SAVE, save_every)
 
         def spent(seconds: float | None = None) -> float:
@@ -118,7 +124,7 @@ def fit(
             if not finite(method.parameters()):
                 refuse("a parameter is not finite")
             memory = max(state.peak_memory, peak_memory(method.device))
-            now = State(step, clock.seconds, compile_seconds, memory)
+            now = State(step, clock.seconds, compile_seconds, memory, passes)
             with clock.paused():
                 previews.take(step, spent(now.seconds))
                 if run:
@@ -139,10 +145,14 @@ def fit(
             terms = method.step(batch, step, Descent(method, optimizers, batch, step, logged, refuse))
             method.after_step(step)
             step += 1
-            row = record(step, clock.seconds, terms, method) if logged or display.due else {}
-            display.update(step, clock.seconds, progress, batch, row)
+            passes += share_seen(batch)
+            losses.append(sum(value.item() for value in terms.values()))
+            row = record(step, clock.seconds, terms, method, losses, passes) if logged or display.due else {}
+            display.update(step, clock.seconds, budget, batch, row)
             if watch:
                 watch.note(step, progress, row)
+            if logged:
+                losses.clear()
             if run and logged:
                 run.log(row | {"learning_rate": [g["lr"] for o in optimizers for g in o.param_groups if "lr" in g]})
             if clock.seconds >= next_save and spent() < 1:  # the last save comes after
@@ -191,17 +201,20 @@ class Descent:
             optimizer.step()
 
 
-def record(step: int, seconds: float, terms: dict[str, Tensor], method: Method) -> dict[str, Any]:
+def record(
+    step: int, seconds: float, terms: dict[str, Tensor], method: Method, losses: Sequence[float], passes: float
+) -> dict[str, Any]:
     """A line of metrics.jsonl: the loss and its terms, the method's figures, and the PSNR of what the step learnt from
-    where the method reports a squared error of colours."""
-    losses = {name: value.item() for name, value in terms.items()}
+    where the method reports a squared error of colours; the mean loss since the line before, and how often everything
+    was learnt from by now."""
+    own = {name: value.item() for name, value in terms.items()}
     statistics = {name: float(value) for name, value in method.statistics().items()}
     row: dict[str, Any] = {"step": step, "seconds": round(seconds, 4)}
-    if losses:
-        row["loss"] = sum(losses.values())
+    if own:
+        row |= {"loss": sum(own.values()), "mean_loss": sum(losses) / len(losses), "passes": round(passes, 6)}
     if "mse" in statistics:
         row["psnr"] = -10 * math.log10(max(statistics["mse"], DARKEST_ERROR))
-    return row | {"terms": losses, "statistics": statistics}
+    return row | {"terms": own, "statistics": statistics}
 
 
 def set_learning_rate(optimizers: Iterable[torch.optim.Optimizer], rate: float | dict[str, float] | None) -> None:
@@ -213,24 +226,6 @@ def set_learning_rate(optimizers: Iterable[torch.optim.Optimizer], rate: float |
             own = rate.get(group.get("name", "")) if isinstance(rate, dict) else rate
             if own is not None:
                 group["lr"] = own * group.get("scale", 1.0)
-
-
-@dataclass(frozen=True)
-class Budget:
-    """When training ends: after a number of steps, or of seconds."""
-
-    steps: int | None
-    seconds: float | None
-
-    def __post_init__(self) -> None:
-        if (self.steps is None) == (self.seconds is None):
-            raise LumigraphError("Training needs either steps or seconds, and not both; give one of them")
-        if not 0 < (self.steps or self.seconds or 0) < math.inf:
-            raise LumigraphError(f"Training cannot last {self.steps or self.seconds or 0}; give a number above 0")
-
-    def progress(self, step: int, seconds: float) -> float:
-        """The share that is spent, in [0, 1]."""
-        return min(step / self.steps if self.steps else seconds / (self.seconds or 1), 1.0)
 
 
 class Clock:
@@ -249,28 +244,6 @@ class Clock:
         yield
         pause = time.perf_counter() - begin
         self._begin, self.pauses = self._begin + pause, self.pauses + pause
-
-
-class Interrupt:
-    """Inside this block the first Ctrl-C or SIGTERM only leaves its number; the second acts as usual."""
-
-    def __init__(self) -> None:
-        self.signal: int | None = None
-        self._previous: dict[int, object] = {}
-
-    def __enter__(self) -> Interrupt:
-        if threading.current_thread() is threading.main_thread():  # only there may handlers be set
-            for number in (signal.SIGINT, signal.SIGTERM):
-                self._previous[number] = signal.signal(number, self._note)
-        return self
-
-    def __exit__(self, *fault: object) -> None:
-        for number, handler in self._previous.items():
-            signal.signal(number, handler)  # type: ignore[arg-type]
-
-    def _note(self, number: int, frame: object) -> None:
-        self.signal = number
-        self.__exit__()
 
 
 class Previews:
@@ -310,6 +283,8 @@ def rehearse(method: Method, data: Dataset, step: int) -> float:
     begin = time.perf_counter()
     double = copy.deepcopy(method).train()
     optimizers = double.optimizers()
+    if step == 0:
+        double.rehearse_begin()
     set_learning_rate(optimizers, double.learning_rate(step, 0.0))
     double.before_step(step, 0.0)
     batch = double.batch(data, torch.Generator().manual_seed(0))

@@ -128,6 +128,7 @@ BAD = {
     "no steps": ["train", "voxel-grid", "{photographs}", "--steps", "0"],
     "negative seconds": ["train", "voxel-grid", "{photographs}", "--seconds", "-1"],
     "two budgets": ["train", "voxel-grid", "{photographs}", "--steps", "3", "--seconds", "3"],
+    "steps and a quality": ["train", "voxel-grid", "{photographs}", "--steps", "3", "--quality", "good"],
     "a run in the way": ["train", "voxel-grid", "{photographs}", "--steps", "3", "--output", "{trained}"],
     "photographs in the way": ["train", "voxel-grid", "{photographs}", "--steps", "3", "--output", "{photographs}"],
     "no such device": ["train", "voxel-grid", "{photographs}", "--steps", "3", "--device", "abacus"],

@@ -15,6 +15,7 @@ from lumigraph.capabilities import HasDensity, HasGaussians, HasLooks, can
 from lumigraph.composition import Placed, compose, frame_around, standing
 from lumigraph.composition.union import union
 from lumigraph.controls import Control
+from lumigraph.crop import Box
 from lumigraph.errors import LumigraphError, LumigraphWarning
 from lumigraph.exchange import write_gaussians
 from lumigraph.geometry import Similarity, to_matrix
@@ -184,7 +185,7 @@ def test_density_adds_up_per_unit_of_the_picture():
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_box_cuts_a_part(kind):
     """Without the half towards -x, the ball behind it in -x is seen from +x to end in the middle."""
-    half = ((0.0, -1.0, -1.0), (1.0, 1.0, 1.0))
+    half = Box((0.0, -1.0, -1.0), (1.0, 1.0, 1.0))
     parts = [Placed(KINDS[kind](RED), HERE, half), Placed(KINDS[kind](BLUE), at(0.0, 0, 0, scale=0.4))]
     both = compose(WHITE, parts)
     rgb, depth, _ = middle(both.render(eye((3.0, 0, 0))))
@@ -253,7 +254,7 @@ def folder(tmp_path_factory):
 
 
 def test_a_file_opens_as_it_was_written(folder):
-    parts = [Part("red.ply", HERE), Part("blue.ply", at(0, -0.75, 0), ((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0)))]
+    parts = [Part("red.ply", HERE), Part("blue.ply", at(0, -0.75, 0), Box((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0)))]
     write_composition(folder / "two.json", parts, lead=1)
     read, lead = read_composition(folder / "two.json")
     assert lead == 1 and [(p.source, p.box) for p in read] == [(p.source, p.box) for p in parts]

@@ -15,15 +15,18 @@ import lumigraph
 # Each floor may know the floors above it in this list, and a room on it knows no other room of its own floor.
 # A new room is a new name here, on the floor where it belongs.
 FLOORS: list[set[str]] = [
-    {"errors"},
-    {"blending", "choice", "controls", "geometry", "loops", "memory", "progress", "readers", "srgb", "threads"},
+    {"console", "errors", "processes", "quality", "signals"},
+    {
+        *("blending", "budget", "choice", "controls", "geometry", "loops"),
+        *("memory", "names", "progress", "readers", "srgb", "threads"),
+    },
     {"files", "plain", "lens", "rays"},
-    {"camera", "images", "kernels", "figures", "metrics"},
+    {"camera", "crop", "images", "kernels", "figures", "locks", "metrics"},
     {"volume", "scene"},
     {"dataset", "gaussians", "mesh"},
     {"capabilities", "collection", "shapes"},
-    {"components", "capture", "exchange", "method", "paths"},
-    {"composition", "display"},
+    {"announce", "components", "capture", "exchange", "method", "paths"},
+    {"composition", "display", "verdict"},
     {"methods", "export", "viewer"},
     {"run"},
     {"evaluate"},

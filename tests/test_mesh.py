@@ -18,6 +18,7 @@ from solids import SOLID, Seen, Solid, around, ball, painted, shell, together, t
 
 from lumigraph.camera import Camera
 from lumigraph.cli import main
+from lumigraph.crop import Box
 from lumigraph.errors import LumigraphError
 from lumigraph.exchange import write_gaussians
 from lumigraph.export.mesh import extract_mesh, meshed_box
@@ -125,10 +126,10 @@ def test_a_surface_that_leaves_the_box_is_closed_there_or_open():
 
 def test_the_box_may_be_larger_or_smaller_and_grows_in_the_open():
     frame = Frame(bounds=((-0.4,) * 3, (0.4,) * 3), near=0.1, reach=4.0)
-    assert meshed_box(frame, None).tolist() == [[pytest.approx(-0.6)] * 3, [pytest.approx(0.6)] * 3]
-    assert meshed_box(frame, 100.0).tolist() == [[-4.0] * 3, [4.0] * 3]
-    assert meshed_box(replace(frame, reach=1.0), None)[1].tolist() == [pytest.approx(0.4)] * 3
-    mesh = extract_mesh(Seen(ball(), frame), around(), cell=CELL, box=2.0)
+    assert meshed_box(frame, None) == Box((pytest.approx(-0.6),) * 3, (pytest.approx(0.6),) * 3)
+    assert meshed_box(frame, 100.0) == Box((-4.0,) * 3, (4.0,) * 3)
+    assert meshed_box(replace(frame, reach=1.0), None).upper == (pytest.approx(0.4),) * 3
+    mesh = extract_mesh(Seen(ball(), frame), around(), cell=CELL, extent=2.0)
     assert as_trimesh(mesh).is_watertight and as_trimesh(mesh).extents.min() > 1.1
 
 
@@ -236,6 +237,23 @@ def test_a_glb_is_unlit_and_well_formed(solid_ball, tmp_path):
     assert about["buffers"][0]["byteLength"] == struct.unpack("<I", data[20 + size : 24 + size])[0]
 
 
+@pytest.mark.parametrize("up", [(0.0, 0.0, 1.0), (0.0, -1.0, 0.0), (0.6, 0.0, -0.8), (0.0, 1.0, 0.0)])
+def test_a_glb_stands_upright_elsewhere(solid_ball, tmp_path, up):
+    """Vertices are the source's, and the node above them brings up to +y, as glTF demands."""
+    path, up = tmp_path / "ball.glb", np.array(up)
+    far = int((solid_ball.vertices @ up).argmax())
+    write_mesh(path, solid_ball, up)
+    scene = trimesh.load_scene(path, process=False)
+    (name,) = scene.graph.nodes_geometry
+    placed, _ = scene.graph.get(name)
+    np.testing.assert_allclose(placed[:3, :3] @ up, [0, 1, 0], atol=1e-6)
+    np.testing.assert_allclose(placed[:3, :3] @ placed[:3, :3].T, np.eye(3), atol=1e-6)
+    (seen,) = scene.dump()
+    assert int(seen.vertices[:, 1].argmax()) == far and seen.volume > 0
+    about = json.loads((data := path.read_bytes())[20 : 20 + struct.unpack("<I", data[12:16])[0]])
+    np.testing.assert_allclose(about["nodes"][0]["extras"]["source_from_upright"], placed[:3, :3].T, atol=1e-6)
+
+
 def test_another_frame_moves_scales_and_keeps_the_outside_outside(solid_ball):
     moved = solid_ball.in_source(Frame(source_from_scene=MOVED))
     np.testing.assert_allclose(moved.vertices.mean(0), (5, -1, 0.5), atol=0.05)
@@ -307,9 +325,11 @@ def test_commands_write_in_the_frame_of_the_photographs(tmp_path, capsys):
     assert main(["export", "mesh", str(run.folder), str(mesh), "--cell-size", "0.15", *options]) == 0
     assert main(["export", "points", str(run.folder), str(points), "--count", "300", *options]) == 0
     assert "triangles" in capsys.readouterr().out
-    found = trimesh.load_mesh(mesh, process=False)
+    scene = trimesh.load_scene(mesh, process=False)
+    (found,) = scene.geometry.values()
     assert found.is_watertight
     np.testing.assert_allclose(found.bounds.mean(0), (5, -1, 0.5), atol=0.3)
+    np.testing.assert_allclose(scene.bounds.mean(0), (5, 0.5, 1), atol=0.3)  # +z of the source is up
     assert found.volume == pytest.approx(4 / 3 * math.pi * 1.2**3, rel=0.35)
 
 
@@ -364,7 +384,8 @@ def test_an_empty_scene(make):
 BAD = {
     "ending": ["mesh", "RUN", "ball.stl"],
     "cell size": ["mesh", "RUN", "ball.ply", "--cell-size", "-1"],
-    "box": ["mesh", "RUN", "ball.ply", "--box", "0"],
+    "extent": ["mesh", "RUN", "ball.ply", "--extent", "0"],
+    "empty box": ["mesh", "RUN", "ball.ply", "--box", *"0 0 0 1 1 -1".split()],
     "faces": ["mesh", "RUN", "ball.ply", "--faces", "0"],
     "share": ["mesh", "RUN", "ball.ply", "--keep", "2"],
     "no run": ["mesh", "RUN", "ball.ply"],

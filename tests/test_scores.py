@@ -17,6 +17,7 @@ from lumigraph import methods
 from lumigraph.benchmark.cell import Cell, Settings
 from lumigraph.benchmark.conduct import conduct
 from lumigraph.benchmark.table import markdown
+from lumigraph.budget import Budget
 from lumigraph.cli import main
 from lumigraph.errors import LumigraphError
 from lumigraph.evaluate import evaluate, evaluate_collection, evaluate_on, evaluate_run, evaluate_shapes
@@ -25,7 +26,7 @@ from lumigraph.metrics.surfaces import chamfer_distance, intersection_over_union
 from lumigraph.report import write_report
 from lumigraph.run import Run, build
 from lumigraph.shapes import Shapes
-from lumigraph.train import Budget, fit
+from lumigraph.train import fit
 from lumigraph.viewer.training_panel import describe, measure_of
 
 CPU = torch.device("cpu")

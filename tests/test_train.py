@@ -13,7 +13,7 @@ from lumigraph.errors import LumigraphError
 from lumigraph.evaluate import evaluate
 from lumigraph.run import Run
 from lumigraph.run.checkpoint import Checkpoints
-from lumigraph.train import Budget, Clock, finite, fit, rehearse, set_learning_rate
+from lumigraph.train import Clock, finite, fit, rehearse, set_learning_rate
 
 
 def final_state(run: Run) -> tuple[dict[str, torch.Tensor], str]:
@@ -210,30 +210,11 @@ def test_lines_and_previews_tell_the_steps_once(tmp_path):
     train(Run(run.folder), steps=40)
     rows = run.metrics()
     assert [row["step"] for row in rows] == [10, 20, 30, 40]
-    assert {"seconds", "loss", "terms", "psnr", "statistics", "learning_rate"} <= rows[-1].keys()
+    assert {"seconds", "loss", "terms", "psnr", "statistics", "learning_rate", "mean_loss", "passes"} <= rows[-1].keys()
     assert set(rows[-1]["terms"]) == {"colour", "thin"}
     assert [row["seconds"] for row in rows] == sorted(row["seconds"] for row in rows)
     assert rows[-1]["learning_rate"][0] == pytest.approx(0.1 * 0.1 ** (39 / 40))
     assert max(run.previews()) == 40 and len(run.previews()) >= 4
-
-
-def test_plain_lines_where_there_is_no_terminal(capsys):
-    scene = tiny.scene()
-    fit(tiny.method(scene.frame), scene, steps=10)
-    lines = capsys.readouterr().err.splitlines()
-    assert "Compiling" in lines[0] and "100 %" in lines[-1] and "step 10" in lines[-1] and "dB" in lines[-1]
-
-
-@pytest.mark.parametrize("budget", [{}, {"steps": 3, "seconds": 1.0}, {"steps": 0}, {"seconds": -1.0}])
-def test_a_budget_is_steps_or_seconds(budget):
-    with pytest.raises(LumigraphError):
-        fit(tiny.method(), tiny.scene(), show=False, **budget)
-
-
-def test_progress_is_the_share_of_the_budget():
-    assert Budget(200, None).progress(50, 1e9) == 0.25
-    assert Budget(None, 60.0).progress(10**9, 15.0) == 0.25
-    assert Budget(None, 60.0).progress(0, 75.0) == 1.0
 
 
 @pytest.mark.parametrize(

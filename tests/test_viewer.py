@@ -22,16 +22,18 @@ from torch import nn
 from viewer_client import Client
 
 from lumigraph.cli import main
+from lumigraph.crop import Box
 from lumigraph.errors import LumigraphError, LumigraphWarning
 from lumigraph.figures import NOTHING, RAMP, hex_colour
 from lumigraph.gaussians import Gaussians, splatting
+from lumigraph.gaussians.cleaning import cleaned
 from lumigraph.method import Method, RayMethod
 from lumigraph.rays import Rendering
 from lumigraph.run import Run
 from lumigraph.train import fit
 from lumigraph.viewer import Subject, Viewer, choose_address
 from lumigraph.viewer.cameras import angle_for, angles, pose_of, rows
-from lumigraph.viewer.crop import CropBox, render_inside
+from lumigraph.viewer.crop import render_inside
 from lumigraph.viewer.extras import PALETTE
 from lumigraph.viewer.flight import upwards
 from lumigraph.viewer.modes import along_axis, extra_modes, normals, picture
@@ -256,7 +258,7 @@ def test_a_crop_begins_where_rays_enter_the_box(learnt):
     camera = scene.cameras[0]  # on the side of positive x
     method = Walls(scene.frame)
     assert (method.render(camera).rgb[..., 0] == 1).all()
-    seen = render_inside(method, camera, CropBox((-0.5, -1.0, -1.0), (0.0, 1.0, 1.0)), False)
+    seen = render_inside(method, camera, Box((-0.5, -1.0, -1.0), (0.0, 1.0, 1.0)))
     inside = seen.opacity == 1
     assert inside.sum() > 50
     assert (seen.rgb[inside] == torch.tensor([0.0, 0.0, 1.0])).all()
@@ -275,7 +277,7 @@ def test_a_crop_keeps_extras_even_of_bands_beside_the_box(learnt):
             return seen.with_extra(wall=1 + (seen.rgb[:, 2] > 0).long(), where=rays.origins)
 
     bands = [
-        render_inside(Numbered(scene.frame), rows(camera, a, b), CropBox((-0.5, -1.0, -0.1), (0.0, 1.0, 0.1)), False)
+        render_inside(Numbered(scene.frame), rows(camera, a, b), Box((-0.5, -1.0, -0.1), (0.0, 1.0, 0.1)))
         for a, b in ((0, 1), (1, tiny.SIZE))
     ]
     assert (bands[0].opacity == 0).all() and (bands[0].extra["wall"] == 0).all()
@@ -289,7 +291,7 @@ def test_a_crop_keeps_extras_even_of_bands_beside_the_box(learnt):
 def test_a_crop_of_other_methods_goes_by_depth(learnt):
     scene, _ = learnt
     camera = scene.cameras[0]
-    seen = render_inside(Wall(scene.frame, None), camera, CropBox((-0.1, -0.3, -1.0), (0.1, 0.3, 1.0)), False)
+    seen = render_inside(Wall(scene.frame, None), camera, Box((-0.1, -0.3, -1.0), (0.1, 0.3, 1.0)))
     y = camera.rays(camera.pixels()).at(seen.depth.reshape(-1).nan_to_num(0, 0))[:, 1].view_as(seen.depth)
     inside = seen.opacity == 1
     assert 0 < inside.sum() < inside.numel()
@@ -299,8 +301,8 @@ def test_a_crop_of_other_methods_goes_by_depth(learnt):
 
 def test_a_crop_of_a_cloud_picks_centres():
     cloud = some_cloud(50)
-    box = CropBox((-0.5, -1.0, -1.0), (0.5, 0.2, 1.0))
-    kept = box.cropped(cloud).means
+    box = Box((-0.5, -1.0, -1.0), (0.5, 0.2, 1.0))
+    kept = cleaned(cloud, box).means
     assert 0 < len(kept) < 50
     assert (kept[:, 0].abs() <= 0.5).all() and (kept[:, 1] <= 0.2).all()
 

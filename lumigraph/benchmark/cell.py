@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import Any
 
 from .. import files
+from ..budget import Budget
 from ..errors import LumigraphError
 from ..run import Run
-from ..train import Budget
 
 
 @dataclass(frozen=True)
@@ -62,11 +62,6 @@ class Cell:
         return f"{self.method} on {self.scene}{views}, {duration(self.budget)}, seed {self.seed}"
 
 
-def budget_of(plain: dict[str, Any]) -> Budget:
-    """A cell's budget as runs and results hold it: {"seconds": s} or {"steps": n}."""
-    return Budget(plain.get("steps"), plain.get("seconds"))
-
-
 def duration(budget: Budget) -> str:
     return f"{budget.seconds:g} s" if budget.seconds else f"{budget.steps} steps"
 
@@ -111,7 +106,7 @@ def options(told: dict[str, Any]) -> list[str]:
 def trained(folder: Path) -> bool:
     """Whether a run has spent its budget."""
     run = Run(folder)
-    return run.has_state and budget_of(run.settings.budget).progress(run.state.step, run.state.seconds) >= 1
+    return run.has_state and Budget.from_json(run.settings.budget).progress(run.state.step, run.state.seconds) >= 1
 
 
 def evaluated(folder: Path, settings: Settings) -> bool:

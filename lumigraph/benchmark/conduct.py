@@ -8,7 +8,8 @@ from pathlib import Path
 
 from .. import files
 from ..errors import LumigraphError
-from ..progress import clock
+from ..locks import held
+from ..progress import clock, counting
 from .cell import Cell, Settings, claim, evaluation, training
 from .launch import STOPPED, Launch, launch, reason
 from .pictures import draw_charts, draw_views
@@ -29,12 +30,22 @@ def conduct(
     says why. tell: hears which cell is next. Returns the signal's exit code if one stopped it, otherwise 0.
     """
     claim(output, cells, settings)
+    with held(output, "worked in"):
+        return carry_on(cells, settings, output, tell, launch)
+
+
+def carry_on(
+    cells: Sequence[Cell], settings: Settings, output: Path, tell: Callable[[str], object], launch: Launch
+) -> int:
+    """All cells, one after the other, in a folder that is ours alone."""
     rows, patience = read_rows(output), Patience()
     for number, cell in enumerate(cells, 1):
         todo = [one for one in cells[number - 1 :] if unfinished(one, output, settings)]
         if cell in todo:
             tell(f"{number} of {len(cells)}: {cell.title}; {patience.left(todo)}")
-        begin, (code, failure) = time.monotonic(), carry_out(cell, output, settings, launch)
+        begin = time.monotonic()
+        with counting(cell.title):
+            code, failure = carry_out(cell, output, settings, launch)
         if code in STOPPED:
             return code
         if cell in todo and not failure:

@@ -9,7 +9,8 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from .. import files
-from ..train import Interrupt
+from ..processes import start
+from ..signals import Interrupt
 
 Launch = Callable[[Sequence[str], Path], int]
 STOPPED = (130, 143)  # after Ctrl-C and SIGTERM
@@ -19,8 +20,8 @@ LOOKS = 0.2  # seconds between looks at whether to stop
 def launch(arguments: Sequence[str], log: Path) -> int:
     """Run `lumigraph ARGUMENTS`, with all that it says added to a log. Returns its exit code, as shells count.
 
-    Ctrl-C and SIGTERM are passed on, and the command may end as it does by itself: with its state saved. It stands
-    apart from the terminal, which would send it Ctrl-C a second time.
+    Ctrl-C and SIGTERM are passed on, and the command may end as it does by itself: with its state saved. It does so too
+    when this process is killed. It stands apart from the terminal, which would send it Ctrl-C a second time.
     """
     with files.explained(log):
         log.parent.mkdir(parents=True, exist_ok=True)
@@ -29,7 +30,7 @@ def launch(arguments: Sequence[str], log: Path) -> int:
         out.write(f"$ lumigraph {' '.join(arguments)}\n".encode())
         out.flush()
         command = [sys.executable, "-m", "lumigraph", *arguments]
-        process = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=out, stderr=out, start_new_session=True)
+        process = start(command, stdin=subprocess.DEVNULL, stdout=out, stderr=out, start_new_session=True)
         passed_on = False
         try:
             while (code := ended(process)) is None:

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import re
 import statistics
 from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any
 
+from ..budget import Budget
 from ..metrics import named, scores_of
-from .cell import budget_of, duration
+from .cell import duration
 from .results import Row
 
 NONE = "–"
@@ -81,8 +83,13 @@ def full_table(rows: Sequence[Row]) -> str:
 def table(names: Sequence[str], lines: Sequence[Sequence[str]]) -> str:
     """A Markdown table. Columns that say nothing anywhere are left out."""
     kept = [i for i in range(len(names)) if any(line[i] != NONE for line in lines)]
-    shown = [[line[i].replace("|", "/") for i in kept] for line in (names, ["---"] * len(names), *lines)]
+    shown = [[literal(line[i]) for i in kept] for line in (names, ["---"] * len(names), *lines)]
     return "\n".join(f"| {' | '.join(line)} |" for line in shown) if lines else ""
+
+
+def literal(text: str) -> str:
+    """Text that Markdown shows as it is."""
+    return re.sub(r"([\\`*\[\]<>|])", r"\\\1", text)
 
 
 def in_order(rows: Sequence[Row]) -> list[Row]:
@@ -93,7 +100,7 @@ def in_order(rows: Sequence[Row]) -> list[Row]:
 
 
 def trained_for(row: Row) -> str:
-    return duration(budget_of(row["budget"]))
+    return duration(Budget.from_json(row["budget"]))
 
 
 def resolution(row: Row) -> str:

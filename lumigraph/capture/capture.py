@@ -50,6 +50,8 @@ class Shot:
     image: the pixels, or a function that makes them when asked (it needs `size`), or files: the same photograph reduced
            1, 2, 4... times, {1: Path, ...}
     mask:  where the photograph is to be trusted: non-zero is good; a file or (height, width) numbers
+    alpha: a file, white where an object is that alone counts, black where nothing is to be. It becomes the opacity,
+           times that which the picture has
     split: "train", "test" or "val" where the source publishes that. If no shot of a capture has one, every 8th by name
            is held out
     time:  moment of exposure
@@ -64,6 +66,7 @@ class Shot:
     size: tuple[int, int] | None
     image: dict[int, Path] | Pixels | Callable[[], Pixels]
     mask: Path | np.ndarray | None = None
+    alpha: Path | None = None
     split: str | None = None
     time: float | None = None
     depths: tuple[float, float] | None = None
@@ -86,6 +89,7 @@ class Capture:
     reach:    half-size of the cube around the bounds' centre that holds everything, source's units
     near:     distance within which nothing is, source's units
     background: colour behind everything
+    up:       which way is up, source's frame, any length
     """
 
     source: str
@@ -98,3 +102,4 @@ class Capture:
     reach: float | None = None
     near: float | None = None
     background: tuple[float, float, float] | None = None
+    up: tuple[float, float, float] | None = None

@@ -6,12 +6,13 @@ import struct
 from pathlib import Path
 
 import numpy as np
-import pycolmap
 import torch
 
 from ..errors import LumigraphError
 from ..lens import Equirectangular, Fisheye, Lens, OpenCV, Pinhole
+from ..names import natural
 from .capture import Capture, Shot
+from .library import pycolmap
 from .pictures import reductions, versions
 from .points import SparsePoints, read_points3d
 
@@ -59,7 +60,7 @@ def read(folder: Path) -> Capture:
     place = model_folder(folder)
     assert place is not None
     model = read_model(place)
-    images = sorted((image for image in model.images.values() if image.has_pose), key=lambda image: image.name)
+    images = sorted((image for image in model.images.values() if image.has_pose), key=lambda image: natural(image.name))
     names = [image.name for image in images]
     folders = reductions(folder / "images") or reductions(folder / "input") or {1: folder}
     shots, missing = [], []
@@ -70,7 +71,7 @@ def read(folder: Path) -> Capture:
             continue
         lens, size = lenses[image.camera_id]
         pose = image.cam_from_world().inverse().matrix()
-        shots.append(Shot(image.name, pose, lens, size, files, find_mask(folder / "masks", image.name)))
+        shots.append(Shot(image.name, pose, lens, size, files))
     if not shots and names:
         raise LumigraphError(
             f"{folders[min(folders)]} holds none of the {len(names)} photographs that {place} lists, "
@@ -131,12 +132,6 @@ def read_points(place: Path, model: pycolmap.Reconstruction) -> SparsePoints:
         np.array([p.color for p in found], np.uint8).reshape(-1, 3),
         np.array([p.track.length() for p in found], np.int64),
     )
-
-
-def find_mask(folder: Path, name: str) -> Path | None:
-    """COLMAP's own masks are called image.jpg.png; image.png is common as well. Black is to be ignored."""
-    candidates = (folder / f"{name}.png", (folder / name).with_suffix(".png"))
-    return next((path for path in candidates if path.is_file()), None)
 
 
 def read_lens(camera: pycolmap.Camera, place: Path) -> Lens:

@@ -35,7 +35,8 @@ def find_file(path: Path) -> Path:
 
 
 def list_images(folder: Path) -> list[str]:
-    """Names of the images below a folder, sorted, with / between folders."""
+    """Names of the images below a folder, with / between folders, in the order in which programs pair them with poses:
+    by their letters, 10 before 2."""
     if not folder.is_dir():
         return []
     files = (p for p in folder.rglob("*") if p.suffix.lower() in {s.lower() for s in SUFFIXES} and p.is_file())
@@ -113,7 +114,7 @@ def choose(shot: Shot, downscale: int | None) -> Chosen:
         made = pixels if isinstance(pixels, np.ndarray) else pixels()
         return made if size == own else np.asarray(Image.fromarray(made).resize(size, Image.Resampling.BOX))
 
-    return Chosen(ImageSource(size, with_mask(make, shot.mask, size, False)), calibrated, wanted)
+    return Chosen(ImageSource(size, masked(make, shot, size, False)), calibrated, wanted)
 
 
 def choose_file(shot: Shot, files: dict[int, Path], downscale: int | None) -> Chosen:
@@ -143,12 +144,13 @@ def choose_file(shot: Shot, files: dict[int, Path], downscale: int | None) -> Ch
         )
     size = smaller(own, wanted)
     identity = f"{path.resolve()} {stat(path)} {turn}"
-    if isinstance(shot.mask, Path):
-        identity += f" {shot.mask.resolve()} {stat(shot.mask)}"
-    elif shot.mask is not None:
+    for beside in (shot.mask, shot.alpha):
+        if isinstance(beside, Path):
+            identity += f" {beside.resolve()} {stat(beside)}"
+    if isinstance(shot.mask, np.ndarray):
         identity += f" {zlib.crc32(shot.mask.tobytes())}"
     return Chosen(
-        ImageSource(size, with_mask(lambda: read_image(path, turn, size), shot.mask, size, turn), identity),
+        ImageSource(size, masked(lambda: read_image(path, turn, size), shot, size, turn), identity),
         calibrated,
         wanted,
         deep_plane(path, turn, identity),
@@ -248,10 +250,40 @@ def resize(image: Image.Image, size: Size) -> Image.Image:
     return image if image.size == size else image.resize(size, Image.Resampling.BOX)
 
 
-def with_mask(
-    make: Callable[[], np.ndarray], mask: Path | np.ndarray | None, size: Size, turn: bool
+def masked(
+    make: Callable[[], np.ndarray], shot: Shot, size: Size, turn: bool
 ) -> Callable[[], tuple[np.ndarray, np.ndarray | None]]:
-    return lambda: (make(), None if mask is None else read_mask(mask, size, turn))
+    """What reads a shot's pixels, with the alpha that its silhouette gives them, and which of them to trust."""
+
+    def read() -> tuple[np.ndarray, np.ndarray | None]:
+        pixels = make() if shot.alpha is None else with_alpha(make(), read_alpha(shot.alpha, size, turn))
+        return pixels, None if shot.mask is None else read_mask(shot.mask, size, turn)
+
+    return read
+
+
+def with_alpha(pixels: np.ndarray, alpha: np.ndarray) -> np.ndarray:
+    """RGBA: another alpha beside the colours, times the one that they have."""
+    if pixels.shape[2] == 4:
+        alpha = (pixels[..., 3].astype(np.uint16) * alpha + 127) // 255
+    return np.concatenate([pixels[..., :3], alpha[..., None].astype(np.uint8)], -1)
+
+
+def read_alpha(path: Path, size: Size, turn: bool) -> np.ndarray:
+    """A silhouette at a size, (height, width) of uint8: its brightest channel, times its alpha where it has one."""
+    return np.asarray(Image.fromarray(read_grey(path, size, turn)).resize(size, Image.Resampling.BOX))
+
+
+def read_grey(path: Path, size: Size, turn: bool) -> np.ndarray:
+    """A mask's brightest channel, times its alpha, as uint8; in its own size, which has the photograph's shape."""
+    with readable(path), Image.open(path) as image:
+        upright = ImageOps.exif_transpose(image) if turn else image
+        channels = np.asarray(eight_bits(upright)).astype(np.uint16)
+        grey = channels[..., :3].max(-1)
+        grey = grey * channels[..., 3] // 255 if channels.shape[2] == 4 else grey
+        if not same_shape((grey.shape[1], grey.shape[0]), size):
+            raise ValueError(f"its shape {grey.shape[1]}x{grey.shape[0]} is not the image's {size[0]}x{size[1]}")
+    return grey.astype(np.uint8)
 
 
 def read_mask(mask: Path | np.ndarray, size: Size, turn: bool) -> np.ndarray:
@@ -259,12 +291,7 @@ def read_mask(mask: Path | np.ndarray, size: Size, turn: bool) -> np.ndarray:
     if isinstance(mask, np.ndarray):
         grey = Image.fromarray(mask.astype(bool))
     else:
-        with readable(mask), Image.open(mask) as image:
-            upright = ImageOps.exif_transpose(image) if turn else image
-            channels = np.asarray(eight_bits(upright))
-            grey = Image.fromarray(channels[..., :3].max(-1) > 127)
-            if not same_shape(grey.size, size):
-                raise ValueError(f"its shape {grey.size[0]}x{grey.size[1]} is not the image's {size[0]}x{size[1]}")
+        grey = Image.fromarray(read_grey(mask, size, turn) > 127)
     if grey.size == size:
         return np.asarray(grey)
     return np.asarray(grey.convert("L").resize(size, Image.Resampling.BOX)) > 254

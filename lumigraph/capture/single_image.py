@@ -49,7 +49,7 @@ def read(path: Path, downscale: int | None = None) -> Capture:
     longest = max(size)
     lens = Pinhole(torch.full((1, 2), AWAY * longest / 2), torch.tensor([[width / 2, height / 2]]))
     shots = [
-        Shot(name, FACING, lens, size, pixels, mask, split)
+        Shot(name, FACING, lens, size, pixels, mask, split=split)
         for name, split, mask in (("held-out", "test", held_out), ("learnt", "train", ~held_out))
     ]
     corner = (width / longest, THICKNESS, height / longest)

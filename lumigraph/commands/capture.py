@@ -10,7 +10,7 @@ from typing import Annotated, Any, Literal
 from tyro.conf import Positional
 
 from ..errors import LumigraphError
-from .common import needed, option, say, scene_name, show
+from .common import needed, option, say, scene_name, show, typed
 
 NAMELESS = ("images", "photos", "photographs", "pictures", "input", "frames")  # folders named after what is in them
 NAMED = 12  # photographs at most that a list names; all are in capture.json and photographs.png
@@ -40,6 +40,10 @@ class CaptureCommand:
     max_size: Annotated[int, option("PIXELS")] = 1600
     """Longer side to which photographs are reduced when details are looked for."""
 
+    mask_object: bool = False
+    """For one thing before a backdrop: find it in every photograph, so that training learns it alone. Writes
+    object_masks/ and object.png into the scene; look at that picture before you train."""
+
     def run(self) -> int:
         from ..capture.motion import Options
 
@@ -47,8 +51,33 @@ class CaptureCommand:
             raise LumigraphError("Nothing to capture; name a folder of photographs, image files or a video")
         options = Options(self.frames, self.mapper, self.matching, self.camera, self.max_size)
         folder = self.output or scene_folder(self.what)
-        tell(folder, find_cameras(self.what, folder, options), f"lumigraph train gaussian-splatting {folder}")
+        onward = typed("train", "gaussian-splatting", folder)
+        tell(folder, find_cameras(self.what, folder, options), None if self.mask_object else onward)
+        if self.mask_object:
+            tell_masks(folder, onward)
         return 0
+
+
+def tell_masks(folder: Path, onward: str) -> None:
+    """Find the object of a scene, unless that was done before: what was written to stdout, doubts to stderr."""
+    from ..capture import choose_reader
+    from ..capture.masks import OBJECT_MASKS
+    from ..capture.objects import mask_object
+    from ..progress import track
+
+    if (folder / OBJECT_MASKS).exists():
+        show({"masks": f"{folder / OBJECT_MASKS}, as they are; delete them to have them made anew", "next": onward})
+        return
+    masked = mask_object(folder, choose_reader(folder).read(folder), track)
+    show(
+        {
+            "masks": f"{masked.photographs} in {folder / OBJECT_MASKS}",
+            "look at": f"{masked.sheet}: what is bright is learnt, what is dark is nothing",
+            "next": onward,
+        }
+    )
+    for doubt in masked.doubts:
+        say(f"warning: {doubt}; look at {masked.sheet}, and correct or delete {folder / OBJECT_MASKS}")
 
 
 def posed(scene: str) -> str:
@@ -107,9 +136,8 @@ def rows(folder: Path, result: dict[str, Any]) -> dict[str, str]:
         found["duplicates"] = lines([f"{name} of {other}" for name, other in result["duplicates"].items()])
     found["error"] = f"{result['error']:.2f} pixels"
     found["points"] = f"{result['points']:,}, each in {result['track_length']:.1f} photographs on average"
-    found["seen"] = (
-        f"points fill {100 * result['filled']:.0f} % of a picture; rays to one differ by {result['angle']:.0f} degrees"
-    )
+    found["coverage"] = f"points span {100 * result['filled']:.0f} % of a photograph, on average"
+    found["parallax"] = f"{result['angle']:.0f} degrees between the outermost views of a point (median)"
     if coverage := result["coverage"]:
         found["around"] = f"{coverage['degrees']:.0f} of 360 degrees"
         gaps = [f"{g['degrees']:.0f} degrees between {' and '.join(g['between'])}" for g in coverage["gaps"]]

@@ -3,17 +3,22 @@
 from __future__ import annotations
 
 import itertools
+import shlex
 import sys
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
-from rich.console import Console
+from rich.text import Text
 
+from ..budget import Budget
+from ..console import console, dim
 from ..errors import LumigraphError
 from ..files import scene_name as scene_name
+from ..quality import MEANS, Quality
 from ..readers import LISTED, NAMES
+from ..signals import exit_code as exit_code
 
 if TYPE_CHECKING:
     Reader = str
@@ -21,9 +26,9 @@ else:
     Reader = Literal[NAMES]
 
 
-def option(metavar: str, default: str | None = None) -> Any:
-    """How an option looks in --help: what to put there, and what happens without it."""
-    return tyro.conf.arg(metavar=metavar, help_behavior_hint=default and f"(default: {default})")
+def option(metavar: str, default: str | None = None, about: str | None = None) -> Any:
+    """How an option looks in --help: what to put there, what happens without it, what it is about."""
+    return tyro.conf.arg(metavar=metavar, help_behavior_hint=default and f"(default: {default})", help=about)
 
 
 def needed(metavar: str) -> Any:
@@ -54,16 +59,33 @@ def choose_device(name: str) -> Any:
     return device
 
 
-def budget_of(steps: int | None, seconds: float | None) -> dict[str, Any]:
-    """What --steps and --seconds say, as fit() takes it; empty if they say nothing."""
-    from ..train import Budget
+def told_budget(steps: int | None, seconds: float | None, quality: Quality | None = None) -> Budget | None:
+    """What --steps or --seconds say; None where they say nothing. Raises LumigraphError, before anything is opened, for
+    what makes no sense, and for more than one of these options."""
+    if sum(told is not None for told in (steps, seconds, quality)) > 1:
+        raise LumigraphError("--steps, --seconds and --quality are ways to say how long; give one of them")
+    return None if steps is None and seconds is None else Budget(steps, seconds)
 
-    if steps is not None and seconds is not None:
-        raise LumigraphError("--steps and --seconds are two ways to say how long; give one of them")
-    told = {name: value for name, value in (("steps", steps), ("seconds", seconds)) if value is not None}
-    if told:
-        Budget(steps, seconds)  # refuses what makes no sense, before anything is opened
-    return told
+
+def quality_budget(quality: Quality, method: Any, data: Any) -> Budget:
+    """The steps that --quality asks a method for on its data."""
+    return Budget(method.steps_for(quality, data), quality=quality)
+
+
+def about_quality(kind: Any = None) -> str:
+    """What --quality means, in help texts; of a kind of method with its numbers."""
+    told = "Train for as many steps as the method needs for so many photographs of this size. "
+    return told + "; ".join(f"{name}, {means}{numbers(kind, name)}" for name, means in MEANS.items()) + "."
+
+
+def numbers(kind: Any, quality: Quality) -> str:
+    """What a quality asks of a kind of method: passes and steps."""
+    if kind is None:
+        return ""
+    from ..method import RayMethod
+
+    effort, unit = kind.efforts[quality], "pixel" if issubclass(kind, RayMethod) else "photograph"
+    return f": each {unit} {effort.passes:g} times, at least {effort.at_least:,} steps"
 
 
 def check_film(frames: int | None, fps: float, size: int | None) -> None:
@@ -81,18 +103,18 @@ def say(text: str) -> None:
     print(text, file=sys.stderr, flush=True)
 
 
-def show(rows: Mapping[str, str]) -> None:
+def show(rows: Mapping[str, str | Text]) -> None:
     """Results, one to a line, names aligned."""
-    console, width = Console(highlight=False, soft_wrap=True), max(map(len, rows))
+    out, width = console(soft_wrap=True), max(map(len, rows))
     for name, value in rows.items():
-        console.print(f"[dim]{name:<{width}}[/dim]  {value}")
+        out.print(dim(f"{name:<{width}}") + "  " + value)
+
+
+def typed(*words: object) -> str:
+    """A command to go on with, as a shell understands it whatever names are in it."""
+    return shlex.join(["lumigraph", *map(str, words)])
 
 
 def next_free(prefix: str) -> Path:
     """The first of prefix-1, prefix-2, ... that does not exist yet."""
     return next(path for n in itertools.count(1) if not (path := Path(f"{prefix}-{n}")).exists())
-
-
-def exit_code(signal: int | None) -> int:
-    """As shells count: 130 after Ctrl-C."""
-    return 0 if signal is None else 128 + signal

@@ -9,7 +9,7 @@ from typing import Annotated
 from tyro.conf import Positional, arg
 
 from ..errors import LumigraphError
-from .common import needed, option, show
+from .common import needed, option, show, typed
 
 Triple = tuple[float, float, float]
 
@@ -46,6 +46,7 @@ class Compose:
         import torch
 
         from ..composition import standing
+        from ..crop import Box
         from ..geometry import Similarity
         from ..run import open_any
         from ..run.composition import Part, relative, write_composition
@@ -64,7 +65,7 @@ class Compose:
             spot = None if self.at is None else torch.tensor(self.at, dtype=torch.float64)
             place = standing(part.frame, lead.frame, spot, self.scale or 1.0, self.turn or 0.0)
         named = [Part(relative(self.lead, self.output), Similarity.make(1.0))]
-        named.append(Part(relative(self.part, self.output), place, self.box))
+        named.append(Part(relative(self.part, self.output), place, self.box and Box(*self.box)))
         write_composition(self.output, named)
         opened = open_any(self.output)
         low, high = opened.frame.bounds
@@ -72,7 +73,7 @@ class Compose:
             {
                 "composition": str(self.output),
                 "bounds": f"({', '.join(f'{x:.3g}' for x in low)}) to ({', '.join(f'{x:.3g}' for x in high)})",
-                "next": f"lumigraph view {self.output}",
+                "next": typed("view", self.output),
             }
         )
         return 0

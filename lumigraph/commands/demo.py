@@ -6,7 +6,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
-from .common import budget_of, check_film, choose_device, exit_code, next_free, option, say, show
+from ..budget import Budget
+from ..console import bold
+from .common import check_film, choose_device, exit_code, next_free, option, say, show, typed
 
 FRAMES = 90
 
@@ -42,7 +44,7 @@ class Demo:
         from ..run import Run, build, check_new
         from ..train import fit
 
-        budget = budget_of(None, self.seconds)
+        budget = Budget(seconds=self.seconds)
         check_film(self.frames, fps=30, size=None)
         kind, device = methods.find(self.method), choose_device(self.device)
         output = self.output or next_free("demo/run")
@@ -51,10 +53,10 @@ class Demo:
         say(f"Photographing {self.scene}")
         data = open_dataset(self.scene, kind.learns_from)
         method = build(kind, data.frame, kind.preset(device), device, seed=0)
-        run = Run.create(output, method, data, budget=budget)
-        outcome = fit(method, data, run, **budget)
+        run = Run.create(output, method, data, budget=budget.to_json())
+        outcome = fit(method, data, run, budget=budget)
         if outcome.signal is not None:
-            say(f"Stopped and saved after step {outcome.state.step}; go on with: lumigraph resume {run.folder}")
+            say(f"Stopped and saved after step {outcome.state.step}; go on with: {typed('resume', run.folder)}")
             return exit_code(outcome.signal)
         result = evaluate_run(run, method, data)
         orbit = run.folder / "renders" / "orbit.mp4"
@@ -63,7 +65,7 @@ class Demo:
         headline, what = scores_of(result)[0], "views" if "views" in result["protocol"] else "shapes"
         show(
             {
-                f"held-out {headline.name}": f"[bold]{headline}[/bold] over {result['protocol'][what]} {what}",
+                f"held-out {headline.name}": bold(headline) + f" over {result['protocol'][what]} {what}",
                 "film": str(orbit),
                 "report": str(report),
                 "run": str(run.folder),

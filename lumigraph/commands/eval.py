@@ -9,8 +9,11 @@ from typing import Annotated, Any, Literal
 
 from tyro.conf import Positional
 
+from ..console import bold
 from .common import choose_device, needed, option, show
 from .controls import Set, tell
+
+MEMORISED = 4.0  # dB by which photographs learnt from are better than held-out ones, from which on they are remembered
 
 
 @dataclass(frozen=True)
@@ -43,17 +46,31 @@ class Eval:
         from ..evaluate import evaluate_run, stem
         from ..metrics import scores_of
         from ..run import Run
+        from ..verdict import last_psnr
+        from .outcome import next_commands
 
         run, lpips = Run(self.run_folder), chosen_lpips(self.lpips)
         method = tell(run, run.method(choose_device(self.device)), self.told)
         data = run.dataset(self.scene)
         result = evaluate_run(run, method, data, self.split, self.save_images, self.views, lpips)
-        rows = {score.name: f"[bold]{score}[/bold]" for score in scores_of(result)}
+        rows: dict[str, Any] = {score.name: bold(score) for score in scores_of(result)}
         for size, part in result.get("by_resolution", {}).items():
             rows[size] = f"{', '.join(f'{x.name} {x}' for x in scores_of(part))}, {part['views']} views"
         name = run.folder / stem(self.split)
-        show(rows | compared(result) | {"files": f"{name}.json, {name}.png"})
+        rows |= compared(result) | {"files": f"{name}.json, {name}.png"}
+        learnt = last_psnr(run.metrics())
+        if learnt is not None and self.split != "train" and "psnr" in result:
+            rows["photographs learnt from"] = beside_training(learnt, result["psnr"])
+        show(rows | next_commands(run, "eval"))
         return 0
+
+
+def beside_training(learnt: float, psnr: float) -> str:
+    """The PSNR of the photographs learnt from, beside that of others, and what a gap means."""
+    told, better = f"{learnt:.2f} dB while training", learnt - psnr
+    if better > MEMORISED:
+        told += f", {better:.1f} dB better: it knows them by heart, so more photographs would help more than time"
+    return told
 
 
 def chosen_lpips(given: Sequence[Path]) -> Any:

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
-from rich.console import Console
 from tyro.conf import Positional
 
+from ..console import console
 from .common import ReaderOption, needed, option
 
 LONG = 4096  # letters; a tree cuts its lines where the console ends, and folders have long names
@@ -42,5 +42,5 @@ class Info:
         else:
             told: dict[str, Any] = {"downscale": self.downscale, "reader": self.reader}
             tree = dataset_tree(open_dataset(self.what, **told))
-        Console(highlight=False, width=LONG, soft_wrap=True).print(tree)
+        console(width=LONG, soft_wrap=True).print(tree)
         return 0

@@ -7,11 +7,14 @@ from typing import Any
 
 from rich.tree import Tree
 
+from ..budget import Budget
 from ..choice import evenly
+from ..console import bold, dim
 from ..dataset import Dataset
 from ..errors import LumigraphError
 from ..gaussians import Gaussians
 from ..metrics import scores_of
+from ..names import natural
 from ..run import Run
 from ..scene import Frame, Scene
 from ..shapes import Shapes
@@ -21,7 +24,7 @@ MEMBERS = 12  # of many shapes, that are told of one by one
 
 def run_tree(run: Run) -> Tree:
     said = run.settings
-    tree = Tree(f"[bold]{run.folder}[/bold]  a run of {run.method_name}")
+    tree = Tree(bold(run.folder) + f"  a run of {run.method_name}")
     branch(tree, "scene", {"source": said.scene.source, **said.splits, **said.scene.options})
     branch(tree, "frame", frame_rows(run.frame))
     branch(tree, "config", said.config)
@@ -30,15 +33,18 @@ def run_tree(run: Run) -> Tree:
     if run.has_state:
         state = run.state
         rows = {"step": state.step, "seconds": state.seconds, "compiling, beside": state.compile_seconds}
-        branch(tree, "trained", rows | {"budget": said.budget, "seed": said.seed, "on": said.device})
+        branch(
+            tree,
+            "trained",
+            rows | {"budget": said.budget and str(Budget.from_json(said.budget)), "seed": said.seed, "on": said.device},
+        )
     if evaluation := run.evaluation():
         figures: dict[str, Any] = {score.name: str(score) for score in scores_of(evaluation)}
         figures["seconds per view"] = evaluation.get("seconds_per_view")
         protocol = ("split", "views", "shapes", "members", "resolution")
         branch(tree, "evaluated", figures | {name: evaluation["protocol"].get(name) for name in protocol})
-    found = sorted(
-        path for path in run.folder.rglob("*") if path.is_file() and path.suffix in (".mp4", ".html", ".png")
-    )
+    found = [path for path in run.folder.rglob("*") if path.is_file() and path.suffix in (".mp4", ".html", ".png")]
+    found.sort(key=lambda path: natural(path.as_posix()))
     pages = [path for path in found if path.parent in (run.folder, run.folder / "renders")]
     if pages:
         branch(tree, "files", {str(path.relative_to(run.folder)): size(path) for path in pages})
@@ -62,7 +68,7 @@ def dataset_tree(data: Dataset) -> Tree:
 
 
 def shapes_tree(shapes: Shapes) -> Tree:
-    tree = Tree(f"[bold]{shapes.source}[/bold]  {len(shapes)} shape{'' if len(shapes) == 1 else 's'}")
+    tree = Tree(bold(shapes.source) + f"  {len(shapes)} shape{'' if len(shapes) == 1 else 's'}")
     branch(tree, "splits", {name: len(index) for name, index in shapes.splits.items()})
     for shape in evenly(shapes.members, MEMBERS):
         count = f"{len(shape.mesh.vertices):,} vertices, {len(shape.mesh.faces):,} triangles"
@@ -73,14 +79,14 @@ def shapes_tree(shapes: Shapes) -> Tree:
 
 
 def collection_tree(data: Dataset) -> Tree:
-    tree = Tree(f"[bold]{data.source}[/bold]  a collection of {len(data.names)}")
+    tree = Tree(bold(data.source) + f"  a collection of {len(data.names)}")
     branch(tree, "members", {name: ", ".join(data.names[i] for i in index) for name, index in data.splits.items()})
     return tree
 
 
 def scene_tree(scene: Scene) -> Tree:
     cameras = scene.cameras
-    tree = Tree(f"[bold]{scene.source}[/bold]  a scene of {len(scene)} photographs")
+    tree = Tree(bold(scene.source) + f"  a scene of {len(scene)} photographs")
     sizes, counts = cameras.size.unique(dim=0, return_counts=True)
     shapes = (f"{count} of {w}x{h}" for (w, h), count in zip(sizes.tolist(), counts.tolist(), strict=True))
     photographs = {name: f"{len(index)} views" for name, index in scene.splits.items()}
@@ -96,7 +102,7 @@ def scene_tree(scene: Scene) -> Tree:
 
 
 def cloud_tree(name: str, cloud: Gaussians) -> Tree:
-    tree = Tree(f"[bold]{name}[/bold]  a cloud of {len(cloud):,} Gaussians")
+    tree = Tree(bold(name) + f"  a cloud of {len(cloud):,} Gaussians")
     rows: dict[str, Any] = {"file": size(Path(name)), "harmonics": f"degree {cloud.degree}"}
     rows["opacities"] = "antialiased (Mip-Splatting's 2-D filter)" if cloud.antialiased else "as in the first release"
     if len(cloud):
@@ -110,11 +116,11 @@ def cloud_tree(name: str, cloud: Gaussians) -> Tree:
 
 
 def composition_tree(composition: Any) -> Tree:
-    tree = Tree(f"[bold]{composition.path}[/bold]  a composition of {len(composition.parts)} parts")
+    tree = Tree(bold(composition.path) + f"  a composition of {len(composition.parts)} parts")
     for number, (part, place) in enumerate(zip(composition.parts, composition.places, strict=True)):
         rows = {"source": part.source, "leads": "yes" if number == composition.lead else None}
         rows |= {"scale": place.scale, "origin": vector(tuple(place.matrix[:3, 3].tolist())) + " in the frame below"}
-        rows |= {"box": part.box and f"{vector(part.box[0])} to {vector(part.box[1])}"}
+        rows |= {"box": part.box and f"{vector(part.box.lower)} to {vector(part.box.upper)}"}
         branch(tree, f"part {number}", rows)
     branch(tree, "frame", frame_rows(composition.frame))
     return tree
@@ -124,7 +130,7 @@ def frame_rows(frame: Frame) -> dict[str, Any]:
     low, high = frame.bounds
     return {
         "bounds": f"{vector(low)} to {vector(high)}",
-        "reach": frame.reach,
+        "half-extent": f"{frame.reach:g} scene units, from the middle to each side",
         "near": frame.near,
         "cameras": frame.forward and f"forward-facing, near plane at {frame.forward.near:.3g}",
         "background": vector(frame.background) + (" behind alpha" if frame.has_alpha else ""),
@@ -134,11 +140,11 @@ def frame_rows(frame: Frame) -> dict[str, Any]:
 
 
 def branch(tree: Tree, title: str, rows: dict[str, Any]) -> None:
-    node = tree.add(f"[bold]{title}[/bold]")
+    node = tree.add(bold(title))
     width = max(map(len, rows))
     for name, value in rows.items():
         if value is not None:
-            node.add(f"[dim]{name:<{width}}[/dim]  {f'{value:.4g}' if isinstance(value, float) else value}")
+            node.add(dim(f"{name:<{width}}") + f"  {f'{value:.4g}' if isinstance(value, float) else value}")
 
 
 def vector(numbers: tuple[float, ...]) -> str:

@@ -8,6 +8,7 @@ from typing import Annotated
 
 from tyro.conf import Positional
 
+from ..progress import counting
 from .common import needed, show
 
 
@@ -25,5 +26,7 @@ class Report:
         from ..report import write_report
         from ..run import Run
 
-        show({"report": str(write_report(Run(self.run_folder)))})
+        with counting("Putting the page together"):
+            path = write_report(Run(self.run_folder))
+        show({"report": str(path)})
         return 0

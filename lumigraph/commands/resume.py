@@ -4,17 +4,23 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 from tyro.conf import Positional
 
+from ..budget import Budget
 from ..errors import LumigraphError
-from .common import budget_of, choose_device, exit_code, needed, option
+from ..quality import Quality
+from .common import choose_device, exit_code, needed, option, quality_budget, told_budget
 
 
 @dataclass(frozen=True)
 class Resume:
-    """Go on with a run that was interrupted, exactly as if it had not been; or give it a larger budget."""
+    """Go on with a run that was interrupted, exactly as if it had not been; or give it a larger budget.
+
+    A run that is done may get a larger budget too. Its schedules then follow the new total: learning rates rise again
+    and fall anew, and clouds may grow; what is coarse at the beginning of a run is not repeated.
+    """
 
     run_folder: Annotated[Positional[Path], needed("RUN")]
     """Folder of the run."""
@@ -22,6 +28,8 @@ class Resume:
     """New total of seconds, those already trained included."""
     steps: Annotated[int | None, option("N", "as begun")] = None
     """New total of steps, those already done included."""
+    quality: Annotated[Quality | None, option("draft|good|best", "as begun")] = None
+    """New total of steps, as for `lumigraph train`."""
     scene: Annotated[str | None, option("SCENE", "where they were")] = None
     """Where what it learns from is now, if it has moved."""
     device: Annotated[str, option("NAME", "the one it began on")] = "same"
@@ -37,24 +45,42 @@ class Resume:
 
     def run(self) -> int:
         from ..run import Run
-        from ..train import Budget, fit
-        from .train import tell_outcome
-        from .view import keep_showing, watching
 
         run = Run(self.run_folder)
-        budget = budget_of(self.steps, self.seconds) or run.settings.budget
-        state = run.state if run.has_state else None
-        if state and Budget(budget.get("steps"), budget.get("seconds")).progress(state.step, state.seconds) >= 1:
-            raise LumigraphError(
-                f"{run.folder} has spent its budget at step {state.step}, {state.seconds:.0f} s; "
-                f"give a larger total by --steps or --seconds"
-            )
+        with run.held():
+            return self._go_on(run)
+
+    def _go_on(self, run: Any) -> int:
+        from ..train import fit
+        from .outcome import tell_outcome
+        from .view import keep_showing, watching
+
+        told = told_budget(self.steps, self.seconds, self.quality)
+        if self.quality is None:
+            budget = budget_from_now(run, told)
         device = choose_device(run.settings.device if self.device == "same" else self.device)
         method, data = run.new_method(device), run.dataset(self.scene)
-        if budget != run.settings.budget:
-            run.set_budget(**budget)
+        if self.quality is not None:
+            budget = budget_from_now(run, quality_budget(self.quality, method, data))
+        if budget.to_json() != run.settings.budget:
+            run.set_budget(**budget.to_json())
         with watching(self.view, method, data, run, self.host, self.port) as watch:
-            outcome = fit(method, data, run, **budget, seed=run.settings.seed, pause_at=self.pause_at, watch=watch)
-            tell_outcome(run, outcome)
+            outcome = fit(method, data, run, budget=budget, seed=run.settings.seed, pause_at=self.pause_at, watch=watch)
+            tell_outcome(run, outcome, method, data)
             keep_showing(watch, outcome.signal)
         return exit_code(outcome.signal)
+
+
+def budget_from_now(run: Any, told: Budget | None) -> Budget:
+    """The run's own budget, or another total that it was told. Raises LumigraphError where nothing is left of it."""
+    said = run.settings.budget
+    budget = told or Budget.from_json(said)
+    if not run.has_state:
+        return budget
+    step, seconds = run.state.step, run.state.seconds
+    if budget.progress(step, seconds) >= 1:
+        raise LumigraphError(
+            f"{run.folder} has spent its budget at step {step}, {seconds:.0f} s; "
+            f"give a larger total by --steps, --seconds or --quality"
+        )
+    return Budget.from_json(said).extended(budget, step, seconds) if said else budget

@@ -9,18 +9,20 @@ from typing import Annotated, Any, Literal
 from tyro.conf import Fixed, OmitArgPrefixes, Positional, Suppress
 
 from .. import methods
+from ..budget import Budget
+from ..quality import Quality
 from .capture import posed
 from .common import (
     ReaderOption,
-    budget_of,
+    about_quality,
     choose_device,
     exit_code,
     needed,
     next_free,
     option,
-    say,
+    quality_budget,
     scene_name,
-    show,
+    told_budget,
 )
 
 DEFAULT_SECONDS = 60.0
@@ -46,6 +48,7 @@ class Train:
     """Train for so long. Compiling kernels on first use comes before and is reported beside."""
     steps: Annotated[int | None, option("N", "as long as --seconds")] = None
     """Train for so many steps instead."""
+    quality: Annotated[Quality | None, option("draft|good|best", "as long as --seconds", about_quality())] = None
     downscale: Annotated[int | None, option("N", "none, or what suits the photographs")] = None
     """Shrink photographs by a whole number."""
     reader: ReaderOption = None
@@ -73,9 +76,10 @@ class Train:
         from ..dataset import check_kind
         from ..run import Run, build, check_new
         from ..train import fit
+        from .outcome import tell_outcome
         from .view import keep_showing, watching
 
-        budget = budget_of(self.steps, self.seconds) or {"seconds": DEFAULT_SECONDS}
+        budget = told_budget(self.steps, self.seconds, self.quality)
         kind, device = methods.find(self.method), choose_device(self.device)
         if self.output is not None:
             check_new(self.output)
@@ -94,10 +98,13 @@ class Train:
         config = self.method_config(kind)
         seed = getattr(config, "seed", self.seed)
         method = build(kind, data.frame, config, device, seed)
-        run = Run.create(output, method, data, seed=seed, options=options, budget=budget)
+        if budget is None:
+            asked = self.quality
+            budget = quality_budget(asked, method, data) if asked else Budget(seconds=DEFAULT_SECONDS)
+        run = Run.create(output, method, data, seed=seed, options=options, budget=budget.to_json())
         with watching(self.view, method, data, run, self.host, self.port) as watch:
-            outcome = fit(method, data, run, **budget, seed=seed, pause_at=self.pause_at, watch=watch)
-            tell_outcome(run, outcome)
+            outcome = fit(method, data, run, budget=budget, seed=seed, pause_at=self.pause_at, watch=watch)
+            tell_outcome(run, outcome, method, data)
             keep_showing(watch, outcome.signal)
         return exit_code(outcome.signal)
 
@@ -121,6 +128,8 @@ def with_options_of(name: str, device: str, preset: str) -> type[Train]:
     for common in dataclasses.fields(Train):  # where a method has a number of that name, it is the one to ask for
         if common.name in {field.name for field in dataclasses.fields(kind.Config)}:
             extra.append((common.name, Annotated[Any, Fixed, Suppress], dataclasses.field(default=common.default)))
+    asked = option("draft|good|best", "as long as --seconds", about_quality(kind))
+    extra.append(("quality", Annotated[Quality | None, asked], dataclasses.field(default=None)))
     made = dataclasses.make_dataclass("Train", extra, bases=(Train,), frozen=True)
     made.__doc__ = Train.__doc__
     return made
@@ -131,13 +140,3 @@ def preset_device(device: str, preset: str) -> Any:
     import torch
 
     return choose_device(device) if preset == "auto" else torch.device("cuda" if preset == "paper" else "cpu")
-
-
-def tell_outcome(run: Any, outcome: Any) -> None:
-    """Where a Run is after an Outcome, and how to go on."""
-    state = outcome.state
-    if not outcome.finished:
-        say(f"Stopped and saved after step {state.step}; go on with: lumigraph resume {run.folder}")
-    besides = f"{state.compile_seconds:.1f} s compiling, {outcome.saving_seconds:.1f} s saving"
-    rows = {"run": str(run.folder), "training": f"{state.step} steps in {state.seconds:.1f} s (besides: {besides})"}
-    show(rows | ({"next": f"lumigraph eval {run.folder}"} if outcome.finished else {}))

@@ -1,6 +1,9 @@
-"""Composition: several methods in one picture, each at a place of its own, hiding one another as things do."""
+"""Composition: several methods in one picture, each at a place of its own, hiding one another as things do; and parts
+of one method."""
 
 from .composed import compose as compose
+from .picked import PickedCloud as PickedCloud
+from .picked import cropped as cropped
 from .placed import Placed as Placed
 from .standing import frame_around as frame_around
 from .standing import standing as standing

@@ -1,4 +1,4 @@
-"""Placed: a method somewhere else, turned and scaled, cut by a box."""
+"""Placed: a method somewhere else, turned and scaled, cut by a box or a sphere."""
 
 from __future__ import annotations
 
@@ -11,13 +11,12 @@ from torch import Tensor
 from ..camera import Camera
 from ..capabilities import HasDensity, HasGaussians, HasLooks, needs
 from ..controls import Value
+from ..crop import Crop
 from ..gaussians import Gaussians
+from ..gaussians.cleaning import cleaned
 from ..geometry import Similarity
 from ..method import Method
 from ..rays import Look, Rays, Rendering, Samples
-from ..scene import Vector
-
-Box = tuple[Vector, Vector]
 
 
 @dataclass(frozen=True)
@@ -25,18 +24,18 @@ class Placed:
     """One part of a picture.
 
     place:  from the frame of the method to that of the picture
-    box:    two corners in the method's own frame; nothing outside it is shown. None for all there is
+    crop:   in the method's own frame; nothing outside it is shown. None for all there is
     leads:  whether the picture's cameras are this part's. They keep its `Frame.near` free, as its own did, and what it
             learnt for each of its photographs holds for them. Cameras may come as near as they like to any other part
     """
 
     method: Method
     place: Similarity
-    box: Box | None = None
+    crop: Crop | None = None
     leads: bool = False
 
     def look(self, rays: Rays) -> Look:
-        """The last look of a method that marches: distances and density per unit of the picture, cut by the box.
+        """The last look of a method that marches: distances and density per unit of the picture, cut by the crop.
 
         A ray that does not lead begins `Frame.near` behind the eye, for the method looks at nothing that is nearer.
         """
@@ -44,9 +43,9 @@ class Placed:
         local = self._inward(rays, behind)
         found = needs(self.method, HasLooks).looks(local)[-1]
         begin, end = found.samples.t_start, found.samples.t_end
-        if self.box is not None:
+        if self.crop is not None:
             ray = found.samples.ray_index
-            enter, leave = local.through_box(self._corners(begin))
+            enter, leave = self.crop.through(local)
             begin, end = torch.maximum(begin, enter[ray]), torch.minimum(end, leave[ray])
         begin, end = ((t - behind).clamp_min(0) * scale for t in (begin, end))
         keep = begin < end
@@ -59,14 +58,11 @@ class Placed:
         return needs(self.method, HasDensity).density(local) / self.place.scale * self._holds(local)
 
     def gaussians(self) -> Gaussians:
-        """The cloud in the picture's frame, without those Gaussians whose centres the box leaves out."""
-        cloud = needs(self.method, HasGaussians).gaussians()
-        if self.box is not None:
-            cloud = cloud[self._holds(cloud.means)]
-        return cloud.transformed(self.place.matrix)
+        """The cloud in the picture's frame, without those Gaussians whose centres the crop leaves out."""
+        return cleaned(needs(self.method, HasGaussians).gaussians(), self.crop).transformed(self.place.matrix)
 
     def rendering(self, camera: Camera) -> Rendering:
-        """What a camera of the picture sees of any method, over black. A box leaves out pixels by their depth."""
+        """What a camera of the picture sees of any method, over black. A crop leaves out pixels by their depth."""
         local = self._camera(camera)
         seen = self.method.render(local)
         background = torch.tensor(self.method.frame.background, device=seen.rgb.device)
@@ -93,12 +89,8 @@ class Placed:
         moved = camera.transformed(self.place.inverse.matrix)
         return moved if self.leads else replace(moved, image_index=None)
 
-    def _corners(self, like: Tensor) -> Float[Tensor, "2 3"]:
-        return torch.tensor(self.box).to(like)
-
     def _holds(self, points: Float[Tensor, "point 3"]) -> Bool[Tensor, " point"]:
-        """Whether the box holds points of the method's frame; all, where there is none."""
-        if self.box is None:
+        """Whether the crop holds points of the method's frame; all, where there is none."""
+        if self.crop is None:
             return torch.ones(len(points), dtype=torch.bool, device=points.device)
-        lower, upper = self._corners(points)
-        return ((points >= lower) & (points <= upper)).all(-1)
+        return self.crop.holds(points)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import replace
@@ -11,9 +10,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from ..crop import Box
 from ..geometry import Similarity
 from ..scene import Frame
-from .placed import Box
 
 LARGEST_REACH = 64.0
 
@@ -52,18 +51,13 @@ def frame_around(lead: Frame, others: Sequence[tuple[Frame, Similarity, Box | No
     corners = [torch.tensor(lead.bounds)]
     farthest = lead.reach
     for frame, place, box in others:
-        corners.append(moved(box or frame.bounds, place))
-        cube = ((-frame.reach,) * 3, (frame.reach,) * 3)
-        farthest = max(farthest, float(moved(box or (frame.bounds if frame.reach == 1 else cube), place).abs().max()))
+        interest = box or Box(*frame.bounds)
+        corners.append(interest.moved(place).corners.float())
+        all_of_it = interest if box or frame.reach == 1 else Box((-frame.reach,) * 3, (frame.reach,) * 3)
+        farthest = max(farthest, float(all_of_it.moved(place).corners.abs().max()))
     points = torch.cat(corners)
     lower, upper = ((x, y, z) for x, y, z in (points.amin(0).tolist(), points.amax(0).tolist()))
     reach = lead.reach
     while reach < min(farthest - 1e-6, LARGEST_REACH):
         reach *= 2
     return replace(lead, bounds=(lower, upper), reach=reach)
-
-
-def moved(box: Box, place: Similarity) -> Float[Tensor, "8 3"]:
-    """A box's corners, elsewhere."""
-    corners = torch.tensor(list(itertools.product(*zip(*box, strict=True))))
-    return place.points(corners)

@@ -14,6 +14,7 @@ from ..files import scene_name, write_json
 from ..method import Method
 from ..metrics import Score
 from ..metrics.lpips import Lpips
+from ..progress import counting
 from ..rays import Rendering
 from ..run import Run
 from ..scene import Scene
@@ -92,7 +93,8 @@ def evaluate_run(
     }
     figures = [f"{score.name} {score}" for score in found.scores]
     title = " · ".join([run.method_name, scene_name(run.settings.scene.source), found.compared, *figures])
-    save_picture(run.folder / f"{stem(split)}.png", found.contact_sheet(title))
+    with counting("Drawing the contact sheet"):
+        save_picture(run.folder / f"{stem(split)}.png", found.contact_sheet(title))
     write_json(run.folder / f"{stem(split)}.json", result)
     return result
 

@@ -14,6 +14,7 @@ from torch import Tensor
 from ..camera import Camera, ring
 from ..capabilities import HasDistance, HasMesh, can
 from ..choice import evenly
+from ..crop import Box
 from ..errors import LumigraphError
 from ..export.mesh import AT_ONCE, TRUNCATION, extract_mesh, find_surface, make_grid
 from ..export.sightings import all_around
@@ -161,15 +162,15 @@ def surface_of(method: Method, frame: Frame, cells: int) -> Mesh:
     Raises LumigraphError where there is none."""
     if isinstance(method, HasMesh):
         return method.mesh()
-    box = torch.tensor(frame.bounds)
-    cell = float((box[1] - box[0]).max()) / cells
+    box = Box(*frame.bounds)
+    cell = max(b - a for a, b in zip(box.lower, box.upper, strict=True)) / cells
     if not can(method, HasDistance):
         return extract_mesh(method, all_around(ring(frame.bounds)), cell=cell, smooth=0)
 
     def value(points: Float[Tensor, "point 3"]) -> Float[Tensor, " point"]:
         return (-distances(method, points) / (TRUNCATION * cell)).clamp(-1, 1)
 
-    vertices, faces = find_surface(make_grid(box, cell), 2, box, value, -1.0)
+    vertices, faces = find_surface(make_grid(box, cell), 2, box.holds, value, -1.0)
     if not len(faces):
         raise LumigraphError("The learnt distance is nowhere zero, so there is no surface to compare; train for longer")
     return Mesh(vertices, faces, np.full((len(vertices), 3), 160, np.uint8))

@@ -20,7 +20,7 @@ from ..figures import ERROR_GAIN, Row, colour_depth, colour_error, contact_sheet
 from ..method import Method
 from ..metrics import WINDOW, Score, psnr, scores_of, ssim_map
 from ..metrics.lpips import DEFINITION, Lpips
-from ..progress import track
+from ..progress import counting, track
 from ..rays import Rendering
 from ..scene import Scene
 
@@ -134,7 +134,8 @@ def evaluate(
         raise LumigraphError(f"{views} views cannot be compared; give --views a number above 0")
     compared = evenly(chosen.tolist(), views or len(chosen))
     method.eval()
-    compile_seconds = warm_up(method, scene.cameras[compared[0]])
+    with counting("Preparing to render"):
+        compile_seconds = warm_up(method, scene.cameras[compared[0]])
     spread = set(evenly(compared, SHOWN))
     scores: list[ViewScore] = []
     shown: dict[str, tuple[Tensor, Rendering]] = {}

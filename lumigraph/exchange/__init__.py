@@ -7,6 +7,7 @@ from pathlib import Path
 from ..errors import LumigraphError
 from ..files import explained
 from ..gaussians import Gaussians
+from ..progress import counting
 from . import compressed_ply, ply, splat, spz
 from .checks import checked
 from .ply_header import read_header
@@ -27,7 +28,8 @@ def read_gaussians(path: Path | str) -> Gaussians:
         _refuse_folder(path)
         if path.stat().st_size == 0:
             raise LumigraphError(f"{path} is empty; copy or download it again")
-        gaussians = _read(path, suffix)
+        with counting(f"Reading {path.name}"):
+            gaussians = _read(path, suffix)
     return checked(gaussians, str(path), "restore it from a copy, or remove them with an editor of splats")
 
 
@@ -42,7 +44,8 @@ def write_gaussians(path: Path | str, gaussians: Gaussians) -> None:
     write = WRITERS[_suffix(path)]
     with explained(path):
         _refuse_folder(path)
-    write(path, checked(gaussians, f"what is to be written to {path}", "remove them first"))
+    with counting(f"Writing {path.name}"):
+        write(path, checked(gaussians, f"what is to be written to {path}", "remove them first"))
 
 
 def is_splat_file(path: Path | str) -> bool:

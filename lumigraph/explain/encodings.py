@@ -15,6 +15,7 @@ from ..metrics import psnr
 from ..progress import track
 from ..run import build
 from ..scene import Scene
+from ..signals import go_on_unless
 from ..train import fit
 from .tangent_kernel import spectrum, tangent_kernel
 
@@ -125,7 +126,7 @@ def learn(scene: Scene, config: Config, steps: int, device: torch.device) -> Fit
     assert isinstance(method, FourierFeatures)
     eigenvalues = spectrum(kernel_at_start(method))
     begin = time.perf_counter()
-    fit(method, scene, steps=steps, seed=config.seed, show=False)
+    go_on_unless(fit(method, scene, steps=steps, seed=config.seed, show=False).signal)
     seconds = time.perf_counter() - begin
     rgb, picture = method.render(scene.cameras[0]).rgb.cpu(), truth(scene)
     masks = [scene.images.mask(int(scene.splits[split][0])) for split in ("train", "test")]

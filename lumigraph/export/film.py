@@ -86,5 +86,6 @@ def film_depth_range(methods: Sequence[Method], cameras: Camera) -> Range:
     probes = evenly(range(len(cameras)), PROBES)
     chosen = cameras[torch.tensor(probes)]
     small = chosen.resized(min(1.0, PROBE_SIZE / int(chosen.size.max())))
-    seen = [methods[frame].render(small[i]).cpu() for i, frame in enumerate(probes)]
+    told = track(enumerate(probes), "Looking at depths", len(probes))
+    seen = [methods[frame].render(small[i]).cpu() for i, frame in told]
     return depth_range(torch.cat([x.depth.flatten() for x in seen]), torch.cat([x.opacity.flatten() for x in seen]))

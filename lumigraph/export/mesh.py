@@ -8,17 +8,18 @@ from typing import Literal
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from scipy import ndimage
 from torch import Tensor
 from torch.nn.functional import grid_sample
 
 from ..camera import Camera
 from ..capabilities import HasDensity, can, needs
+from ..crop import Box, Crop
 from ..errors import LumigraphError
 from ..mesh import Mesh
 from ..method import Method
-from ..progress import track
+from ..progress import counting, track
 from ..scene import Frame
 from .fusion import Fusion
 from .polygons import BLOCK, Grid, zero_level
@@ -43,7 +44,8 @@ def extract_mesh(
     method: Method,
     cameras: Camera,
     *,
-    box: float | None = None,
+    extent: float | None = None,
+    crop: Crop | None = None,
     cell: float | None = None,
     level: float | None = None,
     way: Way = "auto",
@@ -57,7 +59,8 @@ def extract_mesh(
     """The surface in the middle of a scene, in the scene's frame.
 
     cameras: the scene's own; what none of them sees is left out, or filled in
-    box:     size of what is meshed, times the frame's box of interest; None for 1 around an object, 1.5 in the open
+    extent:  size of what is meshed, times the frame's box of interest; None for 1 around an object, 1.5 in the open
+    crop:    what is meshed instead, as far as the scene reaches
     cell:    side of the cubes that are marched through, scene units; None for 1/256 of the box's longest side
     level:   density of the surface, per scene unit; None for that where the cameras see surfaces
     way:     "density", "depth", or "auto" for density where the method has one
@@ -71,7 +74,8 @@ def extract_mesh(
     """
     method.eval()
     closed = method.frame.reach == 1 if closed is None else closed
-    limits = meshed_box(method.frame, box)
+    limits = meshed_box(method.frame, extent) if crop is None else within_reach(method.frame, crop)
+    holds = limits.holds if crop is None else lambda points: limits.holds(points) & crop.holds(points)
     grid = make_grid(limits, cell)
     sightings = look_around(method, cameras, size, views)
     step = max(2, math.ceil(max(grid.shape) / PROBES))
@@ -79,9 +83,9 @@ def extract_mesh(
     if way == "depth" or (way == "auto" and not can(method, HasDensity)):
         value = seen
     else:
-        level = surface_level(method, sightings, limits) if level is None else level
+        level = surface_level(method, sightings, holds) if level is None else level
         value = from_density(method, level, interpolated(seen, grid, step))
-    vertices, triangles = find_surface(grid, step, limits, value, -1.0 if closed else math.nan)
+    vertices, triangles = find_surface(grid, step, holds, value, -1.0 if closed else math.nan)
     if len(triangles):
         hidden = unseen(torch.from_numpy(vertices).float(), sightings, 2 * grid.cell).numpy()
         if not closed:
@@ -92,25 +96,41 @@ def extract_mesh(
             "Nothing inside the box is solid at this density, so there is no surface; train for longer, or "
             "try a lower --level"
         )
-    vertices = smoothed(vertices, triangles, smooth)
-    if faces is not None:
-        vertices, triangles = simplified(vertices, triangles, faces)
+    with counting("Smoothing the surface"):
+        vertices = smoothed(vertices, triangles, smooth)
+        if faces is not None:
+            vertices, triangles = simplified(vertices, triangles, faces)
     points, normals = (torch.from_numpy(x).float() for x in (vertices, vertex_normals(vertices, triangles)))
     rgb = colours(points, normals, sightings, 3 * grid.cell)
     return Mesh(vertices, triangles, (rgb * 255).round().to(torch.uint8).numpy())
 
 
-def meshed_box(frame: Frame, times: float | None) -> Float[Tensor, "2 3"]:
+def meshed_box(frame: Frame, times: float | None) -> Box:
     """The frame's box of interest, larger or smaller about its middle, within the cube that holds everything."""
     low, high = torch.tensor(frame.bounds)
     half = 0.5 * (high - low) * ((1.0 if frame.reach == 1 else OPEN_BOX) if times is None else times)
     middle = 0.5 * (low + high)
-    return torch.stack([middle - half, middle + half]).clamp(-frame.reach, frame.reach)
+    return upright(torch.stack([middle - half, middle + half]).clamp(-frame.reach, frame.reach))
 
 
-def make_grid(box: Float[Tensor, "2 3"], cell: float | None) -> Grid:
+def within_reach(frame: Frame, crop: Crop) -> Box:
+    """The upright box around a crop, within the cube that holds everything. Raises LumigraphError for one outside."""
+    corners = torch.tensor(crop.bounds).clamp(-frame.reach, frame.reach)
+    if not (corners[1] > corners[0]).all():
+        raise LumigraphError(
+            "The crop lies outside the scene, so there is nothing to mesh; `lumigraph info` tells the scene's bounds"
+        )
+    return upright(corners)
+
+
+def upright(corners: Float[Tensor, "2 3"]) -> Box:
+    (a, b, c), (d, e, f) = corners.tolist()
+    return Box((a, b, c), (d, e, f))
+
+
+def make_grid(box: Box, cell: float | None) -> Grid:
     """Cubes over a box and a little around it. Raises LumigraphError for cubes too small or too large."""
-    longest = float((box[1] - box[0]).max())
+    longest = max(b - a for a, b in zip(box.lower, box.upper, strict=True))
     if cell is None:
         cell = longest / CELLS
     if not longest / MOST <= cell <= longest / FEWEST:
@@ -118,11 +138,11 @@ def make_grid(box: Float[Tensor, "2 3"], cell: float | None) -> Grid:
             f"Cells of {cell / longest:.3g} times the longest side of the box make no mesh; give "
             f"--cell-size something from 1/{MOST} to 1/{FEWEST} of it"
         )
-    low, high = box.tolist()
-    return Grid.around(tuple(low), tuple(high), cell, 1.5)
+    return Grid.around(box.lower, box.upper, cell, 1.5)
 
 
 Value = Callable[[Float[Tensor, "point 3"]], Float[Tensor, " point"]]
+Holds = Callable[[Float[Tensor, "point 3"]], Bool[Tensor, " point"]]
 
 
 def from_depth(sightings: Sequence[Sighting], cell: float, closed: bool) -> Value:
@@ -156,7 +176,7 @@ def from_density(method: Method, level: float, depth: Value) -> Value:
     return value
 
 
-def surface_level(method: Method, sightings: Sequence[Sighting], box: Float[Tensor, "2 3"]) -> float:
+def surface_level(method: Method, sightings: Sequence[Sighting], holds: Holds) -> float:
     """The density where rays begin to end, found from the field itself, whatever its units and however sharp it is.
 
     At the rendered depth half of a ray's light is spent; the median density there is known. But fields begin at the
@@ -169,7 +189,7 @@ def surface_level(method: Method, sightings: Sequence[Sighting], box: Float[Tens
         good = (seen.opacity > 0.9) & (seen.depth < FAR) & (seen.facing > 0.3)
         points.append(rays.at(seen.depth.reshape(-1))[good.reshape(-1)])
     found = torch.cat(points)
-    found = found[((found > box[0]) & (found < box[1])).all(-1)]
+    found = found[holds(found)]
     if not len(found):
         raise LumigraphError(
             "No camera sees a surface inside the box, so there is nothing to make a mesh of; train for "
@@ -201,16 +221,17 @@ def interpolated(value: Value, grid: Grid, step: int) -> Value:
 
 
 def find_surface(
-    grid: Grid, step: int, box: Float[Tensor, "2 3"], value: Value, beyond: float
+    grid: Grid, step: int, holds: Holds, value: Value, beyond: float
 ) -> tuple[Float[np.ndarray, "vertex 3"], Int[np.ndarray, "face 3"]]:
     """From coarse to fine: probes tell which blocks the surface may pass through, and those are marched through.
 
     step:   corners of the grid from one probe to the next
-    beyond: value outside the box: -1 closes the surface there, NaN leaves it open
+    holds:  which points are inside what is meshed
+    beyond: value outside of it: -1 closes the surface there, NaN leaves it open
     """
 
     def inside(points: Float[Tensor, "point 3"]) -> Float[Tensor, " point"]:
-        return torch.where(((points < box[0]) | (points > box[1])).any(-1), beyond, value(points))
+        return torch.where(holds(points), value(points), beyond)
 
     probed = at_probes(inside, grid, step).nan_to_num(nan=-1.0).numpy()
     near = ndimage.maximum_filter(np.abs(probed) < 1, 3)

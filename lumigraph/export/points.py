@@ -12,10 +12,11 @@ from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
 from ..camera import Camera
+from ..crop import Crop
 from ..errors import LumigraphError
 from ..files import replacing
 from ..method import Method
-from ..progress import track
+from ..progress import counting, track
 from ..scene import Frame
 from .sightings import FAR, Sighting, compare, look_around
 
@@ -46,18 +47,24 @@ class PointCloud:
 
 @torch.no_grad()
 def extract_points(
-    method: Method, cameras: Camera, count: int = 200_000, size: int = 400, views: int = 64
+    method: Method,
+    cameras: Camera,
+    count: int = 200_000,
+    size: int = 400,
+    views: int = 64,
+    crop: Crop | None = None,
 ) -> PointCloud:
     """At most `count` points in the scene's frame, spread evenly over what the cameras see.
 
     size:  longer side of the cameras' pictures at most, pixels
     views: cameras at most
+    crop:  what the points lie in; None for everywhere
     A point stays if other cameras see a surface there too, and at most half as many look through it. Raises
     LumigraphError where nothing is solid.
     """
     method.eval()
     sightings = look_around(method, cameras, size, views)
-    good = [(seen.depth < FAR) & (seen.facing > SQUARELY) for seen in sightings]
+    good = [wanted(seen, crop) for seen in sightings]
     share = min(1.0, CANDIDATES * count / max(1, sum(int(x.sum()) for x in good)))
     chance = torch.Generator().manual_seed(0)
     found = []
@@ -69,11 +76,22 @@ def extract_points(
     kept = all_found[witnessed(all_found[:, :3], sightings)].double().numpy()
     if not len(kept):
         raise LumigraphError(
-            "No two cameras agree on where anything solid is, so there are no points; train for longer and try again"
+            "No two cameras agree on where anything solid is"
+            f"{'' if crop is None else ' inside the crop'}, so there are no points; train for longer and try again"
         )
-    columns = thinned(kept, count)
+    with counting("Thinning points"):
+        columns = thinned(kept, count)
     normals = columns[:, 3:6] / np.maximum(np.linalg.norm(columns[:, 3:6], axis=-1, keepdims=True), 1e-30)
     return PointCloud(columns[:, :3], normals, (columns[:, 6:] * 255).round().astype(np.uint8))
+
+
+def wanted(seen: Sighting, crop: Crop | None) -> Bool[Tensor, "height width"]:
+    """Which pixels show a surface squarely, inside the crop."""
+    good = (seen.depth < FAR) & (seen.facing > SQUARELY)
+    if crop is None:
+        return good
+    rays = seen.camera.rays(seen.camera.pixels())
+    return good & crop.holds(rays.at(seen.depth.reshape(-1).nan_to_num(0, 0, 0))).view(good.shape)
 
 
 def witnessed(points: Float[Tensor, "point 3"], sightings: list[Sighting]) -> Bool[Tensor, " point"]:

@@ -69,7 +69,8 @@ def zero_level(
     blocks = evaluate(grid, values, where)
     held, elsewhere = np.pad(held, (0, 1), constant_values=-1), np.pad(elsewhere, (0, 1), constant_values=np.nan)
     keys, places, faces, count = [], [], [], 0
-    for block in np.argwhere(touched(active)):
+    marched = np.argwhere(touched(active))
+    for block in track(marched, "Marching through cubes", len(marched)):
         cube = with_neighbours(block, blocks, held, elsewhere)
         known = np.isfinite(cube)
         cube = np.where(known, cube, -1.0)

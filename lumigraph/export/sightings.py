@@ -146,7 +146,7 @@ def unseen(points: Float[Tensor, "point 3"], sightings: Sequence[Sighting], marg
     """
     needed = 1 + len(sightings) // SEERS
     left, count = torch.arange(len(points)), torch.zeros(len(points), dtype=torch.int64)
-    for sighting in sightings:
+    for sighting in track(sightings, "Looking for what nobody sees", len(sightings)):
         count[left] += compare(sighting, points[left], margin).ahead >= -margin
         left = left[count[left] < needed]
     return count < needed
@@ -172,7 +172,7 @@ def colours(
     tolerance: how far from a camera's own surface a point may lie to be seen by it, scene units
     """
     total, weight = torch.zeros(len(points), 3), torch.zeros(len(points))
-    for sighting in sightings:
+    for sighting in track(sightings, "Colouring", len(sightings)):
         seen = compare(sighting, points, tolerance)
         back = unit(sighting.camera.position - points)
         cosine = (normals * back).sum(-1)

@@ -21,6 +21,7 @@ from torch import Tensor
 
 from ..errors import LumigraphError
 from ..files import replacing
+from ..progress import counting, track
 
 CRF = 17  # x264's constant rate factor: 0 is lossless, 18 looks it, 28 is small
 WEBP_QUALITY = 85  # of 100
@@ -169,12 +170,13 @@ class Gif(Video):
         width, height = self.size
         self.waiting.flush()
         frames = np.memmap(self.waiting, np.uint8, "r", shape=(self.count, height, width, 3))
-        colours = choose_colours(frames)
+        with counting("Choosing colours"):
+            colours = choose_colours(frames)
         table = np.zeros((256, 4), np.uint8)  # alpha, red, green, blue
         table[: len(colours), 0], table[: len(colours), 1:] = 255, colours
         gif = self.stream("gif", "pal8", {})
         gif.codec_context.time_base = Fraction(1, 100)
-        for i, frame in enumerate(frames):
+        for i, frame in enumerate(track(frames, f"Encoding {self.path.name}", self.count)):
             indexed: Any = (dithered(frame, colours), table)
             picture = av.VideoFrame.from_ndarray(indexed, format="pal8")
             picture.pts, picture.time_base = round(100 * i / self.fps), Fraction(1, 100)

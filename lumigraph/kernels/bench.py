@@ -17,7 +17,9 @@ from rich.console import Console
 from rich.table import Table
 from torch import Tensor
 
+from ..console import console as plain_console
 from ..files import write_json
+from ..progress import track
 from ._dispatch import Engine, using
 from ._facts import operations as all_operations
 from ._facts import tensors
@@ -47,7 +49,8 @@ def bench_kernels(
     device = torch.device(device or ("cuda" if torch.cuda.is_available() else "cpu"))
     fast: Engine = "gpu" if device.type == "cuda" else "cpu"
     result: dict[str, Any] = {"protocol": _protocol(device, size, repeats), "operations": {}}
-    for name in all_operations() if operations is None else operations:
+    names = all_operations() if operations is None else operations
+    for name in track(names, "Timing kernels", len(names)):
         folder = importlib.import_module(f"{__package__}.{name}")
         inputs = [_moved(x, device) for x in folder.benchmark_case(torch.Generator().manual_seed(0), size)]
         count = math.prod(inputs[0].shape[: folder.FACTS.unit_axes])
@@ -56,7 +59,7 @@ def bench_kernels(
         ratios = {k: v / engines["reference"][k] for k, v in engines[fast].items() if k.endswith("per_second")}
         engines[fast] |= {k.replace("per_second", "ratio"): v for k, v in ratios.items()}
         result["operations"][name] = {"unit": folder.FACTS.unit, "count": count, "engines": engines}
-    _print(result, console or Console())
+    _print(result, console or plain_console())
     if output is not None:
         write_json(output, result)
     return result

@@ -61,6 +61,7 @@ class Config:
 STAGES = ((0.0, 1 / 4, 1 / 4), (0.04, 1 / 2, 1 / 2), (0.12, 1, 2 / 3), (0.75, 1, 1))
 LOOKS = 4  # cells updated at most, for each sample of a step
 PROBES = 0.02  # share of all cells updated at random, in case something has grown there
+SAMPLES_OF_A_RAY = 24  # that a ray needs, about, once empty space is known
 BATCH_GROWTH = 1.5  # rays per step at most, from one step to the next
 
 
@@ -177,6 +178,9 @@ class InstantNGP(RayMethod):
             exposure_correction=True,
             refine_cameras=True,
         )
+
+    def rays_in_a_step(self, data: Scene) -> float:
+        return self.config.samples_per_step / SAMPLES_OF_A_RAY
 
     def begin(self, scene: Scene) -> None:
         if scene.images.has_alpha and self.frame.reach == 1:

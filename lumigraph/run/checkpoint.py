@@ -34,12 +34,14 @@ class State:
     """How far training has come: completed steps, and seconds that they took; compilation is counted apart.
 
     peak_memory: bytes at most, see `memory.peak_memory`; 0 if unknown
+    passes:      how often everything was learnt from, on average, see `verdict.shares_seen`; 0 if unknown
     """
 
     step: int = 0
     seconds: float = 0.0
     compile_seconds: float = 0.0
     peak_memory: int = 0
+    passes: float = 0.0
 
 
 class Checkpoints:
@@ -69,7 +71,7 @@ class Checkpoints:
     def state(self) -> State:
         """How far the latest complete state has come."""
         checkpoint = self.latest
-        about = {"peak_memory": 0} | self._about(checkpoint)  # older runs do not tell it
+        about = {"peak_memory": 0, "passes": 0.0} | self._about(checkpoint)  # older runs do not tell it
         with understood(checkpoint):
             return State(**{field.name: about[field.name] for field in fields(State)})
 

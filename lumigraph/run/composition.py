@@ -33,7 +33,7 @@ from torch import Tensor
 from .. import files
 from ..camera import Camera
 from ..composition import Placed, compose, frame_around
-from ..composition.placed import Box
+from ..crop import Box
 from ..errors import LumigraphError
 from ..geometry import Similarity, to_matrix, to_quaternion
 from ..method import Method
@@ -147,7 +147,7 @@ def part_to_json(part: Part) -> dict[str, Any]:
     if place := place_to_json(part.place):
         said["place"] = place
     if part.box is not None:
-        said["box"] = [list(corner) for corner in part.box]
+        said["box"] = [list(part.box.lower), list(part.box.upper)]
     return said
 
 
@@ -157,7 +157,7 @@ def box_from_json(said: Any) -> Box | None:
     (ax, ay, az), (bx, by, bz) = ([float(x) for x in corner] for corner in said)
     if not (ax < bx and ay < by and az < bz):
         raise ValueError(f"the box {said} has nothing between its lower and its upper corner")
-    return (ax, ay, az), (bx, by, bz)
+    return Box((ax, ay, az), (bx, by, bz))
 
 
 def place_from_json(said: Any) -> Similarity:

@@ -16,6 +16,7 @@ import json
 import platform
 import re
 from collections.abc import Callable, Iterable
+from contextlib import AbstractContextManager
 from dataclasses import asdict
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -28,6 +29,8 @@ from ..camera import Camera, ring
 from ..dataset import Dataset
 from ..errors import LumigraphError
 from ..lens import Lens
+from ..locks import NAME as LOCK
+from ..locks import held
 from ..method import Method
 from ..plain import understood
 from ..scene import Frame, Scene
@@ -82,13 +85,19 @@ class Run(Opened):
         )
         with files.explained(folder):
             folder.mkdir(parents=True, exist_ok=True)
-        if isinstance(data, Scene):
-            files.write_json(folder / "cameras.json", cameras_to_json(data))
-        settings.write(folder / "config.json")  # last: a folder with it is a run
+        with held(folder, "made a run"):
+            check_new(folder)  # again, for somebody else may have been quicker
+            if isinstance(data, Scene):
+                files.write_json(folder / "cameras.json", cameras_to_json(data))
+            settings.write(folder / "config.json")  # last: a folder with it is a run
         return cls(folder)
 
-    def set_budget(self, **budget: float) -> None:
-        """Remember another total of steps or seconds."""
+    def held(self) -> AbstractContextManager[None]:
+        """A block in which no other process trains this run. Raises LumigraphError that says who does."""
+        return held(self.folder, "trained")
+
+    def set_budget(self, **budget: Any) -> None:
+        """Remember another budget, as `Budget.to_json` says it."""
         self.settings = self.settings.with_budget(**budget)
         self.settings.write(self._config)
 
@@ -153,10 +162,14 @@ class Run(Opened):
 
         Raises LumigraphError if it gives another frame than the run was trained in.
         """
-        from ..capture import KINDS, open_dataset
+        from ..capture import KINDS, Before, open_dataset
 
         source = source or self.settings.scene.source
         options = {name: value for name, value in self.settings.scene.options.items() if value is not None}
+        if self.photographed:
+            with understood(self.folder / "cameras.json"):
+                names = files.read_json(self.folder / "cameras.json")["names"]
+            options["before"] = Before(names, self.frame.to_source.rotation.T.numpy())
         data = open_dataset(source, KINDS[self.kind], **options)
         if not self.settings.agrees(data.frame):
             what = "cameras or bounds differ" if self.photographed else "bounds differ"
@@ -275,7 +288,7 @@ def check_new(folder: Path) -> None:
             f"{folder} already holds a run; go on with it by `lumigraph resume {folder}`, or choose another --output"
         )
     with files.explained(folder):
-        if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        if folder.exists() and (not folder.is_dir() or any(path.name != LOCK for path in folder.iterdir())):
             raise LumigraphError(f"{folder} is not an empty folder; choose another --output")
 
 

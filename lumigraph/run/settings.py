@@ -37,7 +37,7 @@ class Settings:
     config:    the method's numbers by name, as the run was written with; see `method_config`
     splits:    number of photographs or shapes by purpose
     seed:      of all random choices
-    budget:    {"steps": n} or {"seconds": s}
+    budget:    {"steps": n} or {"seconds": s}, and what else `Budget.to_json` says
     device:    that it began on;  processor: what kind of machine that was
     said:      the file as it was read. What a newer version has added to it is kept when it is written again
     """
@@ -76,8 +76,8 @@ class Settings:
         frame = self.said["frame"] if unchanged else self.frame.to_json()
         return {"format": FORMAT} | self.said | own | {"frame": frame, "scene": self.scene.to_json()}
 
-    def with_budget(self, **budget: float) -> Settings:
-        """The same with another total of steps or seconds."""
+    def with_budget(self, **budget: Any) -> Settings:
+        """The same with another budget."""
         return replace(self, budget=budget)
 
     def method_config(self, kind: type[Method]) -> Any:

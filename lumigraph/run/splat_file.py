@@ -29,9 +29,8 @@ class SplatFile(Opened):
         self.gaussians: Gaussians = read_gaussians(self.path)
         if not len(self.gaussians):
             raise LumigraphError(f"{self.path} holds no Gaussians, so there is nothing to show")
-        scene_from_file = upright_similarity(self.gaussians)
-        self.frame = Frame(reach=64.0, near=0.01, source_from_scene=scene_from_file.inverse.rows)
-        self._in_scene = self.gaussians.transformed(scene_from_file.matrix)
+        self.frame = frame_of(self.gaussians)
+        self._in_scene = self.gaussians.transformed(self.frame.to_source.inverse.matrix)
 
     def method(self, device: torch.device | str = "cpu") -> Method:
         """The cloud, ready to render."""
@@ -43,6 +42,11 @@ class SplatFile(Opened):
     def cameras(self) -> dict[str, Camera]:
         """A ring of cameras around the middle, looking at it."""
         return {"train": ring(self.frame.bounds)}
+
+
+def frame_of(gaussians: Gaussians) -> Frame:
+    """The frame of a scene whose source are the axes of a file."""
+    return Frame(reach=64.0, near=0.01, source_from_scene=upright_similarity(gaussians).inverse.rows)
 
 
 def upright_similarity(gaussians: Gaussians) -> Similarity:

@@ -1,67 +1,38 @@
-"""Cropping: what a camera sees inside a box of the scene.
+"""Cropping: what a camera sees inside a box or a sphere of the scene.
 
-A cloud of Gaussians is filtered by its centres. A RayMethod's rays begin where they enter the box, so what stands in
-front of it vanishes. What lies behind the box is removed pixel by pixel, by its expected depth; for all other methods,
-so is what lies before it. Where something see-through inside stands before something solid outside, their mean depth
-decides.
+A RayMethod's rays begin where they enter the crop, so what stands in front of it vanishes. What lies behind it is
+removed pixel by pixel, by its expected depth; for all other methods, so is what lies before it. Where something
+see-through inside stands before something solid outside, their mean depth decides. (Of a cloud, Gaussians are picked;
+see `Shared.cloud`.)
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import torch
-from jaxtyping import Bool, Float, Shaped
+from jaxtyping import Bool, Shaped
 from torch import Tensor
 
 from ..camera import Camera
-from ..capabilities import HasGaussians, needs
-from ..gaussians import Gaussians, splatting
+from ..crop import Crop
 from ..method import Method, RayMethod
 from ..rays import Rays, Rendering
-from ..scene import Vector
 
-TOLERANCE = 0.01  # of the box's sides: an expected depth may lie so far outside
-
-
-@dataclass(frozen=True)
-class CropBox:
-    """A box by its corners in the scene's frame; lower is nowhere above upper."""
-
-    lower: Vector
-    upper: Vector
-
-    def holds(self, points: Float[Tensor, "*point 3"], tolerance: float = 0.0) -> Bool[Tensor, "*point"]:
-        """Whether each point lies inside, or outside by no more than a tolerance, a share of the box's sides."""
-        lower, upper = torch.tensor(self.lower).to(points), torch.tensor(self.upper).to(points)
-        margin = tolerance * (upper - lower)
-        return ((points >= lower - margin) & (points <= upper + margin)).all(-1)
-
-    def entered(self, rays: Rays) -> tuple[Float[Tensor, " ray"], Bool[Tensor, " ray"]]:
-        """Distance at which each ray is first inside, 0 for one that begins inside, and whether it ever is."""
-        enter, leave = rays.through_box(rays.origins.new_tensor((self.lower, self.upper)))
-        enter = enter.clamp_min(0)
-        return enter, enter < leave
-
-    def cropped(self, cloud: Gaussians) -> Gaussians:
-        """The Gaussians whose centres lie inside."""
-        return cloud[self.holds(cloud.means)]
+TOLERANCE = 0.01  # of the crop's size: an expected depth may lie so far outside
 
 
-def render_inside(method: Method, camera: Camera, box: CropBox, is_cloud: bool) -> Rendering:
-    """What a camera sees inside a box. is_cloud: whether the method has Gaussians."""
+def render_inside(method: Method, camera: Camera, crop: Crop) -> Rendering:
+    """What a camera sees inside a crop of a method that has no Gaussians."""
     frame = method.frame
-    if is_cloud:
-        cloud = box.cropped(needs(method, HasGaussians).gaussians())
-        return splatting.render(cloud, camera.to(method.device), frame.background, frame.near)
     rays = camera.rays(camera.pixels())
     if isinstance(method, RayMethod):
-        rendering = from_entry(method, rays, box)
+        rendering = from_entry(method, rays, crop)
     else:
         rendering = method.render(camera).cpu()
     width, height = camera.size[0].tolist()
     depth = rendering.depth.reshape(-1)
-    inside = box.holds(rays.at(depth.nan_to_num(0, 0)), TOLERANCE) & depth.isfinite()
+    inside = crop.holds(rays.at(depth.nan_to_num(0, 0)), TOLERANCE) & depth.isfinite()
     keep = inside.view(height, width)
     rendering = rendering.reshape(height, width)
     return replace(
@@ -80,11 +51,11 @@ def kept(values: Shaped[Tensor, "*all"], where: Bool[Tensor, "*pixels"]) -> Shap
 
 
 @torch.no_grad()
-def from_entry(method: RayMethod, rays: Rays, box: CropBox) -> Rendering:
-    """What rays see from the point at which they enter a box; depth still counts from their origins."""
-    enter, hits = box.entered(rays)
+def from_entry(method: RayMethod, rays: Rays, crop: Crop) -> Rendering:
+    """What rays see from the point at which they enter a crop; depth still counts from their origins."""
+    enter, hits = crop.entered(rays)
     asked = hits.clone()
-    asked[0] = True  # so that a picture beside the box has the method's extras too
+    asked[0] = True  # so that a picture beside the crop has the method's extras too
     begin = torch.where(hits, enter - method.frame.near, 0).clamp_min(0)[asked]  # no method looks nearer than near
     moved = replace(rays[asked], origins=rays[asked].at(begin))
     background = torch.tensor(method.frame.background)

@@ -9,9 +9,9 @@ import torch
 
 from ..camera import Camera
 from ..controls import Value
+from ..crop import Crop
 from ..lens import Pinhole
 from ..scene import Vector
-from .crop import CropBox
 
 
 @dataclass(frozen=True)
@@ -25,9 +25,10 @@ class ViewRequest:
     mode:       one of MODES, or the name of one of the method's extras
     background: colour behind everything
     exact:      whether Gaussians are rendered here rather than by the browser
-    box:        what is shown of the scene; None for all of it
+    crop:       what is shown of the scene; None for all of it
     depth:      whether the browser needs depth, because it draws something beside the scene
     told:       names and values of the method's controls that the client has turned
+    floaters:   names and numbers of what `cleaned` is told of them; nothing if they stay
     """
 
     pose: tuple[tuple[float, ...], ...]
@@ -37,9 +38,15 @@ class ViewRequest:
     mode: str
     background: Vector
     exact: bool = False
-    box: CropBox | None = None
+    crop: Crop | None = None
     depth: bool = False
     told: tuple[tuple[str, Value], ...] = ()
+    floaters: tuple[tuple[str, float], ...] = ()
+
+    @property
+    def part(self) -> bool:
+        """Whether less than the whole scene is shown."""
+        return self.crop is not None or bool(self.floaters)
 
     @property
     def full(self) -> tuple[int, int]:

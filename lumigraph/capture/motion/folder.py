@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 from collections.abc import Sequence
 from pathlib import Path
@@ -9,13 +10,15 @@ from typing import Any
 
 import numpy as np
 import plyfile
-import pycolmap
+from PIL import Image
 
 from ...errors import LumigraphError
 from ...files import PARTIAL, read_json, remove, replacing, write_json
+from ..library import pycolmap
+from ..masks import MASKS as MASKS
 from ..photos import Photo
 from ..photos.track import Track
-from ..pictures import list_images
+from ..pictures import list_images, read_grey
 from ..transforms import OPENCV_FROM_OPENGL
 
 WORK = "work"
@@ -76,20 +79,50 @@ def copy_photographs(photos: Sequence[Photo], images: Path, track: Track) -> Non
                 shutil.copy2(photo.path, partial)
 
 
+def copy_masks(photos: Sequence[Photo], masks: Path, track: Track) -> Path | None:
+    """Masks as COLMAP wants them: image.jpg.png, black and white, of the photographs' size. None where there are none.
+
+    Raises LumigraphError for a mask that has not its photograph's shape.
+    """
+    having = [photo for photo in photos if photo.mask is not None]
+    if not having:
+        return None
+    kept = {f"{photo.name}.png" for photo in having}
+    for name in list_images(masks):
+        if name not in kept:
+            remove(masks / name)
+    for photo in track(having, "Copying masks", len(having)):
+        assert photo.mask is not None
+        target = masks / f"{photo.name}.png"
+        if target.is_file() and target.stat().st_mtime_ns == photo.mask.stat().st_mtime_ns:
+            continue
+        trusted = np.asarray(Image.fromarray(read_grey(photo.mask, photo.size, True)).resize(photo.size)) > 127
+        with replacing(target) as partial:
+            Image.fromarray(trusted).save(partial)
+            about = photo.mask.stat()
+            os.utime(partial, ns=(about.st_atime_ns, about.st_mtime_ns))
+    return masks
+
+
 def stamp(path: Path) -> tuple[int, int]:
     """What changes when a file does: nanoseconds and bytes."""
     about = path.stat()
     return about.st_mtime_ns, about.st_size
 
 
-def write_model(folder: Path, model: pycolmap.Reconstruction, photos: Sequence[Photo]) -> None:
-    """sparse/0, points.ply and transforms.json, all in the model's frame; frames in the order of `photos`."""
+def write_model(folder: Path, model: pycolmap.Reconstruction, photos: Sequence[Photo], z_up: bool) -> None:
+    """sparse/0, points.ply and transforms.json, all in the model's frame; frames in the order of `photos`.
+
+    z_up: whether +z is known to be up, by more than how cameras were held
+    """
     with replacing(folder / "sparse") as partial:
         (partial / "0").mkdir(parents=True)
         model.write(partial / "0")
     write_points(folder / POINTS, model)
     by_name = {image.name: image for image in model.images.values() if image.has_pose}
-    write_json(folder / "transforms.json", transforms(model, [by_name[p.name] for p in photos if p.name in by_name]))
+    up = {"up": [0.0, 0.0, 1.0]} if z_up else {}
+    images = [by_name[p.name] for p in photos if p.name in by_name]
+    write_json(folder / "transforms.json", up | transforms(model, images))
 
 
 def transforms(model: pycolmap.Reconstruction, images: Sequence[pycolmap.Image]) -> dict[str, Any]:

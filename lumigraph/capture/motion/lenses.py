@@ -7,9 +7,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Literal
 
-import pycolmap
-
 from ...errors import LumigraphError
+from ..library import pycolmap
 from ..photos import Photo
 
 Sharing = Literal["auto", "single", "per-device", "per-image"]

@@ -7,9 +7,10 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-import pycolmap
 from jaxtyping import Float
 from scipy.cluster.vq import kmeans2, vq
+
+from ..library import pycolmap
 
 Matching = Literal["auto", "exhaustive", "sequential", "retrieval"]
 Pair = tuple[int, int]

@@ -11,15 +11,18 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-import pycolmap
 
 from ...errors import LumigraphError
 from ...files import read_json, remove, replacing, write_bytes, write_json
+from ...locks import held
+from ...names import natural
+from ...progress import counting
+from ..library import pycolmap
 from ..photos import Intake, Photo, gather
 from ..photos.track import Track, untracked
 from .diagnosis import FEW_FEATURES, Diagnosis, Matches, counted, diagnose, folds, read_matches
 from .drawings import draw_capture, draw_photographs
-from .folder import RESULT, claim, copy_photographs, stamp, write_model
+from .folder import MASKS, RESULT, claim, copy_masks, copy_photographs, stamp, write_model
 from .georeference import Georeference, georeference, gps_positions, upright
 from .lenses import Sharing, group_by_lens, model_for, prior, write_database
 from .pairs import NEIGHBOURS, Matching, choose_matching, choose_pairs
@@ -61,7 +64,8 @@ def reconstruct(
     sources: a folder, a list of image files, or one video; they are only read
     folder:  where the scene goes: images, sparse/0, transforms.json, points.ply, capture.json, two pictures, and a
              folder `work` that nobody needs afterwards. What lies there of an earlier call for the same sources is used
-    Raises LumigraphError if there are too few photographs, if none fit together, and for a folder of something else.
+    Raises LumigraphError if there are too few photographs, if none fit together, and for a folder of something else or
+    that another process works in.
     """
     options = options or Options()
     check(options)
@@ -69,15 +73,16 @@ def reconstruct(
         if not source.exists():
             raise LumigraphError(f"{source} does not exist; check the path")
     work = claim(folder, sources)
-    intake = with_safe_names(gather(sources, work, options.frames, track))
-    photos = [photo for photo in intake.photos if photo.name not in intake.duplicates]
-    if len(photos) < FEWEST:
-        raise LumigraphError(
-            f"{intake.source} has {counted(len(photos), 'photograph')} that can be used, and {FEWEST} are the least; "
-            f"take some from other places"
-        )
-    work_to_do = Reconstruction(sources, folder, work, options, intake, photos, track)
-    return finished(folder, work_to_do.keys["result"]) or work_to_do.run()
+    with held(work, "worked in"):
+        intake = with_safe_names(gather(sources, work, options.frames, track))
+        photos = [photo for photo in intake.photos if photo.name not in intake.duplicates]
+        if len(photos) < FEWEST:
+            raise LumigraphError(
+                f"{intake.source} has {counted(len(photos), 'photograph')} that can be used, and {FEWEST} are the "
+                f"least; take some from other places"
+            )
+        work_to_do = Reconstruction(sources, folder, work, options, intake, photos, track)
+        return finished(folder, work_to_do.keys["result"]) or work_to_do.run()
 
 
 def check(options: Options) -> None:
@@ -138,6 +143,7 @@ class Reconstruction:
             self.work / "models",
         )
         self.unfolded = self.work / "unfolded"
+        self.masks: Path | None = None
         self.names = [photo.name for photo in self.photos]
         self.groups = group_by_lens(self.photos, self.intake.in_order, self.options.camera)
         chosen = choose_matching(len(self.photos), self.intake.in_order)
@@ -149,7 +155,7 @@ class Reconstruction:
         """For each stage a name of everything that its result depends on."""
         features = key_of(
             pycolmap.__version__,
-            [[p.name, *stamp(p.path)] for p in self.photos],
+            [[p.name, *stamp(p.path), *(stamp(p.mask) if p.mask else ())] for p in self.photos],
             [[prior(group), model_for(group), [p.name for p in group]] for group in self.groups],
             self.options.max_size,
             self.count_features(),
@@ -162,11 +168,13 @@ class Reconstruction:
 
     def run(self) -> dict[str, Any]:
         copy_photographs(self.photos, self.images, self.track)
+        self.masks = copy_masks(self.photos, self.folder / MASKS, self.track)
         self.find_features(self.keys["features"])
         self.compare(self.keys["matching"])
         self.place(self.keys["mapping"])
         self.unfold(self.keys["mapping"])
-        return self.write(self.keys["result"])
+        with counting("Writing the scene"):
+            return self.write(self.keys["result"])
 
     def count_features(self) -> int:
         return next((features for most, features in FEATURES if len(self.photos) <= most), FEWEST_FEATURES)
@@ -187,6 +195,7 @@ class Reconstruction:
                 stage="features",
                 names=self.names,
                 images=str(self.images),
+                masks=self.masks and str(self.masks),
                 max_size=self.options.max_size,
                 features=self.count_features(),
             )
@@ -200,7 +209,8 @@ class Reconstruction:
             opened.clear_two_view_geometries()
             opened.close()
         with self.stages.working("matching", key):
-            pairs = choose_pairs(self.matching, self.names, self.database, gps_positions(self.photos))
+            with counting("Choosing pairs"):
+                pairs = choose_pairs(self.matching, self.names, self.database, gps_positions(self.photos))
             listed = self.work / "pairs.txt"
             write_bytes(listed, "".join(f"{self.names[i]} {self.names[j]}\n" for i, j in pairs).encode())
             self.colmap("Comparing pairs", len(pairs), self.database, stage="matching", pairs=str(listed))
@@ -224,8 +234,10 @@ class Reconstruction:
             return
         with self.stages.working("unfolding", key):
             remove(self.unfolded)
-            found, matches = read_models(self.models), read_matches(self.database)
-            if found and self.leaps(found[0], matches):
+            with counting("Looking for folds"):
+                found, matches = read_models(self.models), read_matches(self.database)
+                folded = bool(found) and self.leaps(found[0], matches) > 0
+            if folded:
                 near = self.work / "near.db"
                 copy_database(self.database, near)
                 keep_near(near, self.names, NEIGHBOURS)
@@ -279,14 +291,18 @@ class Reconstruction:
             remove(self.folder / name)
         model = found[0]
         place = self.turn_upright(model)
-        others = [sorted(image.name for image in other.images.values() if image.has_pose) for other in found[1:]]
+        others = [
+            sorted((image.name for image in other.images.values() if image.has_pose), key=natural)
+            for other in found[1:]
+        ]
         taken = {image.name for image in model.images.values() if image.has_pose}
         others = [left for names in others if len(left := [name for name in names if name not in taken]) > 1]
         diagnosis = diagnose(self.intake, self.photos, model, others, matches)
         if place is not None and place.new_from_old is None:
             told.append(place.say)
         diagnosis = replace(diagnosis, warnings=[*diagnosis.warnings, *told])
-        write_model(self.folder, model, self.photos)
+        known = place is not None and place.new_from_old is not None
+        write_model(self.folder, model, self.photos, z_up=known)
         draw_capture(
             self.folder / "capture.png", model, diagnosis, place is not None and place.new_from_old is not None
         )
@@ -302,7 +318,8 @@ class Reconstruction:
         stacked = np.stack([poses[photo.name] for photo in photos])
         place = georeference(stacked[:, :, 3], photos)
         known = place is not None and place.new_from_old is not None
-        model.transform(place.new_from_old if place is not None and known else upright(stacked))
+        points = np.array([point.xyz for point in model.points3D.values()]).reshape(-1, 3)
+        model.transform(place.new_from_old if place is not None and known else upright(stacked, points))
         return place
 
     def summary(

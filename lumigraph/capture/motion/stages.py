@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import signal
 import subprocess
 import sys
 import time
@@ -14,6 +15,7 @@ from typing import Any
 
 from ...errors import LumigraphError
 from ...files import read_json, write_json
+from ...processes import start
 
 WORKER = Path(__file__).with_name("worker.py")
 
@@ -67,9 +69,8 @@ class Stages:
         """
         command = [sys.executable, "-P", str(WORKER), json.dumps(job)]
         with open(self.log, "ab") as log:
-            process = subprocess.Popen(
-                command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=log, start_new_session=True, text=True
-            )
+            pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": log}
+            process = start(command, signal.SIGKILL, **pipes, start_new_session=True, text=True)
         assert process.stdin and process.stdout
         told = 0
         try:

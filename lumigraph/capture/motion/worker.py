@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 import os
+import signal
 import subprocess
 import sys
 import threading
@@ -26,12 +27,21 @@ MANY_CORES = 16  # more threads would ask for more memory than they save time
 
 
 def find_features(job: dict[str, Any]) -> None:
-    """Scale-invariant features (Lowe 2004), as root-SIFT; photographs that have theirs are passed over."""
+    """Scale-invariant features (Lowe 2004), as root-SIFT, where masks allow them; photographs that have theirs are
+    passed over."""
     options = pycolmap.FeatureExtractionOptions()
     options.max_image_size, options.num_threads = job["max_size"], job["threads"]
     options.sift.max_num_features = job["features"]
+    reading = pycolmap.ImageReaderOptions()
+    if job["masks"]:
+        reading.mask_path = job["masks"]
     pycolmap.extract_features(
-        job["database"], job["images"], image_names=job["names"], extraction_options=options, device=pycolmap.Device.cpu
+        job["database"],
+        job["images"],
+        image_names=job["names"],
+        reader_options=reading,
+        extraction_options=options,
+        device=pycolmap.Device.cpu,
     )
 
 
@@ -100,6 +110,7 @@ def end_with_input() -> None:
 
 
 def main() -> None:
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)  # COLMAP's logging library has taken it
     job = json.loads(sys.argv[1])
     job["threads"] = min(os.cpu_count() or 1, MANY_CORES)
     job["seed"] = 0

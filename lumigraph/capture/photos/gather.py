@@ -14,6 +14,8 @@ from PIL import Image, UnidentifiedImageError
 
 from ...errors import LumigraphError
 from ...files import explained
+from ...names import natural
+from ..masks import MASKS, OBJECT_MASKS, find_mask
 from ..pictures import describe, reductions
 from . import upright
 from .exif import read_facts
@@ -26,6 +28,7 @@ HEIC = (".heic", ".heif")
 PHOTOGRAPHS = {
     ".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".bmp", ".heic", ".heif", ".avif"
 }  # fmt: skip
+LEVELS = 3  # of folders above a photograph in which a folder of masks is looked for
 MADE = ("transforms.json", "transforms_train.json", "sparse", "checkpoints")  # a folder with these is a program's
 
 
@@ -48,7 +51,8 @@ def gather(sources: Sequence[Path], work: Path, frames: int | None = None, track
     files = named_files(list_photographs(sources, work))
     taken = examine(files, work / "upright", track)
     unreadable = {name: why for name, why in taken.items() if isinstance(why, str)}
-    seen = [one for _, one in sorted(taken.items()) if isinstance(one, Candidate)]
+    readable = {name: one for name, one in taken.items() if isinstance(one, Candidate)}
+    seen = [readable[name] for name in sorted(readable, key=natural)]
     if not seen:
         raise LumigraphError(nothing(source, unreadable))
     return assess(Intake(source, with_altitudes([one.photo for one in seen]), unreadable=unreadable), seen)
@@ -87,7 +91,8 @@ def assess(intake: Intake, seen: Sequence[Candidate]) -> Intake:
         return one.photo.name in bad, -math.prod(one.photo.size), -one.bytes, one.photo.name
 
     signatures = {one.photo.name: one.judgement.signature for one in sorted(seen, key=worth)}
-    return replace(intake, blurred=bad, duplicates=dict(sorted(duplicates(signatures, sizes).items())))
+    same = duplicates(signatures, sizes)
+    return replace(intake, blurred=bad, duplicates={name: same[name] for name in sorted(same, key=natural)})
 
 
 def nothing(source: str, unreadable: Mapping[str, str]) -> str:
@@ -119,13 +124,15 @@ def list_photographs(sources: Sequence[Path], work: Path) -> list[Path]:
 
 
 def walk(folder: Path, work: Path | None = None) -> Iterator[Path]:
-    """Photographs below a folder, sorted: no hidden ones, none that a program reduced or rendered."""
+    """Photographs below a folder, sorted: no hidden ones, no masks, none that a program reduced or rendered."""
     with explained(folder):
-        entries = sorted(folder.iterdir())
+        entries = sorted(folder.iterdir(), key=lambda path: natural(path.name))
     folders = [entry for entry in entries if entry.is_dir()]
     reduced = {path for folder in folders for times, path in reductions(folder).items() if times > 1}
     for entry in entries:
         if entry.name.startswith(".") or entry in reduced or entry.resolve() == work:
+            continue
+        if entry.name in (MASKS, OBJECT_MASKS) and entry.is_dir():
             continue
         if entry.is_dir():
             if not entry.is_symlink() and not any((entry / name).exists() for name in MADE):
@@ -174,7 +181,15 @@ def take(name: str, path: Path, copies: Path) -> Candidate | str:
     except Exception as fault:  # image libraries raise anything for a damaged file
         return unread(path, fault)
     photo = Photo(name, upright_file, size, facts.device, facts.focal, facts.gps, facts.time)
-    return Candidate(replace(photo, sharpness=found.sharpness, brightness=found.brightness), found, path.stat().st_size)
+    photo = replace(photo, sharpness=found.sharpness, brightness=found.brightness, mask=mask_beside(path))
+    return Candidate(photo, found, path.stat().st_size)
+
+
+def mask_beside(path: Path) -> Path | None:
+    """The mask of a photograph, in a folder of masks beside it or beside the folder it is in, as far as three above."""
+    above = path.absolute().parents[:LEVELS]
+    found = (find_mask(folder / MASKS, path.absolute().relative_to(folder).as_posix()) for folder in above)
+    return next((mask for mask in found if mask is not None), None)
 
 
 def unread(path: Path, fault: Exception) -> str:

@@ -18,6 +18,7 @@ class Photo:
     gps:       latitude and longitude in degrees (WGS 84), altitude in metres
     time:      of exposure, in seconds; since 1970 for photographs, since the beginning for a video's frames
     sharpness: how much fine detail there is, comparable among pictures of one subject
+    mask:      beside it, black where nothing is to be learnt; None where there is none
     brightness: mean of log2 of the linear luminance, so that one stop more is 1 more
     """
 
@@ -30,6 +31,7 @@ class Photo:
     time: float | None = None
     sharpness: float = 0.0
     brightness: float = 0.0
+    mask: Path | None = None
 
 
 @dataclass(frozen=True)

@@ -49,8 +49,8 @@ class Cells:
         """Train and compare everything with everything. views: numbers of photographs by the scene's source."""
         from ...benchmark.cell import Cell, Settings
         from ...benchmark.conduct import conduct
+        from ...budget import Budget
         from ...metrics.lpips import load_lpips, named_files
-        from ...train import Budget
 
         if seconds and steps:
             raise LumigraphError("--steps and --seconds are two ways to say how long; give one of them")

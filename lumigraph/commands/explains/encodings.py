@@ -9,6 +9,7 @@ from typing import Annotated
 from tyro.conf import Positional
 
 from ...errors import LumigraphError
+from ...progress import counting
 from ..common import choose_device, needed, option, scene_name, show
 
 
@@ -54,6 +55,7 @@ class ExplainEncodings:
         config = replace(FourierFeatures.preset(device), seed=self.seed)
         comparison = compare(scene, tuple(sorted(set(self.scales))), self.steps, device, config)
         folder = self.output or Path("explained") / f"{scene_name(str(self.picture))}-encodings"
-        write_page(folder, comparison)
+        with counting("Drawing the page"):
+            write_page(folder, comparison)
         show({fit.name: f"{fit.held_out:.2f} dB" for fit in comparison.leading} | {"page": str(folder / "index.html")})
         return 0

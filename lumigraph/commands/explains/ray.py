@@ -9,6 +9,7 @@ from typing import Annotated, Any, Literal
 from tyro.conf import Positional
 
 from ...errors import LumigraphError
+from ...progress import counting
 from ..common import choose_device, needed, option, say, show
 from ..controls import Set, tell
 
@@ -52,7 +53,8 @@ class ExplainRay:
         method = tell(run, run.method(choose_device(self.device)), self.told)
         camera = method.refined(camera)
         x, y = pixel = self.pixel or tuple((camera.size[0] // 2).tolist())
-        sight = along_ray(method, camera, pixel)
+        with counting("Looking along the ray"):
+            sight = along_ray(method, camera, pixel)
         sight = sight.beside(self._photograph(run, name))
         output = self.output or run.folder / "rays" / f"{file_name(name)}-{x}-{y}.svg"
         title = f"{run.method_name}: pixel ({x}, {y}) of {name}"

@@ -6,29 +6,32 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
-from tyro.conf import Positional, arg
+from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from ...errors import LumigraphError
 from ..common import needed, option, show
 from ..controls import Set, open_method
+from ..keeping import Keeping
 from .points import check_pictures
+
+FOR_PHONES = 100_000  # triangles that a phone shows with ease
 
 
 @dataclass(frozen=True)
 class ExportMesh:
-    """Triangles with colours at their corners, in the frame of the photographs.
+    """Triangles with colours at their corners, in the frame of the photographs or upright.
 
-    The ending says which format: .ply, .obj or .glb. Marching cubes on the density of methods that have one, fusion of
-    the depth that others render. Only the middle of a scene is meshed. What no camera sees is closed up (objects) or
-    left out (rooms and the open).
+    The ending says which format: .ply and .obj, in that frame; .glb, upright; .usdz, upright and for phones. Marching
+    cubes on the density of methods that have one, fusion of the depth that others render. Only the middle of a scene is
+    meshed. What no camera sees is closed up (objects) or left out (rooms and the open).
     """
 
     source: Annotated[Positional[Path], needed("RUN_OR_FILE")]
     """Folder of a run, a splat file, or a composition."""
     output: Annotated[Positional[Path], needed("FILE")]
     """The new file."""
-    box: Annotated[float | None, option("TIMES", "1 for objects, 1.5 for the rest")] = None
-    """Size of what is meshed, times the box of interest that `lumigraph info` tells."""
+    extent: Annotated[float | None, option("TIMES", "1 for objects, 1.5 for the rest")] = None
+    """Size of what is meshed, times the box of interest that `lumigraph info` tells; or give --box or --sphere."""
     cell_size: Annotated[float | None, option("LENGTH", "1/256 of the box")] = None
     """Side of the cubes marched through, in the units of the photographs' frame: details are twice as large."""
     way: Annotated[
@@ -40,7 +43,7 @@ class ExportMesh:
     """Density of the surface, per unit of the scene's own frame."""
     smooth: Annotated[int, option("N")] = 10
     """Rounds of smoothing; 0 for none."""
-    faces: Annotated[int | None, option("N", "as many as there are")] = None
+    faces: Annotated[int | None, option("N", f"as many as there are, for phones {FOR_PHONES:,}")] = None
     """Triangles to come down to."""
     keep: Annotated[float, option("SHARE")] = 0.01
     """Pieces smaller than this share of the largest one are dropped."""
@@ -50,6 +53,7 @@ class ExportMesh:
     """Longer side of the pictures that tell colours, and depth where it is fused; at most that of the photographs."""
     views: Annotated[int, option("N")] = 64
     """Number of these pictures at most."""
+    part: OmitArgPrefixes[Keeping] = Keeping()
     told: Set = ()
     device: Annotated[str, option("NAME")] = "auto"
     """auto, cpu, cuda, cuda:1."""
@@ -59,23 +63,24 @@ class ExportMesh:
         from ...export.mesh import extract_mesh
         from ...export.mesh_file import ending, write_mesh
 
-        ending(self.output)
+        for_phones = ending(self.output) == ".usdz"
         opened, method, cameras = open_method(self.source, self.device, self.told)
         mesh = extract_mesh(
-            method,
+            self.part.without_floaters(method),
             opened.survey(cameras["train"]),
-            box=self.box,
+            extent=self.extent,
+            crop=self.part.crop(opened.frame),
             cell=None if self.cell_size is None else self.cell_size / opened.frame.to_source.scale,
             level=self.level,
             way=self.way,
             smooth=self.smooth,
-            faces=self.faces,
+            faces=FOR_PHONES if self.faces is None and for_phones else self.faces,
             keep=self.keep,
             closed=None if self.unseen is None else self.unseen == "close",
             size=self.size,
             views=self.views,
         ).in_source(opened.frame)
-        write_mesh(self.output, mesh)
+        write_mesh(self.output, mesh, opened.frame.to_source.rotation[:, 2].numpy())
         low, high = mesh.vertices.min(0), mesh.vertices.max(0)
         show(
             {
@@ -91,8 +96,11 @@ class ExportMesh:
         """Raises LumigraphError for numbers that make no sense, before anything is opened."""
         if self.cell_size is not None and not self.cell_size > 0:
             raise LumigraphError(f"Cells cannot be {self.cell_size:g} large; give --cell-size a length above 0")
-        if self.box is not None and not self.box > 0:
-            raise LumigraphError(f"A box cannot be {self.box:g} times as large; give --box a number above 0")
+        if self.extent is not None and not self.extent > 0:
+            raise LumigraphError(f"A box cannot be {self.extent:g} times as large; give --extent a number above 0")
+        if self.extent is not None and self.part.crops:
+            raise LumigraphError("--extent and a crop both say how much is meshed; give one of them")
+        self.part.check()
         if self.level is not None and not self.level > 0:
             raise LumigraphError(f"A density of {self.level:g} is nowhere a surface; give --level a number above 0")
         if not 0 <= self.smooth <= 1000:

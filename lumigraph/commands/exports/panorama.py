@@ -6,10 +6,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
-from tyro.conf import Positional, arg
+from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from ..common import needed, option, show
 from ..controls import Set, open_method
+from ..keeping import Keeping
 
 Place = Annotated[
     tuple[float, float, float] | None,
@@ -36,6 +37,7 @@ class ExportPanorama:
     """Where to stand, in the frame of the photographs."""
     size: Annotated[int, option("PIXELS")] = 2048
     """Width; the height is half of it."""
+    part: OmitArgPrefixes[Keeping] = Keeping()
     told: Set = ()
     device: Annotated[str, option("NAME")] = "auto"
     """auto, cpu, cuda, cuda:1."""
@@ -45,7 +47,9 @@ class ExportPanorama:
 
         picture_format(self.output)
         sphere_size(self.size)
+        self.part.check()
         opened, method, cameras = open_method(self.source, self.device, self.told)
+        method = self.part.of_method(method)
         place, heading, where = standpoint(cameras["train"], opened.frame, self.place)
         save_sphere(self.output, panorama(method, place, heading, self.size).rgb, whole=True)
         show({"panorama": str(self.output), "size": f"{self.size}x{self.size // 2}", "from": where})

@@ -6,11 +6,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
-from tyro.conf import Positional
+from tyro.conf import OmitArgPrefixes, Positional
 
 from ...errors import LumigraphError
 from ..common import needed, option, show
 from ..controls import Set, open_method
+from ..keeping import Keeping
 
 
 @dataclass(frozen=True)
@@ -30,6 +31,7 @@ class ExportPoints:
     """Longer side of the pictures that the points come from; at most that of the photographs."""
     views: Annotated[int, option("N")] = 64
     """Number of these pictures at most."""
+    part: OmitArgPrefixes[Keeping] = Keeping()
     told: Set = ()
     device: Annotated[str, option("NAME")] = "auto"
     """auto, cpu, cuda, cuda:1."""
@@ -40,11 +42,13 @@ class ExportPoints:
         if self.count < 1:
             raise LumigraphError(f"A cloud cannot have {self.count} points; give --count a number above 0")
         check_pictures(self.size, self.views)
+        self.part.check()
         from ...export.points import extract_points, write_points
 
         opened, method, cameras = open_method(self.source, self.device, self.told)
         seers = opened.survey(cameras["train"])
-        points = extract_points(method, seers, self.count, self.size, self.views).in_source(opened.frame)
+        method, crop = self.part.without_floaters(method), self.part.crop(opened.frame)
+        points = extract_points(method, seers, self.count, self.size, self.views, crop).in_source(opened.frame)
         write_points(self.output, points)
         show(
             {

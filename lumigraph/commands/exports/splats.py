@@ -6,11 +6,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
-from tyro.conf import Positional
+from tyro.conf import OmitArgPrefixes, Positional
 
 from ...errors import LumigraphError
 from ..common import needed, show
 from ..controls import Set, tell
+from ..keeping import Keeping
 
 
 @dataclass(frozen=True)
@@ -25,6 +26,7 @@ class ExportSplats:
     """Folder of a run, a splat file, or a composition."""
     output: Annotated[Positional[Path], needed("FILE")]
     """The new file."""
+    part: OmitArgPrefixes[Keeping] = Keeping()
     told: Set = ()
 
     def run(self) -> int:
@@ -32,16 +34,24 @@ class ExportSplats:
         from ...exchange import is_splat_file, read_gaussians, write_gaussians
         from ...export.splats import export_splats
         from ...run import open_any
+        from ...run.splat_file import frame_of
 
+        self.part.check()
         if is_splat_file(self.source):
             if self.told:
                 raise LumigraphError(f"{self.source} is a file of Gaussians, which has no controls; leave out --set")
             written = read_gaussians(self.source)
+            if self.part.crops or self.part.floaters:
+                frame = frame_of(written)
+                crop = self.part.crop(frame)
+                written = self.part.of_gaussians(written, crop and crop.moved(frame.to_source))
             write_gaussians(self.output, written)
         else:
             opened = open_any(self.source)
             method = tell(opened, opened.method(), self.told)
-            written = export_splats(needs(method, HasGaussians).gaussians(), method.frame, self.output)
+            gaussians = needs(method, HasGaussians).gaussians()
+            gaussians = self.part.of_gaussians(gaussians, self.part.crop(method.frame))
+            written = export_splats(gaussians, method.frame, self.output)
         size = self.output.stat().st_size
         show(
             {

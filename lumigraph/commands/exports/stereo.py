@@ -6,11 +6,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
-from tyro.conf import Positional
+from tyro.conf import OmitArgPrefixes, Positional
 
 from ...errors import LumigraphError
 from ..common import needed, option, show
 from ..controls import Set, open_method
+from ..keeping import Keeping
 from .panorama import Place
 
 
@@ -33,6 +34,7 @@ class ExportStereo:
     """Distance between the eyes, in the units of the photographs' frame."""
     size: Annotated[int, option("PIXELS")] = 2048
     """Width, and height of both halves together."""
+    part: OmitArgPrefixes[Keeping] = Keeping()
     told: Set = ()
     device: Annotated[str, option("NAME")] = "auto"
     """auto, cpu, cuda, cuda:1."""
@@ -43,11 +45,13 @@ class ExportStereo:
 
         picture_format(self.output)
         sphere_size(self.size)
+        self.part.check()
         if self.interpupillary is not None and not 0 < self.interpupillary < float("inf"):
             raise LumigraphError(
                 f"Eyes cannot be {self.interpupillary:g} apart; give --interpupillary a length above 0"
             )
         opened, method, cameras = open_method(self.source, self.device, self.told)
+        method = self.part.of_method(method)
         place, heading, where = standpoint(cameras["train"], opened.frame, self.place)
         unit = opened.frame.to_source.scale
         near, middle = surrounding_distances(method, place, heading)

@@ -41,6 +41,10 @@ class AdaptiveDensity(nn.Module):
         """Set the gradients seen so far to zero, for a cloud of `count` Gaussians."""
         self.pulls, self.sightings = self.pulls.new_zeros(count), self.sightings.new_zeros(count)
 
+    def prune(self, keep: Bool[Tensor, " gaussian"]) -> None:
+        """Forget the gradients of Gaussians that are no longer there."""
+        self.pulls, self.sightings = self.pulls[keep], self.sightings[keep]
+
     @torch.no_grad()
     def note(self, pull: Float[Tensor, "gaussian 2"], shown: Bool[Tensor, " gaussian"], size: tuple[int, int]) -> None:
         """Add one step's gradient in the footprints' centres, given per pixel."""

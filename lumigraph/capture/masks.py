@@ -1,0 +1,74 @@
+"""Masks beside photographs, by the folders that they lie in, for every reader.
+
+masks/          what to learn from: where a mask is black (0) the photograph is ignored, be it a passer-by, a hand or
+                the sky. COLMAP's and nerfstudio's meaning.
+object_masks/   what the object is: where one is black there is nothing, so that the object stands alone. A mask is the
+                photograph's alpha.
+
+A mask is named after its photograph, image.png or image.jpg.png for image.jpg, and has its shape, at any size.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path, PurePosixPath
+
+from ..errors import LumigraphWarning
+from .capture import Capture
+from .pictures import list_images
+
+MASKS, OBJECT_MASKS = "masks", "object_masks"
+IMAGES = ("images", "image", "input", "photos", "photographs", "frames")  # folders that a name may begin with
+
+
+def find_mask(folder: Path, name: str) -> Path | None:
+    """The mask of a photograph in a folder of masks; None where there is none."""
+    for within in inner_names(name):
+        candidates = (folder / f"{within}.png", folder / PurePosixPath(within).with_suffix(".png"))
+        for path in candidates:
+            if path.is_file():
+                return path
+    return None
+
+
+def inner_names(name: str) -> Iterator[str]:
+    """A photograph's name below the folder of all photographs, which its path may begin with."""
+    path = PurePosixPath(name)
+    if path.parts[0] in IMAGES and len(path.parts) > 1:
+        yield PurePosixPath(*path.parts[1:]).as_posix()
+    yield path.as_posix()
+
+
+def with_masks(capture: Capture, folder: Path) -> Capture:
+    """The capture with the masks that lie in its folder; a mask that the capture itself names stays.
+
+    Where there are silhouettes, photographs without one would show what the others say is not there: they are left
+    out, and named. Warns of masks none of which is named after a photograph.
+    """
+    shots, missing = list(capture.shots), list(capture.missing)
+    if (folder / MASKS).is_dir():
+        shots = [
+            shot if shot.mask is not None else replace(shot, mask=find_mask(folder / MASKS, shot.name))
+            for shot in shots
+        ]
+        tell_unmatched(folder / MASKS, any(shot.mask is not None for shot in shots))
+    if (folder / OBJECT_MASKS).is_dir():
+        found = [replace(shot, alpha=find_mask(folder / OBJECT_MASKS, shot.name)) for shot in shots]
+        there = [shot for shot in found if shot.alpha is not None]
+        tell_unmatched(folder / OBJECT_MASKS, bool(there))
+        if there:
+            missing += [f"{OBJECT_MASKS} of {shot.name}" for shot in found if shot.alpha is None]
+            shots = there
+    return replace(capture, shots=shots, missing=missing)
+
+
+def tell_unmatched(folder: Path, matched: bool) -> None:
+    if not matched and list_images(folder):
+        warnings.warn(
+            f"None of the masks in {folder} is named after a photograph, so they are passed over; call them "
+            "image.png or image.jpg.png for image.jpg",
+            LumigraphWarning,
+            3,
+        )

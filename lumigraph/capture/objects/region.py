@@ -1,0 +1,95 @@
+"""Where an object must be: what nearly all cameras look at, above the plane that it stands on."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from .view import View
+
+CELLS = 56  # along each side of the cube that is searched
+SEEN = 0.7  # share of the views whose picture holds a cell of the object
+LEVEL = 0.9  # cosine between a table's normal and up, at the least
+TABLE = 0.06  # share of the points nearby that lie on a table, at the least
+BELOW = 0.1  # share of them that may lie below it
+THICK = 0.015  # of the cube's half-size: how far a table's points stray
+TRIALS = 500  # of three points each (RANSAC, Fischler and Bolles 1981)
+
+
+@dataclass(frozen=True)
+class Table:
+    """A plane below the object: points with normal . x > height are above it."""
+
+    normal: Float[Tensor, " 3"]
+    height: float
+
+    def above(self, points: Float[Tensor, "point 3"]) -> Float[Tensor, " point"]:
+        """How far points are above the plane, scene units."""
+        return points @ self.normal - self.height
+
+
+@dataclass(frozen=True)
+class Region:
+    """Cells that the object may fill.
+
+    cells: their middles
+    size:  their side
+    table: what it stands on, where points tell
+    """
+
+    cells: Float[Tensor, "cell 3"]
+    size: float
+    table: Table | None
+
+    def holds(self, points: Float[Tensor, "point 3"]) -> Bool[Tensor, " point"]:
+        """Which points lie in one of the cells."""
+        if not len(points):
+            return torch.zeros(0, dtype=torch.bool)
+        low = self.cells.amin(0) - 0.5 * self.size
+        filled = torch.zeros((CELLS + 2,) * 3, dtype=torch.bool)
+        filled[((self.cells - low) / self.size).long().unbind(-1)] = True
+        index = ((points - low) / self.size).floor().long()
+        inside = ((index >= 0) & (index < CELLS)).all(-1)
+        return inside & filled[index.clamp(0, CELLS + 1).unbind(-1)]
+
+
+def find_region(views: Sequence[View], points: Float[Tensor, "point 3"] | None) -> Region:
+    """The cells of [-1, 1]^3 that most pictures hold and that are above the table, if sparse points show one."""
+    size = 2 / CELLS
+    axis = torch.linspace(-1 + 0.5 * size, 1 - 0.5 * size, CELLS)
+    cells = torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"), -1).reshape(-1, 3)
+    seen = np.mean([view.at(cells)[1] for view in views], 0)
+    cells = cells[(torch.from_numpy(seen) >= SEEN) & (cells.norm(dim=-1) <= 1.0)]
+    table = None if points is None else find_table(points)
+    if table is not None:
+        cells = cells[table.above(cells) > 0.5 * THICK]
+    return Region(cells, size, table)
+
+
+def find_table(points: Float[Tensor, "point 3"]) -> Table | None:
+    """The level plane that most points nearby lie on and hardly any below; None where there is none."""
+    near = points[points.abs().amax(-1) < 1.5].double()
+    if len(near) < 50:
+        return None
+    chance = torch.Generator().manual_seed(0)
+    three = near[torch.randint(0, len(near), (TRIALS, 3), generator=chance)]
+    normals = torch.linalg.cross(three[:, 1] - three[:, 0], three[:, 2] - three[:, 0])
+    normals = normals / normals.norm(dim=-1, keepdim=True).clamp_min(1e-12)
+    normals = normals * normals[:, 2:].sign()
+    heights = (normals * three[:, 0]).sum(-1)
+    away = near @ normals.T - heights
+    on, below = (away.abs() < THICK).double().mean(0), (away < -2 * THICK).double().mean(0)
+    score = torch.where((normals[:, 2] > LEVEL) & (below < BELOW), on, 0.0)
+    best = int(score.argmax())
+    if score[best] < TABLE:
+        return None
+    some = near[away[:, best].abs() < THICK]
+    middle = some.mean(0)
+    normal = torch.linalg.svd(some - middle, full_matrices=False).Vh[2]
+    normal = normal * normal[2].sign()
+    return Table(normal.float(), float(normal @ middle))

@@ -1,0 +1,157 @@
+"""An object cut out of all its photographs at once, by its colours and by what one solid body can look like.
+
+After Campbell, Vogiatzis, Hernández and Cipolla 2010 ("Automatic object segmentation from calibrated images"): cameras
+that fixate on an object tell where it is; colours are learnt from there and from around; each photograph is cut; the
+cuts carve cells of space; what is left of these says where colours are learnt from next. Here cuts go through
+superpixels, and a table that sparse points show bounds the object from below.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from scipy import ndimage
+from torch import Tensor
+
+from ...errors import LumigraphError
+from .colours import Mixture
+from .cut import HOLD, cut
+from .region import CELLS, Region, find_region
+from .view import View
+
+SLACKS = (0.35, 0.3, 0.25, 0.2, 0.15, 0.15)  # share of the views that may see past a cell, round by round
+CORE = 0.35  # of the region's radius around its middle: where colours are first learnt, without sparse points
+SHADED, DARKEST = 0.25, 0.35  # share of surrounding colours that count as shaded too, and what shadows leave of light
+PRIOR = 2.5  # logarithm of likelihood by which a body speaks for the pixels that it covers
+SURE = 4.0  # the largest that colours alone may speak with
+FEWEST = 20  # cells that make a body
+DOUBTFUL = 0.75  # overlap of a cut with the body below which a photograph is named
+
+
+Patches = np.ndarray  # bool: which superpixels of one picture; each picture has a number of its own
+
+
+@dataclass(frozen=True)
+class Segmentation:
+    """What was found.
+
+    views:    the photographs, small
+    inside:   which superpixels of each belong to the object
+    body:     cells of space that the object fills
+    overlaps: intersection over union of each cut and the body as it is seen there
+    distinct: share of superpixels whose colour alone says on which side they are; 0.5 is as good as chance
+    """
+
+    views: list[View]
+    inside: list[Patches]
+    body: Float[Tensor, "cell 3"]
+    region: Region
+    overlaps: Float[np.ndarray, " view"]
+    distinct: float
+
+    @property
+    def doubtful(self) -> list[str]:
+        """Names of photographs whose outline does not agree with the others'."""
+        return [view.name for view, overlap in zip(self.views, self.overlaps, strict=True) if overlap < DOUBTFUL]
+
+
+def segment(
+    views: Sequence[View],
+    points: Float[Tensor, "point 3"] | None,
+    track: Callable[[Sequence[float], str, int], Iterable[float]],
+) -> Segmentation:
+    """Cut the object that the views look at out of all of them.
+
+    points: sparse points, in the scene's frame
+    Raises LumigraphError where no body agrees with the cuts.
+    """
+    region = find_region(views, points)
+    if len(region.cells) < FEWEST:
+        raise LumigraphError("The photographs do not look at one thing together, so there is no object to find")
+    allowed = [view.mean((view.shadow(region.cells, region.size) > 0.5).astype(float)) > 0.5 for view in views]
+    body = first_guess(region, points)
+    shares = [view.mean(view.shadow(body, region.size)) for view in views]
+    inside = [share > 0.5 for share in shares]
+    strength = 0.0  # at first the body is a guess, and only colours speak
+    for slack in track(SLACKS, "Cutting the object out", len(SLACKS)):
+        own, around = learn_colours(views, inside)
+        inside = []
+        for view, share, may in zip(views, shares, allowed, strict=True):
+            colour = around.log_likelihood(view.colours) - own.log_likelihood(view.colours)
+            costs = colour.clip(-SURE, SURE) - strength * (2 * share - 1)
+            inside.append(cut(view, np.where(may, costs, HOLD)))
+        body = carved(region, views, inside, slack)
+        shares = [view.mean(view.shadow(body, region.size)) for view in views]
+        strength = PRIOR
+    overlaps = np.array([overlap(view, a, b > 0.5) for view, a, b in zip(views, inside, shares, strict=True)])
+    return Segmentation(list(views), inside, body, region, overlaps, distinctness(views, inside, own, around))
+
+
+def distinctness(views: Sequence[View], inside: Sequence[Patches], own: Mixture, around: Mixture) -> float:
+    """The share of superpixels that colour alone puts on their side, the object's and the others counted alike."""
+    likely = [own.log_likelihood(view.colours) > around.log_likelihood(view.colours) for view in views]
+    told, true = np.concatenate(likely), np.concatenate(list(inside))
+    return 0.5 * float(told[true].mean() + (~told[~true]).mean())
+
+
+def first_guess(region: Region, points: Float[Tensor, "point 3"] | None) -> Float[Tensor, "cell 3"]:
+    """The cells near sparse points inside the region; those in the middle of it where there are none."""
+    if points is not None:
+        some = points[region.holds(points)]
+        if len(some) >= FEWEST:
+            middle = some.median(0).values
+            radius = (some - middle).norm(dim=-1).median()
+            return region.cells[(region.cells - middle).norm(dim=-1) <= 1.2 * radius]
+    middle = region.cells.mean(0)
+    away = (region.cells - middle).norm(dim=-1)
+    return region.cells[away <= CORE * away.max()]
+
+
+def learn_colours(views: Sequence[View], inside: Sequence[Patches]) -> tuple[Mixture, Mixture]:
+    """The colours of the object, and of what is around it: all that is not inside."""
+    own = np.concatenate([view.colours[i] for view, i in zip(views, inside, strict=True)])
+    around = np.concatenate([view.colours[~i] for view, i in zip(views, inside, strict=True)])
+    if min(len(own), len(around)) < FEWEST:
+        raise LumigraphError("No object stands out from what is around it; take photographs that show it whole")
+    return Mixture.of(own), Mixture.of(np.concatenate([around, shaded(around)]))
+
+
+def shaded(colours: Float[np.ndarray, "patch 3"]) -> Float[np.ndarray, "shaded 3"]:
+    """Some colours as they are in the object's own shadow, which is seen nowhere else.
+
+    Of CIELAB all three numbers shrink together when light does.
+    """
+    some = colours[:: round(1 / SHADED)]
+    return some * np.random.default_rng(0).uniform(DARKEST, 1, (len(some), 1))
+
+
+def carved(region: Region, views: Sequence[View], inside: Sequence[Patches], slack: float) -> Float[Tensor, "cell 3"]:
+    """The cells that all but a share of the pictures that hold them show inside the object; the largest piece."""
+    past, seen = np.zeros(len(region.cells)), np.zeros(len(region.cells))
+    for view, patches in zip(views, inside, strict=True):
+        places, pictured = view.at(region.cells)
+        hit = patches[view.patches[tuple(places.T)]]
+        seen += pictured
+        past += pictured & ~hit
+    keep = past <= slack * seen
+    grid = np.zeros((CELLS,) * 3, bool)
+    index = tuple(((region.cells.numpy() + 1) / region.size).astype(int).T)
+    grid[index] = keep
+    pieces, count = ndimage.label(grid)
+    if not count:
+        raise LumigraphError("No body looks like the outlines found, so no object can be told from the rest")
+    largest = 1 + int(np.argmax(np.bincount(pieces.ravel())[1:]))
+    body = region.cells[torch.from_numpy((pieces == largest)[index])]
+    if len(body) < FEWEST:
+        raise LumigraphError("No body looks like the outlines found, so no object can be told from the rest")
+    return body
+
+
+def overlap(view: View, a: Bool[np.ndarray, " patch"], b: Bool[np.ndarray, " patch"]) -> float:
+    """Intersection over union of two sets of superpixels, by pixels; 1 where both are empty."""
+    union = view.sizes[a | b].sum()
+    return float(view.sizes[a & b].sum() / union) if union else 1.0

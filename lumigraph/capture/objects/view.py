@@ -1,0 +1,96 @@
+"""One photograph as segmentation sees it: small, in patches of like colour."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from scipy import ndimage
+from skimage.color import rgb2lab
+from skimage.segmentation import slic
+
+from ...camera import Camera
+
+SIDE = 400  # pixels of the longer side
+PATCHES = 1500  # superpixels of a picture (SLIC, Achanta 2012)
+COMPACT = 8.0
+
+
+@dataclass
+class View:
+    """A small photograph.
+
+    lab:     colours in CIELAB
+    patches: the number of each pixel's superpixel
+    colours: mean colour of each superpixel
+    edges:   pairs of superpixels that touch
+    lengths: of each pair's common border, in pixels
+    """
+
+    name: str
+    camera: Camera
+    lab: Float[np.ndarray, "height width 3"]
+    patches: Int[np.ndarray, "height width"] = field(init=False)
+    colours: Float[np.ndarray, "patch 3"] = field(init=False)
+    sizes: Float[np.ndarray, " patch"] = field(init=False)
+    edges: Int[np.ndarray, "edge 2"] = field(init=False)
+    lengths: Float[np.ndarray, " edge"] = field(init=False)
+
+    def __post_init__(self) -> None:
+        # SLIC scales what it is given to [0, 1]; compactness is meant for CIELAB's own units.
+        compact = COMPACT / float(np.ptp(self.lab))
+        self.patches = slic(
+            self.lab, PATCHES, compact, max_num_iter=5, start_label=0, convert2lab=False, channel_axis=2
+        )
+        count = int(self.patches.max()) + 1
+        self.sizes = np.bincount(self.patches.ravel(), minlength=count).astype(np.float64)
+        self.colours = np.stack([self.mean(self.lab[..., k]) for k in range(3)], -1)
+        across = np.stack([self.patches[:, :-1].ravel(), self.patches[:, 1:].ravel()], -1)
+        down = np.stack([self.patches[:-1].ravel(), self.patches[1:].ravel()], -1)
+        pairs = np.sort(np.concatenate([across, down]), -1)
+        pairs = pairs[pairs[:, 0] != pairs[:, 1]]
+        self.edges, lengths = np.unique(pairs, axis=0, return_counts=True)
+        self.lengths = lengths.astype(np.float64)
+
+    @staticmethod
+    def of(name: str, camera: Camera, rgb: Float[torch.Tensor, "height width 3"]) -> View:
+        """A view of a photograph of any size."""
+        share = min(1.0, SIDE / max(rgb.shape[:2]))
+        small = camera.resized(share)
+        width, height = small.size[0].tolist()
+        shrunk = torch.nn.functional.interpolate(rgb.permute(2, 0, 1)[None].float(), (height, width), mode="area")[
+            0
+        ].permute(1, 2, 0)
+        return View(name, small, rgb2lab(shrunk.clamp(0, 1).numpy()))
+
+    def mean(self, values: Float[np.ndarray, "height width"]) -> Float[np.ndarray, " patch"]:
+        """The mean of pixels' values in each superpixel."""
+        return np.bincount(self.patches.ravel(), values.ravel(), len(self.sizes)) / self.sizes
+
+    def at(
+        self, points: Float[torch.Tensor, "point 3"]
+    ) -> tuple[Int[np.ndarray, "point 2"], Bool[np.ndarray, " point"]]:
+        """The (row, column) at which points are seen, clamped to the picture, and whether they are in it."""
+        pixels, valid = self.camera.project(points)
+        height, width = self.lab.shape[:2]
+        places = pixels.nan_to_num(-1, -1, -1).clamp(-1, 1e6).floor().long().numpy()[:, ::-1]
+        inside = valid.numpy() & (places >= 0).all(-1) & (places < (height, width)).all(-1)
+        return places.clip(0, (height - 1, width - 1)), inside
+
+    def shadow(self, points: Float[torch.Tensor, "point 3"], size: float) -> Float[np.ndarray, "height width"]:
+        """How much of each pixel cubes cover that are `size` large and stand at points: about 1 inside, 0 outside."""
+        places, inside = self.at(points)
+        hit = np.zeros(self.lab.shape[:2])
+        hit[tuple(places[inside].T)] = 1.0
+        radius = self.pixels(points, size)
+        grown = ndimage.maximum_filter(hit, size=2 * int(np.ceil(radius)) + 1)
+        closed = ndimage.minimum_filter(grown, size=2 * int(np.floor(0.5 * radius)) + 1)
+        return ndimage.gaussian_filter(closed, 0.5 * radius)
+
+    def pixels(self, points: Float[torch.Tensor, "point 3"], size: float) -> float:
+        """How large a length appears in the middle of points, in pixels."""
+        middle = points.mean(0)
+        ends, _ = self.camera.project(torch.stack([middle, middle + size * self.camera.pose[0, :, 0]]))
+        return max(1.0, float((ends[1] - ends[0]).norm()))

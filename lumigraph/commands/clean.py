@@ -1,0 +1,79 @@
+"""`lumigraph clean`: a cloud of Gaussians without floaters, or a part of it, kept."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+from tyro.conf import OmitArgPrefixes, Positional, arg
+
+from .common import choose_device, needed, option, show
+from .keeping import Keeping
+
+SIZE = 400  # pixels of the longer side of the pictures that compare
+
+
+@dataclass(frozen=True)
+class Clean:
+    """Remove floaters from a trained cloud of Gaussians, or all but a part of it, and keep the rest.
+
+    A run becomes a new run, which opens, renders and resumes, or a splat file, if --output ends like one. The source
+    stays as it is. Beside the result lies a picture: before, after, and what went. --no-clean with --box or --sphere
+    crops and leaves floaters.
+    """
+
+    source: Annotated[Positional[Path], needed("RUN_OR_FILE")]
+    """Folder of a run, a splat file, or a composition."""
+    output: Annotated[Path, arg(metavar="NEW", help_behavior_hint="")]
+    """New folder for a run, or new file: .ply, .compressed.ply, .spz, .splat."""
+    part: OmitArgPrefixes[Keeping] = Keeping(clean=True)
+    device: Annotated[str, option("NAME")] = "auto"
+    """Where the pictures are rendered: auto, cpu, cuda, cuda:1."""
+
+    def run(self) -> int:
+        from ..capabilities import HasGaussians, needs
+        from ..figures import save_picture
+        from ..gaussians.cleaning import gone
+        from ..run import open_any
+        from ..run.picking import check_output, save_picked
+
+        self.part.check()
+        opened, device = open_any(self.source), choose_device(self.device)
+        check_output(opened, self.output)
+        gaussians = needs(opened.method(device), HasGaussians).gaussians()
+        reasons = self.part.unwanted(gaussians, self.part.crop(opened.frame))
+        which = gone(reasons)
+        counts = {reason: count for reason, some in reasons.items() if (count := int(some.sum()))}
+        save_picked(opened, ~which.cpu(), self.output, {"removed": counts})
+        picture = (
+            self.output / "clean.png" if self.output.is_dir() else self.output.with_name(f"{self.output.name}.png")
+        )
+        save_picture(picture, before_and_after(opened, gaussians, which))
+        show(
+            {"Gaussians": f"{int((~which).sum()):,} of {len(gaussians):,} stay"}
+            | {reason: f"{count:,} went" for reason, count in counts.items()}
+            | {"saved": str(self.output), "picture": str(picture), "next": f"lumigraph view {self.output}"}
+        )
+        return 0
+
+
+def before_and_after(opened: Any, gaussians: Any, gone: Any) -> Any:
+    """A sheet of some views: all Gaussians, those that stay, those that went. Some from afar, where floaters show."""
+    from ..camera import ring
+    from ..choice import evenly
+    from ..composition import PickedCloud
+    from ..figures import Row, contact_sheet
+    from ..progress import track
+
+    clouds = [PickedCloud(opened.frame, some) for some in (gaussians, gaussians[~gone], gaussians[gone])]
+    around = ring(opened.frame.bounds, size=SIZE)
+    views = [around[i] for i in evenly(range(len(around)), 3)[:2]]
+    if opened.photographed:
+        own = opened.cameras()["train"]
+        views = [own[i] for i in evenly(range(len(own)), 3)[1:]] + views
+    rows = [
+        Row("", [cloud.render(camera.resized(min(1.0, SIZE / int(camera.size.max())))).rgb for cloud in clouds])
+        for camera in track(views, "Drawing before and after", len(views))
+    ]
+    return contact_sheet(opened.title, ("before", "after", "what went"), rows, SIZE)

@@ -1,0 +1,107 @@
+"""`--box`, `--sphere`, `--clean` and what goes with them: how much of a trained scene is wanted."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Annotated, Any, Literal
+
+from tyro.conf import arg
+
+from ..errors import LumigraphError
+from .common import option
+
+Six = tuple[float, float, float, float, float, float]
+Four = tuple[float, float, float, float]
+
+
+@dataclass(frozen=True)
+class Keeping:
+    """Which part of the scene is wanted, and which Gaussians are not: crop and floaters."""
+
+    box: Annotated[Six | None, arg(metavar="X0 Y0 Z0 X1 Y1 Z1", help_behavior_hint="(default: everything)")] = None
+    """Crop: only what lies between two corners."""
+    sphere: Annotated[Four | None, arg(metavar="X Y Z RADIUS", help_behavior_hint="(default: everything)")] = None
+    """Crop: only what lies inside a sphere."""
+    units: Literal["scene", "source"] = "scene"
+    """The frame of --box and --sphere: the scene's, in which `lumigraph info` tells bounds and the viewer crops, or
+    that of the photographs, in which exports lie."""
+    clean: bool = False
+    """Leave out floaters, where the scene is Gaussians: faint, huge or isolated ones, as much as is safe for most."""
+    min_opacity: Annotated[float | None, option("SHARE", "0, with --clean 0.02")] = None
+    """Leave out Gaussians that are fainter."""
+    max_scale: Annotated[float | None, option("SHARE", "any, with --clean 1")] = None
+    """Leave out Gaussians whose standard deviation is larger, in extents of the cloud."""
+    isolation: Annotated[float | None, option("DEVIATIONS", "any, with --clean 3")] = None
+    """Leave out Gaussians that are farther from their neighbours than most, by so many standard deviations."""
+
+    @property
+    def crops(self) -> bool:
+        return self.box is not None or self.sphere is not None
+
+    @property
+    def floaters(self) -> Mapping[str, float]:
+        """What `cleaned` is told of floaters: the numbers that were given, with --clean the defaults of the rest."""
+        from ..gaussians.cleaning import ISOLATION, MAX_SCALE, MIN_OPACITY
+
+        usual = {"min_opacity": MIN_OPACITY, "max_scale": MAX_SCALE, "isolation": ISOLATION}
+        given = {name: value for name in usual if (value := getattr(self, name)) is not None}
+        return usual | given if self.clean else given
+
+    def check(self) -> None:
+        """Raises LumigraphError for what holds nothing or makes no sense, before anything is opened."""
+        if self.box is not None and self.sphere is not None:
+            raise LumigraphError("--box and --sphere are two ways to crop; give one of them")
+        if self.box is not None and not all(a < b for a, b in zip(self.box[:3], self.box[3:], strict=True)):
+            raise LumigraphError("The box holds nothing; give --box its lower corner first, then its upper one")
+        if self.sphere is not None and not 0 < self.sphere[3] < float("inf"):
+            raise LumigraphError(f"A sphere of radius {self.sphere[3]:g} holds nothing; give it one above 0")
+        if self.min_opacity is not None and not 0 <= self.min_opacity <= 1:
+            raise LumigraphError(f"No opacity is {self.min_opacity:g}; give --min-opacity a number from 0 to 1")
+        if self.max_scale is not None and not self.max_scale > 0:
+            raise LumigraphError(f"No Gaussian is smaller than {self.max_scale:g}; give --max-scale a number above 0")
+
+    def crop(self, frame: Any) -> Any:
+        """The Crop, in the scene's frame; None where there is none."""
+        from ..crop import Box, Crop, Sphere
+
+        crop: Crop
+        if self.box is not None:
+            crop = Box(self.box[:3], self.box[3:])
+        elif self.sphere is not None:
+            crop = Sphere(self.sphere[:3], self.sphere[3])
+        else:
+            return None
+        return crop if self.units == "scene" else crop.moved(frame.to_source.inverse)
+
+    def unwanted(self, gaussians: Any, crop: Any) -> Any:
+        """Which Gaussians are not wanted, by the reason. Raises LumigraphError if that is all of them."""
+        from ..gaussians.cleaning import gone, unwanted
+
+        reasons = unwanted(gaussians, crop, **self.floaters)
+        if len(gaussians) and gone(reasons).all():
+            raise LumigraphError(
+                "No Gaussian is left; give --box or --sphere where the scene is (`lumigraph info` tells its bounds), "
+                "or clean less"
+            )
+        return reasons
+
+    def of_gaussians(self, gaussians: Any, crop: Any) -> Any:
+        """The Gaussians that are wanted. Raises LumigraphError if that is none."""
+        from ..gaussians.cleaning import gone
+
+        return gaussians[~gone(self.unwanted(gaussians, crop))]
+
+    def of_method(self, method: Any) -> Any:
+        """The part of a method that is wanted, ready to render. Raises LumigraphError where it can have no floaters."""
+        from ..capabilities import HasGaussians, can, needs
+        from ..composition import PickedCloud, cropped
+
+        crop = self.crop(method.frame)
+        if self.floaters or (crop is not None and can(method, HasGaussians)):
+            return PickedCloud(method.frame, self.of_gaussians(needs(method, HasGaussians).gaussians(), crop))
+        return method if crop is None else cropped(method, crop)
+
+    def without_floaters(self, method: Any) -> Any:
+        """All of a method but its floaters, for what crops by itself."""
+        return replace(self, box=None, sphere=None).of_method(method)

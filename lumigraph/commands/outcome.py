@@ -1,0 +1,99 @@
+"""What `train` and `resume` say at the end: what became of the training, what would help, and what to do next."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+from ..budget import Budget
+from ..method import Method, RayMethod
+from ..quality import QUALITIES
+from .common import say, show, typed
+
+TOTALS = (10.0, 30.0, 60.0, 180.0, 600.0, 1800.0, 3600.0, 7200.0)  # seconds that are suggested
+MORE = 2.5  # times the budget so far that a suggestion has at least
+NEXT = {
+    "eval": "compare with what it has not seen",
+    "view": "look at it in the browser",
+    "export": "make a page to share",
+}
+
+
+def tell_outcome(run: Any, outcome: Any, method: Method, data: Any) -> None:
+    """Where a Run is after an Outcome, and how to go on."""
+    from ..verdict import last_psnr, loss_trend
+
+    state, budget = outcome.state, Budget.from_json(run.settings.budget)
+    besides = f"{state.compile_seconds:.1f} s compiling, {outcome.saving_seconds:.1f} s saving"
+    rows = {"run": str(run.folder), "training": f"{state.step} steps in {state.seconds:.1f} s (besides: {besides})"}
+    by_photograph = not isinstance(method, RayMethod)
+    if state.passes:
+        rows["seen"] = seen(state.passes, "photograph" if by_photograph else "pixel")
+    if not outcome.finished:
+        say(f"Stopped and saved after step {state.step}; go on with: {typed('resume', run.folder)}")
+        show(rows)
+        return
+    metrics = run.metrics()
+    trend, psnr = loss_trend(metrics, by_photograph), last_psnr(metrics)
+    if psnr is not None:
+        rows["PSNR of training photographs"] = f"{psnr:.2f} dB"
+    if trend:
+        how = f"fell by {100 * trend.fall:.0f} %" if trend.falling else "did not fall any more"
+        rows["loss"] = f"{how} over the second half of training"
+    enough = state.step >= method.steps_for("draft", data)
+    more = more_time(run.folder, budget) if enough else typed("resume", run.folder, "--quality", "draft")
+    rows["advice"] = advice(trend, enough, more, photographed(run, data))
+    show(rows | next_commands(run))
+
+
+def seen(passes: float, what: str) -> str:
+    """How often each photograph or pixel was learnt from, on average."""
+    if passes >= 1:
+        return f"each {what} {passes:.{0 if passes >= 10 else 1}f} times"
+    return f"one {what} in {1 / passes:.{0 if passes < 0.1 else 1}f}"
+
+
+def advice(trend: Any, enough: bool, more: str, photographed: bool) -> str:
+    """What would help most, in one sentence.
+
+    trend:  of the loss, see `verdict.loss_trend`
+    enough: whether there were as many steps as a draft has
+    more:   the command that trains for longer
+    photographed: whether photographs could be added
+    """
+    if trend and trend.falling:
+        return f"it was still getting better, so more time will help: {more}"
+    if not enough:
+        return f"it has had fewer steps than a draft needs, so more time will help: {more}"
+    if trend is None:
+        return f"whether more time would help cannot be told; to try: {more}"
+    return "it has settled; " + (
+        "more photographs would help more than time" if photographed else "time changes little"
+    )
+
+
+def photographed(run: Any, data: Any) -> bool:
+    """Whether a run learnt from photographs of a place, to which some could be added."""
+    return run.photographed and len(data.splits["train"]) > 1 and not data.source.startswith("procedural:")
+
+
+def more_time(folder: Any, budget: Budget) -> str:
+    """The command that goes on with a finished run, by the next larger budget of its kind."""
+    longer: list[str]
+    if budget.quality in QUALITIES[:-1]:
+        longer = ["--quality", QUALITIES[QUALITIES.index(budget.quality) + 1]]
+    elif budget.steps is not None:
+        digits = 10 ** (int(math.log10(3 * budget.steps)) - 1) if budget.steps > 3 else 1
+        longer = ["--steps", str(math.ceil(3 * budget.steps / digits) * digits)]
+    else:
+        fitting = [total for total in TOTALS if total >= MORE * budget.total]
+        longer = ["--seconds", f"{fitting[0] if fitting else 2 * budget.total:g}"]
+    return typed("resume", folder, *longer)
+
+
+def next_commands(run: Any, *but: str) -> dict[str, str]:
+    """What to type next, with the run's own path. but: commands to leave out."""
+    page = run.folder / f"{run.title}.html"
+    commands = {"eval": typed("eval", run.folder), "view": typed("view", run.folder)}
+    commands["export"] = typed("export", "web", run.folder, page)
+    return {NEXT[name]: command for name, command in commands.items() if name not in but}

@@ -1,0 +1,98 @@
+"""One at a time: who works in a folder holds a lock on it, which the system drops when the process ends, even killed.
+
+So a lock that a killed process has left behind is no lock, and nobody has to delete it.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import json
+import os
+import socket
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, TextIO
+
+from .errors import LumigraphError
+from .files import explained
+
+NAME = "lock.json"  # in the folder: who holds it, for people; what counts is the system's lock on this file
+FAR = 1 << 30  # byte that Windows locks, for it lets nobody read what is locked
+
+_ours: set[Path] = set()  # held by this process
+
+
+@contextlib.contextmanager
+def held(folder: Path, doing: str) -> Iterator[None]:
+    """Hold an existing folder inside this block; a process that holds it already goes on holding it.
+
+    doing: what is done with the folder meanwhile, as in "trained"
+    Raises LumigraphError, which says who it is, if another process holds it.
+    """
+    place = folder.resolve() / NAME
+    if place in _ours:
+        yield
+        return
+    with explained(place):
+        file = taken(place)
+    if file is None:
+        raise LumigraphError(f"{folder} is being {doing} by {holder(place)}; wait until that ends, or end it")
+    _ours.add(place)
+    try:
+        yield
+    finally:
+        _ours.discard(place)
+        with contextlib.suppress(OSError):  # Windows deletes no open file; then it stays, and means nothing
+            place.unlink()
+        file.close()
+
+
+def taken(place: Path) -> TextIO | None:
+    """The lock's file, open and locked; None if somebody else has it."""
+    while True:
+        file = open(place, "a+", encoding="utf-8")
+        if not lock(file):
+            file.close()
+            return None
+        if os.name == "nt" or is_still(place, file):
+            file.truncate(0)
+            json.dump({"process": os.getpid(), "host": socket.gethostname(), "since": time.strftime("%F %T")}, file)
+            file.flush()
+            return file
+        file.close()  # whoever had it deleted it just now: the next one will be another file
+
+
+def is_still(place: Path, file: TextIO) -> bool:
+    try:
+        return os.path.samestat(os.stat(place), os.fstat(file.fileno()))
+    except FileNotFoundError:
+        return False
+
+
+def lock(file: TextIO) -> bool:
+    """Whether an open file could be locked. Where the file system knows no locks, it could."""
+    try:
+        if sys.platform == "win32":
+            import msvcrt
+
+            file.seek(FAR)
+            msvcrt.locking(file.fileno(), msvcrt.LK_NBLCK, 1)
+        else:
+            import fcntl
+
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError as fault:
+        return fault.errno in (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP)
+    return True
+
+
+def holder(place: Path) -> str:
+    """Who holds a lock, in words."""
+    try:
+        said: Any = json.loads(place.read_text("utf-8"))
+        return f"process {said['process']} on {said['host']} since {said['since']}"
+    except (OSError, ValueError, LookupError, TypeError):  # it is being written just now
+        return "another process"

@@ -1,0 +1,33 @@
+"""Processes that do not outlive the one that started them."""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Sequence
+from typing import Any
+
+ON_PARENTS_DEATH = 1  # Linux's PR_SET_PDEATHSIG
+
+
+def start(command: Sequence[str], ends_by: int = signal.SIGTERM, **options: Any) -> subprocess.Popen[Any]:
+    """subprocess.Popen of a command that is sent a signal when this process ends, even where that was killed.
+
+    Linux alone can promise that; elsewhere a child should watch its standard input, which ends at the same moment.
+    """
+    return subprocess.Popen(command, preexec_fn=tied(ends_by) if sys.platform == "linux" else None, **options)
+
+
+def tied(number: int) -> Any:
+    """What the child does between fork and exec, where it must not load anything."""
+    prctl, parent = ctypes.CDLL(None).prctl, os.getpid()
+
+    def tie() -> None:
+        prctl(ON_PARENTS_DEATH, number)
+        if os.getppid() != parent:  # it died just before
+            os._exit(1)
+
+    return tie

@@ -1,0 +1,206 @@
+"""Cropping and cleaning: what a box and a sphere hold, which Gaussians go, and what is kept of a run."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import plyfile
+import pytest
+import tiny
+import torch
+from balls import RED, WHITE, Dense, Splatted, eye
+from test_gaussian_splatting import new
+
+from lumigraph import cli
+from lumigraph.composition import PickedCloud, cropped
+from lumigraph.crop import Box, Crop, Sphere
+from lumigraph.exchange import read_gaussians, write_gaussians
+from lumigraph.gaussians import Gaussians
+from lumigraph.gaussians.cleaning import cleaned, extent, unwanted
+from lumigraph.geometry import Similarity, to_matrix
+from lumigraph.rays import Rays
+from lumigraph.run import Run, open_any
+from lumigraph.train import fit
+
+CROPS: dict[str, Crop] = {
+    "box": Box((-0.3, -0.5, -0.2), (0.4, 0.1, 0.6)),
+    "sphere": Sphere((0.1, -0.2, 0.3), 0.45),
+}
+
+
+def place() -> Similarity:
+    rotation = to_matrix(torch.tensor([[0.8, 0.3, -0.4, 0.2]], dtype=torch.float64))[0]
+    return Similarity.make(1.7, rotation, torch.tensor([0.3, -0.2, 0.5]))
+
+
+@pytest.mark.parametrize("kind", CROPS)
+def test_a_crop_is_the_same_part_of_space_in_every_frame(kind, generator):
+    crop, points = CROPS[kind], 2 * torch.rand(4000, 3, generator=generator) - 1
+    inside = crop.holds(points)
+    assert 0.02 < inside.float().mean() < 0.3
+    moved = crop.moved(place())
+    assert torch.equal(moved.holds(place().points(points.double())), inside)
+    low, high = torch.tensor(moved.bounds)
+    there = place().points(points)[inside]
+    assert (there >= low - 1e-6).all() and (there <= high + 1e-6).all()
+    assert (there.amin(0) - low).max() < 0.3 and (high - there.amax(0)).max() < 0.3
+    assert moved.moved(place().inverse).holds(points).ne(inside).sum() <= 1
+
+
+@pytest.mark.parametrize("kind", CROPS)
+def test_rays_are_inside_between_where_they_enter_and_leave(kind, generator):
+    crop = CROPS[kind].moved(place())
+    origins = 3 * torch.randn(300, 3, generator=generator)
+    directions = torch.nn.functional.normalize(torch.randn(300, 3, generator=generator) - origins, dim=-1)
+    rays = Rays(origins, directions, torch.zeros(300))
+    enter, leave = crop.through(rays)
+    t = torch.linspace(-2, 12, 400)
+    within = crop.holds(origins[:, None] + t[:, None] * directions[:, None])
+    expected = (t > enter[:, None]) & (t < leave[:, None])
+    at_edge = ((t - enter[:, None]).abs() < 1e-4) | ((t - leave[:, None]).abs() < 1e-4)
+    assert 40 < (enter < leave).sum() < 290
+    assert torch.equal(within | at_edge, expected | at_edge)
+    begin, hits = crop.entered(rays)
+    assert torch.equal(hits, enter.clamp_min(0) < leave) and (begin >= 0).all()
+
+
+@pytest.mark.parametrize("method", [Dense(RED), Splatted(RED)], ids=["ray", "cloud"])
+def test_a_cropped_method_shows_what_lies_inside(method):
+    half = cropped(method, Box((-1.0, 0.0, -1.0), (1.0, 1.0, 1.0)))
+    camera = eye((-3.0, 0, 0))
+    whole, seen = method.render(camera).opacity, half.render(camera).opacity
+    y = camera.rays(camera.pixels()).at(torch.full((whole.numel(),), 3.0))[:, 1].view_as(whole)
+    assert (seen - whole)[y > 0.1].abs().max() < 0.05
+    assert seen[y < -0.1].max() < 0.05 < 0.9 < whole[y < -0.1].max()
+
+
+def soiled() -> tuple[Gaussians, dict[str, slice]]:
+    """A shell of 1500 Gaussians, and after them ten of each kind that nobody wants."""
+    shell, chance = Splatted(RED).cloud, torch.Generator().manual_seed(1)
+    away = torch.nn.functional.normalize(torch.randn(30, 3, generator=chance), dim=-1)
+    bad = replace(
+        shell[:30],
+        means=torch.cat([0.5 * away[:20], 1.5 * away[20:]]),
+        opacities=torch.cat([torch.full((10,), -6.0), torch.full((20,), 5.0)]),
+        log_scales=torch.cat([torch.full((10, 3), 0.025), torch.full((10, 3), 3.0), torch.full((10, 3), 0.025)]).log(),
+    )
+    tensors = ("means", "quaternions", "log_scales", "opacities", "harmonics")
+    both = {name: torch.cat([getattr(shell, name), getattr(bad, name)]) for name in tensors}
+    kinds = {"too faint": slice(1500, 1510), "too large": slice(1510, 1520), "isolated": slice(1520, 1530)}
+    return Gaussians(**both), kinds
+
+
+@pytest.mark.parametrize("unit", [1.0, 700.0])
+def test_floaters_go_each_for_its_reason_in_any_unit(unit):
+    cloud, kinds = soiled()
+    cloud = cloud.transformed(Similarity.make(unit).matrix)
+    assert extent(cloud) == pytest.approx(unit, rel=0.15)  # of a ball of radius 0.5
+    reasons = unwanted(cloud, min_opacity=0.02, max_scale=1.0, isolation=4.0)
+    for reason, some in kinds.items():
+        expected = torch.zeros(len(cloud), dtype=torch.bool)
+        expected[some] = True
+        assert torch.equal(reasons[reason], expected), reason
+    assert not reasons["outside the crop"].any()
+    assert torch.equal(cleaned(cloud, None, 0.02, 1.0, 4.0).means, cloud.means[:1500])
+    assert len(cleaned(cloud)) == len(cloud)
+
+
+def test_one_that_goes_for_two_reasons_counts_once():
+    cloud, _ = soiled()
+    reasons = unwanted(cloud, Sphere((0.0, 0.0, 0.0), 1.0), 0.02, 1.0, 4.0)
+    assert [int(which.sum()) for which in reasons.values()] == [10, 10, 10, 0]
+
+
+@pytest.fixture(scope="module")
+def cloud_run(tmp_path_factory) -> Run:
+    """Gaussians that have learnt the tiny scene for some steps of sixty."""
+    method, run = new(tmp_path_factory.mktemp("runs") / "cloud")
+    fit(method, tiny.scene(), run, steps=60, pause_at=40, show=False, rehearsal=False)
+    return run
+
+
+def test_a_cleaned_run_opens_renders_and_goes_on(cloud_run, tmp_path, capsys):
+    before = sorted(path.read_bytes() for path in cloud_run.folder.rglob("*") if path.is_file())
+    said = ["clean", str(cloud_run.folder), "--box", *"-1 -1 -1 1 1 0".split(), "--output", str(tmp_path / "half")]
+    assert cli.main([*said, "--device", "cpu"]) == 0
+    told = capsys.readouterr().out
+    run = open_any(tmp_path / "half")
+    whole, half = cloud_run.method().gaussians(), run.method().gaussians()
+    assert 0 < len(half) < len(whole) and half.means[:, 2].max() <= 0
+    assert f"{len(half):,} of {len(whole):,} stay" in told and "outside the crop" in told
+    assert (tmp_path / "half" / "clean.png").stat().st_size > 1000
+    assert json.loads((tmp_path / "half" / "config.json").read_text())["cleaned"]["removed"]["outside the crop"] > 0
+    method = run.new_method()
+    outcome = fit(method, tiny.scene(), run, steps=60, show=False, rehearsal=False)
+    assert outcome.finished and outcome.state.step == 60 and run.state.step == 60
+    assert sorted(path.read_bytes() for path in cloud_run.folder.rglob("*") if path.is_file()) == before
+    assert cli.main([*said]) == 2  # not over what is there
+    assert "already holds a run" in capsys.readouterr().err
+
+
+def test_the_moments_of_those_left_stay_with_them(cloud_run):
+    method, generator = cloud_run.method(), torch.Generator()
+    (optimizer,) = method.optimizers()
+    cloud_run.restore_training([optimizer], generator)
+    moments = optimizer.state[method.cloud.means]["mean"].clone()
+    assert moments.abs().max() > 0
+    keep = torch.rand(len(method.cloud), generator=generator) < 0.5
+    method.prune(keep)
+    assert torch.equal(optimizer.state[method.cloud.means]["mean"], moments[keep])
+    assert len(method.density_control.pulls) == int(keep.sum()) == len(method.gaussians())
+
+
+def test_exports_of_a_part_hold_as_many_as_another_reader_counts(cloud_run, tmp_path, capsys):
+    frame, cloud = cloud_run.frame, cloud_run.method().gaussians()
+    corners = torch.tensor([[-1.0, -1, -1], [1, 1, 0]])
+    source = frame.to_source.points(corners)
+    low, high = source.amin(0), source.amax(0)
+    numbers = [str(x) for x in torch.cat([low, high]).tolist()]
+    folder = str(cloud_run.folder)
+    assert cli.main(["export", "splats", folder, str(tmp_path / "a.ply"), "--box", *"-1 -1 -1 1 1 0".split()]) == 0
+    assert cli.main(["export", "splats", folder, str(tmp_path / "b.ply"), "--units", "source", "--box", *numbers]) == 0
+    expected = int(Box((-1.0, -1.0, -1.0), (1.0, 1.0, 0.0)).holds(cloud.means).sum())
+    for name in ("a.ply", "b.ply"):
+        assert plyfile.PlyData.read(tmp_path / name)["vertex"].count == expected
+    assert cli.main(["clean", str(tmp_path / "a.ply"), "--sphere", *"0 0 0 0.8".split(), "--units", "source",
+                     "--no-clean", "--output", str(tmp_path / "c.ply")]) == 0  # fmt: skip
+    there = plyfile.PlyData.read(tmp_path / "c.ply")["vertex"]
+    positions = np.stack([there[k] for k in "xyz"], -1)
+    assert 0 < len(positions) < expected and np.linalg.norm(positions, axis=-1).max() <= 0.8
+    assert len(read_gaussians(tmp_path / "c.ply")) == len(positions)
+    assert f"{len(positions):,} of {expected:,} stay" in capsys.readouterr().out
+
+
+REFUSED = {
+    "no Gaussians": (["RAYS", "--output", "OUT"], "holds no Gaussians"),
+    "a file to a run": (["FILE", "--output", "OUT"], "is no run"),
+    "nothing left": (["FILE", "--sphere", "90", "0", "0", "1", "--output", "OUT.ply"], "No Gaussian is left"),
+    "its own source": (["FILE", "--output", "FILE"], "is there already"),
+    "two crops": (["FILE", "--sphere", *"0 0 0 1".split(), "--box", *"0 0 0 1 1 1".split(), "--output", "OUT.ply"],
+                  "two ways to crop"),
+    "an empty box": (["FILE", "--box", *"0 0 0 1 1 -1".split(), "--output", "OUT.ply"], "holds nothing"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", REFUSED)
+def test_what_cannot_be_cleaned_is_refused_in_a_sentence(case, ball_run, tmp_path, capsys):
+    write_gaussians(tmp_path / "ball.ply", Splatted(RED).cloud)
+    places = {
+        "RAYS": ball_run.folder,
+        "FILE": tmp_path / "ball.ply",
+        "OUT": tmp_path / "new",
+        "OUT.ply": tmp_path / "new.ply",
+    }
+    arguments, sentence = REFUSED[case]
+    assert cli.main(["clean", *(str(places.get(x, x)) for x in arguments)]) == 2
+    said = capsys.readouterr().err
+    assert sentence in said and said.count("\n") == 1
+    assert not (tmp_path / "new").exists() and not (tmp_path / "new.ply").exists()
+
+
+def test_picked_gaussians_look_as_they_did():
+    method, camera = Splatted(RED), eye((-3.0, 0, 0))
+    seen = PickedCloud(WHITE, method.cloud).render(camera)
+    assert torch.equal(seen.rgb, method.render(camera).rgb)
