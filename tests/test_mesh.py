@@ -18,7 +18,7 @@ from solids import SOLID, Seen, Solid, around, ball, painted, shell, together, t
 
 from lumigraph.camera import Camera
 from lumigraph.cli import main
-from lumigraph.crop import Box
+from lumigraph.crop import Box, Sphere
 from lumigraph.errors import LumigraphError
 from lumigraph.exchange import write_gaussians
 from lumigraph.export.mesh import extract_mesh, meshed_box
@@ -124,11 +124,22 @@ def test_a_surface_that_leaves_the_box_is_closed_there_or_open():
     assert all(abs(x.vertices[:, 2].min() + 0.3) < 1.5 * CELL for x in (closed, cut))
 
 
+@pytest.mark.parametrize("kind", [Solid, Seen], ids=["density", "depth"])
+def test_a_crop_is_all_that_is_meshed(kind):
+    crop = Sphere((0.5, 0.0, 0.0), 0.4)
+    mesh = as_trimesh(extract_mesh(kind(ball()), around(), cell=CELL, crop=crop, smooth=0))
+    away = np.linalg.norm(mesh.vertices - crop.middle, axis=-1)
+    assert mesh.is_watertight and away.max() < 0.4 + CELL
+    assert np.linalg.norm(mesh.vertices[away < 0.35], axis=-1) == pytest.approx(0.6, abs=CELL)
+    with pytest.raises(LumigraphError, match="outside the scene"):
+        extract_mesh(kind(ball()), around(), cell=CELL, crop=Sphere((9.0, 0.0, 0.0), 0.4))
+
+
 def test_the_box_may_be_larger_or_smaller_and_grows_in_the_open():
     frame = Frame(bounds=((-0.4,) * 3, (0.4,) * 3), near=0.1, reach=4.0)
-    assert meshed_box(frame, None) == Box((pytest.approx(-0.6),) * 3, (pytest.approx(0.6),) * 3)
+    assert meshed_box(frame, None).upper == pytest.approx((0.6,) * 3)
     assert meshed_box(frame, 100.0) == Box((-4.0,) * 3, (4.0,) * 3)
-    assert meshed_box(replace(frame, reach=1.0), None).upper == (pytest.approx(0.4),) * 3
+    assert meshed_box(replace(frame, reach=1.0), None).upper == pytest.approx((0.4,) * 3)
     mesh = extract_mesh(Seen(ball(), frame), around(), cell=CELL, extent=2.0)
     assert as_trimesh(mesh).is_watertight and as_trimesh(mesh).extents.min() > 1.1
 
