@@ -133,7 +133,7 @@ class GaussianSplatting(Method):
 
     @classmethod
     def preset(cls, device: torch.device) -> Any:
-        """On a GPU the paper's numbers; on a CPU a smaller cloud that begins dense, which learns more in the same time."""
+        """On a GPU the paper's numbers; on a CPU a smaller cloud that begins dense: it learns more in the time."""
         if device.type == "cuda":
             return Config()
         return Config(
