@@ -5,6 +5,8 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING, Any
 
+from . import threads
+
 if TYPE_CHECKING:
     from .camera import Camera as Camera
     from .capture import open_dataset as open_dataset
@@ -28,6 +30,9 @@ if TYPE_CHECKING:
     from .volume import composite as composite
 
 __version__ = "0.1.0"
+
+threads.settle()  # before anything below loads PyTorch
+threads.share_one_pool()
 
 _homes = {
     "Camera": "camera",

@@ -1,13 +1,17 @@
 """`python -m lumigraph` is `lumigraph`."""
 
+from .signals import exit_code, listening, number_of
+
 
 def main() -> int:
-    """Run a command. Returns the exit code; Ctrl-C is heard from the first moment on."""
+    """Run a command. Returns the exit code; signals are heard from the first moment on."""
     try:
-        from .cli import main as run
-    except KeyboardInterrupt:
-        return 130
-    return run()
+        with listening():
+            from .cli import main as run
+
+            return run()
+    except KeyboardInterrupt as stopped:
+        return exit_code(number_of(stopped))
 
 
 if __name__ == "__main__":

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from typing import Any
 
-import numba
 import torch
 from jaxtyping import Int
 from torch import Tensor
 
+from . import threads
 from .budget import Budget, lasting
 from .capabilities import HasGaussians, can
 from .dataset import Dataset
@@ -45,8 +45,7 @@ def machine(device: torch.device) -> str:
     """A device; on a CPU how many threads compute."""
     if device.type == "cuda":
         return f"on {torch.cuda.get_device_name(device)} ({device})"
-    threads = max(torch.get_num_threads(), numba.get_num_threads())
-    return f"on the CPU with {threads} thread{'' if threads == 1 else 's'}"
+    return f"on the CPU with {threads.told()}"
 
 
 def how_long(budget: Budget, step: int, seconds: float) -> str:

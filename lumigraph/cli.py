@@ -20,7 +20,7 @@ from . import __version__, methods
 from .commands.bench import Bench
 from .commands.capture import CaptureCommand
 from .commands.clean import Clean
-from .commands.common import exit_code, say
+from .commands.common import say
 from .commands.compose import Compose
 from .commands.demo import Demo
 from .commands.eval import Eval
@@ -35,7 +35,8 @@ from .commands.train import Train, with_options_of
 from .commands.view import ViewCommand
 from .errors import LumigraphError, LumigraphWarning
 from .files import refusal
-from .signals import listening, number_of
+from .signals import exit_code, listening, number_of
+from .threads import considerate
 
 COMMANDS: dict[str, type] = {
     "demo": Demo,
@@ -69,7 +70,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"lumigraph {__version__}")
         return 0
     try:
-        with listening(), told_warnings():
+        with listening(), told_warnings(), considerate():
             return parse(arguments).run()
     except LumigraphError as error:
         return refuse(str(error))

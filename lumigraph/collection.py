@@ -13,6 +13,7 @@ from torch import Tensor
 
 from .camera import Camera
 from .dataset import Dataset, splits_of
+from .names import natural
 from .scene import Frame
 
 
@@ -36,7 +37,7 @@ class Collection:
     @staticmethod
     def of(members: Mapping[str, Dataset | Callable[[], Dataset]], source: str = "") -> Collection:
         """Of datasets, or of what opens them, by name; every 8th is held out, the first one among them."""
-        names = sorted(members)
+        names = sorted(members, key=natural)
         ready = {name: x for name, x in members.items() if isinstance(x, Dataset)}
         openers = {name: opener_of(members[name]) for name in names}
         return Collection(openers, splits_of(len(names)), source, ready)

@@ -5,7 +5,8 @@ from __future__ import annotations
 import math
 import sys
 import time
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from typing import Any
 
 from rich.console import RenderableType
@@ -23,7 +24,7 @@ REFRESH = 0.5  # seconds between looks at a bar
 FIRST = 3.0  # seconds to the first line with a time left
 LINES = 10.0, 60.0  # seconds between lines where there is no terminal: at least, and later at most
 SHARE = 0.1  # of the time so far that passes between lines, within these limits
-MEMORY = 0.8  # share of the smoothed error that one look keeps
+MEMORY = 0.8  # share of the smoothed PSNR that another value leaves
 TOLD_OTHERWISE = {"mse", "rays", "samples", "visible_samples"}  # statistics, as PSNR and by the second
 NAMES = {"gaussians": "Gaussians"}  # of statistics, for people
 
@@ -50,13 +51,13 @@ class TrainingDisplay:
         self.show, self.terminal = show, is_live()
         columns = (
             SpinnerColumn(),
-            TextColumn("[bold]{task.description}"),
+            TextColumn("{task.description}", "bold", markup=False),
             BarColumn(24),
-            TextColumn("{task.fields[told]}"),
+            TextColumn("{task.fields[told]}", markup=False),
         )
         self.bar = Bar(*columns, console=self.console, refresh_per_second=1 / REFRESH)
         self.task = self.bar.add_task("Starting", total=1.0, told="")
-        self.error: float | None = None  # smoothed squared error
+        self.psnr: float | None = None  # smoothed
         self._begun: tuple[int, float] | None = None  # step and seconds at which this sitting began
         self._seen: tuple[int, float] | None = None  # step and seconds at the last look
         self._count = 0  # of what was learnt from, since then
@@ -76,6 +77,18 @@ class TrainingDisplay:
     def __exit__(self, *fault: object) -> None:
         if self._live:
             self.bar.stop()
+
+    @contextmanager
+    def aside(self) -> Iterator[None]:
+        """Inside this block the bar makes room for that of a stage ahead of the first step."""
+        if not self._live:
+            yield
+            return
+        self.bar.live.transient = True
+        self.bar.stop()
+        yield
+        self.bar.live.transient = False
+        self.bar.start()
 
     def begin(self, data: Dataset) -> None:
         """What there is to learn from, and that kernels are compiled before anything is learnt."""
@@ -103,8 +116,8 @@ class TrainingDisplay:
         if not row:
             return
         if "psnr" in row:
-            mse = 10 ** (-row["psnr"] / 10)
-            self.error = mse if self.error is None else MEMORY * self.error + (1 - MEMORY) * mse
+            now = row["psnr"]
+            self.psnr = now if self.psnr is None else MEMORY * self.psnr + (1 - MEMORY) * now
         self._loss = row.get("loss")
         if self.due:
             self._look(step, seconds, budget, row["statistics"])
@@ -113,8 +126,8 @@ class TrainingDisplay:
 
     def _quality(self) -> list[str]:
         """The PSNR of what was learnt from; the loss, of methods that have none."""
-        if self.error is not None:
-            return [f"PSNR of training photographs {-10 * math.log10(max(self.error, 1e-10)):.2f} dB"]
+        if self.psnr is not None:
+            return [f"PSNR of training photographs {self.psnr:.2f} dB"]
         return [] if self._loss is None else [f"loss {short(self._loss)}"]
 
     def _look(self, step: int, seconds: float, budget: Budget, statistics: dict[str, float]) -> None:

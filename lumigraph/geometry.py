@@ -30,6 +30,18 @@ def look_at(
     return torch.stack([x, torch.linalg.cross(z, x), z, position], -1)
 
 
+def turning(start: Float[Tensor, " 3"], end: Float[Tensor, " 3"]) -> Float[Tensor, "3 3"]:
+    """The smallest rotation that takes one direction to another, in double precision (Rodrigues)."""
+    a, b = unit(start.double()), unit(end.double())
+    cosine, axis = float(a @ b), torch.linalg.cross(a, b)
+    eye = torch.eye(3, dtype=torch.float64)
+    if cosine < -1 + 1e-9:  # half a turn, about any direction at right angles
+        across = unit(torch.linalg.cross(a, torch.linalg.cross(eye[a.abs().argmin()], a)))
+        return 2 * across[:, None] * across - eye
+    cross = torch.linalg.cross(axis.expand(3, 3), eye).T
+    return eye + cross + cross @ cross / (1 + cosine)
+
+
 def to_matrix(quaternions: Float[Tensor, "rotation 4"]) -> Float[Tensor, "rotation 3 3"]:
     """Rotation matrices of quaternions, which need not have unit length."""
     w, x, y, z = torch.nn.functional.normalize(quaternions, dim=-1).unbind(-1)

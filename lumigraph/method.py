@@ -119,6 +119,9 @@ class Method(nn.Module, ABC):
     def begin(self, data: Any) -> None:
         """Called once, ahead of the first step of a new run: what the data tell without any learning."""
 
+    def rehearse_begin(self) -> None:
+        """Called on a copy before the clock starts: compile what `begin` needs and no step does."""
+
     def before_step(self, step: int, progress: float) -> None:
         """Called ahead of each step. progress is the share of the budget (steps or seconds) spent, in [0, 1]."""
 

@@ -176,7 +176,7 @@ def settings(run: Run, evaluation: dict[str, Any] | None) -> str:
         ),
         **{name: value for name, value in said.scene.options.items() if value is not None},
         "bounds": " to ".join("(" + ", ".join(f"{x:.3g}" for x in corner) + ")" for corner in frame.bounds),
-        "reach": f"{frame.reach:g}",
+        "half-extent": f"{frame.reach:g} scene units",
         "near": f"{frame.near:.3g}",
         "background": ", ".join(f"{x:g}" for x in frame.background),
         "budget": str(Budget.from_json(said.budget)) if said.budget else "unknown",

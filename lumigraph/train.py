@@ -109,7 +109,8 @@ def fit(
         share_seen, passes, losses = shares_seen(data), state.passes, list[float]()
         clock, step, watched = Clock(state.seconds), state.step, 0.0
         if step == 0:
-            method.begin(data)
+            with display.aside():
+                method.begin(data)
         display.ready(methods.name_of(method), method, budget, step, clock.seconds)
         next_save = clock.seconds + min(FIRST_SAVE, save_every)
 
@@ -282,6 +283,8 @@ def rehearse(method: Method, data: Dataset, step: int) -> float:
     begin = time.perf_counter()
     double = copy.deepcopy(method).train()
     optimizers = double.optimizers()
+    if step == 0:
+        double.rehearse_begin()
     set_learning_rate(optimizers, double.learning_rate(step, 0.0))
     double.before_step(step, 0.0)
     batch = double.batch(data, torch.Generator().manual_seed(0))

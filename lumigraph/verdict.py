@@ -67,8 +67,7 @@ def loss_trend(rows: Sequence[dict[str, Any]], by_photograph: bool) -> Trend | N
 
 
 def last_psnr(rows: Sequence[dict[str, Any]]) -> float | None:
-    """The PSNR of training photographs at the end, in dB: of the mean squared error over the last quarter of training.
-    None where nothing was recorded."""
+    """The PSNR of training photographs in dB, its mean over the last quarter of training; None where there is none."""
     found = [(row["step"], row["psnr"]) for row in rows if "psnr" in row]
-    last = [10 ** (-psnr / 10) for step, psnr in found if step > 3 / 4 * found[-1][0]]
-    return -10 * math.log10(sum(last) / len(last)) if last else None
+    last = [psnr for step, psnr in found if step > 3 / 4 * found[-1][0]]
+    return sum(last) / len(last) if last else None

@@ -2,8 +2,8 @@
 
 What counts is the lesser of a test's seconds and its processors' seconds, without what Numba compiled for the first
 time: so neither a busy machine nor a fresh clone makes a file costly. It is divided by how slow the machine proves to
-be. `pytest_terminal_summary` prints the table and the files beyond their shares. A file beyond three times its share ends
-the session with code 1: less than that is within what one machine differs from another.
+be. `pytest_terminal_summary` prints the table and the files beyond their shares. A file beyond three times its share
+ends the session with code 1: less than that is within what one machine differs from another.
 """
 
 from __future__ import annotations
@@ -53,9 +53,10 @@ A_METHOD = 6.0  # by contract, of each method, beside what its own file takes
 GROUPS: dict[str, str] = {
     **dict.fromkeys("test_bench_kernels test_lanes".split(), "kernels"),
     **dict.fromkeys(
-        "test_export test_viewer_controls test_exchange test_explain_ray test_keyframes test_browser".split(),
+        "test_export test_viewer_controls test_viewer_crop test_exchange test_explain_ray test_keyframes".split(),
         "exports, viewer, web",
     ),
+    **dict.fromkeys("test_browser".split(), "exports, viewer, web"),
     **dict.fromkeys(
         "test_locks test_old_runs test_opened test_composed test_scores test_memory test_progress".split(),
         "runs, commands, benchmark",
@@ -64,7 +65,9 @@ GROUPS: dict[str, str] = {
         "test_charts test_multiscale test_fewer_views test_budget test_verdict test_display".split(),
         "runs, commands, benchmark",
     ),
-    **dict.fromkeys("test_coordinate_network test_density_control test_gaussians test_encodings".split(), "methods"),
+    **dict.fromkeys(
+        "test_coordinate_network test_density_control test_schedule test_gaussians test_encodings".split(), "methods"
+    ),
     **dict.fromkeys("test_house test_budgets".split(), "house"),
 }  # the others are of nouns and capture
 MUCH, TOO_MUCH = 1.5, 3.0  # times its share: what is told, and what fails

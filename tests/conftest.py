@@ -43,7 +43,8 @@ def checked_modules() -> set[str]:
 if not torch.cuda.is_available():
     os.environ["TRITON_INTERPRET"] = "1"  # read when Triton is imported
 
-loaded = sorted(name for name in sys.modules if name.startswith("lumigraph."))
+own = {"lumigraph.threads"}  # must come before PyTorch, and has no shapes
+loaded = sorted(name for name in sys.modules if name.startswith("lumigraph.") and name not in own)
 assert not loaded, f"loaded before their shapes could be checked: {loaded}"
 checker = "beartype.beartype(conf=beartype.BeartypeConf(is_pep484_tower=True))"  # an int will do for a float
 manager = install_import_hook(["lumigraph"], checker)

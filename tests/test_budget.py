@@ -107,17 +107,16 @@ def test_a_run_remembers_its_quality_and_goes_on_to_the_next(tmp_path, monkeypat
     assert "give one of them" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("total", ["--steps=200", "--seconds=0.7"])
-def test_a_finished_run_goes_on_and_may_be_stopped_meanwhile(tmp_path, monkeypatch, capsys, total):
+@pytest.mark.parametrize("total", ["--steps=200", "--seconds=9999"])
+def test_a_finished_run_goes_on_and_may_be_stopped_meanwhile(tmp_path, total):
     photographs, run = tiny.write_blender(tmp_path / "ball"), tmp_path / "run"
     assert main(["train", "voxel-grid", str(photographs), "--output", str(run), "--steps", "20"]) == 0
     assert main(["resume", str(run), total, "--pause-at", "30"]) == 0 and Run(run).state.step == 30
     said = Run(run).settings.budget
     assert said["joined"][1] == pytest.approx(REJOIN)
-    assert main(["resume", str(run)]) == 0 and Run(run).settings.budget == said
+    assert main(["resume", str(run), "--pause-at", "35"]) == 0 and Run(run).settings.budget == said
     state = Run(run).state
-    assert Budget.from_json(said).progress(state.step, state.seconds) == 1.0
-    assert main(["resume", str(run)]) == 2 and "has spent its budget" in capsys.readouterr().err
+    assert state.step == 35 and REJOIN < Budget.from_json(said).progress(state.step, state.seconds) < 0.5
 
 
 def test_extending_is_exact_too(tmp_path):

@@ -31,8 +31,9 @@ from PIL import Image
 
 from lumigraph.capture import Capture, Shot, assemble, choose_reader, open_scene
 from lumigraph.capture.hull import farthest
-from lumigraph.capture.normalise import power_of_two, turn_onto_z
+from lumigraph.capture.normalise import power_of_two
 from lumigraph.capture.points import similarity
+from lumigraph.capture.up import turn_onto_z
 from lumigraph.errors import LumigraphError, LumigraphWarning
 from lumigraph.lens import Equirectangular, Fisheye, OpenCV, Pinhole
 from lumigraph.rays import Rays

@@ -188,7 +188,7 @@ def test_the_sampling_interval_is_depth_over_focal_length():
 
 
 def test_a_cloud_without_points_begins_inside_the_silhouettes(generator):
-    begun = initial_cloud(tiny.scene(), 500, 1000, 2, generator)
+    begun = initial_cloud(tiny.scene(), "random", 500, 1000, 2, generator)
     assert len(begun) == 500 and begun.degree == 2
     away = begun.means.norm(dim=-1)  # the ball has a radius of 0.6 and a pixel 0.1; of the box 38 % lie within 0.9
     assert (away < 0.9).float().mean() > 0.9
@@ -199,7 +199,7 @@ def test_a_cloud_with_points_begins_at_them(generator):
 
     points = torch.randn(50, 3, generator=generator) * 0.3
     colours = torch.randint(0, 256, (50, 3), generator=generator).byte()
-    begun = initial_cloud(replace(tiny.scene(), points=points, point_colours=colours), 500, 40, 1, generator)
+    begun = initial_cloud(replace(tiny.scene(), points=points, point_colours=colours), "sparse", 500, 40, 1, generator)
     assert len(begun) == 40  # no more than may be
     which = torch.cdist(begun.means, points).argmin(1)
     assert torch.equal(begun.means, points[which])

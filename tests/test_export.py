@@ -22,9 +22,9 @@ from lumigraph.evaluate import evaluate
 from lumigraph.export.film import film
 from lumigraph.export.video import open_video
 from lumigraph.figures import NOTHING, RAMP, colour_depth, colour_error, depth_range, hex_colour, save_picture
-from lumigraph.geometry import look_at
+from lumigraph.geometry import look_at, unit
 from lumigraph.lens import Equirectangular, Pinhole
-from lumigraph.paths import PATHS, Surroundings, angle_of_view, camera_path, film_size
+from lumigraph.paths import PATHS, Surroundings, angle_of_view, best_centred, camera_path, film_size, pivot
 from lumigraph.paths.keyframes import CameraPath, Keyframe
 from lumigraph.report import write_report
 from lumigraph.run.settings import Source
@@ -87,6 +87,38 @@ def test_cameras_that_look_outward_give_a_turn_on_the_spot():
     assert path.position.norm(dim=-1).max() < 0.21
     seen = torch.atan2(path.forward[:, 1], path.forward[:, 0]).sort().values
     assert seen.diff().max() < 0.25 and path.forward[:, 2].abs().max() < 0.05
+
+
+def test_an_orbit_goes_around_what_half_of_the_photographs_look_at():
+    """Somebody walked around a fountain and photographed it and the houses around: nobody stood in the fountain."""
+    inward, place = ring(), ring().position
+    around = Camera.cat([inward, cameras(1.1 * place, 2 * place)])
+    path = camera_path("orbit", around, FRAME, 36, (64, 48))
+    assert (path.position.norm(dim=-1) - math.sqrt(10)).abs().max() < 0.05
+    pixels, seen = path.project(torch.zeros(36, 3), torch.arange(36))
+    assert seen.all() and (pixels - torch.tensor([32.0, 24.0])).abs().max() < 3
+
+
+def test_cameras_that_look_outward_turn_where_one_of_them_stood():
+    angle = torch.arange(16) * (2 * math.pi / 16)
+    out = torch.stack([angle.cos(), angle.sin(), 0 * angle], -1)
+    path = camera_path("orbit", cameras(0.2 * out, 5 * out), FRAME, 6, (64, 48))
+    assert torch.cdist(path.position, 0.2 * out).min(-1).values.max() < 1e-5  # the middle may be a pillar
+
+
+def test_a_camera_turns_about_what_the_photographs_look_at():
+    around = Surroundings(ring(), FRAME)
+    for i, eye in enumerate(around.position):
+        assert pivot(around, eye, around.forward[i]).norm() < 0.05
+    aside = unit(torch.tensor([[0.3, 0.2, -0.4]]).double() - around.position[0])[0]  # past it, so not exactly
+    point = pivot(around, around.position[0], aside)
+    assert (point - around.position[0]) @ aside > 2.9 and (point @ aside).abs() < 0.05  # where the axis is nearest
+    back = pivot(around, around.position[0], -around.forward[0])
+    assert 0.2 < (back - around.position[0]).norm() < 0.4  # ahead of it, not in its lens
+    beside = 0.5 * (-1.0) ** torch.arange(24)
+    beside[5] = 0
+    crooked = cameras(ring().position, torch.stack([0 * beside, 0 * beside, beside], -1))
+    assert best_centred(Surroundings(crooked, FRAME)) == 5
 
 
 def test_a_far_stray_camera_does_not_pull_the_orbit():

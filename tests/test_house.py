@@ -16,7 +16,10 @@ import lumigraph
 # A new room is a new name here, on the floor where it belongs.
 FLOORS: list[set[str]] = [
     {"console", "errors", "processes", "quality", "signals"},
-    {"blending", "budget", "choice", "controls", "geometry", "loops", "memory", "progress", "readers", "srgb"},
+    {
+        *("blending", "budget", "choice", "controls", "geometry", "loops"),
+        *("memory", "names", "progress", "readers", "srgb", "threads"),
+    },
     {"files", "plain", "lens", "rays"},
     {"camera", "crop", "images", "kernels", "figures", "locks", "metrics"},
     {"volume", "scene"},

@@ -248,6 +248,23 @@ def test_a_glb_is_unlit_and_well_formed(solid_ball, tmp_path):
     assert about["buffers"][0]["byteLength"] == struct.unpack("<I", data[20 + size : 24 + size])[0]
 
 
+@pytest.mark.parametrize("up", [(0.0, 0.0, 1.0), (0.0, -1.0, 0.0), (0.6, 0.0, -0.8), (0.0, 1.0, 0.0)])
+def test_a_glb_stands_upright_elsewhere(solid_ball, tmp_path, up):
+    """Vertices are the source's, and the node above them brings up to +y, as glTF demands."""
+    path, up = tmp_path / "ball.glb", np.array(up)
+    far = int((solid_ball.vertices @ up).argmax())
+    write_mesh(path, solid_ball, up)
+    scene = trimesh.load_scene(path, process=False)
+    (name,) = scene.graph.nodes_geometry
+    placed, _ = scene.graph.get(name)
+    np.testing.assert_allclose(placed[:3, :3] @ up, [0, 1, 0], atol=1e-6)
+    np.testing.assert_allclose(placed[:3, :3] @ placed[:3, :3].T, np.eye(3), atol=1e-6)
+    (seen,) = scene.dump()
+    assert int(seen.vertices[:, 1].argmax()) == far and seen.volume > 0
+    about = json.loads((data := path.read_bytes())[20 : 20 + struct.unpack("<I", data[12:16])[0]])
+    np.testing.assert_allclose(about["nodes"][0]["extras"]["source_from_upright"], placed[:3, :3].T, atol=1e-6)
+
+
 def test_another_frame_moves_scales_and_keeps_the_outside_outside(solid_ball):
     moved = solid_ball.in_source(Frame(source_from_scene=MOVED))
     np.testing.assert_allclose(moved.vertices.mean(0), (5, -1, 0.5), atol=0.05)
@@ -319,9 +336,11 @@ def test_commands_write_in_the_frame_of_the_photographs(tmp_path, capsys):
     assert main(["export", "mesh", str(run.folder), str(mesh), "--cell-size", "0.15", *options]) == 0
     assert main(["export", "points", str(run.folder), str(points), "--count", "300", *options]) == 0
     assert "triangles" in capsys.readouterr().out
-    found = trimesh.load_mesh(mesh, process=False)
+    scene = trimesh.load_scene(mesh, process=False)
+    (found,) = scene.geometry.values()
     assert found.is_watertight
     np.testing.assert_allclose(found.bounds.mean(0), (5, -1, 0.5), atol=0.3)
+    np.testing.assert_allclose(scene.bounds.mean(0), (5, 0.5, 1), atol=0.3)  # +z of the source is up
     assert found.volume == pytest.approx(4 / 3 * math.pi * 1.2**3, rel=0.35)
 
 

@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import ast
+import contextlib
 import os
 import signal
 import subprocess
 import sys
+import time
 
 import pytest
 from conftest import PACKAGE
 
 from lumigraph.cli import main
-from lumigraph.signals import Interrupt, Stopped, go_on_unless, listening, until_interrupted
+from lumigraph.signals import AGAIN, Interrupt, Stopped, go_on_unless, listening, until_interrupted
 
 BOTH = [signal.SIGINT, signal.SIGTERM]
 # What each command is doing when the signal comes: RUN and PICTURE are put in.
@@ -90,6 +92,47 @@ def test_the_second_signal_breaks_off_and_both_act_as_before_afterwards():
     assert stopped.value.number == signal.SIGTERM
     assert [signal.getsignal(number) for number in BOTH] == before
     go_on_unless(None)
+
+
+def test_a_signal_that_comes_while_something_is_loaded_is_heard_afterwards(tmp_path, monkeypatch):
+    """Here a module takes any exception for something else, as libraries do."""
+    lines = ["import signal", "try: signal.raise_signal(signal.SIGTERM)", "except BaseException: raise ImportError"]
+    (tmp_path / "touchy.py").write_text("\n".join(lines))
+    monkeypatch.syspath_prepend(tmp_path)
+    with pytest.raises(Stopped), listening():
+        import touchy  # noqa: F401
+
+        time.sleep(20)
+
+
+def test_a_signal_that_somebody_has_lost_comes_again():
+    begin = time.monotonic()
+    with pytest.raises(Stopped), listening():
+        with contextlib.suppress(KeyboardInterrupt):
+            signal.raise_signal(signal.SIGTERM)
+        time.sleep(20)
+    assert time.monotonic() - begin < 15
+    with listening(), until_interrupted():
+        signal.raise_signal(signal.SIGINT)
+    time.sleep(2 * AGAIN)  # one that was heeded does not
+
+
+def test_cleaning_up_is_not_disturbed_by_reminders_but_by_a_second_signal():
+    cleaned = []
+    with pytest.raises(Stopped), listening():
+        try:
+            signal.raise_signal(signal.SIGTERM)
+        finally:
+            time.sleep(3 * AGAIN)
+            cleaned.append("up")
+    assert cleaned
+    with pytest.raises(Stopped), listening():
+        try:
+            signal.raise_signal(signal.SIGTERM)
+        finally:
+            signal.raise_signal(signal.SIGTERM)
+            cleaned.append("again")
+    assert cleaned == ["up"]
 
 
 def test_what_control_c_is_meant_to_end_still_heeds_sigterm():

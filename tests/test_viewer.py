@@ -258,7 +258,7 @@ def test_a_crop_begins_where_rays_enter_the_box(learnt):
     camera = scene.cameras[0]  # on the side of positive x
     method = Walls(scene.frame)
     assert (method.render(camera).rgb[..., 0] == 1).all()
-    seen = render_inside(method, camera, Box((-0.5, -1.0, -1.0), (0.0, 1.0, 1.0)), False)
+    seen = render_inside(method, camera, Box((-0.5, -1.0, -1.0), (0.0, 1.0, 1.0)))
     inside = seen.opacity == 1
     assert inside.sum() > 50
     assert (seen.rgb[inside] == torch.tensor([0.0, 0.0, 1.0])).all()
@@ -277,7 +277,7 @@ def test_a_crop_keeps_extras_even_of_bands_beside_the_box(learnt):
             return seen.with_extra(wall=1 + (seen.rgb[:, 2] > 0).long(), where=rays.origins)
 
     bands = [
-        render_inside(Numbered(scene.frame), rows(camera, a, b), Box((-0.5, -1.0, -0.1), (0.0, 1.0, 0.1)), False)
+        render_inside(Numbered(scene.frame), rows(camera, a, b), Box((-0.5, -1.0, -0.1), (0.0, 1.0, 0.1)))
         for a, b in ((0, 1), (1, tiny.SIZE))
     ]
     assert (bands[0].opacity == 0).all() and (bands[0].extra["wall"] == 0).all()
@@ -291,7 +291,7 @@ def test_a_crop_keeps_extras_even_of_bands_beside_the_box(learnt):
 def test_a_crop_of_other_methods_goes_by_depth(learnt):
     scene, _ = learnt
     camera = scene.cameras[0]
-    seen = render_inside(Wall(scene.frame, None), camera, Box((-0.1, -0.3, -1.0), (0.1, 0.3, 1.0)), False)
+    seen = render_inside(Wall(scene.frame, None), camera, Box((-0.1, -0.3, -1.0), (0.1, 0.3, 1.0)))
     y = camera.rays(camera.pixels()).at(seen.depth.reshape(-1).nan_to_num(0, 0))[:, 1].view_as(seen.depth)
     inside = seen.opacity == 1
     assert 0 < inside.sum() < inside.numel()

@@ -40,9 +40,9 @@ def viewer(tmp_path_factory):
         yield made
 
 
-def visit(viewer, page):
-    """Open the page; gives the visitor that the viewer has made of it, at rest."""
-    page.set_viewport_size({"width": SIZE[0], "height": SIZE[1]})
+def visit(viewer, page, size=SIZE):
+    """Open the page in a window of (width, height); gives the visitor that the viewer has made of it, at rest."""
+    page.set_viewport_size({"width": size[0], "height": size[1]})
     known = set(map(id, viewer._everyone()))
     page.goto(viewer.address.url)
     visitor = wait(lambda: next((v for v in viewer._everyone() if id(v) not in known), None))
@@ -117,6 +117,49 @@ def test_the_scene_appears_turns_and_changes_modes(viewer, page, faults):
         wait(lambda seen=seen: psnr(shot(page), seen) < 20)
         seen = shot(page)
     assert faults == []
+
+
+def middle(visitor) -> np.ndarray:
+    """Where the window shows the middle of the ball, in half-sizes from its middle."""
+    request = visitor.request()
+    (place,), _ = request.camera(request.canvas).project(torch.zeros(1, 3))
+    return place.numpy() / (np.array(request.canvas) / 2) - 1
+
+
+def drag(page, visitor, pixels: int) -> None:
+    width, height = page.viewport_size["width"], page.viewport_size["height"]
+    before = visitor.request().pose
+    page.mouse.move(width / 3, height / 2)
+    page.mouse.down()
+    page.mouse.move(width / 3 + pixels, height / 2, steps=4)
+    page.mouse.up()
+    wait(lambda: visitor.request().pose != before)
+    wait(visitor.painter.settled.is_set)
+
+
+@pytest.mark.parametrize("size", [SIZE, (320, 480)], ids=["desktop", "phone"])
+def test_a_drag_keeps_the_ball_where_it_is(viewer, page, size):
+    """On a phone the panel begins folded, opens at a touch, and stays open."""
+    visitor = visit(viewer, page, size)
+    wait(lambda: page.title() == "ball")
+    before = middle(visitor)
+    eye = np.array(visitor.request().pose)[:, 3]
+    assert np.abs(before).max() < 0.2
+    drag(page, visitor, 60)
+    moved = np.array(visitor.request().pose)[:, 3]
+    assert np.abs(middle(visitor) - before).max() < 0.1
+    assert np.linalg.norm(moved - eye) > 0.2 * np.linalg.norm(eye)  # around the ball, and as far from it
+    assert np.linalg.norm(moved) == pytest.approx(np.linalg.norm(eye), rel=0.05)
+
+    cameras = page.get_by_role("checkbox", name="Cameras")
+    if size == SIZE:
+        cameras.wait_for(state="visible")
+        return
+    wait(lambda: page.locator(".mantine-Paper-root").first.bounding_box()["height"] < 100)
+    page.get_by_text("ball", exact=True).click()
+    wait(lambda: page.locator(".mantine-Paper-root").first.bounding_box()["height"] > 200)
+    time.sleep(0.5)
+    assert cameras.is_visible()
 
 
 def test_a_click_on_a_camera_flies_there(viewer, page):

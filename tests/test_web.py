@@ -232,6 +232,22 @@ def test_a_mesh_is_drawn_where_it_is(tmp_path, window):
     assert psnr(opened.settled(), first) < 25
 
 
+def test_the_open_sky(tmp_path, window):
+    """Overhead above, underfoot below, the background between; and the camera stays above the floor."""
+    sky = (0.2, 0.4, 0.9), (0.1, 0.6, 0.2)
+    opening = dataclasses.replace(OPENING, sky=sky, within=((-1.0,) * 3, (1.0,) * 3))
+    mesh_page(tmp_path / "page.html", cube(), opening)
+    opened = window(tmp_path / "page.html")
+    level = torch.tensor([[[1.0, 0, 0, 0], [0, 0, 1, -9], [0, -1, 0, 5]]])  # above the cube, looking along +y
+    shown = opened.look(dataclasses.replace(some_camera(), pose=level), 90.0)
+    for row, expected in ((2, sky[0]), (SIZE // 2, OPENING.background), (SIZE - 2, sky[1])):
+        np.testing.assert_allclose(shown[row, SIZE // 4], expected, atol=0.02)
+    opened.page.keyboard.press("r")
+    before = opened.settled()
+    mesh_page(tmp_path / "lifted.html", cube(), dataclasses.replace(opening, floor=1.5))
+    assert psnr(window(tmp_path / "lifted.html").settled(), before) < 30
+
+
 def test_pictures_are_turned_over(tmp_path, window):
     made, cameras = tiny_method(), scene().cameras
     views_page(tmp_path / "page.html", made, cameras, opening_of_scene("ball", cameras, made.frame), 8, 96)

@@ -52,6 +52,17 @@ class Client:
         message = {"type": "GuiUpdateMessage", "uuid": handle._impl.uuid, "updates": {"value": value}}
         self.socket.send(msgspec.msgpack.encode(message))
 
+    def drag(self, handle, position) -> None:
+        """Drag arrows in the scene to a place, as its browser would."""
+        message = {
+            "type": "TransformControlsUpdateMessage",
+            "name": handle.name,
+            "owner": handle._impl.api._owner_id,
+            "wxyz": (1.0, 0.0, 0.0, 0.0),
+            "position": position,
+        }
+        self.socket.send(msgspec.msgpack.encode(message))
+
     def messages(self, seconds: float):
         """What comes within so many seconds, each a dict."""
         end = time.monotonic() + seconds

@@ -12,10 +12,12 @@ from typing import Any
 from ..collection import Collection
 from ..dataset import Dataset
 from ..errors import LumigraphError
+from ..names import natural
 from ..readers import LISTED, NAMES
 from ..scene import Scene
 from ..shapes import Shapes
 from . import meshes, single_image
+from .assemble import Before as Before
 from .assemble import assemble as assemble
 from .capture import Capture as Capture
 from .capture import Shot as Shot
@@ -75,11 +77,12 @@ def members_of(folder: Path) -> dict[str, Path]:
     if not folder.is_dir():
         return {}
     readers = [reader.recognises for reader in READERS.values()]
-    found = sorted(
+    found = [
         path
         for path in folder.iterdir()
         if meshes.recognises(path) or (path.is_dir() and any(recognises(path) for recognises in readers))
-    )
+    ]
+    found.sort(key=lambda path: natural(path.name))
     return {path.stem if path.is_file() else path.name: path for path in found}
 
 
@@ -91,6 +94,7 @@ def open_scene(
     cache: Path | None = None,
     views: int | None = None,
     scales: int = 1,
+    before: Before | None = None,
 ) -> Scene:
     """The Scene in a folder of posed photographs, a single picture as a scene, or a procedural one.
 
@@ -101,6 +105,7 @@ def open_scene(
     cache:     where that file goes; None means the user's cache folder
     views:     learn from so many photographs, spread evenly over the cameras; None means all
     scales:    every photograph so many times, each half as large as the one before; see `multiscale`
+    before:    how they were opened for a run; see `Before`
     Raises LumigraphError for anything that keeps the photographs from becoming a scene.
     """
     if str(source).startswith(PROCEDURAL):
@@ -111,7 +116,7 @@ def open_scene(
         capture, downscale = single_image.read(path, downscale), 1  # it is reduced by now
     else:
         capture = with_masks(choose_reader(path, reader).read(path), path)
-    scene = assemble(capture, downscale, memory, cache)
+    scene = assemble(capture, downscale, memory, cache, before)
     if views is not None:
         scene = with_fewer_views(scene, views)
     return multiscale(scene, scales, memory, cache)

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import warnings
-from dataclasses import replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +16,7 @@ from ..camera import Camera
 from ..errors import LumigraphError, LumigraphWarning
 from ..images import ImageSource, ImageStore
 from ..lens import Equirectangular, Lens, Pinhole
+from ..names import natural
 from ..progress import counting, track
 from ..scene import Forward, Frame, Scene
 from .beside import make_about, make_layers
@@ -28,18 +30,35 @@ RIGID = 0.01  # how far a pose's axes may be from unit length and right angles
 NAMED = 20  # missing files at most in a warning; further ones are counted
 
 
+@dataclass(frozen=True)
+class Before:
+    """How photographs were opened when a run began, so that they are numbered and turned the same way again.
+
+    names:   of the photographs, in order
+    upright: the rotation from the source's frame that brought up to +z
+    """
+
+    names: Sequence[str]
+    upright: Float[np.ndarray, "3 3"]
+
+
 def assemble(
-    capture: Capture, downscale: int | None = None, memory: int | None = None, cache: Path | None = None
+    capture: Capture,
+    downscale: int | None = None,
+    memory: int | None = None,
+    cache: Path | None = None,
+    before: Before | None = None,
 ) -> Scene:
     """The Scene that a capture holds.
 
+    before: how it was opened for a run that goes on, or is evaluated
     Raises LumigraphError for fewer than two photographs, poses that are no poses, images that cannot be read or
     contradict their lens, and published splits that hold nothing out. What is missing or unusual becomes a
     LumigraphWarning, which is kept in `Scene.warnings` too.
     """
     check_downscale(downscale)
     told = [about_missing(capture)] if capture.missing else []
-    shots = sorted(capture.shots, key=lambda shot: shot.name)
+    shots = in_order(capture.shots, before)
     if len(shots) < 2:
         raise LumigraphError(
             f"{capture.source} has {counted(len(shots), 'usable photograph')} with a pose, and two are the least; "
@@ -63,8 +82,9 @@ def assemble(
     # Single precision is for what is near the origin: maps may put a capture hundreds of kilometres away.
     away = poses[:, :, 3].mean(0)
     cameras = make_cameras(shots, moved(poses, translation(-away)), lenses, images.sizes)
+    upright = None if before is None else in_four(before.upright)
     with counting("Looking for what the cameras look at"):
-        place = find_place(shifted(capture, -away), cameras, images, splits["train"].tolist())
+        place = find_place(shifted(capture, -away), cameras, images, splits["train"].tolist(), upright)
     matrix = place.scene_from_source @ translation(-away)
     cameras = make_cameras(shots, moved(poses, matrix), lenses, images.sizes)
     forward = None
@@ -89,6 +109,12 @@ def assemble(
         make_about(shots),
         torch.tensor([c.calibrated for c in chosen]),
     )
+
+
+def in_order(shots: list[Shot], before: Before | None) -> list[Shot]:
+    """By name, 2 ahead of 10; as they were before, if that is known."""
+    place = {} if before is None else {name: i for i, name in enumerate(before.names)}
+    return sorted(shots, key=lambda shot: (place.get(shot.name, len(place)), natural(shot.name)))
 
 
 def split(source: str, shots: list[Shot]) -> dict[str, Int[Tensor, " image"]]:
@@ -165,6 +191,12 @@ def moved(poses: Float[np.ndarray, "camera 3 4"], matrix: Float[np.ndarray, "4 4
     return np.concatenate([rotation, position[:, :, None]], -1)
 
 
+def in_four(rotation: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "4 4"]:
+    matrix = np.eye(4)
+    matrix[:3, :3] = rotation
+    return matrix
+
+
 def translation(by: Float[np.ndarray, " 3"]) -> Float[np.ndarray, "4 4"]:
     matrix = np.eye(4)
     matrix[:3, 3] = by
@@ -223,7 +255,7 @@ def within_reach(lens: Lens, size: tuple[int, int]) -> np.ndarray | None:
 
 def about_missing(capture: Capture) -> str:
     """One sentence with the names of all missing files."""
-    names = sorted(capture.missing)
+    names = sorted(capture.missing, key=natural)
     more = f" and {len(names) - NAMED} more" if len(names) > NAMED else ""
     verb = "does" if len(names) == 1 else "do"
     return (

@@ -89,6 +89,7 @@ class Capture:
     reach:    half-size of the cube around the bounds' centre that holds everything, source's units
     near:     distance within which nothing is, source's units
     background: colour behind everything
+    up:       which way is up, source's frame, any length
     """
 
     source: str
@@ -101,3 +102,4 @@ class Capture:
     reach: float | None = None
     near: float | None = None
     background: tuple[float, float, float] | None = None
+    up: tuple[float, float, float] | None = None

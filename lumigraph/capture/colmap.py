@@ -10,6 +10,7 @@ import torch
 
 from ..errors import LumigraphError
 from ..lens import Equirectangular, Fisheye, Lens, OpenCV, Pinhole
+from ..names import natural
 from .capture import Capture, Shot
 from .library import pycolmap
 from .pictures import reductions, versions
@@ -59,7 +60,7 @@ def read(folder: Path) -> Capture:
     place = model_folder(folder)
     assert place is not None
     model = read_model(place)
-    images = sorted((image for image in model.images.values() if image.has_pose), key=lambda image: image.name)
+    images = sorted((image for image in model.images.values() if image.has_pose), key=lambda image: natural(image.name))
     names = [image.name for image in images]
     folders = reductions(folder / "images") or reductions(folder / "input") or {1: folder}
     shots, missing = [], []

@@ -13,6 +13,7 @@ from plyfile import PlyData
 from ..dataset import splits_of
 from ..errors import LumigraphError, LumigraphWarning
 from ..mesh import Mesh
+from ..names import natural
 from ..progress import track
 from ..shapes import Shape, Shapes, normalised
 
@@ -37,7 +38,11 @@ def read_shapes(path: Path) -> Shapes:
     Of many, every 8th by name is for testing. What the Shapes should tell its user is a LumigraphWarning too.
     Raises LumigraphError for files that hold no surface and no points.
     """
-    files = [path] if path.is_file() else sorted(file for file in path.rglob("*") if is_mesh(file))
+    files = (
+        [path]
+        if path.is_file()
+        else sorted(filter(is_mesh, path.rglob("*")), key=lambda file: natural(file.as_posix()))
+    )
     if not files:
         raise LumigraphError(f"{path} holds no meshes; name a file or a folder of {', '.join(SUFFIXES)}")
     members = [read_shape(file, name_of(file, path)) for file in track(files, "Reading meshes", len(files))]

@@ -19,6 +19,7 @@ from ..images import ImageStore
 from ..scene import Vector
 from .capture import Capture
 from .hull import hull_box, silhouettes
+from .up import find_upright, upright_by
 
 MARGIN = 1.01  # around an object that is known exactly
 FARTHEST = 64  # half-size of the largest cube, in scene units
@@ -30,7 +31,6 @@ SAME_WAY = 0.5  # length of the mean viewing direction, below which cameras look
 BEFORE_NEAREST = 0.4  # rays begin at this share of the distance to the nearest thing seen
 SMALLEST_NEAR = 1e-3
 SAMPLED_POINTS, SAMPLED_CAMERAS = 5000, 64
-UPRIGHT = math.cos(math.radians(15))  # a source axis nearer to up than this is up
 
 
 @dataclass(frozen=True)
@@ -49,12 +49,26 @@ BLACK: Vector = (0.0, 0.0, 0.0)
 WHITE: Vector = (1.0, 1.0, 1.0)
 
 
-def find_place(capture: Capture, cameras: Camera, images: ImageStore, views: list[int]) -> Place:
-    """Where the capture is. cameras: in the source's frame; views: the images that may be looked at, not held out."""
+def find_place(
+    capture: Capture,
+    cameras: Camera,
+    images: ImageStore,
+    views: list[int],
+    upright: Float[np.ndarray, "4 4"] | None = None,
+) -> Place:
+    """Where the capture is.
+
+    cameras: in the source's frame
+    views:   the images that may be looked at, not held out
+    upright: the rotation that brings up to +z; None to find it
+    """
     background = capture.background or (WHITE if images.has_alpha else BLACK)
     if capture.bounds is not None:
         return stated_place(capture, cameras, background)
-    upright = find_upright(cameras)
+    if upright is None:
+        cloud = reliable_points(capture, np.eye(4))
+        seen = None if cloud is None else cloud.points
+        upright = find_upright(cameras, seen) if capture.up is None else upright_by(np.array(capture.up))
     turned = cameras.transformed(torch.from_numpy(upright))
     gaze = find_gaze(capture, turned, upright)
     found = silhouettes(turned, images, views, gaze.centre)
@@ -210,47 +224,6 @@ def where_axes_meet(position: np.ndarray, forward: np.ndarray) -> tuple[np.ndarr
     meeting = np.linalg.solve(across.sum(0), (across @ position[:, :, None]).sum(0))[:, 0]
     in_front = ((meeting - position) * forward).sum(-1) > 0
     return meeting, bool(in_front.mean() > 0.8)
-
-
-def find_upright(cameras: Camera) -> Float[np.ndarray, "4 4"]:
-    """The rotation that brings the cameras' common up to +z; none if the source already has an axis there."""
-    up = common_up(cameras)
-    if up is None:
-        return np.eye(4)
-    nearest = np.zeros(3)
-    nearest[np.abs(up).argmax()] = np.sign(up[np.abs(up).argmax()])
-    if up @ nearest > UPRIGHT:
-        up = nearest
-    matrix = np.eye(4)
-    matrix[:3, :3] = turn_onto_z(up)
-    return matrix
-
-
-def common_up(cameras: Camera) -> Float[np.ndarray, " 3"] | None:
-    """The direction that was up where the photographs were taken, unit length; None if cameras cannot tell.
-
-    People hold cameras level rather than straight ahead: up is the direction most at right angles to all pictures'
-    rows, on the side of the pictures' own up, or where all look straight down, on the side that they look from. Where
-    rows are all parallel, up is the mean of the pictures' own.
-    """
-    rows, downs, forwards = (cameras.pose[:, :, k].double().numpy() for k in range(3))
-    own, length = -downs.mean(0), np.linalg.norm(downs.mean(0))
-    values, vectors = np.linalg.eigh(rows.T @ rows / len(rows))
-    level = vectors[:, 0]
-    if length > 0.2:
-        own /= length
-        level = level * np.sign(level @ own)
-        return level if values[1] > 0.1 and level @ own > 0.7 else own
-    return level * np.sign(-level @ forwards.mean(0)) if values[1] > 0.1 else None
-
-
-def turn_onto_z(up: Float[np.ndarray, " 3"]) -> Float[np.ndarray, "3 3"]:
-    """The smallest rotation that takes a unit vector to +z (Rodrigues)."""
-    x, y, z = up
-    if z < -1 + 1e-9:
-        return np.diag([1.0, -1.0, -1.0])
-    cross = np.array([[0, 0, -x], [0, 0, -y], [x, y, 0]])
-    return np.eye(3) + cross + cross @ cross / (1 + z)
 
 
 def similarity(upright: np.ndarray, centre: np.ndarray, half: float) -> Float[np.ndarray, "4 4"]:

@@ -35,7 +35,8 @@ def find_file(path: Path) -> Path:
 
 
 def list_images(folder: Path) -> list[str]:
-    """Names of the images below a folder, sorted, with / between folders."""
+    """Names of the images below a folder, with / between folders, in the order in which programs pair them with poses:
+    by their letters, 10 before 2."""
     if not folder.is_dir():
         return []
     files = (p for p in folder.rglob("*") if p.suffix.lower() in {s.lower() for s in SUFFIXES} and p.is_file())

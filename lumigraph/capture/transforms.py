@@ -66,7 +66,21 @@ def read(folder: Path) -> Capture:
         None if points is None else points.sightings,
         missing,
         reach=reach,
+        up=read_up(path, whole),
     )
+
+
+def read_up(path: Path, whole: Json) -> tuple[float, float, float] | None:
+    """Which way is up, where the file says so, as instant-ngp's may."""
+    if "up" not in whole:
+        return None
+    try:
+        x, y, z = (float(value) for value in whole["up"])
+    except (TypeError, ValueError):
+        x = y = z = math.nan
+    if not 0 < math.hypot(x, y, z) < math.inf:
+        raise LumigraphError(f'{path}: "up" should be three numbers, and is {whole["up"]!r}; correct it or remove it')
+    return x, y, z
 
 
 def read_frames_file(path: Path) -> Json:

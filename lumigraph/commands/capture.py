@@ -136,9 +136,8 @@ def rows(folder: Path, result: dict[str, Any]) -> dict[str, str]:
         found["duplicates"] = lines([f"{name} of {other}" for name, other in result["duplicates"].items()])
     found["error"] = f"{result['error']:.2f} pixels"
     found["points"] = f"{result['points']:,}, each in {result['track_length']:.1f} photographs on average"
-    found["seen"] = (
-        f"points fill {100 * result['filled']:.0f} % of a picture; rays to one differ by {result['angle']:.0f} degrees"
-    )
+    found["coverage"] = f"points span {100 * result['filled']:.0f} % of a photograph, on average"
+    found["parallax"] = f"{result['angle']:.0f} degrees between the outermost views of a point (median)"
     if coverage := result["coverage"]:
         found["around"] = f"{coverage['degrees']:.0f} of 360 degrees"
         gaps = [f"{g['degrees']:.0f} degrees between {' and '.join(g['between'])}" for g in coverage["gaps"]]

@@ -18,6 +18,7 @@ from ..errors import LumigraphError
 from ..files import scene_name as scene_name
 from ..quality import MEANS, Quality
 from ..readers import LISTED, NAMES
+from ..signals import exit_code as exit_code
 
 if TYPE_CHECKING:
     Reader = str
@@ -117,8 +118,3 @@ def typed(*words: object) -> str:
 def next_free(prefix: str) -> Path:
     """The first of prefix-1, prefix-2, ... that does not exist yet."""
     return next(path for n in itertools.count(1) if not (path := Path(f"{prefix}-{n}")).exists())
-
-
-def exit_code(signal: int | None) -> int:
-    """As shells count: 130 after Ctrl-C, 143 after SIGTERM."""
-    return 0 if signal is None else 128 + signal

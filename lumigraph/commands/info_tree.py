@@ -14,6 +14,7 @@ from ..dataset import Dataset
 from ..errors import LumigraphError
 from ..gaussians import Gaussians
 from ..metrics import scores_of
+from ..names import natural
 from ..run import Run
 from ..scene import Frame, Scene
 from ..shapes import Shapes
@@ -42,9 +43,8 @@ def run_tree(run: Run) -> Tree:
         figures["seconds per view"] = evaluation.get("seconds_per_view")
         protocol = ("split", "views", "shapes", "members", "resolution")
         branch(tree, "evaluated", figures | {name: evaluation["protocol"].get(name) for name in protocol})
-    found = sorted(
-        path for path in run.folder.rglob("*") if path.is_file() and path.suffix in (".mp4", ".html", ".png")
-    )
+    found = [path for path in run.folder.rglob("*") if path.is_file() and path.suffix in (".mp4", ".html", ".png")]
+    found.sort(key=lambda path: natural(path.as_posix()))
     pages = [path for path in found if path.parent in (run.folder, run.folder / "renders")]
     if pages:
         branch(tree, "files", {str(path.relative_to(run.folder)): size(path) for path in pages})
@@ -130,7 +130,7 @@ def frame_rows(frame: Frame) -> dict[str, Any]:
     low, high = frame.bounds
     return {
         "bounds": f"{vector(low)} to {vector(high)}",
-        "reach": frame.reach,
+        "half-extent": f"{frame.reach:g} scene units, from the middle to each side",
         "near": frame.near,
         "cameras": frame.forward and f"forward-facing, near plane at {frame.forward.near:.3g}",
         "background": vector(frame.background) + (" behind alpha" if frame.has_alpha else ""),

@@ -41,7 +41,8 @@ def tell_outcome(run: Any, outcome: Any, method: Method, data: Any) -> None:
         how = f"fell by {100 * trend.fall:.0f} %" if trend.falling else "did not fall any more"
         rows["loss"] = f"{how} over the second half of training"
     enough = state.step >= method.steps_for("draft", data)
-    rows["advice"] = advice(trend, enough, more_time(run.folder, budget), photographed(run, data))
+    more = more_time(run.folder, budget) if enough else typed("resume", run.folder, "--quality", "draft")
+    rows["advice"] = advice(trend, enough, more, photographed(run, data))
     show(rows | next_commands(run))
 
 
@@ -78,14 +79,15 @@ def photographed(run: Any, data: Any) -> bool:
 
 def more_time(folder: Any, budget: Budget) -> str:
     """The command that goes on with a finished run, by the next larger budget of its kind."""
+    longer: list[str]
     if budget.quality in QUALITIES[:-1]:
-        longer = "--quality", QUALITIES[QUALITIES.index(budget.quality) + 1]
+        longer = ["--quality", QUALITIES[QUALITIES.index(budget.quality) + 1]]
     elif budget.steps is not None:
         digits = 10 ** (int(math.log10(3 * budget.steps)) - 1) if budget.steps > 3 else 1
-        longer = "--steps", str(math.ceil(3 * budget.steps / digits) * digits)
+        longer = ["--steps", str(math.ceil(3 * budget.steps / digits) * digits)]
     else:
         fitting = [total for total in TOTALS if total >= MORE * budget.total]
-        longer = "--seconds", f"{fitting[0] if fitting else 2 * budget.total:g}"
+        longer = ["--seconds", f"{fitting[0] if fitting else 2 * budget.total:g}"]
     return typed("resume", folder, *longer)
 
 

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
 from tyro.conf import Positional
 
+from ..errors import LumigraphError
 from ..signals import until_interrupted
 from .common import needed, option, show
 from .controls import Set, open_method
@@ -45,8 +46,12 @@ class ViewCommand:
         return 0
 
 
-def subject_of(opened: Any, cameras: Any = None) -> Any:
-    """Something Opened, as the viewer wants it. cameras: by split, where the method sees them otherwise."""
+def subject_of(opened: Any, cameras: Any = None, finished: bool = True) -> Any:
+    """Something Opened, as the viewer wants it.
+
+    cameras:  by split, where the method sees them otherwise
+    finished: whether what is opened is what is shown, so that part of it can be saved
+    """
     from ..viewer import Subject
 
     return Subject(
@@ -57,7 +62,27 @@ def subject_of(opened: Any, cameras: Any = None) -> Any:
         f"lumigraph render {opened.path}",
         opened.open_scene,
         opened.metrics(),
+        saver(opened) if finished else None,
     )
+
+
+def saver(opened: Any) -> Any:
+    """What saves a part of a cloud of Gaussians beside it, as `lumigraph clean` does: a splat file or a new run."""
+
+    def save(name: str, crop: Any, floaters: Mapping[str, float]) -> str:
+        from ..capabilities import HasGaussians, needs
+        from ..gaussians.cleaning import gone, unwanted
+        from ..run.picking import save_picked
+
+        reasons = unwanted(needs(opened.method(), HasGaussians).gaussians(), crop, **floaters)
+        keep = ~gone(reasons)
+        if not keep.any():
+            raise LumigraphError("No Gaussian is left; crop or clean less")
+        output = opened.path.parent / name
+        save_picked(opened, keep, output, {"removed": {reason: int(some.sum()) for reason, some in reasons.items()}})
+        return str(output)
+
+    return save
 
 
 @contextlib.contextmanager
@@ -70,7 +95,7 @@ def watching(wanted: bool, method: Any, data: Any, run: Any, host: str, port: in
 
     from ..viewer import Viewer, choose_address
 
-    subject = subject_of(run)
+    subject = subject_of(run, finished=False)
     if run.photographed:
         subject = dataclasses.replace(subject, open_scene=lambda: data)
     with Viewer(method, subject, choose_address(host, port), training=True) as viewer:

@@ -107,9 +107,10 @@ def about_scales(comparison: Comparison) -> str:
     best = comparison.best("gaussian")
     where = "inside of the range" if comparison.peak_inside else "at the end of the range; give other --scales"
     return (
-        f"The scale says how far apart two places must be for the network to tell them apart. Too small, and it "
-        f"cannot follow the picture: neither half is learnt. Too large, and every pixel stands for itself: what is "
-        f"learnt of one says nothing of the next. Gaussian features are best at {best.scale:g} cycles across the "
+        f"The scale is the frequency up to which the encoding has waves: the larger it is, the closer together two "
+        f"places may be that the network can tell apart. At a small scale it cannot follow the picture, and learns "
+        f"neither half of the pixels. At a large one it learns each pixel by itself, and the held-out ones between "
+        f"them are noise. Gaussian features are best at {best.scale:g} cycles across the "
         f"picture, {where}; they win {comparison.gain:.2f} dB over no encoding. Positional features spread their "
         f"frequencies evenly in octaves up to the scale, along the axes alone."
     )

@@ -34,11 +34,11 @@ def against(pixels, valid, away, depth, jump, ahead, smooth):
             ahead[i] = surface - away[i]
 
 
-@njit(parallel=True, cache=True, error_model="numpy")
+@njit(nogil=True, cache=True, error_model="numpy")
 def fuse(pixels, valid, away, depth, facing, least, truncation, total, weight, pictured):
     """fusion.Fusion: one camera's word on each point, added to those of the others."""
     height, width = depth.shape
-    for i in prange(len(away)):
+    for i in range(len(away)):
         x, y = pixels[i, 0], pixels[i, 1]
         if valid[i] and 0 <= x < width and 0 <= y < height:
             pictured[i] = True

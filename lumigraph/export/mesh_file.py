@@ -1,4 +1,4 @@
-"""Meshes as files: PLY, OBJ and GLB, each with its colours where most programs look for them."""
+"""Meshes as files: PLY, OBJ, GLB and USDZ, each with its colours where most programs look for them."""
 
 from __future__ import annotations
 
@@ -7,30 +7,41 @@ import struct
 from pathlib import Path
 
 import numpy as np
+import torch
 import trimesh
+from jaxtyping import Float
 
 from ..errors import LumigraphError
 from ..files import write_bytes
+from ..geometry import to_quaternion, turning
 from ..mesh import Mesh
 from ..progress import counting
 from ..srgb import linear_from_srgb
 from .surface import vertex_normals
+from .usdz import usdz
 
+Z = np.array([0.0, 0.0, 1.0])
 FLOAT, UNSIGNED_INT = 5126, 5125  # glTF 2.0, 3.6.2.2
 VERTICES, INDICES = 34962, 34963  # glTF 2.0, 5.11.5
 
 
-def write_mesh(path: Path, mesh: Mesh) -> None:
-    """Write in the format that the ending names, whole or not at all, in the frame that the mesh is in.
+def write_mesh(path: Path, mesh: Mesh, up: Float[np.ndarray, " 3"] = Z) -> None:
+    """Write in the format that the ending names, whole or not at all.
 
+    .ply and .obj, which have no custom of what is up, are in the frame that the mesh is in. The other two stand
+    upright, +y up; a .glb by a node that turns the vertices, which are in the mesh's own frame there too.
+
+    up: in the mesh's frame
     .ply: binary, float32, sRGB-encoded bytes at each vertex
     .obj: sRGB-encoded colours from 0 to 1 after each vertex, as MeshLab, Blender and others read them
     .glb: linear colours, float32, and an unlit material, for the light is in the colours already
+    .usdz: a picture of the colours, as `usdz` has it
     Raises LumigraphError for any other ending.
     """
     encode = ENCODERS[ending(path)]
+    upright = turning(torch.from_numpy(np.asarray(up)), torch.tensor([0.0, 1.0, 0.0])).numpy()
     with counting(f"Writing {path.name}"):
-        write_bytes(path, encode(mesh))
+        write_bytes(path, encode(mesh, upright))
 
 
 def ending(path: Path) -> str:
@@ -40,17 +51,17 @@ def ending(path: Path) -> str:
     return path.suffix.lower()
 
 
-def ply(mesh: Mesh) -> bytes:
+def ply(mesh: Mesh, upright: Float[np.ndarray, "3 3"]) -> bytes:
     return bytes(as_trimesh(mesh).export(file_type="ply", vertex_normal=True))
 
 
-def obj(mesh: Mesh) -> bytes:
+def obj(mesh: Mesh, upright: Float[np.ndarray, "3 3"]) -> bytes:
     text = as_trimesh(mesh).export(file_type="obj", include_normals=True, digits=7, header="written by Lumigraph")
     return str(text).encode()
 
 
-def glb(mesh: Mesh) -> bytes:
-    """A binary glTF 2.0 of one mesh."""
+def glb(mesh: Mesh, upright: Float[np.ndarray, "3 3"]) -> bytes:
+    """A binary glTF 2.0 of one mesh in its own frame, below a node that turns it upright."""
     positions = mesh.vertices.astype("<f4")
     parts = [
         (positions, FLOAT, "VEC3", VERTICES),
@@ -73,7 +84,15 @@ def glb(mesh: Mesh) -> bytes:
         "extensionsUsed": ["KHR_materials_unlit"],
         "scene": 0,
         "scenes": [{"nodes": [0]}],
-        "nodes": [{"mesh": 0, "name": "mesh"}],
+        "nodes": [
+            {
+                "name": "upright",
+                "rotation": quaternion(upright),
+                "extras": {"source_from_upright": upright.T.tolist()},
+                "children": [1],
+            },
+            {"name": "source", "mesh": 0},
+        ],
         "meshes": [
             {"primitives": [{"attributes": {"POSITION": 0, "NORMAL": 1, "COLOR_0": 2}, "indices": 3, "material": 0}]}
         ],
@@ -94,10 +113,16 @@ def glb(mesh: Mesh) -> bytes:
     return struct.pack("<4sII", b"glTF", 2, 12 + len(body)) + body
 
 
+def quaternion(rotation: Float[np.ndarray, "3 3"]) -> list[float]:
+    """(x, y, z, w), as glTF has it."""
+    w, x, y, z = to_quaternion(torch.from_numpy(rotation)).tolist()
+    return [x, y, z, w]
+
+
 def as_trimesh(mesh: Mesh) -> trimesh.Trimesh:
     """For trimesh, which leaves vertices and their order as they are."""
     normals = vertex_normals(mesh.vertices, mesh.faces)
     return trimesh.Trimesh(mesh.vertices, mesh.faces, vertex_normals=normals, vertex_colors=mesh.colours, process=False)
 
 
-ENCODERS = {".ply": ply, ".obj": obj, ".glb": glb}
+ENCODERS = {".ply": ply, ".obj": obj, ".glb": glb, ".usdz": usdz}

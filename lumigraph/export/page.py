@@ -31,15 +31,16 @@ from ..files import write_bytes
 from ..gaussians import Gaussians
 from ..mesh import Mesh
 from ..method import Method
-from ..paths import Surroundings, angle_of_view, camera_path, film_size
+from ..paths import Surroundings, angle_of_view, camera_path, film_size, pivot
 from ..progress import counting, track
 from ..scene import Frame, Vector
+from .backdrop import Backdrop
 
 WEB = Path(__file__).parent / "web"
 NEAREST, FARTHEST = 0.1, 3.0  # times the first distance to what is looked at: how far zooming goes
-BELOW = 20.0  # degrees below the lowest photograph that the camera may go
+FARTHEST_OPEN = 1.5  # likewise, where the ground ends somewhere: from far outside it would be an island
+BELOW, BELOW_OPEN = 20.0, 5.0  # degrees below the lowest photograph that the camera may go, also under the open sky
 ARC = 0.8  # of the arc that photographs cover is shown
-AHEAD = 0.02  # scene units: of what a camera turns about that looks outward from the middle
 FINE = 2, 4  # of 1/128: steps of the harmonics, a quarter of those that .spz files have by custom
 CROP = 1.45  # times larger than fits, at most, is a picture without a plain background, to fill the window
 QUALITY = 90  # of the pictures, as WebP
@@ -59,6 +60,9 @@ class Opening:
     nearest, farthest: distances from the target that zooming keeps to
     lowest:     largest angle between up and the direction from the target to the camera
     inward:     whether the camera goes around the target; otherwise it turns on the spot
+    within:     two corners of the box that the target stays in, where it is moved sideways
+    floor:      height that the camera stays above; None for any
+    sky:        colours overhead and underfoot, with the background at the horizon; None for the background everywhere
     """
 
     title: str
@@ -72,32 +76,48 @@ class Opening:
     farthest: float
     lowest: float
     inward: bool
+    within: tuple[tuple[float, ...], tuple[float, ...]] | None = None
+    floor: float | None = None
+    sky: tuple[Vector, Vector] | None = None
 
 
-def opening_of_scene(title: str, cameras: Camera, frame: Frame, background: Vector | None = None) -> Opening:
+def opening_of_scene(
+    title: str,
+    cameras: Camera,
+    frame: Frame,
+    background: Vector | None = None,
+    behind: Backdrop | None = None,
+) -> Opening:
     """An opening from where photographs were typically taken, looking at what they look at.
 
     cameras:    of the photographs
     background: instead of the frame's
+    behind:     of a scene under the open sky; its colours count where no background is given
     """
     around = Surroundings(cameras, frame)
     pose = camera_path("orbit", cameras, frame, 1, (2, 2)).pose[0].double()
     position, forward = pose[:, 3], pose[:, 2]
-    target = around.focus if around.inward else position + AHEAD * forward
+    target = pivot(around, position, forward)
     distance = float((position - target).norm())
     elevation = math.degrees(float(around.polar[:, 1].min()))
+    alone = frame.reach == 1
+    low, high = (torch.tensor(corner, dtype=torch.double) for corner in frame.bounds)
+    coloured = behind if background is None else None
     return Opening(
         title,
-        background or frame.background,
+        background or (coloured.horizon if coloured else frame.background),
         tuple(position.tolist()),
         tuple(target.tolist()),
         math.degrees(angle_of_view(cameras)),
         frame.near,
         100 * frame.reach,
         NEAREST * distance,
-        FARTHEST * distance,
-        min(90 - elevation + BELOW, 175.0) if around.inward else 175.0,
+        (FARTHEST if alone else FARTHEST_OPEN) * distance,
+        min(90 - elevation + (BELOW if alone else BELOW_OPEN), 175.0) if around.inward else 175.0,
         around.inward,
+        (tuple(torch.minimum(low, target).tolist()), tuple(torch.maximum(high, target).tolist())),
+        behind.floor if behind else None,
+        (coloured.overhead, coloured.underfoot) if coloured else None,
     )
 
 

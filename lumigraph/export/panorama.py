@@ -165,8 +165,7 @@ def standpoint(cameras: Camera, frame: Frame, source: Vector | None = None) -> t
     """
     around = Surroundings(cameras, frame)
     if source is None:
-        away = (around.position - around.position.median(0).values).norm(dim=-1)
-        place = around.position[int(away.argmin())]
+        place = around.position[around.middle]
         given = frame.to_source.points(place)
         words = "where the camera in the middle of all stood"
     else:

@@ -1,14 +1,12 @@
-"""Pictures for people: PNG files, depth and error in colour, contact sheets."""
+"""Pictures for people: PNG files, depth and error in colour."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import torch
 from jaxtyping import Float, UInt8
-from PIL import Image, ImageDraw, ImageFont
+from PIL import Image
 from torch import Tensor
 
 from ..blending import before
@@ -18,7 +16,6 @@ from ..files import replacing
 RAMP = ("fff6dc", "fbcf7f", "f39a5b", "db5f60", "a93b77", "6c2e80", "352a6e", "131a3e")
 NOTHING = "0a0c12"  # where a ray meets nothing
 ERROR_GAIN = 5
-NARROWEST_COLUMN = 120  # pixels, room for its name
 
 Range = tuple[float, float]
 
@@ -78,44 +75,13 @@ def hex_colour(text: str) -> Float[Tensor, " 3"]:
     return torch.tensor(list(bytes.fromhex(text))) / 255
 
 
-@dataclass(frozen=True)
-class Row:
-    """A line of a contact sheet: pictures of one size, and what to say of them all, or of each."""
-
-    label: str | Sequence[str]
-    pictures: Sequence[Float[Tensor, "height width 3"]]
-
-
-def contact_sheet(title: str, columns: Sequence[str], rows: Sequence[Row], cell: int = 256) -> Image.Image:
-    """Pictures in rows under named columns, each at most `cell` pixels wide and 1.25 times that high."""
-    ink, faint, paper = "#1b1d22", "#6d717a", "#fbfaf8"
-    gap, margin, line = 10, 28, 22
-    shrunk = [[fit_into(to_image(p), cell, cell * 5 // 4) for p in row.pictures] for row in rows]
-    width = max(NARROWEST_COLUMN, *(image.width for images in shrunk for image in images))
-    heights = [max(image.height for image in images) for images in shrunk]
-    size = (
-        2 * margin + len(columns) * (width + gap) - gap,
-        2 * margin + 2 * line + 8 + sum(height + line + gap for height in heights) - gap,
-    )
-    sheet = Image.new("RGB", size, paper)
-    draw = ImageDraw.Draw(sheet)
-    draw.text((margin, margin - 10), title, ink, ImageFont.load_default(17))
-    small = ImageFont.load_default(13)
-    y = margin + line + 2
-    for i, name in enumerate(columns):
-        draw.text((margin + i * (width + gap), y), name, faint, small)
-    y += line
-    for row, images, height in zip(rows, shrunk, heights, strict=True):
-        for i, image in enumerate(images):
-            sheet.paste(image, (margin + i * (width + gap), y))
-        for i, label in enumerate([row.label] if isinstance(row.label, str) else row.label):
-            draw.text((margin + i * (width + gap), y + height + 2), label, ink, small)
-        y += height + line + gap
-    return sheet
-
-
 def fit_into(image: Image.Image, width: int, height: int) -> Image.Image:
     """Shrunk to fit, never enlarged."""
-    scale = min(width / image.width, height / image.height, 1.0)
-    size = (max(1, round(image.width * scale)), max(1, round(image.height * scale)))
+    size = fitted(*image.size, width, height)
     return image if size == image.size else image.resize(size, Image.Resampling.LANCZOS)
+
+
+def fitted(width: int, height: int, most_width: int, most_height: int) -> tuple[int, int]:
+    """The size of what is shrunk to fit, never enlarged."""
+    scale = min(most_width / width, most_height / height, 1.0)
+    return max(1, round(width * scale)), max(1, round(height * scale))

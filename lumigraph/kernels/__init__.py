@@ -7,6 +7,7 @@ from .hash_encode import HashLevels as HashLevels
 from .hash_encode import hash_encode as hash_encode
 from .march import march as march
 from .perceptron import perceptron as perceptron
+from .plane_sweep import plane_sweep as plane_sweep
 from .project import View as View
 from .project import project as project
 from .rasterize import rasterize as rasterize

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import ast
-import difflib
 import importlib
 import inspect
 import pkgutil
@@ -11,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import LumigraphError
+from ..names import meant
 
 
 def available() -> list[str]:
@@ -32,8 +32,8 @@ def check(name: str) -> str:
     """The name of an installed method, or LumigraphError naming those there are."""
     name = name.replace("_", "-")
     if name not in available():
-        near = difflib.get_close_matches(name, available(), n=1)
-        hint = f"; did you mean {near[0]}?" if near else ""
+        near = meant(name, available())
+        hint = f"; did you mean {near}?" if near else ""
         raise LumigraphError(f"No method {name!r} is installed; there are: {', '.join(available()) or 'none'}{hint}")
     return name
 

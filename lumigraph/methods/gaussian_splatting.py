@@ -14,9 +14,12 @@ from .. import kernels
 from ..blending import over
 from ..camera import Camera
 from ..components.clouds.cloud import Cloud, CloudAdam
+from ..components.clouds.dense_points import compile_sweep
 from ..components.clouds.density_control import AdaptiveDensity, MarkovChain
-from ..components.clouds.initial_cloud import initial_cloud, random_cloud
+from ..components.clouds.initial_cloud import Initialization, initial_cloud, random_cloud
 from ..components.clouds.smoothing import sampling_interval, smoothed
+from ..components.training.rhythm import Rhythm, haste, intervals
+from ..components.training.schedules import falling
 from ..errors import LumigraphWarning
 from ..gaussians import Gaussians
 from ..gaussians.splatting import Splatted, render, splat, view_of
@@ -36,11 +39,15 @@ class Config:
     ssim_weight: float = 0.2  # share of D-SSIM in the loss, eq. 7
     strategy: Literal["adaptive", "mcmc"] = "adaptive"  # density control: section 5, or Kheradmand 2024
     max_gaussians: int = 1_000_000  # cap of the cloud's size, under either strategy
-    initial_gaussians: int = 100_000  # at random places, where a capture has no points, section 7.1
+    initialization: Initialization = "sparse"  # points of structure from motion, "dense" with plane sweeps' beside them
+    initial_gaussians: int = 100_000  # at random places, where nothing else is known, section 7.1
     half_resolution_until: float = 0.0  # share of the budget at half size; the first quarter of it at a quarter
-    refine_every: int = 100  # steps between changes of the cloud, section 5.2
-    refine_from: int = 500  # step
+    refine_every: int = 100  # steps between changes of the cloud, section 5.2; or the share, if that is sooner
+    refine_every_share: float = 0.1
+    refine_from: int = 500  # step; or the share of the budget, if that is sooner
+    refine_from_share: float = 0.15
     refine_until: float = 0.5  # share of the budget; section 7.1: 15 000 of 30 000 steps
+    joining_per_step: float = 0.0  # Gaussians that mcmc has added by each step, if 5 % a change would be fewer
     densify_grad_threshold: float = 2e-4  # gradient of a footprint's centre that asks for more Gaussians, section 5.2
     opacity_reset_interval: int = 3000  # steps, section 5.2
     means_lr: float = 1.6e-4  # times the extent of the cameras
@@ -49,6 +56,7 @@ class Config:
     opacities_lr: float = 0.05
     scales_lr: float = 5e-3
     quaternions_lr: float = 1e-3
+    most_haste: float = 1.0  # times the rates of scales and harmonics in a run of few steps, at most
     opacity_regularization: float = 0.01  # weight of the mean opacity in the loss, for mcmc (Kheradmand 2024, eq. 11)
     scale_regularization: float = 0.01  # weight of the mean deviation, in extents, for mcmc
     transmittance_threshold: float = 1e-4  # at which a pixel is finished, appendix C
@@ -59,6 +67,7 @@ class Config:
 
 NEAR = 0.1  # times the scene's near distance: the near plane of splats
 SMALLEST = 64  # pixels of a photograph's shorter side that are kept when it is reduced
+ENOUGH = 2400  # steps, with which sizes and colours need not hurry
 RECOVERY = 3  # opacity_reset_intervals that must be left after opacities are reset, or the pictures stay dim
 GROWTH = 1.05  # of the number at each change, for mcmc (Kheradmand 2024, section 3.2)
 LAST_MOVE = 0.9  # share of the budget after which mcmc moves and adds no Gaussians, so that those there converge
@@ -104,6 +113,7 @@ class GaussianSplatting(Method):
         self.cloud.antialiased = config.antialiased
         self.density_control = AdaptiveDensity(len(self.cloud), config.densify_grad_threshold)
         self.exploration = MarkovChain()
+        self.rhythm = Rhythm(config.refine_every, config.refine_every_share)
         self.register_buffer("extent", torch.tensor(1.0))
         self.register_buffer("drawn", torch.tensor(0))
         self.register_buffer("began", torch.tensor(len(self.cloud)))
@@ -123,10 +133,17 @@ class GaussianSplatting(Method):
 
     @classmethod
     def preset(cls, device: torch.device) -> Any:
-        """On a GPU the paper's numbers; on a CPU a smaller cloud, which learns more in the same time."""
+        """On a GPU the paper's numbers; on a CPU a smaller cloud that begins dense: it learns more in the time."""
         if device.type == "cuda":
             return Config()
-        return Config(max_gaussians=120_000, initial_gaussians=20_000, half_resolution_until=0.3)
+        return Config(
+            initialization="dense",
+            max_gaussians=120_000,
+            initial_gaussians=20_000,
+            half_resolution_until=0.3,
+            joining_per_step=120.0,
+            most_haste=4.0,
+        )
 
     @classmethod
     def smallest(cls) -> Any:
@@ -143,9 +160,14 @@ class GaussianSplatting(Method):
             opacity_reset_interval=5,
         )
 
+    def rehearse_begin(self) -> None:
+        if self.config.initialization == "dense":
+            compile_sweep()
+
     def begin(self, scene: Scene) -> None:
         config = self.config
-        found = initial_cloud(scene, config.initial_gaussians, config.max_gaussians, config.sh_degree, self.random(1))
+        counts = config.initial_gaussians, config.max_gaussians
+        found = initial_cloud(scene, config.initialization, *counts, config.sh_degree, self.random(1))
         self.cloud.replace(found, self._optimizer)
         self.density_control.begin(len(found))
         self.began.fill_(len(found))
@@ -203,36 +225,44 @@ class GaussianSplatting(Method):
         groups = [
             {"name": "means", "params": [cloud.means], "lr": c.means_lr},
             {"params": [cloud.quaternions], "lr": c.quaternions_lr},
-            {"params": [cloud.log_scales], "lr": c.scales_lr},
+            {"name": "scales", "params": [cloud.log_scales], "lr": c.scales_lr},
             {"params": [cloud.opacities], "lr": c.opacities_lr},
-            {"params": [cloud.harmonics], "lr": c.sh_lr, "columns": columns},
+            {"name": "harmonics", "params": [cloud.harmonics], "lr": c.sh_lr, "columns": columns},
         ]
         self._optimizer = CloudAdam(groups)
         return [self._optimizer]
 
     def learning_rate(self, step: int, progress: float) -> dict[str, float]:
-        """Exponential decay of the means' rate (section 7.1), in extents of the cameras; the others stay."""
+        """Exponential decay of the means' rate (section 7.1), in extents of the cameras; the others stay. Sizes and
+        colours hurry where there are few steps."""
         c = self.config
-        return {"means": float(self.extent) * c.means_lr * (c.final_means_lr / c.means_lr) ** progress}
+        times = haste(step, progress, ENOUGH, c.most_haste)
+        means = float(self.extent) * falling(c.means_lr, c.final_means_lr, progress)
+        return {"means": means, "scales": times * c.scales_lr, "harmonics": times * c.sh_lr}
 
     def before_step(self, step: int, progress: float) -> None:
         config, self._progress = self.config, progress
-        raised = max(step // config.sh_degree_interval, int(progress / config.sh_degree_interval_share))
-        self._bands = 1 + min(raised, config.sh_degree)
+        raised = intervals(step, progress, config.sh_degree_interval, config.sh_degree_interval_share)
+        self._bands = 1 + min(int(raised), config.sh_degree)
 
     @torch.no_grad()
     def after_step(self, step: int) -> None:
         config, seen, optimizer = self.config, self._seen, self._optimizer
         assert seen is not None and optimizer is not None
         self._seen, size = None, len(self.cloud)
-        due = step >= config.refine_from and step % config.refine_every == 0
+        due = self.due(step)
         if config.strategy == "mcmc":
-            self._sample(due, optimizer, self.random(step))
+            self._sample(step, due, optimizer, self.random(step))
         elif self._progress < config.refine_until:
             self._densify(step, due, seen, optimizer)
         if config.filter_3d and (due or len(self.cloud) != size):
             assert self._cameras is not None
             self.interval = sampling_interval(self.cloud.means, self._cameras, self._near)
+
+    def due(self, step: int) -> bool:
+        """Whether the cloud may change after this step."""
+        first, share = self.config.refine_from, self.config.refine_from_share
+        return self.rhythm.due(step, self._progress) and intervals(step, self._progress, first, share) >= 1
 
     def _densify(self, step: int, due: bool, seen: Splatted, optimizer: CloudAdam) -> None:
         height, width = seen.opacity.shape
@@ -244,14 +274,16 @@ class GaussianSplatting(Method):
             wanted_more = control.refine(self.cloud, optimizer, float(self.extent), most, chance)
             if wanted_more and len(self.cloud) >= 0.99 * self._most():
                 self._tell_full()
-        every = self.config.opacity_reset_interval
-        if step and step % every == 0 and step / max(self._progress, 1e-6) - step >= RECOVERY * every:
+        every, whole = self.config.opacity_reset_interval, self._progress >= self.config.half_resolution_until
+        if step and step % every == 0 and whole and step / max(self._progress, 1e-6) - step >= RECOVERY * every:
             control.reset_opacity(self.cloud, optimizer)
 
-    def _sample(self, due: bool, optimizer: CloudAdam, chance: torch.Generator) -> None:
+    def _sample(self, step: int, due: bool, optimizer: CloudAdam, chance: torch.Generator) -> None:
         if due and self._progress < LAST_MOVE:
             count = len(self.cloud)
-            wanted = int(GROWTH * count) if self._progress < self.config.refine_until else count
+            wanted = count
+            if self._progress < self.config.refine_until:
+                wanted = int(max(GROWTH * count, int(self.began) + step * self.config.joining_per_step))
             if wanted > max(most := self._most(), count) and most < self.config.max_gaussians:
                 self._tell_full()
             self.exploration.refine(self.cloud, optimizer, min(wanted, max(most, count)), chance)

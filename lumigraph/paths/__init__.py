@@ -8,3 +8,5 @@ from .automatic import camera_path as camera_path
 from .automatic import film_size as film_size
 from .film import WAYS as WAYS
 from .film import film_cameras as film_cameras
+from .opening import best_centred as best_centred
+from .opening import pivot as pivot

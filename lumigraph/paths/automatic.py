@@ -2,7 +2,8 @@
 
 Cameras that look at something are described by where they stand around it: azimuth, elevation and distance about the
 point that they look at. Photographs taken all around it give a full circle; those from one side, a sway to and fro.
-Cameras that look outward give a turn on the spot. All paths but `held_out` close upon themselves or end smoothly.
+Cameras that look outward give a turn on the spot, where one of them stood. All paths but `held_out` close upon
+themselves or end smoothly.
 """
 
 from __future__ import annotations
@@ -30,6 +31,8 @@ SHARPNESS = 4.0  # of the weights with which nearby cameras set a path's height 
 OUTLYING = 4.0  # median deviations of log distance beyond which a camera does not count
 FRAMES_PER_KEY = 6  # interpolated frames between two photographs, at least
 WIDEST, NARROWEST = 75.0, 20.0  # degrees, of a film's smaller angle of view
+FACING = 0.5  # cosine of the angle to the focus up to which a camera looks at it
+ENOUGH = 0.4  # of the cameras that must look at the focus; gazes in all directions give a quarter to a third
 
 
 def camera_path(kind: str, cameras: Camera, frame: Frame, frames: int, size: tuple[int, int]) -> Camera:
@@ -90,25 +93,40 @@ class Surroundings:
         return torch.linalg.solve(across.mean(0) + loose, target)
 
     @cached_property
+    def cosine(self) -> Float[Tensor, " camera"]:
+        """Of the angle between each camera's gaze and the focus."""
+        return (unit(self.focus - self.position) * self.forward).sum(-1)
+
+    @cached_property
+    def middle(self) -> int:
+        """Number of the camera nearest to the middle of all: its place is free for certain."""
+        return int((self.position - self.position.median(0).values).norm(dim=-1).argmin())
+
+    @cached_property
     def axes(self) -> Float[Tensor, "3 3"]:
         """Rows: towards azimuth 0, towards azimuth 90 degrees, up. Azimuth 0 is where the cameras are, on average."""
-        towards = (self.position - self.focus if self.inward else self.forward).mean(0)
+        towards = self._offset.mean(0)
         level = torch.stack([towards[0], towards[1], torch.zeros((), dtype=torch.double)])
         first = unit(level) if level.norm() > 1e-6 else torch.tensor([1.0, 0.0, 0.0], dtype=torch.double)
         return torch.stack([first, torch.linalg.cross(UP, first), UP])
 
     @cached_property
     def inward(self) -> bool:
-        """Whether the cameras look at something between them."""
-        towards = unit(self.focus - self.position)
-        return float((towards * self.forward).sum(-1).mean()) > 0.5
+        """Whether the cameras look at something between them. Some may look elsewhere, as where somebody walked around
+        a courtyard and photographed both its fountain and its walls."""
+        return float((self.cosine > FACING).double().mean()) > ENOUGH
+
+    @cached_property
+    def _offset(self) -> Float[Tensor, "camera 3"]:
+        """From the focus to each camera that looks at it; of cameras that look outward, their directions."""
+        return (self.position - self.focus)[self.cosine > FACING] if self.inward else self.forward
 
     @cached_property
     def polar(self) -> Float[Tensor, "camera 3"]:
-        """Azimuth, elevation and log distance of each camera about the focus; of its direction, if all look outward."""
-        offset = self.position - self.focus if self.inward else self.forward
-        x, y, z = (offset @ self.axes.T).unbind(-1)
-        distance = offset.norm(dim=-1).clamp_min(1e-9)
+        """Azimuth, elevation and log distance about the focus of each camera that looks at it; of the directions of
+        all, if they look outward."""
+        x, y, z = (self._offset @ self.axes.T).unbind(-1)
+        distance = self._offset.norm(dim=-1).clamp_min(1e-9)
         return torch.stack([torch.atan2(y, x), torch.asin((z / distance).clamp(-1, 1)), distance.log()], -1)
 
     @cached_property
@@ -136,13 +154,14 @@ class Surroundings:
         return (high - low) / 2
 
     def poses(self, azimuth: Tensor, elevation: Tensor, log_distance: Tensor) -> Poses:
-        """Cameras standing there and looking at the focus; looking that way from the middle, if they look outward."""
+        """Cameras standing there and looking at the focus; looking that way from the middle camera's place, if all look
+        outward."""
         elevation = elevation.clamp(math.radians(-85), math.radians(85))
         level = elevation.cos()
         outward = torch.stack([level * azimuth.cos(), level * azimuth.sin(), elevation.sin()], -1) @ self.axes
         if self.inward:
             return look_at(self.focus + log_distance.exp()[:, None] * outward, -outward, UP)
-        return look_at(self.position.median(0).values.expand(len(outward), 3), outward, UP)
+        return look_at(self.position[self.middle].expand(len(outward), 3), outward, UP)
 
 
 def orbit(around: Surroundings, frames: int) -> Poses:

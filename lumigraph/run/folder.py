@@ -162,10 +162,14 @@ class Run(Opened):
 
         Raises LumigraphError if it gives another frame than the run was trained in.
         """
-        from ..capture import KINDS, open_dataset
+        from ..capture import KINDS, Before, open_dataset
 
         source = source or self.settings.scene.source
         options = {name: value for name, value in self.settings.scene.options.items() if value is not None}
+        if self.photographed:
+            with understood(self.folder / "cameras.json"):
+                names = files.read_json(self.folder / "cameras.json")["names"]
+            options["before"] = Before(names, self.frame.to_source.rotation.T.numpy())
         data = open_dataset(source, KINDS[self.kind], **options)
         if not self.settings.agrees(data.frame):
             what = "cameras or bounds differ" if self.photographed else "bounds differ"

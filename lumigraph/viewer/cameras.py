@@ -1,4 +1,4 @@
-"""Cameras of the house from the browser's, and where and how widely a camera looks."""
+"""Cameras of the house from the browser's, and how widely a camera looks."""
 
 from __future__ import annotations
 
@@ -12,8 +12,6 @@ from torch import Tensor
 from ..camera import Camera
 from ..geometry import to_matrix
 from ..lens import Pinhole
-from ..paths import Surroundings
-from ..scene import Frame
 
 WIDEST = math.radians(120)  # of a view, and of a photograph that is drawn as a frustum
 
@@ -52,11 +50,3 @@ def angle_for(camera: Camera, aspect: float) -> float:
     """Vertical angle of view, in radians, at which a window of an aspect (width / height) shows a whole photograph."""
     across, down = angles(camera)
     return min(WIDEST, max(down, 2 * math.atan(math.tan(across / 2) / aspect)))
-
-
-def target(camera: Camera, frame: Frame, around: Surroundings) -> Float[Tensor, " 3"]:
-    """The point that a camera turns about, on its optical axis: beside the focus of all cameras if those look inward,
-    10 near distances ahead if they look outward."""
-    position, forward = camera.position[0].double(), camera.forward[0].double()
-    towards = float((around.focus - position) @ forward) if around.inward else 0.0
-    return position + max(towards, 10 * frame.near) * forward

@@ -2,15 +2,10 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections.abc import Callable
-from typing import Any, cast
+from typing import Any
 
-import numpy as np
-from jaxtyping import Float
-
-from ..crop import Box
 from ..scene import Frame, Vector
 from .modes import MODES
 from .scenery import CAMERAS, POINTS
@@ -41,24 +36,18 @@ class Controls:
                 "Angle of view", NARROWEST, WIDEST, 1.0, 50.0, hint="Degrees, from top to bottom"
             )
             self._sharpest = gui.add_slider(
-                "Sharpest", 240, 2048, 16, SHARPEST, hint="Pixels along the longer side, once the camera rests"
+                "Resolution", 240, 2048, 16, SHARPEST, hint="Pixels along the longer side, once the camera rests"
             )
             self._background = gui.add_rgb("Background", to_bytes(frame.background))
             self._cameras = gui.add_checkbox("Cameras", True, hint="Click on one to fly there")
             self._points = gui.add_checkbox("Sparse points", False, visible=False)
-            with gui.add_folder("Crop", expand_by_default=False):
-                self._crop = gui.add_checkbox("Inside this box alone", False)
-                lower, upper = frame.bounds
-                self._lower = gui.add_vector3("Lower", lower, step=0.01)
-                self._upper = gui.add_vector3("Upper", upper, step=0.01)
             self.status = gui.add_markdown("")
-        for drawn in (self._mode, self._exact, self._sharpest, self._background, self._crop, self._lower, self._upper):
+        for drawn in (self._mode, self._exact, self._sharpest, self._background):
             drawn.on_update(lambda _: self._update())
         self._cameras.on_update(lambda _: self._update())
         self._points.on_update(lambda _: self._update())
         self._angle.on_update(lambda _: self._set_angle())
         self._shadows = {CAMERAS: True, POINTS: True}
-        self._box: Any = None
         self._update()
 
     @property
@@ -83,18 +72,9 @@ class Controls:
         return own if chosen == to_bytes(own) else (chosen[0] / 255, chosen[1] / 255, chosen[2] / 255)
 
     @property
-    def crop(self) -> Box | None:
-        """The box of what is shown; None while nothing is cropped."""
-        if not self._crop.value:
-            return None
-        a, b = self._lower.value, self._upper.value
-        lower, upper = (tuple(float(x) for x in pick(a, b)) for pick in (np.minimum, np.maximum))
-        return Box(cast(Vector, lower), cast(Vector, upper))
-
-    @property
     def surrounded(self) -> bool:
         """Whether anything is drawn beside the scene itself."""
-        return bool(self._cameras.value or self._points.value or self._crop.value)
+        return bool(self._cameras.value or self._points.value)
 
     def offer_points(self) -> None:
         """Show the checkbox for sparse points."""
@@ -123,26 +103,7 @@ class Controls:
             if shown != self._shadows[name]:
                 self._client.scene.add_frame(name, show_axes=False, visible=shown)
                 self._shadows[name] = shown
-        self._show_box()
         self._changed()
-
-    def _show_box(self) -> None:
-        if self._box is not None:
-            self._box.remove()
-            self._box = None
-        box = self.crop
-        if box is not None:
-            self._box = self._client.scene.add_line_segments(
-                "/crop", edges(box), (240, 190, 80), thickness=2.0, thickness_units="screen"
-            )
-
-
-def edges(box: Box) -> Float[np.ndarray, "12 2 3"]:
-    """The two ends of each of a box's twelve edges."""
-    corners = np.array(list(itertools.product((0, 1), repeat=3)))
-    ends = [(a, b) for a, b in itertools.combinations(corners, 2) if abs(a - b).sum() == 1]
-    lower, upper = np.array(box.lower), np.array(box.upper)
-    return lower + np.array(ends) * (upper - lower)
 
 
 def to_bytes(colour: Vector) -> tuple[int, int, int]:

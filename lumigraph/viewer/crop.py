@@ -1,9 +1,9 @@
 """Cropping: what a camera sees inside a box or a sphere of the scene.
 
-A cloud of Gaussians is filtered by its centres. A RayMethod's rays begin where they enter the crop, so what stands in
-front of it vanishes. What lies behind it is removed pixel by pixel, by its expected depth; for all other methods,
-so is what lies before it. Where something see-through inside stands before something solid outside, their mean depth
-decides.
+A RayMethod's rays begin where they enter the crop, so what stands in front of it vanishes. What lies behind it is
+removed pixel by pixel, by its expected depth; for all other methods, so is what lies before it. Where something
+see-through inside stands before something solid outside, their mean depth decides. (Of a cloud, Gaussians are picked;
+see `Shared.cloud`.)
 """
 
 from __future__ import annotations
@@ -15,22 +15,16 @@ from jaxtyping import Bool, Shaped
 from torch import Tensor
 
 from ..camera import Camera
-from ..capabilities import HasGaussians, needs
 from ..crop import Crop
-from ..gaussians import splatting
-from ..gaussians.cleaning import cleaned
 from ..method import Method, RayMethod
 from ..rays import Rays, Rendering
 
 TOLERANCE = 0.01  # of the crop's size: an expected depth may lie so far outside
 
 
-def render_inside(method: Method, camera: Camera, crop: Crop, is_cloud: bool) -> Rendering:
-    """What a camera sees inside a crop. is_cloud: whether the method has Gaussians."""
+def render_inside(method: Method, camera: Camera, crop: Crop) -> Rendering:
+    """What a camera sees inside a crop of a method that has no Gaussians."""
     frame = method.frame
-    if is_cloud:
-        cloud = cleaned(needs(method, HasGaussians).gaussians(), crop)
-        return splatting.render(cloud, camera.to(method.device), frame.background, frame.near)
     rays = camera.rays(camera.pixels())
     if isinstance(method, RayMethod):
         rendering = from_entry(method, rays, crop)

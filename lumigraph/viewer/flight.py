@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -52,8 +53,18 @@ class Flight:
             time.sleep(STEP)
         self.place(pose, distance, angle)
 
-    def play(self, poses: Float[np.ndarray, "frame 3 4"], distance: float, angles: list[float], seconds: float) -> bool:
-        """Move the camera along a path in a time, skipping frames if need be; returns whether it came to the end."""
+    def play(
+        self,
+        poses: Float[np.ndarray, "frame 3 4"],
+        distance: float,
+        angles: list[float],
+        seconds: float,
+        shown: Callable[[int], None] = lambda frame: None,
+    ) -> bool:
+        """Move the camera along a path in a time, skipping frames if need be; returns whether it came to the end.
+
+        shown: told the number of each frame that is not skipped
+        """
         self._number += 1
         number, begin = self._number, time.perf_counter()
         while (now := time.perf_counter() - begin) < seconds:
@@ -61,8 +72,10 @@ class Flight:
                 return False
             i = min(int(now / seconds * len(poses)), len(poses) - 1)
             self.place(poses[i], distance, angles[i])
+            shown(i)
             time.sleep(STEP)
         self.place(poses[-1], distance, angles[-1])
+        shown(len(poses) - 1)
         return True
 
 

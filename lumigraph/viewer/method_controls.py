@@ -41,6 +41,11 @@ class MethodControls:
         time = self._now().get("time")
         return None if time is None else float(time)
 
+    def show_time(self, moment: float) -> None:
+        """Turn the control `time` to a moment, where there is one."""
+        if "time" in self._handles:
+            self._handles["time"].value = moment
+
     def _now(self) -> dict[str, Value]:
         return {control.name: value_of(control, self._handles[control.name].value) for control in self._controls}
 

@@ -17,13 +17,13 @@ from ..camera import Camera
 from ..errors import LumigraphError
 from ..geometry import to_quaternion
 from ..lens import Pinhole
+from ..names import natural
 from ..paths.keyframes import CameraPath, Keyframe
 from ..scene import Frame
 from .cameras import pose_of
 from .flight import Flight
-from .subject import Subject
+from .subject import NAME, NAMING, Subject
 
-NAME = re.compile(r"\w[\w .-]{0,80}")
 COLOUR = (200, 60, 150)
 FINENESS = 24  # points of the drawn path between two keyframes
 LEG = 2.0  # seconds from one keyframe to the next, unless something else is set
@@ -44,6 +44,7 @@ class PathPanel:
     size: of a frustum, in scene units
     tell: says a title and a text to the client
     time: gives the moment of a moving scene that the client sees, which a keyframe keeps
+    show_time: shows the client a moment
     """
 
     def __init__(
@@ -55,8 +56,9 @@ class PathPanel:
         size: float,
         tell: Callable[[str, str], None],
         time: Callable[[], float | None],
+        show_time: Callable[[float], None],
     ):
-        self._time = time
+        self._time, self._show_time = time, show_time
         self._client, self._subject, self._flight, self._size, self._tell = client, subject, flight, size, tell
         self._stops: list[Stop] = []
         self._nodes: list[Any] = []
@@ -146,7 +148,10 @@ class PathPanel:
 
     def _go(self) -> None:
         if self._stops:
-            poses, angles = self._views(CameraPath((self._stops[self._index].key,)), 1)
+            key = self._stops[self._index].key
+            poses, angles, _ = self._views(CameraPath((key,)), 1)
+            if key.time is not None:
+                self._show_time(key.time)
             self._flight.fly(poses[0], self._distance, angles[0])
 
     def _play(self) -> None:
@@ -156,8 +161,13 @@ class PathPanel:
             self._tell("Nothing to play", str(error))
             return
         seconds = max(path.duration, 0.1)
-        poses, angles = self._views(path, max(2, round(30 * seconds)))
-        self._flight.play(poses, self._distance, angles, seconds)
+        poses, angles, moments = self._views(path, max(2, round(30 * seconds)))
+
+        def shown(frame: int) -> None:
+            if moments is not None:
+                self._show_time(moments[frame])
+
+        self._flight.play(poses, self._distance, angles, seconds, shown)
 
     @property
     def _distance(self) -> float:
@@ -165,14 +175,17 @@ class PathPanel:
         camera = self._client.camera
         return float(np.linalg.norm(camera.look_at - camera.position))
 
-    def _views(self, path: CameraPath, frames: int) -> tuple[Float[np.ndarray, "frame 3 4"], list[float]]:
-        """Poses in the scene's frame and vertical angles for this client's window."""
+    def _views(
+        self, path: CameraPath, frames: int
+    ) -> tuple[Float[np.ndarray, "frame 3 4"], list[float], list[float] | None]:
+        """Poses in the scene's frame, vertical angles for this client's window, and moments where the path has them."""
         camera = self._client.camera
         size = (max(1, int(camera.image_width)), max(1, int(camera.image_height)))
         cameras = path.cameras(self._subject.frame, size, frames)
         assert isinstance(cameras.lens, Pinhole)
         angles = 2 * torch.atan(0.5 * size[1] / cameras.lens.focal[:, 1])
-        return cameras.pose.double().numpy(), angles.tolist()
+        moments = None if cameras.time is None else cameras.time.tolist()
+        return cameras.pose.double().numpy(), angles.tolist(), moments
 
     def _fill(self, at: int) -> None:
         """Show the keyframes in the panel, number `at` chosen."""
@@ -222,13 +235,13 @@ class PathPanel:
 
     def _names(self) -> tuple[str, ...]:
         folder = self._subject.paths
-        names = sorted(path.stem for path in folder.glob("*.json")) if folder.is_dir() else []
+        names = sorted((path.stem for path in folder.glob("*.json")), key=natural) if folder.is_dir() else []
         return tuple(names) or (NONE,)
 
     def _save(self) -> None:
         name = self._name.value.strip()
         if not NAME.fullmatch(name):
-            self._tell("Not saved", "A path's name is made of letters, digits, spaces, dots and dashes")
+            self._tell("Not saved", NAMING)
             return
         file = self._subject.paths / f"{name}.json"
         try:

@@ -7,7 +7,7 @@ from typing import Any
 
 from ..camera import Camera
 from ..capabilities import HasGaussians, needs
-from ..gaussians import Gaussians
+from ..gaussians import Gaussians, splatting
 from ..gaussians.cleaning import cleaned
 from ..method import Method
 from ..rays import Rendering
@@ -24,7 +24,7 @@ class Shared:
 
     is_cloud:           whether the method has Gaussians
     server:             viser's
-    view_tab, path_tab: where each client's own controls go
+    tabs:               View, Crop and Path, where each client's own controls go
     step:               to which the method has been trained
     stopped:            whether the viewer has ended
     """
@@ -34,24 +34,32 @@ class Shared:
     subject: Subject
     turns: Turns
     server: Any
-    view_tab: Any
-    path_tab: Any
+    tabs: tuple[Any, Any, Any]
     scenery: Scenery
     step: int = 0
     stopped: bool = False
+    _picked: tuple[Any, Gaussians] | None = None  # what was wanted last of part of the cloud, and that part
 
     def cloud(self, request: ViewRequest) -> Gaussians:
-        """The Gaussians of the method as a client told it, those inside its crop. Raises LumigraphError if it has none.
-        Call it inside `turns.turn`."""
-        cloud = needs(self._given(request), HasGaussians).gaussians()
-        return cleaned(cloud, request.crop)
+        """The Gaussians of the method as a client told it, of which its crop and cleaning leave these. Raises
+        LumigraphError if it has none. Call it inside `turns.turn`."""
+        if not request.part:
+            return needs(self._given(request), HasGaussians).gaussians()
+        wanted = self.step, request.told, request.crop, request.floaters
+        if self._picked is None or self._picked[0] != wanted:
+            cloud = needs(self._given(request), HasGaussians).gaussians()
+            self._picked = wanted, cleaned(cloud, request.crop, **dict(request.floaters))
+        return self._picked[1]
 
     def render(self, camera: Camera, request: ViewRequest) -> Rendering:
         """What a camera sees of the method as a client told it, on the CPU. Call it inside `turns.turn`."""
         method = self._given(request)
-        if request.crop is None:
+        if not request.part:
             return method.render(camera).cpu()
-        return render_inside(method, camera, request.crop, self.is_cloud).cpu()
+        if request.crop is not None and not self.is_cloud:
+            return render_inside(method, camera, request.crop).cpu()
+        cloud, frame = self.cloud(request), method.frame
+        return splatting.render(cloud, camera.to(method.device), frame.background, frame.near).cpu()
 
     def _given(self, request: ViewRequest) -> Method:
         return self.method.given(**dict(request.told)) if request.told else self.method

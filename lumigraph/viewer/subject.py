@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import re
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 from ..camera import Camera
-from ..paths import Surroundings
+from ..crop import Crop
+from ..paths import Surroundings, best_centred, pivot
 from ..scene import Frame, Scene
-from .cameras import target
+
+NAME = re.compile(r"\w[\w .-]{0,80}")  # of what somebody saves
+NAMING = "A name is made of letters, digits, spaces, dots and dashes"
+Keep = Callable[[str, Crop | None, Mapping[str, float]], str]
 
 
 @dataclass(frozen=True)
@@ -24,6 +29,8 @@ class Subject:
     render_command: command line that renders films of the scene, without `--path`
     open_scene:     opens the photographs, for thumbnails and sparse points; None if there are none
     rows:           of metrics.jsonl, as far as the method has been trained
+    keep:           saves what a crop and cleaning leave of the cloud under a name, and says where; None where nothing
+                    can be saved
     """
 
     title: str
@@ -33,12 +40,19 @@ class Subject:
     render_command: str
     open_scene: Callable[[], Scene] | None = None
     rows: list[dict[str, Any]] = field(default_factory=list)
+    keep: Keep | None = None
 
     @cached_property
     def around(self) -> Surroundings:
         """Where all the cameras stand and look."""
         return Surroundings(Camera.cat(list(self.cameras.values())).to("cpu"), self.frame)
 
+    @cached_property
+    def first(self) -> Camera:
+        """The photograph's camera that every client begins with."""
+        return self.around.cameras[best_centred(self.around)]
+
     def distance(self, camera: Camera) -> float:
         """Distance from a camera to the point that it turns about, in scene units."""
-        return float((target(camera, self.frame, self.around) - camera.position[0]).norm())
+        position, forward = camera.position[0].double().cpu(), camera.forward[0].double().cpu()
+        return float((pivot(self.around, position, forward) - position).norm())

@@ -28,6 +28,7 @@ class ViewRequest:
     crop:       what is shown of the scene; None for all of it
     depth:      whether the browser needs depth, because it draws something beside the scene
     told:       names and values of the method's controls that the client has turned
+    floaters:   names and numbers of what `cleaned` is told of them; nothing if they stay
     """
 
     pose: tuple[tuple[float, ...], ...]
@@ -40,6 +41,12 @@ class ViewRequest:
     crop: Crop | None = None
     depth: bool = False
     told: tuple[tuple[str, Value], ...] = ()
+    floaters: tuple[tuple[str, float], ...] = ()
+
+    @property
+    def part(self) -> bool:
+        """Whether less than the whole scene is shown."""
+        return self.crop is not None or bool(self.floaters)
 
     @property
     def full(self) -> tuple[int, int]:

@@ -14,8 +14,9 @@ from ..camera import Camera
 from ..capabilities import HasGaussians, can
 from ..errors import LumigraphError
 from ..method import Method
+from . import window
 from .address import Address
-from .cameras import angles, target
+from .cameras import angles
 from .scenery import Scenery
 from .shared import Shared
 from .subject import Subject
@@ -42,10 +43,10 @@ class Viewer:
         self._server = start_server(address, subject.title)
         self._aim()
         tabs = self._server.gui.add_tab_group()
-        view_tab, path_tab = tabs.add_tab("View"), tabs.add_tab("Path")
+        own_tabs = tabs.add_tab("View"), tabs.add_tab("Crop"), tabs.add_tab("Path")
         self._panel = self._add_training_panel(tabs)
         self._scenery = Scenery(self._server, subject.cameras, self._clicked)
-        self._shared = Shared(method, is_cloud, subject, self.turns, self._server, view_tab, path_tab, self._scenery)
+        self._shared = Shared(method, is_cloud, subject, self.turns, self._server, own_tabs, self._scenery)
         self._server.on_client_connect(self._welcome)
         self._server.on_client_disconnect(self._farewell)
         if subject.open_scene is not None:
@@ -55,11 +56,11 @@ class Viewer:
         """Set the look of the page, and the camera that every client begins with."""
         server, subject = self._server, self.subject
         server.gui.configure_theme(show_logo=False, show_share_button=False, control_width="medium")
-        first = subject.cameras.get("test") or subject.cameras["train"]
-        camera = first[0].to("cpu")
-        server.initial_camera.position = camera.position[0].double().numpy()
-        server.initial_camera.look_at = target(camera, subject.frame, subject.around).numpy()
-        server.initial_camera.fov = angles(camera)[1]
+        window.prepare(server.gui, subject.title)
+        pose, distance = subject.first.pose[0].double().numpy(), subject.distance(subject.first)
+        server.initial_camera.position = pose[:, 3]
+        server.initial_camera.look_at = pose[:, 3] + distance * pose[:, 2]
+        server.initial_camera.fov = angles(subject.first)[1]
 
     def _add_training_panel(self, tabs: Any) -> TrainingPanel | None:
         """The tab `Training`; None where nothing has been or will be trained."""
@@ -137,7 +138,7 @@ class Viewer:
         with self._lock:
             visitor = self._visitors.get(client.client_id)
         if visitor is not None:
-            visitor.fly_to(camera, self.subject.distance(camera.to("cpu")))
+            visitor.fly_to(camera, self.subject.distance(camera))
 
     def _filled(self, fault: str | None) -> None:
         for visitor in self._everyone():

@@ -6,7 +6,7 @@ import os
 import sys
 import time
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
@@ -14,12 +14,14 @@ import torch
 from jaxtyping import UInt8
 
 from ..camera import Camera
+from ..crop import Crop
 from ..errors import LumigraphError
 from ..figures import to_bytes
 from ..rays import Rendering
 from ..scene import Vector
 from .cameras import angle_for, pose_of, rows
 from .controls import Controls
+from .crop_panel import CropPanel
 from .flight import Flight
 from .method_controls import MethodControls
 from .modes import along_axis, extra_modes, picture
@@ -36,6 +38,7 @@ DEPTH_STEP = 256e-5  # scene units, to which that depth is rounded so that it pa
 FEWEST_ROWS = 16  # of a band
 QUALITY, QUALITY_MOVING = 90, 70  # of JPEG
 MOST_RECOLOURED = 500_000  # Gaussians; more are too many to send again whenever the camera rests
+WIDER = 0.01  # radians: a difference of angles of view that is worth setting
 TURNED = 0.03  # how far the eye must move, as a share of its distance to the middle, for colours to change
 Wanted = Callable[[], bool]
 
@@ -53,19 +56,34 @@ class Visitor:
         self._hidden: dict[str, Any] = {}  # frusta that are too near to the eye, and what hides each
         self.painter = Painter(self._draw, shared.turns, self._tell_fault, lambda: shared.step)
         self.flight = Flight(client)
-        self.controls = Controls(client, shared.view_tab, shared.subject.frame, shared.is_cloud, self.painter.ask)
-        self.method_controls = MethodControls(client, shared.view_tab, shared.method, self.painter.ask)
+        view_tab, crop_tab, path_tab = shared.tabs
+        self.controls = Controls(client, view_tab, shared.subject.frame, shared.is_cloud, self.painter.ask)
+        self.method_controls = MethodControls(client, view_tab, shared.method, self.painter.ask)
+        self.crop = CropPanel(
+            client,
+            crop_tab,
+            shared.subject.frame,
+            shared.is_cloud,
+            self.painter.ask,
+            self._keep if shared.is_cloud and shared.subject.keep is not None else None,
+            f"{shared.subject.title.partition('.')[0]}-part.ply",
+            self.tell,
+        )
         self.path = PathPanel(
             client,
-            shared.path_tab,
+            path_tab,
             shared.subject,
             self.flight,
             shared.scenery.size,
             self.tell,
             lambda: self.method_controls.time,
+            self.method_controls.show_time,
         )
         self._seen: tuple[Any, ...] = ()
         client.camera.on_update(self._moved)
+        wide = angle_for(shared.subject.first, client.camera.aspect)
+        if wide > client.camera.fov + WIDER:  # a narrow window shows the whole photograph too
+            client.camera.fov = wide
         self.controls.tell_angle(client.camera.fov)
         if shared.scenery.has_points:
             self.controls.offer_points()
@@ -85,6 +103,12 @@ class Visitor:
         """Fly to where a photograph was taken, with an angle of view that shows all of it."""
         pose = camera.pose[0].double().cpu().numpy()
         self.flight.fly(pose, distance, angle_for(camera.to("cpu"), self._client.camera.aspect))
+
+    def _keep(self, name: str, crop: Crop | None, floaters: Mapping[str, float]) -> str:
+        """Save what is left of the cloud. Raises LumigraphError if it cannot be."""
+        assert self._shared.subject.keep is not None
+        with self._shared.turns.turn():
+            return self._shared.subject.keep(name, crop, floaters)
 
     @property
     def _here(self) -> bool:
@@ -109,9 +133,10 @@ class Visitor:
             controls.mode,
             controls.background,
             controls.exact,
-            controls.crop,
-            controls.surrounded or self.path.drawn,
+            self.crop.crop,
+            controls.surrounded or self.path.drawn or self.crop.drawn,
             self.method_controls.values,
+            self.crop.floaters,
         )
 
     def _draw(self, seconds: float, wanted: Wanted) -> bool:
@@ -170,7 +195,7 @@ class Visitor:
             self._flat = request.background
         if self._splats is not None:
             self._splats.visible = True
-        now, eye = (self._shared.step, request.crop, request.told), torch.tensor(request.pose)[:, 3]
+        now, eye = (self._shared.step, request.crop, request.told, request.floaters), torch.tensor(request.pose)[:, 3]
         if self._splats is None or (seconds > MOVING and self._sent != now):
             self._send_splats(request, eye, wanted)
             self._sent, self._eye = now, eye

@@ -1,6 +1,6 @@
 // A canvas, a camera that a person turns around the scene, and a picture drawn only when something has changed.
 
-import { Color, ColorManagement, LinearSRGBColorSpace, MathUtils, Matrix4, PerspectiveCamera, Scene, Spherical, Vector3, WebGLRenderer } from "three";
+import { BackSide, Color, ColorManagement, LinearSRGBColorSpace, MathUtils, Matrix4, Mesh, PerspectiveCamera, Scene, ShaderMaterial, SphereGeometry, Spherical, Vector3, WebGLRenderer } from "three";
 import { OrbitControls } from "three/addons/controls/OrbitControls.js";
 
 const DENSEST = 2; // physical pixels to a CSS pixel; more cost much and show little
@@ -17,6 +17,7 @@ export class Stage {
     this.renderer.outputColorSpace = LinearSRGBColorSpace; // no second encoding
     this.renderer.setClearColor(new Color(...settings.background), 1);
     this.scene = new Scene();
+    if (settings.sky) this.scene.add(sky(settings));
     this.camera = new PerspectiveCamera(50, 1, settings.near, settings.far);
     this.camera.up.set(0, 0, 1);
     this.paint = () => this.renderer.render(this.scene, this.camera);
@@ -79,9 +80,24 @@ export class Stage {
     if (this.asked) return;
     this.asked = requestAnimationFrame(() => {
       this.asked = null;
-      if (this.controls.enabled) this.controls.update(); // goes on, by way of `change`, until damping has come to rest
+      if (this.controls.enabled) {
+        this.controls.update(); // goes on, by way of `change`, until damping has come to rest
+        this.stay();
+      }
       this.paint();
     });
+  }
+
+  // Keeps the target within the scene and the camera above its floor, by moving both alike.
+  stay() {
+    const { inward, within, floor } = this.settings;
+    if (!inward || !within) return;
+    const [low, high] = within.map((corner) => new Vector3(...corner));
+    const { target } = this.controls;
+    const back = target.clone().clamp(low, high).sub(target);
+    back.z += Math.max(0, (floor ?? -Infinity) - this.camera.position.z - back.z);
+    target.add(back);
+    this.camera.position.add(back);
   }
 
   press(event) {
@@ -131,6 +147,32 @@ export class Stage {
       await shown();
     } while (this.asked);
   }
+}
+
+// A sphere around the camera, wherever it is: overhead, horizon and underfoot, by the height of the direction.
+function sky({ sky: [overhead, underfoot], background, near, far }) {
+  const colour = (rgb) => ({ value: new Vector3(...rgb) });
+  const material = new ShaderMaterial({
+    uniforms: { overhead: colour(overhead), horizon: colour(background), underfoot: colour(underfoot) },
+    vertexShader: `varying vec3 direction;
+      void main() {
+        direction = position;
+        gl_Position = projectionMatrix * vec4(mat3(viewMatrix) * position, 1.0);
+      }`,
+    fragmentShader: `uniform vec3 overhead, horizon, underfoot;
+      varying vec3 direction;
+      void main() {
+        float height = normalize(direction).z;
+        vec3 colour = mix(horizon, height > 0.0 ? overhead : underfoot, smoothstep(0.0, 0.5, abs(height)));
+        gl_FragColor = vec4(colour, 1.0);
+      }`,
+    side: BackSide,
+    depthTest: false,
+    depthWrite: false,
+  });
+  const sphere = new Mesh(new SphereGeometry(Math.sqrt(near * far), 32, 16), material);
+  Object.assign(sphere, { frustumCulled: false, renderOrder: -1 });
+  return sphere;
 }
 
 // Until what was painted is on the screen.

@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial import ConvexHull, QhullError
 
+from ...names import natural
 from ..library import pycolmap
 from ..normalise import where_axes_meet
 from ..photos import Intake, Photo
@@ -164,7 +165,7 @@ def diagnose(
         given=len(intake.photos) + len(intake.unreadable),
         used=len(used),
         registered=registered,
-        left_out=dict(sorted(left_out.items())),
+        left_out={name: left_out[name] for name in sorted(left_out, key=natural)},
         blurred=dict(intake.blurred),
         duplicates=dict(intake.duplicates),
         other_models=others,
@@ -315,8 +316,8 @@ def about_rotation(angle: float, matches: Matches) -> list[str]:
     if angle >= SMALL_ANGLE and not turned:
         return []
     return [
-        f"the photographs were taken from nearly one place (rays to a point differ by {angle:.1f} degrees), so depth "
-        f"is uncertain; walk sideways instead of turning on the spot"
+        f"the photographs were taken from nearly one place (the outermost views of a point are {angle:.1f} degrees "
+        f"apart), so depth is uncertain; walk sideways instead of turning on the spot"
     ]
 
 

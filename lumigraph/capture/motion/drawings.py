@@ -11,6 +11,7 @@ from jaxtyping import Float, UInt8
 from PIL import Image, ImageDraw, ImageFont
 
 from ...figures import RAMP, fit_into, save_picture
+from ...names import natural
 from ..library import pycolmap
 from ..photos import Intake
 from .diagnosis import Diagnosis
@@ -161,7 +162,7 @@ def ramp_at(share: float) -> str:
 def draw_photographs(path: Path, intake: Intake, diagnosis: Diagnosis) -> None:
     """Write a contact sheet: all photographs by name, those with something to say of them framed, and why."""
     files = {photo.name: photo.path for photo in intake.photos}
-    names = [*files, *sorted(intake.unreadable)]
+    names = [*files, *sorted(intake.unreadable, key=natural)]
     cell = 220 if len(names) <= 60 else 150 if len(names) <= 200 else 110
     pictures = {name: thumbnail(files.get(name), cell) for name in names}
     cell = max(NARROWEST, *(picture.width for picture in pictures.values()))

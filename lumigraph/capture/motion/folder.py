@@ -110,14 +110,19 @@ def stamp(path: Path) -> tuple[int, int]:
     return about.st_mtime_ns, about.st_size
 
 
-def write_model(folder: Path, model: pycolmap.Reconstruction, photos: Sequence[Photo]) -> None:
-    """sparse/0, points.ply and transforms.json, all in the model's frame; frames in the order of `photos`."""
+def write_model(folder: Path, model: pycolmap.Reconstruction, photos: Sequence[Photo], z_up: bool) -> None:
+    """sparse/0, points.ply and transforms.json, all in the model's frame; frames in the order of `photos`.
+
+    z_up: whether +z is known to be up, by more than how cameras were held
+    """
     with replacing(folder / "sparse") as partial:
         (partial / "0").mkdir(parents=True)
         model.write(partial / "0")
     write_points(folder / POINTS, model)
     by_name = {image.name: image for image in model.images.values() if image.has_pose}
-    write_json(folder / "transforms.json", transforms(model, [by_name[p.name] for p in photos if p.name in by_name]))
+    up = {"up": [0.0, 0.0, 1.0]} if z_up else {}
+    images = [by_name[p.name] for p in photos if p.name in by_name]
+    write_json(folder / "transforms.json", up | transforms(model, images))
 
 
 def transforms(model: pycolmap.Reconstruction, images: Sequence[pycolmap.Image]) -> dict[str, Any]:

@@ -12,8 +12,8 @@ from jaxtyping import Float
 from ...camera import Camera
 from ...lens import Pinhole
 from ..library import pycolmap
-from ..normalise import common_up, turn_onto_z
 from ..photos import Photo
+from ..up import common_up, turn_onto_z
 
 GPS_ERROR = 10.0  # metres that a position may be off before it is taken for a fault of the receiver
 AGREEMENT = 0.25  # typical error of positions, as a share of how far they spread across their longest axis, at most
@@ -92,10 +92,12 @@ def georeference(centres: Float[np.ndarray, "photo 3"], photos: Sequence[Photo])
     return Georeference(matrix, say, origin, typical)
 
 
-def upright(poses: Float[np.ndarray, "photo 3 4"]) -> pycolmap.Sim3d:
+def upright(
+    poses: Float[np.ndarray, "photo 3 4"], points: Float[np.ndarray, "point 3"] | None = None
+) -> pycolmap.Sim3d:
     """The rotation that brings up to +z, as far as the way that people hold cameras tells; poses: camera-to-world."""
     count = len(poses)
     lens = Pinhole(torch.ones(count, 2), torch.ones(count, 2))
-    up = common_up(Camera(torch.from_numpy(poses).float(), lens, torch.ones(count, 2, dtype=torch.long)))
+    up = common_up(Camera(torch.from_numpy(poses).float(), lens, torch.ones(count, 2, dtype=torch.long)), points)
     turn = np.eye(3) if up is None else turn_onto_z(up)
     return pycolmap.Sim3d(1.0, pycolmap.Rotation3d(turn), np.zeros(3))

@@ -15,6 +15,7 @@ import numpy as np
 from ...errors import LumigraphError
 from ...files import read_json, remove, replacing, write_bytes, write_json
 from ...locks import held
+from ...names import natural
 from ...progress import counting
 from ..library import pycolmap
 from ..photos import Intake, Photo, gather
@@ -290,14 +291,18 @@ class Reconstruction:
             remove(self.folder / name)
         model = found[0]
         place = self.turn_upright(model)
-        others = [sorted(image.name for image in other.images.values() if image.has_pose) for other in found[1:]]
+        others = [
+            sorted((image.name for image in other.images.values() if image.has_pose), key=natural)
+            for other in found[1:]
+        ]
         taken = {image.name for image in model.images.values() if image.has_pose}
         others = [left for names in others if len(left := [name for name in names if name not in taken]) > 1]
         diagnosis = diagnose(self.intake, self.photos, model, others, matches)
         if place is not None and place.new_from_old is None:
             told.append(place.say)
         diagnosis = replace(diagnosis, warnings=[*diagnosis.warnings, *told])
-        write_model(self.folder, model, self.photos)
+        known = place is not None and place.new_from_old is not None
+        write_model(self.folder, model, self.photos, z_up=known)
         draw_capture(
             self.folder / "capture.png", model, diagnosis, place is not None and place.new_from_old is not None
         )
@@ -313,7 +318,8 @@ class Reconstruction:
         stacked = np.stack([poses[photo.name] for photo in photos])
         place = georeference(stacked[:, :, 3], photos)
         known = place is not None and place.new_from_old is not None
-        model.transform(place.new_from_old if place is not None and known else upright(stacked))
+        points = np.array([point.xyz for point in model.points3D.values()]).reshape(-1, 3)
+        model.transform(place.new_from_old if place is not None and known else upright(stacked, points))
         return place
 
     def summary(

@@ -14,6 +14,7 @@ from PIL import Image, UnidentifiedImageError
 
 from ...errors import LumigraphError
 from ...files import explained
+from ...names import natural
 from ..masks import MASKS, OBJECT_MASKS, find_mask
 from ..pictures import describe, reductions
 from . import upright
@@ -50,7 +51,8 @@ def gather(sources: Sequence[Path], work: Path, frames: int | None = None, track
     files = named_files(list_photographs(sources, work))
     taken = examine(files, work / "upright", track)
     unreadable = {name: why for name, why in taken.items() if isinstance(why, str)}
-    seen = [one for _, one in sorted(taken.items()) if isinstance(one, Candidate)]
+    readable = {name: one for name, one in taken.items() if isinstance(one, Candidate)}
+    seen = [readable[name] for name in sorted(readable, key=natural)]
     if not seen:
         raise LumigraphError(nothing(source, unreadable))
     return assess(Intake(source, with_altitudes([one.photo for one in seen]), unreadable=unreadable), seen)
@@ -89,7 +91,8 @@ def assess(intake: Intake, seen: Sequence[Candidate]) -> Intake:
         return one.photo.name in bad, -math.prod(one.photo.size), -one.bytes, one.photo.name
 
     signatures = {one.photo.name: one.judgement.signature for one in sorted(seen, key=worth)}
-    return replace(intake, blurred=bad, duplicates=dict(sorted(duplicates(signatures, sizes).items())))
+    same = duplicates(signatures, sizes)
+    return replace(intake, blurred=bad, duplicates={name: same[name] for name in sorted(same, key=natural)})
 
 
 def nothing(source: str, unreadable: Mapping[str, str]) -> str:
@@ -123,7 +126,7 @@ def list_photographs(sources: Sequence[Path], work: Path) -> list[Path]:
 def walk(folder: Path, work: Path | None = None) -> Iterator[Path]:
     """Photographs below a folder, sorted: no hidden ones, no masks, none that a program reduced or rendered."""
     with explained(folder):
-        entries = sorted(folder.iterdir())
+        entries = sorted(folder.iterdir(), key=lambda path: natural(path.name))
     folders = [entry for entry in entries if entry.is_dir()]
     reduced = {path for folder in folders for times, path in reductions(folder).items() if times > 1}
     for entry in entries:

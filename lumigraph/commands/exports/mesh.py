@@ -14,14 +14,16 @@ from ..controls import Set, open_method
 from ..keeping import Keeping
 from .points import check_pictures
 
+FOR_PHONES = 100_000  # triangles that a phone shows with ease
+
 
 @dataclass(frozen=True)
 class ExportMesh:
-    """Triangles with colours at their corners, in the frame of the photographs.
+    """Triangles with colours at their corners, in the frame of the photographs or upright.
 
-    The ending says which format: .ply, .obj or .glb. Marching cubes on the density of methods that have one, fusion of
-    the depth that others render. Only the middle of a scene is meshed. What no camera sees is closed up (objects) or
-    left out (rooms and the open).
+    The ending says which format: .ply and .obj, in that frame; .glb, upright; .usdz, upright and for phones. Marching
+    cubes on the density of methods that have one, fusion of the depth that others render. Only the middle of a scene is
+    meshed. What no camera sees is closed up (objects) or left out (rooms and the open).
     """
 
     source: Annotated[Positional[Path], needed("RUN_OR_FILE")]
@@ -41,7 +43,7 @@ class ExportMesh:
     """Density of the surface, per unit of the scene's own frame."""
     smooth: Annotated[int, option("N")] = 10
     """Rounds of smoothing; 0 for none."""
-    faces: Annotated[int | None, option("N", "as many as there are")] = None
+    faces: Annotated[int | None, option("N", f"as many as there are, for phones {FOR_PHONES:,}")] = None
     """Triangles to come down to."""
     keep: Annotated[float, option("SHARE")] = 0.01
     """Pieces smaller than this share of the largest one are dropped."""
@@ -61,7 +63,7 @@ class ExportMesh:
         from ...export.mesh import extract_mesh
         from ...export.mesh_file import ending, write_mesh
 
-        ending(self.output)
+        for_phones = ending(self.output) == ".usdz"
         opened, method, cameras = open_method(self.source, self.device, self.told)
         mesh = extract_mesh(
             self.part.without_floaters(method),
@@ -72,13 +74,13 @@ class ExportMesh:
             level=self.level,
             way=self.way,
             smooth=self.smooth,
-            faces=self.faces,
+            faces=FOR_PHONES if self.faces is None and for_phones else self.faces,
             keep=self.keep,
             closed=None if self.unseen is None else self.unseen == "close",
             size=self.size,
             views=self.views,
         ).in_source(opened.frame)
-        write_mesh(self.output, mesh)
+        write_mesh(self.output, mesh, opened.frame.to_source.rotation[:, 2].numpy())
         low, high = mesh.vertices.min(0), mesh.vertices.max(0)
         show(
             {

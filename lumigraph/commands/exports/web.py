@@ -36,7 +36,9 @@ class ExportWeb:
     """What the page holds."""
     title: Annotated[str | None, option("TEXT", "the scene's name")] = None
     """What the page is called."""
-    background: Annotated[str | None, option("#RRGGBB", "the one that the scene was trained with")] = None
+    background: Annotated[
+        str | None, option("#RRGGBB", "the one it was trained with; outdoors the colours of its sky and ground")
+    ] = None
     """Colour behind splats or the mesh."""
     views: Annotated[int, option("N")] = 72
     """Pictures in a page of views."""
@@ -48,6 +50,7 @@ class ExportWeb:
     """auto, cpu, cuda, cuda:1."""
 
     def run(self) -> int:
+        from ...export.backdrop import backdrop
         from ...export.page import opening_of_scene
 
         if self.output.suffix.lower() not in (".html", ".htm"):
@@ -58,7 +61,10 @@ class ExportWeb:
             raise LumigraphError(f"A view cannot be {self.size} pixels large; give --size a number from 16 to 4096")
         self.part.check()
         opened, method, cameras = open_method(self.source, self.device, self.told)
-        opening = opening_of_scene(self.title or opened.title, cameras["train"], opened.frame, self._background())
+        whole = self._kind(method) != "views" and not self.part.crops
+        behind = backdrop(method, cameras["train"]) if whole else None
+        title = self.title or opened.title
+        opening = opening_of_scene(title, cameras["train"], opened.frame, self._background(), behind)
         held = self._write(method, cameras["train"], opening)
         show(
             {
@@ -71,13 +77,11 @@ class ExportWeb:
 
     def _write(self, method: Any, cameras: Any, opening: Any) -> str:
         """Write the page, and say what it holds."""
-        from ...capabilities import HasGaussians, can, needs
+        from ...capabilities import HasGaussians, needs
         from ...export.mesh import extract_mesh
         from ...export.page import mesh_page, splats_page, views_page
 
-        kind = self.kind
-        if kind == "auto":
-            kind = "splats" if can(method, HasGaussians) else "views"
+        kind = self._kind(method)
         if kind == "splats":
             gaussians = self.part.of_gaussians(needs(method, HasGaussians).gaussians(), self.part.crop(method.frame))
             splats_page(self.output, gaussians, opening)
@@ -88,6 +92,13 @@ class ExportWeb:
         mesh = extract_mesh(self.part.without_floaters(method), cameras, crop=self.part.crop(method.frame), faces=FACES)
         mesh_page(self.output, mesh, opening)
         return f"{len(mesh.faces):,} triangles"
+
+    def _kind(self, method: Any) -> str:
+        from ...capabilities import HasGaussians, can
+
+        if self.kind != "auto":
+            return self.kind
+        return "splats" if can(method, HasGaussians) else "views"
 
     def _background(self) -> tuple[float, float, float] | None:
         from ...figures import hex_colour

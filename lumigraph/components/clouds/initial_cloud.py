@@ -1,6 +1,9 @@
-"""Where a cloud begins: at the points that structure from motion found, or at random where something may be."""
+"""Where a cloud begins: at the points that structure from motion found and plane sweeps add, or at random."""
 
 from __future__ import annotations
+
+import math
+from typing import Literal
 
 import torch
 from jaxtyping import Float
@@ -10,27 +13,75 @@ from ...gaussians import Gaussians
 from ...kernels.spherical_harmonics import K00
 from ...scene import Frame, Scene
 from ..sampling.carving import visual_hull
+from .dense_points import dense_points
+
+Initialization = Literal["dense", "sparse", "random"]
 
 OPACITY = 0.1  # of each Gaussian at first (Kerbl 2023; the original release)
 HULL_CELLS = 64  # along an axis
 NEIGHBOURS = 3
+FEW = 100  # points that are too few to begin at
+CROWD = 1 / 3  # of all Gaussians that may be: how many points a cloud begins with at most, as each makes steps slower
+BACKDROP = 0.2  # of the random Gaussians: how many lie far out behind dense points, where nothing else is known
 
 
-def initial_cloud(scene: Scene, count: int, most: int, degree: int, generator: torch.Generator) -> Gaussians:
-    """A cloud at the scene's sparse points, at most `most` of them; without any, `count` random Gaussians.
+def initial_cloud(
+    scene: Scene, initialization: Initialization, count: int, most: int, degree: int, generator: torch.Generator
+) -> Gaussians:
+    """A cloud of at most `most` Gaussians at the points that are known, or where there are none, `count` random ones.
 
+    initialization: "dense" adds to the scene's sparse points those that plane sweeps find, "sparse" takes the sparse
+                    points as they are, "random" takes neither
     Random ones lie inside the silhouettes of photographs with alpha, otherwise inside the box of interest.
     """
-    if scene.points is not None and len(scene.points) >= 2:
-        inside = (scene.points.abs().amax(-1) <= scene.frame.reach) & scene.points.isfinite().all(-1)
-        chosen = inside.nonzero()[:, 0]
-        chosen = chosen[torch.randperm(len(chosen), generator=generator)[:most]]
-        colours = torch.full((len(scene.points), 3), 0.5)
-        if scene.point_colours is not None:
-            colours = scene.point_colours.float() / 255
-        return round_gaussians(scene.points[chosen], colours[chosen], degree)
-    means = random_points(scene, min(count, most), generator)
-    return round_gaussians(means, torch.rand(len(means), 3, generator=generator), degree)
+    means, colours = torch.zeros(0, 3), torch.zeros(0, 3)
+    if initialization != "random":
+        means, colours = sparse_points(scene, most, generator)
+    if initialization == "dense" and len(means) < (crowd := math.ceil(CROWD * most)):
+        means, colours = with_dense_points(scene, means, colours, count, crowd, generator)
+    if len(means) < 2:
+        means = random_points(scene, min(count, most), generator)
+        colours = torch.rand(len(means), 3, generator=generator)
+    return round_gaussians(means, colours, degree)
+
+
+def sparse_points(scene: Scene, most: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+    """Places and colours of the scene's own points, those within reach, at most so many; maybe none."""
+    if scene.points is None or len(scene.points) < 2:
+        return torch.zeros(0, 3), torch.zeros(0, 3)
+    inside = (scene.points.abs().amax(-1) <= scene.frame.reach) & scene.points.isfinite().all(-1)
+    chosen = inside.nonzero()[:, 0]
+    chosen = chosen[torch.randperm(len(chosen), generator=generator)[:most]]
+    colours = torch.full((len(scene.points), 3), 0.5)
+    if scene.point_colours is not None:
+        colours = scene.point_colours.float() / 255
+    return scene.points[chosen], colours[chosen]
+
+
+def with_dense_points(
+    scene: Scene, means: Tensor, colours: Tensor, count: int, most: int, generator: torch.Generator
+) -> tuple[Tensor, Tensor]:
+    """Sparse points and dense ones; without sparse ones also some far out, where sweeps find nothing that agrees."""
+    found = dense_points(scene)
+    inside = (found.positions.abs().amax(-1) <= scene.frame.reach).nonzero()[:, 0]
+    if len(inside) < FEW:
+        return means, colours
+    none_before = not len(means)
+    chosen = inside[torch.randperm(len(inside), generator=generator)[: most - len(means)]]
+    means, colours = torch.cat([means, found.positions[chosen]]), torch.cat([colours, found.colours[chosen]])
+    if none_before and scene.frame.reach > 1:
+        far = backdrop(scene.frame, min(int(BACKDROP * count), most - len(means)), generator)
+        means = torch.cat([means, far])
+        colours = torch.cat([colours, torch.rand(len(far), 3, generator=generator)])
+    return means, colours
+
+
+def backdrop(frame: Frame, count: int, generator: torch.Generator) -> Float[Tensor, "point 3"]:
+    """Random places outside the box of interest, at all distances up to the scene's end, evenly by their logarithm."""
+    directions = torch.nn.functional.normalize(torch.randn(count, 3, generator=generator), dim=-1)
+    nearest = max(float(torch.tensor(frame.bounds).norm(dim=-1).max()), 0.1 * frame.reach)
+    distances = torch.exp(math.log(frame.reach / nearest) * torch.rand(count, 1, generator=generator)) * nearest
+    return directions * distances
 
 
 def random_cloud(frame: Frame, count: int, degree: int, generator: torch.Generator) -> Gaussians:

@@ -1,0 +1,112 @@
+"""Which way was up: from how people hold cameras, from where drones fly, and from what both see."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import torch
+from jaxtyping import Float
+
+from ..camera import Camera
+from ..geometry import turning
+
+UPRIGHT = math.cos(math.radians(15))  # a source axis nearer to up than this is up
+LEVEL = 0.03  # mean square of what pictures' rows have along up, at most, where cameras are held level: 10 degrees
+TURNING = 0.02, 4  # and across their main direction at least, if they turn about up: 8 degrees, and times the former
+ALONG = 0.9  # cosine from which on a camera looks along a direction
+OBLIQUE = 0.1  # share of the cameras that must look elsewhere than the rest
+CANCELLING = (
+    0.5  # length of the pictures' mean up below which cameras were turned about their axes: nobody does by hand
+)
+HELD = 0.2  # below which it says nothing
+AGREEING = 0.7  # cosine between the pictures' mean up and the direction at right angles to rows, if that is up
+WIDE = 0.4  # times the distance to what is seen: deviation of the places both ways from which on they are a map's
+PLANE = 0.2, 0.2  # of the places' extent: the smallest deviation at most, and the middle one at least, of a plane
+FACING = 0.5  # cosine between a map's plane and the view: drones look no flatter than that
+
+
+def find_upright(cameras: Camera, points: Float[np.ndarray, "point 3"] | None = None) -> Float[np.ndarray, "4 4"]:
+    """The rotation that brings the cameras' common up to +z; none if the source already has an axis there."""
+    up = common_up(cameras, points)
+    return np.eye(4) if up is None else upright_by(up)
+
+
+def upright_by(up: Float[np.ndarray, " 3"]) -> Float[np.ndarray, "4 4"]:
+    """The rotation that brings a direction to +z, or the axis that is close to it."""
+    up = unit(up)
+    nearest = np.zeros(3)
+    nearest[np.abs(up).argmax()] = np.sign(up[np.abs(up).argmax()])
+    if up @ nearest > UPRIGHT:
+        up = nearest
+    matrix = np.eye(4)
+    matrix[:3, :3] = turn_onto_z(up)
+    return matrix
+
+
+def common_up(cameras: Camera, points: Float[np.ndarray, "point 3"] | None = None) -> Float[np.ndarray, " 3"] | None:
+    """The direction that was up where the photographs were taken, unit length; None if nothing tells.
+
+    Cameras are held level rather than straight ahead, by hand as by a drone's gimbal: up is the direction most at right
+    angles to all pictures' rows. That says nothing where all rows are parallel, and something else where cameras that
+    look one way were also turned about their axes: then up is where the pictures' own is on average, unless they were
+    taken from above. A drone's places lie in a level plane, and tell up where its pictures cannot.
+
+    points: what the cameras see, in their frame
+    """
+    rows, downs, forwards = (cameras.pose[:, :, k].double().numpy() for k in range(3))
+    places = cameras.position.double().numpy()
+    own, gaze = -downs.mean(0), forwards.mean(0)
+    values, vectors = np.linalg.eigh(rows.T @ rows / len(rows))
+    level, turning = vectors[:, 0], values[1] > max(TURNING[0], TURNING[1] * values[0])
+    elsewhere = np.quantile(np.abs(forwards @ level), OBLIQUE) < ALONG
+    if turning and values[0] < LEVEL and elsewhere:
+        return upwards(level, own, gaze)
+    if (above := from_above(places, own, gaze, points)) is not None:
+        return upwards(level, above, gaze) if turning else above
+    if np.linalg.norm(own) < HELD:
+        return upwards(level, own, gaze) if turning else None
+    own = unit(own)
+    return level * np.sign(level @ own) if turning and abs(level @ own) > AGREEING else own
+
+
+def from_above(
+    places: Float[np.ndarray, "camera 3"],
+    own: Float[np.ndarray, " 3"],
+    gaze: Float[np.ndarray, " 3"],
+    points: Float[np.ndarray, "point 3"] | None,
+) -> Float[np.ndarray, " 3"] | None:
+    """Up, unit length, of cameras that look one way, at a ground from above; None if they look at things ahead.
+
+    They were above if they were turned about their axes, as a drone is that flies to and fro; or if they are spread
+    over what they look at as for a map, which nobody walks. Then the plane of their places is level.
+    own, gaze: mean of the pictures' own up, and of the viewing directions
+    """
+    if np.linalg.norm(gaze) < ALONG:
+        return None
+    _, sizes, axes = np.linalg.svd(places - places.mean(0), full_matrices=False)
+    back, normal = -unit(gaze), axes[-1] * np.sign(-axes[-1] @ gaze)
+    flat = sizes[2:].sum() < PLANE[0] * sizes[0] and sizes[1] > PLANE[1] * sizes[0] and normal @ back > FACING
+    if np.linalg.norm(own) < CANCELLING:
+        return normal if flat else back
+    if not flat or points is None or not len(points):
+        return None
+    distance = float(np.median((places.mean(0) - points) @ normal))
+    return normal if sizes[1] / math.sqrt(len(places)) > WIDE * distance > 0 else None
+
+
+def upwards(
+    axis: Float[np.ndarray, " 3"], own: Float[np.ndarray, " 3"], gaze: Float[np.ndarray, " 3"]
+) -> Float[np.ndarray, " 3"]:
+    """That side of an axis on which the pictures' own up is; where that says nothing, the one that is looked from."""
+    side = axis @ own
+    return axis * np.sign(side if abs(side) > HELD else -axis @ gaze)
+
+
+def unit(vector: Float[np.ndarray, " 3"]) -> Float[np.ndarray, " 3"]:
+    return vector / np.linalg.norm(vector)
+
+
+def turn_onto_z(up: Float[np.ndarray, " 3"]) -> Float[np.ndarray, "3 3"]:
+    """The smallest rotation that takes a direction to +z."""
+    return turning(torch.from_numpy(np.asarray(up)), torch.tensor([0.0, 0.0, 1.0])).numpy()

@@ -1,0 +1,20 @@
+"""Faults that the tests write into a copy of an engine, one at a time, to see their comparison turn red.
+
+By name: the engine, the function, what stands there, and what is put in its place.
+"""
+
+FAULTS = {
+    "half a pixel aside": ("cpu", "_place", "v0) * inverse + HALF", "v0) * inverse"),
+    "what lies behind is seen": ("cpu", "_place", "right) if s > LEAST else ZERO", "right)"),
+    "trust forgotten": ("cpu", "_products", "w, wb = trust[x] * seen[x], trust[x]", "w, wb = trust[x] * seen[x], ONE"),
+    "the most instead of the least": ("cpu", "_keep_least", "= max(c, lower)", "= min(c, lower)"),
+    "a row of long ago": ("cpu", "_sweep", "sums[:] = ZERO", "pass"),
+    "a mean forgotten": ("gpu", "_costs", "- mean_a * mean_b", "- mean_a"),
+    "what lies behind is seen, on the gpu": ("gpu", "_costs", "before = s > LEAST", "before = s > -1e9"),
+    "another neighbour's warp": ("gpu", "_costs", "warps + 12 * neighbour", "warps"),
+}
+
+# These let an index leave its array.
+ASTRAY = {
+    "no border behind": ("cpu", "_place", "np.float32(rows + 1)", "np.float32(rows + 2)"),
+}

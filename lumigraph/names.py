@@ -1,0 +1,46 @@
+"""Names as people read them: in which order, and which one was meant."""
+
+from __future__ import annotations
+
+import difflib
+import re
+from collections.abc import Sequence
+
+DIGITS = 20  # more than any number in a file's name has: nanoseconds since 1970 have 19
+
+
+def natural(name: str) -> tuple[str, str]:
+    """What to sort names by so that numbers in them count as numbers: 1, 2, 10.
+
+    Names whose numbers have the same number of digits keep the order that `sorted` gives them.
+    """
+    return re.sub("[0-9]+", lambda number: number[0].zfill(DIGITS), name), name
+
+
+def meant(name: str, known: Sequence[str]) -> str | None:
+    """The known name that somebody most likely meant by another; None where nothing is close.
+
+    Letters alone count: the same ones ("instantngp"), a part of a name ("splat"), its words' initials ("3dgs", "ff"),
+    and last what differs least from the name or a word of it.
+    """
+    said = letters(name)
+    if not said:
+        return None
+    for fits in (
+        lambda other: said == letters(other),
+        lambda other: said in letters(other) or letters(other) in said,
+        lambda other: said.endswith(initials(other)) and len(initials(other)) > 1,
+    ):
+        if found := sorted(filter(fits, known), key=len):
+            return found[0]
+    parts = {part: other for other in known for part in (*other.split("-"), letters(other))}
+    near = difflib.get_close_matches(said, parts, n=1)
+    return parts[near[0]] if near else None
+
+
+def letters(name: str) -> str:
+    return re.sub("[^a-z]", "", name.lower())
+
+
+def initials(name: str) -> str:
+    return "".join(word[0] for word in re.split("[-_ ]", name.lower()) if word)

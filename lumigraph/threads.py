@@ -1,0 +1,134 @@
+"""Threads: how those that share a loop wait for each other.
+
+GNU's OpenMP lets a thread that has nothing to do look for work 300 000 times before it sleeps: some milliseconds. Alone
+on the machine that saves waking it, which a training step would do dozens of times. Beside other programs a thread that
+looks keeps the processor from the one that it waits for. So threads look for that long, and hardly at all while others
+hold them up (`benchmarks/busy.py`). A shorter look for all times costs too much: of a step of splatting with small
+photographs, a sixth at 100 000 and a quarter at 40 000.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import os
+import sys
+import threading
+from collections.abc import Callable, Iterator, MutableMapping
+from pathlib import Path
+
+LOOKS = 300_000  # for work, before a thread sleeps: some milliseconds
+OWN = "OMP_WAIT_POLICY", "GOMP_SPINCOUNT"  # by which users say how threads wait
+EVERY = 0.5  # seconds between looks at how much others hold us up
+WHILE = 20  # such looks that threads then sleep for
+MUCH = 0.25  # of the time that our threads could run: from here on it matters that others have it
+IDLE = 0.1  # of the time: what runs less than that has nothing to wait for
+TASKS = Path("/proc/self/task")
+
+
+def settle(environment: MutableMapping[str, str] = os.environ) -> None:
+    """Say how long threads look for work, unless the user's environment says how they wait.
+
+    It counts for libraries that are loaded afterwards: for PyTorch and Numba, or for Numba alone where PyTorch was
+    imported before Lumigraph.
+    """
+    if not any(name in environment for name in OWN):
+        environment["GOMP_SPINCOUNT"] = str(LOOKS)
+
+
+def share_one_pool() -> None:
+    """Have PyTorch and Numba use the same threads, where both run theirs by GNU's OpenMP.
+
+    PyTorch brings a copy of the library, and Numba takes the system's. Each copy keeps threads of its own, and those of
+    one look for work on the processors that the other's need. The copy that is loaded first serves both.
+    """
+    if sys.platform == "linux" and "torch" not in sys.modules:
+        with contextlib.suppress(OSError):  # a system without it: Numba then has threads of another kind
+            ctypes.CDLL("libgomp.so.1.0.0")
+
+
+@contextlib.contextmanager
+def considerate() -> Iterator[None]:
+    """Inside this block threads hardly look for work while other programs hold them up.
+
+    Only where Linux tells so; a user's own way of waiting stays.
+    """
+    if not (TASKS / str(os.getpid()) / "schedstat").exists() or os.environ.get("GOMP_SPINCOUNT") != str(LOOKS):
+        yield
+        return
+    over = threading.Event()
+    watch = threading.Thread(target=make_way, args=(over, Held()), name="considerate", daemon=True)
+    watch.start()
+    try:
+        yield
+    finally:
+        over.set()
+        watch.join()
+
+
+class Held:
+    """Calling it tells the share of the time that our threads could have run, since the last call or since it was made,
+    in which others had the processor."""
+
+    def __init__(self) -> None:
+        self._before = self._now()
+
+    def __call__(self) -> float:
+        now = self._now()
+        pairs = [(before, now[name]) for name, before in self._before.items() if name in now]
+        self._before = now
+        ran, waited = (sum(after[i] - before[i] for before, after in pairs) for i in (0, 1))
+        return waited / max(ran + waited, IDLE * EVERY * 1e9)
+
+    @staticmethod
+    def _now() -> dict[str, list[int]]:
+        """Nanoseconds that each thread has run, and has waited for a processor."""
+        found = {}
+        for thread in TASKS.iterdir():
+            with contextlib.suppress(OSError):  # a thread that has just ended
+                found[thread.name] = [int(x) for x in (thread / "schedstat").read_text().split()[:2]]
+        return found
+
+
+def make_way(over: threading.Event, held: Callable[[], float]) -> None:
+    """Until it is over: crowd our threads for a while whenever others hold them up.
+
+    Whether others are still there shows best once threads look for work again: those that sleep may be woken on one
+    processor, where they hold up each other.
+    """
+    leave: threading.Event | None = None
+    looks = 0
+    while not over.wait(EVERY):
+        looks, share = looks + 1, held()
+        if leave is None and share > MUCH and "torch" in sys.modules:
+            leave, looks = threading.Event(), 0
+            threading.Thread(target=crowd, args=(leave,), name="crowd", daemon=True).start()
+        elif leave is not None and looks >= WHILE:
+            leave.set()
+            leave = None
+    if leave is not None:
+        leave.set()
+
+
+def crowd(leave: threading.Event) -> None:
+    """Hold a second set of threads, which sleep. For OpenMP they are more than there are processors, and then every
+    thread looks for work a hundred times only (GOMP_SPINCOUNT in the manual of GNU's libgomp)."""
+    import torch
+
+    torch.ones(torch.get_num_threads() << 16).exp_()  # large enough for every thread to have a share
+    leave.wait()
+
+
+def told() -> str:
+    """How many threads share the work; and the load of the last minute, where it is more than the processors can do."""
+    import torch
+
+    count = torch.get_num_threads()
+    threads = f"{count} thread" + "s" * (count > 1)
+    load = os.getloadavg()[0] if hasattr(os, "getloadavg") else 0.0
+    return f"{threads}, on a machine that is busy (load {load:.1f})" if load > processors() else threads
+
+
+def processors() -> int:
+    """How many this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

@@ -1,0 +1,204 @@
+"""A client's tab `Crop`: which part of the scene is shown, which Gaussians are left out, and what is left saved."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Callable
+from typing import Any, cast
+
+import numpy as np
+from jaxtyping import Float
+
+from ..crop import Box, Crop, Sphere
+from ..errors import LumigraphError
+from ..gaussians.cleaning import ISOLATION, MAX_SCALE, MIN_OPACITY
+from ..scene import Frame, Vector
+from .path_panel import code
+from .subject import NAME, NAMING, Keep
+
+ALL, BOX, SPHERE = "Everything", "Inside a box", "Inside a sphere"
+COLOUR = (240, 190, 80)
+HANDLE = 0.25  # length of a handle's arrows, in longest sides of the bounds
+ROUND = 64  # pieces of a drawn circle
+FINEST = 0.001  # scene units: step of the numbers
+
+
+class CropPanel:
+    """The contents of the tab.
+
+    client:  viser's
+    tab:     viser's, which holds them
+    cloud:   whether the method is a cloud of Gaussians, of which some can be left out
+    changed: called when what is shown changes
+    keep:    saves what is left under a name and says where; None where nothing can be saved
+    name:    that is proposed for it
+    tell:    says a title and a text to the client
+    """
+
+    def __init__(
+        self,
+        client: Any,
+        tab: Any,
+        frame: Frame,
+        cloud: bool,
+        changed: Callable[[], None],
+        keep: Keep | None,
+        name: str,
+        tell: Callable[[str, str], None],
+    ):
+        self._client, self._changed, self._keep, self._tell = client, changed, keep, tell
+        self._nodes: dict[str, Any] = {}  # handles to drag, and the outline
+        self._following = False  # while numbers are set from a handle
+        (lower, upper), gui = frame.bounds, client.gui
+        middle = cast(Vector, tuple((a + b) / 2 for a, b in zip(lower, upper, strict=True)))
+        longest = max(b - a for a, b in zip(lower, upper, strict=True))
+        self._size = longest
+        with tab:
+            self._shape = gui.add_dropdown("Show", (ALL, BOX, SPHERE))
+            self._lower = gui.add_vector3("Lower", lower, step=FINEST, visible=False)
+            self._upper = gui.add_vector3("Upper", upper, step=FINEST, visible=False)
+            self._middle = gui.add_vector3("Middle", middle, step=FINEST, visible=False)
+            self._radius = gui.add_number("Radius", longest / 2, min=FINEST, step=FINEST, visible=False)
+            self._clean = gui.add_checkbox("Leave out floaters", False, visible=cloud)
+            self._floaters = {
+                "min_opacity": gui.add_slider(
+                    "Least opacity", 0.0, 0.5, 0.005, MIN_OPACITY, hint="Fainter Gaussians are left out", visible=False
+                ),
+                "max_scale": gui.add_slider(
+                    "Largest size", 0.01, 1.0, 0.01, MAX_SCALE, hint="In extents of the cloud", visible=False
+                ),
+                "isolation": gui.add_slider(
+                    "Isolation",
+                    *(0.0, 8.0, 0.1, ISOLATION),
+                    hint="How much farther from its neighbours than most one may be, in standard deviations",
+                    visible=False,
+                ),
+            }
+            if keep is not None:
+                self._name = gui.add_text(
+                    "Name", name, hint="Of a splat file, .ply or .spz, or of a folder for a new run"
+                )
+                gui.add_button("Save").on_click(lambda _: self._save())
+                self._about = gui.add_markdown("")
+        numbers = self._lower, self._upper, self._middle, self._radius
+        for handle in (self._shape, *numbers, self._clean, *self._floaters.values()):
+            handle.on_update(lambda _: self._update())
+
+    @property
+    def crop(self) -> Crop | None:
+        """What is shown of the scene, in its frame; None for everything."""
+        if self._shape.value == BOX:
+            a, b = self._lower.value, self._upper.value
+            return Box(vector(np.minimum(a, b)), vector(np.maximum(a, b)))
+        if self._shape.value == SPHERE:
+            return Sphere(vector(self._middle.value), max(float(self._radius.value), FINEST))
+        return None
+
+    @property
+    def floaters(self) -> tuple[tuple[str, float], ...]:
+        """Names and numbers of what `cleaned` is told of floaters; nothing while they stay."""
+        return tuple((name, float(x.value)) for name, x in self._floaters.items()) if self._clean.value else ()
+
+    @property
+    def drawn(self) -> bool:
+        """Whether the crop is drawn beside the scene."""
+        return bool(self._nodes)
+
+    def _update(self) -> None:
+        if self._following:
+            return
+        shape = self._shape.value
+        for handle, shown in (
+            *((x, shape == BOX) for x in (self._lower, self._upper)),
+            *((x, shape == SPHERE) for x in (self._middle, self._radius)),
+            *((x, self._clean.value) for x in self._floaters.values()),
+        ):
+            if handle.visible != shown:
+                handle.visible = shown
+        self._place_handles()
+        self._outline()
+        self._changed()
+
+    def _place_handles(self) -> None:
+        """Arrows to drag: at a box's two corners, or at a sphere's middle."""
+        numbers = {BOX: {"lower": self._lower, "upper": self._upper}, SPHERE: {"middle": self._middle}}
+        wanted = numbers.get(self._shape.value, {})
+        for name in {"lower", "upper", "middle"} & self._nodes.keys() - wanted.keys():
+            self._nodes.pop(name).remove()
+        for name, number in wanted.items():
+            if name not in self._nodes:
+                self._nodes[name] = self._client.scene.add_transform_controls(
+                    f"/crop/{name}",
+                    HANDLE * self._size,
+                    disable_rotations=True,
+                    disable_sliders=True,
+                    depth_test=False,
+                    position=number.value,
+                )
+                self._nodes[name].on_update(self._follower(number))
+            elif not np.allclose(self._nodes[name].position, number.value):
+                self._nodes[name].position = np.array(number.value)
+
+    def _follower(self, number: Any) -> Callable[[Any], Any]:
+        """What takes a handle's place over into the numbers, in the order of its moves."""
+
+        async def follow(event: Any) -> None:
+            self._following = True
+            try:
+                number.value = vector(event.target.position)
+            finally:
+                self._following = False
+            self._outline()
+            self._changed()
+
+        return follow
+
+    def _outline(self) -> None:
+        crop = self.crop
+        if crop is None:
+            if "outline" in self._nodes:
+                self._nodes.pop("outline").remove()
+            return
+        lines = edges(crop) if isinstance(crop, Box) else circles(cast(Sphere, crop))
+        if "outline" in self._nodes:
+            self._nodes["outline"].points = lines
+        else:
+            self._nodes["outline"] = self._client.scene.add_line_segments(
+                "/crop/outline", lines, COLOUR, thickness=2.0, thickness_units="screen"
+            )
+
+    def _save(self) -> None:
+        assert self._keep is not None
+        name = self._name.value.strip()
+        if not NAME.fullmatch(name):
+            self._tell("Not saved", NAMING)
+            return
+        try:
+            where = self._keep(name, self.crop, dict(self.floaters))
+        except LumigraphError as error:
+            self._tell("Not saved", str(error))
+            return
+        self._about.content = f"Saved as {code(where)}"
+
+
+def vector(values: Any) -> Vector:
+    x, y, z = (float(value) for value in values)
+    return x, y, z
+
+
+def edges(box: Box) -> Float[np.ndarray, "12 2 3"]:
+    """The two ends of each of a box's twelve edges."""
+    corners = np.array(list(itertools.product((0, 1), repeat=3)))
+    ends = [(a, b) for a, b in itertools.combinations(corners, 2) if abs(a - b).sum() == 1]
+    lower, upper = np.array(box.lower), np.array(box.upper)
+    return lower + np.array(ends) * (upper - lower)
+
+
+def circles(sphere: Sphere) -> Float[np.ndarray, "piece 2 3"]:
+    """The ends of the pieces of three great circles, one across each axis."""
+    angle = np.linspace(0, 2 * math.pi, ROUND + 1)
+    across, along, none = np.cos(angle), np.sin(angle), np.zeros(ROUND + 1)
+    rings = np.stack([np.roll(np.stack([across, along, none], -1), axis, -1) for axis in range(3)])
+    pieces = np.stack([rings[:, :-1], rings[:, 1:]], 2).reshape(-1, 2, 3)
+    return np.array(sphere.middle) + sphere.radius * pieces

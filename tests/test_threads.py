@@ -1,0 +1,127 @@
+"""How threads wait: what Lumigraph settles before PyTorch and Numba are loaded, and what it leaves to the user."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+
+import pytest
+import torch
+
+from lumigraph import threads
+
+LOOP = """
+import lumigraph, torch, numpy
+from lumigraph.loops import unbend
+none = numpy.zeros((0, 2), numpy.float32)
+unbend(none, numpy.zeros(0, int), none, none, none, none, 1, 0.1, numpy.zeros((0, 3), numpy.float32))
+print(torch.ones(1 << 18).exp().sum())
+"""
+
+LOOKING = """
+import threading, time
+from lumigraph import threads
+import torch
+numbers = torch.ones(torch.get_num_threads() << 16)
+def looking():
+    spent = 0.0
+    for _ in range(10):
+        numbers.exp()
+        begin = time.process_time()
+        time.sleep(0.02)
+        spent += time.process_time() - begin
+    return spent
+looking()
+alone, leave = looking(), threading.Event()
+threading.Thread(target=threads.crowd, args=(leave,), daemon=True).start()
+time.sleep(0.2)
+print(alone, looking())
+leave.set()
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="GNU's OpenMP")
+def test_torch_and_numba_share_one_set_of_threads_which_wait_for_a_bounded_time():
+    environment = {name: value for name, value in os.environ.items() if name not in threads.OWN}
+    environment |= {"PYTHONPATH": str(Path(__file__).parent.parent), "OMP_DISPLAY_ENV": "VERBOSE"}
+    told = subprocess.run([sys.executable, "-c", LOOP], env=environment, capture_output=True, text=True, check=True)
+    copies = told.stderr.split("OPENMP DISPLAY ENVIRONMENT BEGIN")[1:]  # each copy of the library says so when loaded
+    assert len(copies) == 1
+    assert f"GOMP_SPINCOUNT = '{threads.LOOKS}'" in copies[0]
+
+
+@pytest.mark.parametrize("own", threads.OWN)
+def test_a_users_own_way_of_waiting_stays(own):
+    environment = {own: "1"}
+    threads.settle(environment)
+    assert environment == {own: "1"}
+
+
+def test_a_busy_machine_is_told(monkeypatch):
+    monkeypatch.setattr(torch, "get_num_threads", lambda: 2)
+    monkeypatch.setattr(threads, "processors", lambda: 2)
+    monkeypatch.setattr(os, "getloadavg", lambda: (1.5, 0.0, 0.0))
+    assert threads.told() == "2 threads"
+    monkeypatch.setattr(os, "getloadavg", lambda: (3.25, 0.0, 0.0))
+    assert threads.told() == "2 threads, on a machine that is busy (load 3.2)"
+
+
+def test_threads_sleep_for_a_while_when_others_hold_them_up(monkeypatch):
+    monkeypatch.setattr(threads, "EVERY", 0.0)
+    monkeypatch.setattr(threads, "WHILE", 3)
+    shares, log, over = iter([0.0, 0.1, 0.9, 0.0, 0.9, 0.9, 0.0, 0.5]), [], threading.Event()
+
+    def held() -> float:
+        share = next(shares, None)
+        if share is None:
+            over.set()
+        return share or 0.0
+
+    def crowd(leave: threading.Event) -> None:
+        log.append(leave)
+
+    monkeypatch.setattr(threads, "crowd", crowd)
+    threads.make_way(over, held)
+    for thread in threading.enumerate():
+        if thread.name == "crowd":
+            thread.join(10)
+    assert len(log) == 2  # at 0.9 until three looks later, and at 0.5
+    assert all(leave.is_set() for leave in log)
+
+
+@pytest.mark.skipif(not threads.TASKS.exists(), reason="tells what threads wait for by /proc")
+def test_who_waits_behind_another_thread_is_held_up():
+    held, end = threads.Held(), time.monotonic() + 0.3
+    before = os.sched_getaffinity(0)
+    os.sched_setaffinity(0, {min(before)})
+    program = f"import os\nwhile os.getppid() == {os.getpid()}: pass"
+    other = subprocess.Popen([sys.executable, "-S", "-c", program])
+    try:
+        while time.monotonic() < end:
+            pass
+        assert held() > 0.1
+    finally:
+        other.kill()
+        other.wait()
+        os.sched_setaffinity(0, before)
+
+
+def test_who_hardly_runs_is_not_held_up(monkeypatch):
+    second = 10**9
+    states = iter([{"1": [0, 0], "2": [5, 5]}, {"1": [second // 1000, second // 1000], "3": [second, second]}])
+    monkeypatch.setattr(threads.Held, "_now", staticmethod(lambda: next(states)))
+    assert threads.Held()() < threads.MUCH  # half of very little; threads that came or went between do not count
+
+
+@pytest.mark.skipif(threads.processors() < 2, reason="one thread waits for nobody")
+@pytest.mark.skipif(sys.platform != "linux", reason="GNU's OpenMP")
+def test_crowded_threads_hardly_look_for_work():
+    environment = {name: value for name, value in os.environ.items() if name not in threads.OWN}
+    environment |= {"PYTHONPATH": str(Path(__file__).parent.parent), "OMP_NUM_THREADS": f"{threads.processors()}"}
+    told = subprocess.run([sys.executable, "-c", LOOKING], env=environment, capture_output=True, text=True, check=True)
+    alone, crowded = map(float, told.stdout.split())
+    assert crowded < 0.5 * alone
