@@ -64,7 +64,7 @@ def find_region(views: Sequence[View], points: Float[Tensor, "point 3"] | None) 
     axis = torch.linspace(-1 + 0.5 * size, 1 - 0.5 * size, CELLS)
     cells = torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"), -1).reshape(-1, 3)
     seen = np.mean([view.at(cells)[1] for view in views], 0)
-    cells = cells[(torch.from_numpy(seen) >= SEEN) & (cells.norm(dim=-1) <= 1.0)]
+    cells = cells[torch.from_numpy(seen) >= SEEN]
     table = None if points is None else find_table(points)
     if table is not None:
         cells = cells[table.above(cells) > 0.5 * THICK]

@@ -26,6 +26,7 @@ from .view import View
 SLACKS = (0.35, 0.3, 0.25, 0.2, 0.15, 0.15)  # share of the views that may see past a cell, round by round
 CORE = 0.35  # of the region's radius around its middle: where colours are first learnt, without sparse points
 SHADED, DARKEST = 0.25, 0.35  # share of surrounding colours that count as shaded too, and what shadows leave of light
+PLAIN, SAME = 0.8, 3.0  # share of a plain backdrop that differs from its middle by at most so much, in CIELAB
 PRIOR = 2.5  # logarithm of likelihood by which a body speaks for the pixels that it covers
 SURE = 4.0  # the largest that colours alone may speak with
 FEWEST = 20  # cells that make a body
@@ -121,11 +122,13 @@ def learn_colours(views: Sequence[View], inside: Sequence[Patches]) -> tuple[Mix
 
 
 def shaded(colours: Float[np.ndarray, "patch 3"]) -> Float[np.ndarray, "shaded 3"]:
-    """Some colours as they are in the object's own shadow, which is seen nowhere else.
+    """Some colours as they are in the object's own shadow, which is seen nowhere else; none of a plain backdrop, which
+    is no surface that shadows fall on.
 
     Of CIELAB all three numbers shrink together when light does.
     """
-    some = colours[:: round(1 / SHADED)]
+    away = np.linalg.norm(colours - np.median(colours, 0), axis=-1)
+    some = colours[:: round(1 / SHADED)] if np.quantile(away, PLAIN) > SAME else colours[:0]
     return some * np.random.default_rng(0).uniform(DARKEST, 1, (len(some), 1))
 
 
