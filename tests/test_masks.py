@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -143,16 +144,28 @@ def test_an_object_before_a_wall_is_found_and_learnt_alone(tmp_path):
         mask_object(folder, choose_reader(folder).read(folder), untracked)
 
 
-def test_outlines_without_contrast_are_said_to_be_guesses():
-    """Cameras that look at a wall of one kind only."""
+def test_noise_holds_no_object():
     scene = tiny.scene()
     chance = torch.Generator().manual_seed(0)
     views = [
         View.of(scene.names[i], scene.cameras[i], 0.5 + 0.001 * torch.rand(24, 24, 3, generator=chance))
         for i in range(len(scene))
     ]
-    found = segment(views, None, untracked)
-    assert found.distinct < 0.8 and any("colours of what is around it" in doubt for doubt in doubts(found))
+    with pytest.raises(LumigraphError, match="no object can be told from the rest"):
+        segment(views, None, untracked)
+
+
+def test_what_is_unsure_is_told():
+    scene = tiny.scene()
+    rgb = [torch.from_numpy(photographed(pose)[0]) for pose in tiny.poses()[::2]]
+    cameras = [scene.cameras[i].resized(SIDE / tiny.SIZE) for i in range(0, 12, 2)]
+    views = [View.of(f"{i}.jpg", camera, x) for i, (camera, x) in enumerate(zip(cameras, rgb, strict=True))]
+    sure = replace(segment(views, None, untracked), overlaps=np.full(6, 0.9))
+    assert sure.distinct > 0.95
+    assert [doubt[:8] for doubt in doubts(sure)] == ["no table"]
+    unsure = replace(sure, distinct=0.6, overlaps=np.where(np.arange(6) == 2, 0.3, 0.9), body=sure.region.cells)
+    told = " ".join(doubts(unsure))
+    assert "colours of what is around it" in told and "(2.jpg)" in told and "no object at all" in told
 
 
 def test_the_table_is_the_plane_below(generator):

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from scipy import ndimage
 from torch import Tensor
 
@@ -74,6 +74,7 @@ def segment(
     if len(region.cells) < FEWEST:
         raise LumigraphError("The photographs do not look at one thing together, so there is no object to find")
     allowed = [view.mean((view.shadow(region.cells, region.size) > 0.5).astype(float)) > 0.5 for view in views]
+    shown = [behind(region, view) for view in views]
     body = first_guess(region, points)
     shares = [view.mean(view.shadow(body, region.size)) for view in views]
     inside = [share > 0.5 for share in shares]
@@ -85,7 +86,7 @@ def segment(
             colour = around.log_likelihood(view.colours) - own.log_likelihood(view.colours)
             costs = colour.clip(-SURE, SURE) - strength * (2 * share - 1)
             inside.append(cut(view, np.where(may, costs, HOLD)))
-        body = carved(region, views, inside, slack)
+        body = carved(region, shown, inside, slack)
         shares = [view.mean(view.shadow(body, region.size)) for view in views]
         strength = PRIOR
     overlaps = np.array([overlap(view, a, b > 0.5) for view, a, b in zip(views, inside, shares, strict=True)])
@@ -132,14 +133,23 @@ def shaded(colours: Float[np.ndarray, "patch 3"]) -> Float[np.ndarray, "shaded 3
     return some * np.random.default_rng(0).uniform(DARKEST, 1, (len(some), 1))
 
 
-def carved(region: Region, views: Sequence[View], inside: Sequence[Patches], slack: float) -> Float[Tensor, "cell 3"]:
-    """The cells that all but a share of the pictures that hold them show inside the object; the largest piece."""
+def behind(region: Region, view: View) -> Int[np.ndarray, " cell"]:
+    """The superpixel that shows each cell; -1 for those outside the picture."""
+    places, pictured = view.at(region.cells)
+    return np.where(pictured, view.patches[tuple(places.T)], -1).astype(np.int32)
+
+
+def carved(
+    region: Region, shown: Sequence[np.ndarray], inside: Sequence[Patches], slack: float
+) -> Float[Tensor, "cell 3"]:
+    """The cells that all but a share of the pictures that hold them show inside the object; the largest piece.
+
+    shown: by picture, the superpixel that shows each cell, see `behind`
+    """
     past, seen = np.zeros(len(region.cells)), np.zeros(len(region.cells))
-    for view, patches in zip(views, inside, strict=True):
-        places, pictured = view.at(region.cells)
-        hit = patches[view.patches[tuple(places.T)]]
-        seen += pictured
-        past += pictured & ~hit
+    for patch, own in zip(shown, inside, strict=True):
+        seen += patch >= 0
+        past += (patch >= 0) & ~own[patch]
     keep = past <= slack * seen
     grid = np.zeros((CELLS,) * 3, bool)
     index = tuple(((region.cells.numpy() + 1) / region.size).astype(int).T)
