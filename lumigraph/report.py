@@ -13,7 +13,7 @@ from typing import Any
 
 from PIL import Image
 
-from . import __version__
+from . import __version__, methods
 from .budget import Budget
 from .figures.charts import STYLE as CHARTS
 from .figures.charts import Series, bar_chart, line_chart
@@ -125,15 +125,17 @@ def curves(run: Run) -> str:
     if len(rows) < 3:
         return ""
     seconds, steps = [row["seconds"] for row in rows], [row["step"] for row in rows]
-    charts = []
+    charts, own = [], methods.colour(run.method_name)
     if any("psnr" in row for row in rows):
         psnr = [row.get("psnr", math.nan) for row in rows]
         charts += [
-            line_chart([Series("PSNR", seconds, psnr)], "seconds of training", "PSNR of training batches, dB"),
-            line_chart([Series("PSNR", steps, psnr)], "step", "PSNR of training batches, dB"),
+            line_chart([Series("PSNR", seconds, psnr, own)], "seconds of training", "PSNR of training batches, dB"),
+            line_chart([Series("PSNR", steps, psnr, own)], "step", "PSNR of training batches, dB"),
         ]
     names = dict.fromkeys(name for row in rows for name in row["terms"])
-    losses = [Series(name, steps, [row["terms"].get(name, math.nan) for row in rows]) for name in names]
+    losses = [
+        Series(name, steps, [row["terms"].get(name, math.nan) for row in rows], own + i) for i, name in enumerate(names)
+    ]
     if losses:
         charts.append(line_chart(losses, "step", "loss", log=True))
     if all("samples" in row["statistics"] for row in rows):
@@ -142,7 +144,7 @@ def curves(run: Run) -> str:
             for a, b in zip(rows, rows[1:], strict=False)
         ]
         charts.append(
-            line_chart([Series("samples/s", seconds[1:], speed)], "seconds of training", "samples per second")
+            line_chart([Series("samples/s", seconds[1:], speed, own)], "seconds of training", "samples per second")
         )
     if not charts:
         return ""
@@ -153,7 +155,8 @@ def views(run: Run, evaluation: dict[str, Any] | None) -> str:
     if not evaluation or len(evaluation.get("views", ())) < 2:
         return ""
     scores = evaluation["views"]
-    chart = bar_chart([view["name"] for view in scores], [view["psnr"] for view in scores], "PSNR, dB")
+    values, own = [view["psnr"] for view in scores], methods.colour(run.method_name)
+    chart = bar_chart([view["name"] for view in scores], values, "PSNR, dB", own)
     worst, best = (choose(scores, key=lambda view: view["psnr"]) for choose in (min, max))
     note = (
         f"From {worst['psnr']:.2f} dB ({escape(worst['name'])}) to {best['psnr']:.2f} dB ({escape(best['name'])}); "

@@ -8,18 +8,21 @@ from xml.etree import ElementTree
 
 import pytest
 
+from lumigraph.benchmark.pictures import curves
 from lumigraph.figures.charts import (
     COLOURS,
+    DASHES,
     STYLE,
     WIDTH,
     Series,
     bar_chart,
     line_chart,
     log_ticks,
-    number,
+    numbers,
     standalone,
     ticks,
 )
+from lumigraph.methods import COLOURED, available, colour
 
 
 def elements(chart: str, kind: str) -> list[dict[str, str]]:
@@ -34,16 +37,15 @@ def points(chart: str, kind: str) -> list[tuple[float, float]]:
 
 def test_charts_have_round_ticks():
     assert ticks(0, 60) == [0, 20, 40, 60] and ticks(18.2, 24.1) == [20, 22, 24]
-    assert [number(x) for x in (0, 1500, 20_000, 1.5e6)] == ["0", "1500", "20 k", "1.5 M"]
     assert log_ticks(-1, 1) == pytest.approx([0.1, 0.2, 0.5, 1, 2, 5, 10])
     assert len(log_ticks(-12, 6)) <= 8 and all(math.log10(x) == round(math.log10(x)) for x in log_ticks(-12, 6))
     assert log_ticks(math.log10(3.1), math.log10(3.9)) == pytest.approx([3.2, 3.4, 3.6, 3.8])
 
 
 def test_a_curve_is_drawn_twice_or_once():
-    falling = Series("a", [1, 2, 3], [1e-3, 1e-2, 0.0])
+    falling = Series("a", [1, 2, 3, 4], [1e-1, 1e-3, 1e-2, 0.0])
     chart = line_chart([falling], "step", "loss", log=True)
-    assert "nan" not in chart and len(points(chart, "faint")) == len(points(chart, "bold")) == 2
+    assert "nan" not in chart and len(points(chart, "faint")) == len(points(chart, "bold")) == 3
     jagged = Series("a", range(100), [x % 2 for x in range(100)])
     single = line_chart([jagged], "x", "y", smoothed=False)
     assert "faint" not in single and points(single, "bold") == points(line_chart([jagged], "x", "y"), "faint")
@@ -60,11 +62,63 @@ def test_equal_ratios_are_equal_steps_on_logarithmic_axes():
 
 
 def test_each_point_has_its_mark():
-    chart = line_chart([Series("a & b", [1, 2], [3, 4]), Series("c", [2], [5])], "x", "y", marks=True, smoothed=False)
+    series = [Series("a & b", [1, 2, 3], [3, 4, 4]), Series("c", [2], [5])]
+    chart = line_chart(series, "x", "y", marks=True, smoothed=False)
     marks = elements(chart, "circle")
-    assert [mark["class"] for mark in marks] == ["dot c0", "dot c0", "dot c1"]
-    assert [(float(m["cx"]), float(m["cy"])) for m in marks[:2]] == points(chart, "bold")
+    assert [mark["class"] for mark in marks] == ["dot c0"] * 3 + ["dot c1"]
+    assert [(float(m["cx"]), float(m["cy"])) for m in marks[:3]] == points(chart, "bold")
     assert "a &amp; b: 1, 3" in chart
+
+
+@pytest.mark.parametrize("marks", [True, False])
+@pytest.mark.parametrize("smoothed", [True, False])
+def test_no_line_joins_two_points(marks, smoothed):
+    """Between two measurements a line is a guess; what has more keeps its own."""
+    short, long = Series("short", [60, 300], [20, 25]), Series("long", [60, 120, 300], [21, 23, 26])
+    alone = line_chart([short], "seconds", "PSNR", log_x=True, marks=marks, smoothed=smoothed)
+    assert {x["class"] for x in elements(alone, "path")} == {"grid"} and len(elements(alone, "circle")) == 2
+    both = line_chart([short, long], "seconds", "PSNR", log_x=True, marks=marks, smoothed=smoothed)
+    lined = {x["class"].split()[1] for x in elements(both, "path") if x["class"] != "grid"}
+    assert lined == {"c1"} and sum(x["class"] == "dot c0" for x in elements(both, "circle")) == 2
+
+
+def test_numbers_at_the_axes_of_a_chart_are_written_alike():
+    assert numbers([0, 0.1 + 0.2, 1500, 20_000]) == ["0", "0.3", "1500", "20000"]
+    assert numbers([0, 500_000, 1_500_000, -2e6]) == ["0", "5×10⁵", "1.5×10⁶", "-2×10⁶"]
+    assert numbers([1e-5, 2e-5, 5e-5, 1, 10]) == ["10⁻⁵", "2×10⁻⁵", "5×10⁻⁵", "10⁰", "10¹"]
+    falling = Series("a", [1, 10, 100], [1, 1e-3, 1e-6])
+    for log_x in (True, False):
+        chart = line_chart([falling], "samples", "error", log=True, log_x=log_x)
+        written = [x.text for x in ElementTree.fromstring(chart).iter("text") if "class" not in x.attrib]
+        assert len(written) >= 6 and all("10" in x and x[-1] in "⁻⁰¹²³⁴⁵⁶⁷⁸⁹" for x in written if x != "0")
+
+
+def test_a_method_has_one_colour_in_every_chart():
+    """Whatever else is drawn beside it, and in a report as in a benchmark."""
+    cells = [
+        {"method": name, "train_views": n, "psnr": 20.0 + n, "ssim": None, "lpips": None}
+        for name in ("nerf", "mip-nerf", "gaussian-splatting", "instant-ngp")
+        for n in (2, 3, 9)
+    ]
+    for drawn in (cells, cells[:3], cells[3:]):
+        series = curves(drawn, "train_views", lambda row: row["train_views"])
+        assert {one.name: one.colour for one in series} == {row["method"]: colour(row["method"]) for row in drawn}
+        chart = line_chart(series, "x", "y", marks=True, smoothed=False)
+        shown = re.findall(r"class='dot (c\d)' [^>]*><title>([^:]*):", chart)
+        assert set(shown) == {(f"c{colour(name)}", name) for name in {row["method"] for row in drawn}}
+    assert len({colour(name) for name in available()}) == len(available())
+    assert all(colour(name) < COLOURS for name in COLOURED)
+    assert all(colour("not-installed") > colour(name) for name in available())
+    bars = elements(bar_chart(["one", "two"], [20.0, 21.0], "dB", colour("nerf")), "rect")
+    assert {bar["class"] for bar in bars} == {f"bar c{colour('nerf')}"}
+
+
+def test_what_shares_a_colour_is_told_apart_by_dashes():
+    series = [Series(f"nerf, {s} s", [2, 3, 9], [s, s + 1, s + 2], 3, dash) for dash, s in enumerate((60, 300))]
+    chart = line_chart(series, "x", "y", smoothed=False)
+    lines = [x["class"] for x in elements(chart, "path") if x["class"].startswith(("bold", "sample"))]
+    assert lines == ["bold c3", "bold c3 dash1", "sample c3 dash1"]
+    assert all(f".dash{i} " in STYLE for i in range(1, DASHES))
 
 
 def test_an_axis_is_marked_where_it_was_measured_as_far_as_there_is_room():
@@ -77,7 +131,7 @@ def test_an_axis_is_marked_where_it_was_measured_as_far_as_there_is_room():
 
 
 def test_eight_series_have_eight_colours_and_names_that_fit():
-    series = [Series(f"a method called {i}", [1, 2], [i, i + 1]) for i in range(8)]
+    series = [Series(f"a method called {i}", [1, 2, 3], [i, i + 1, i + 2]) for i in range(8)]
     chart = line_chart(series, "seconds of training", "PSNR of held-out views, dB")
     names = [x for x in elements(chart, "text") if x.get("class", "").startswith("name")]
     assert {name["class"] for name in names} == {f"name c{i}" for i in range(COLOURS)} and COLOURS == 8
@@ -91,7 +145,7 @@ def test_eight_series_have_eight_colours_and_names_that_fit():
 
 def test_a_chart_in_a_file_of_its_own_carries_its_style():
     for chart in (
-        line_chart([Series("a < b", [1, 2], [3, 4])], "x", "y", note="fern & lego"),
+        line_chart([Series("a < b", [1, 2, 3], [3, 4, 4])], "x", "y", note="fern & lego"),
         bar_chart(["one", "two"], [20.0, 21.0], "dB"),
     ):
         root = ElementTree.fromstring(standalone(chart))

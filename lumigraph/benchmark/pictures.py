@@ -13,7 +13,7 @@ from jaxtyping import Float
 from PIL import Image
 from torch import Tensor
 
-from .. import files
+from .. import files, methods
 from ..evaluate import file_name
 from ..figures import Row as Line
 from ..figures import contact_sheet, save_picture
@@ -62,20 +62,21 @@ def curves(
 ) -> list[Series]:
     """The first score over x, a curve for each method. Cells that differ in their seeds alone are a point: their means.
 
-    point: what cells of one point have in common;  per: what else tells curves apart
+    point: what cells of one point have in common;  per: what else tells curves apart, of one method by their dashes
     """
     groups: dict[tuple[str, Any], dict[Any, list[Row]]] = {}
     for row in rows:
         groups.setdefault((row["method"], per(row)), {}).setdefault(point(row), []).append(row)
-    several = len({other for _, other in groups}) > 1
+    others = sorted({other for _, other in groups})
     series = []
     for (method, other), points in sorted(groups.items()):
         found = sorted(
             (statistics.fmean(row[x] for row in cells), statistics.fmean(scores_of(row)[0].value for row in cells))
             for cells in points.values()
         )
-        name = f"{method}, {other}" if several else method
-        series.append(Series(name, [at for at, _ in found], [score for _, score in found]))
+        name = f"{method}, {other}" if len(others) > 1 else method
+        x_of, y_of = [at for at, _ in found], [score for _, score in found]
+        series.append(Series(name, x_of, y_of, methods.colour(method), others.index(other)))
     return series
 
 

@@ -12,7 +12,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ..figures import to_image
-from ..figures.charts import Axis, number, svg
+from ..figures.charts import Axis, numbers, svg
 from .ray import Pass, Sight, triple
 
 WIDTH, LEFT, RIGHT = 988, 64, 700  # of the whole, and where the axis of distance begins and ends
@@ -73,8 +73,8 @@ def ray_figure(sight: Sight, title: str) -> str:
     for i, (each, stroke) in enumerate(passes):
         parts.append(lane(each, x, lanes + LANE * i, stroke))
     parts.append(f"<path class='grid' d='M{LEFT} {axis}H{RIGHT}'/>")
-    for value in x.ticks():
-        parts.append(f"<text x='{x(value):.1f}' y='{axis + 18}' text-anchor='middle'>{number(round(value, 9))}</text>")
+    for value, written in zip(x.ticks(), numbers(x.ticks()), strict=True):
+        parts.append(f"<text x='{x(value):.1f}' y='{axis + 18}' text-anchor='middle'>{written}</text>")
     parts.append(f"<text class='label' x='{RIGHT}' y='{axis + 40}' text-anchor='end'>distance, scene units</text>")
     parts.append(expected_depth(sight, x, [(top, top + height) for top, height in zip(tops, heights, strict=True)]))
     return svg("".join(parts), WIDTH, axis + 52)
@@ -142,9 +142,9 @@ def beside(top: float, equation: str, words: str) -> str:
 
 def scale(y: Axis) -> str:
     lines = []
-    for value in y.ticks():
+    for value, written in zip(y.ticks(), numbers(y.ticks()), strict=True):
         lines.append(f"<path class='grid' d='M{LEFT} {y(value):.1f}H{RIGHT}'/>")
-        lines.append(f"<text x='{LEFT - 10}' y='{y(value) + 4:.1f}' text-anchor='end'>{number(round(value, 9))}</text>")
+        lines.append(f"<text x='{LEFT - 10}' y='{y(value) + 4:.1f}' text-anchor='end'>{written}</text>")
     return "".join(lines)
 
 

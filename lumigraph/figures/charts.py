@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from html import escape
 from pathlib import Path
 
@@ -12,17 +12,24 @@ WIDTH, HEIGHT = 480, 270
 LEFT, RIGHT, TOP, BOTTOM = 52, 14, 30, 40  # margins around the plot
 SMOOTHING = 0.06  # share of a curve over which its bold line averages
 POINTS = 600  # of a curve that are drawn; more cannot be seen
-COLOURS = 8  # that charts.css knows
+COLOURS, DASHES = 8, 4  # that charts.css knows
 LETTER, LINE = 7.2, 18  # width of a letter, about, and height of a line of names
+SAMPLE = 30  # width of the piece of line before the name of a dashed one, with the gap behind it
 APART = 24  # between two numbers below the plot, at least
+PLAIN = 1e-3, 1e6  # numbers from here to there are written out if all of a chart are
+RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 STYLE = (Path(__file__).parent / "charts.css").read_text("utf-8")
 
 
 @dataclass(frozen=True)
 class Series:
+    """colour: its number in charts.css, if not that of its place in the chart;  dash: 0 for an unbroken line"""
+
     name: str
     x: Sequence[float]
     y: Sequence[float]
+    colour: int | None = None
+    dash: int = 0
 
 
 def line_chart(
@@ -36,7 +43,9 @@ def line_chart(
     note: str = "",
     x_ticks: Sequence[float] = (),
 ) -> str:
-    """Each series twice: faint as measured, bold as averaged. Empty if no series has a line to draw.
+    """Each series twice: faint as measured, bold as averaged. Empty if all of them have fewer points than two.
+
+    Two points are two marks: a line between them would tell of what nobody measured.
 
     log, log_x: of the y and the x axis; what has no logarithm, or is not finite, is left out
     marks:      a dot at each point, which tells its numbers on hovering
@@ -44,24 +53,26 @@ def line_chart(
     note:       a few words below the plot
     x_ticks:    what the x axis is marked at, in rising order, instead of round numbers
     """
-    kept = [thinned(drawable(s, log_x, log)) for s in series]
+    kept = [thinned(drawable(coloured(s, i), log_x, log)) for i, s in enumerate(series)]
     kept = [s for s in kept if len(s.x) > (0 if marks else 1)]
     if not kept:
         return ""
-    x_axis = spanning([x for s in kept for x in s.x], LEFT, WIDTH - RIGHT, log_x, from_zero=not log_x)
+    x_axis = spanning(
+        [x for s in kept for x in s.x], LEFT, WIDTH - RIGHT, log_x, pad=0.04 if marks else 0.0, from_zero=not log_x
+    )
     y_axis = spanning(
         [y for s in kept for y in s.y], HEIGHT - BOTTOM, TOP, log, pad=0.06, outliers=0.02 if smoothed else 0.0
     )
     lines = []
-    for i, measured in enumerate(kept):
-        colour = f"c{i % COLOURS}"
-        if smoothed:
-            lines.append(f"<path class='faint {colour}' d='{path(measured, x_axis, y_axis)}'/>")
-        bold = smooth(measured) if smoothed else measured
-        lines.append(f"<path class='bold {colour}' d='{path(bold, x_axis, y_axis)}'/>")
-        if marks:
-            lines.append(dots(measured, x_axis, y_axis, colour))
-    rows = legend_rows([s.name for s in kept] if len(kept) > 1 else [], y_label)
+    for measured in kept:
+        if lined := len(measured.x) > 2:
+            if smoothed:
+                lines.append(f"<path class='faint {look(measured)}' d='{path(measured, x_axis, y_axis)}'/>")
+            bold = smooth(measured) if smoothed else measured
+            lines.append(f"<path class='bold {look(measured)}' d='{path(bold, x_axis, y_axis)}'/>")
+        if marks or not lined:
+            lines.append(dots(measured, x_axis, y_axis))
+    rows = legend_rows(kept if len(kept) > 1 else [], y_label)
     above = LINE * (len(rows) - 1)
     names = (legend_row(row, 16 - above + LINE * i) for i, row in enumerate(rows))
     parts = [axes(x_axis, y_axis, x_ticks or x_axis.ticks()), *lines, *names]
@@ -80,7 +91,7 @@ def standalone(chart: str) -> bytes:
     return f"{opening}><style>\n{STYLE}</style>{body}\n".encode()
 
 
-def bar_chart(names: Sequence[str], values: Sequence[float], label: str) -> str:
+def bar_chart(names: Sequence[str], values: Sequence[float], label: str, colour: int = 0) -> str:
     """One bar for each value, its name on hovering, and a line at their mean."""
     low, high = min(values), max(values)
     width = 2 * WIDTH
@@ -88,15 +99,17 @@ def bar_chart(names: Sequence[str], values: Sequence[float], label: str) -> str:
     step = (width - LEFT - RIGHT) / len(values)
     bar = min(0.8 * step, 40.0)
     bars = "".join(
-        f"<rect class='bar' x='{LEFT + (i + 0.5) * step - bar / 2:.1f}' y='{y_axis(value):.1f}' width='{bar:.1f}' "
-        f"height='{y_axis.start - y_axis(value):.1f}' rx='1.5'><title>{escape(name)}: {value:.2f} dB</title></rect>"
+        f"<rect class='bar c{colour % COLOURS}' x='{LEFT + (i + 0.5) * step - bar / 2:.1f}' y='{y_axis(value):.1f}' "
+        f"width='{bar:.1f}' height='{y_axis.start - y_axis(value):.1f}' rx='1.5'>"
+        f"<title>{escape(name)}: {value:.2f} dB</title></rect>"
         for i, (name, value) in enumerate(zip(names, values, strict=True))
     )
     mean = y_axis(sum(values) / len(values))
+    marked = ticks(y_axis.low, y_axis.high, 4)
     grid = "".join(
         f"<path class='grid' d='M{LEFT} {y_axis(y):.1f}H{width - RIGHT}'/>"
-        f"<text x='{LEFT - 8}' y='{y_axis(y) + 4:.1f}' text-anchor='end'>{number(y)}</text>"
-        for y in ticks(y_axis.low, y_axis.high, 4)
+        f"<text x='{LEFT - 8}' y='{y_axis(y) + 4:.1f}' text-anchor='end'>{written}</text>"
+        for y, written in zip(marked, numbers(marked), strict=True)
     )
     line = f"<path class='level' d='M{LEFT} {mean:.1f}H{width - RIGHT}'/>"
     return svg(f"{grid}{bars}{line}<text class='label' x='{LEFT}' y='16'>{escape(label)}</text>", width, 200)
@@ -142,39 +155,54 @@ def spanning(
 
 
 def axes(x_axis: Axis, y_axis: Axis, x_ticks: Sequence[float]) -> str:
-    parts = []
-    for y in y_axis.ticks():
+    y_ticks, parts, taken = y_axis.ticks(), [], -math.inf
+    written = numbers([*y_ticks, *x_ticks])
+    for y, name in zip(y_ticks, written, strict=False):
         parts.append(f"<path class='grid' d='M{x_axis.start} {y_axis(y):.1f}H{x_axis.end}'/>")
-        parts.append(f"<text x='{LEFT - 8}' y='{y_axis(y) + 4:.1f}' text-anchor='end'>{number(y)}</text>")
-    taken = -math.inf
-    for x in x_ticks:
+        parts.append(f"<text x='{LEFT - 8}' y='{y_axis(y) + 4:.1f}' text-anchor='end'>{name}</text>")
+    for x, name in zip(x_ticks, written[len(y_ticks) :], strict=True):
         if x_axis(x) - taken >= APART:
             taken = x_axis(x)
-            parts.append(f"<text x='{taken:.1f}' y='{HEIGHT - BOTTOM + 18}' text-anchor='middle'>{number(x)}</text>")
+            parts.append(f"<text x='{taken:.1f}' y='{HEIGHT - BOTTOM + 18}' text-anchor='middle'>{name}</text>")
     return "".join(parts)
 
 
-Named = list[tuple[str, int]]  # what is said in a legend, and the number of its colour
+def coloured(series: Series, place: int) -> Series:
+    """With a colour of its own: that of its place, unless it has one."""
+    return replace(series, colour=(place if series.colour is None else series.colour) % COLOURS)
 
 
-def legend_rows(names: Sequence[str], label: str) -> list[Named]:
+def look(series: Series) -> str:
+    """The classes of its line in charts.css."""
+    return f"c{series.colour}" + (f" dash{series.dash % DASHES}" if series.dash else "")
+
+
+def letters(series: Series) -> float:
+    """How much room its name takes in a legend, with the piece of line before the name of a dashed one."""
+    return len(series.name) + (SAMPLE / LETTER if series.dash else 0)
+
+
+def legend_rows(series: Sequence[Series], label: str) -> list[list[Series]]:
     """Names in rows: the first stands right of the label, and stays empty if they do not all fit there."""
     room = (WIDTH - RIGHT - LEFT) / LETTER
-    rows: list[Named] = [[]]
-    if len(label) + sum(len(name) + 2 for name in names) > room:
+    rows: list[list[Series]] = [[]]
+    if len(label) + sum(letters(s) + 2 for s in series) > room:
         rows.append([])
-    for i, name in enumerate(names):
-        if rows[-1] and sum(len(other) + 2 for other, _ in rows[-1]) + len(name) > room:
+    for s in series:
+        if rows[-1] and sum(letters(other) + 2 for other in rows[-1]) + letters(s) > room:
             rows.append([])
-        rows[-1].append((name, i))
+        rows[-1].append(s)
     return rows
 
 
-def legend_row(names: Named, y: float) -> str:
+def legend_row(row: Sequence[Series], y: float) -> str:
     parts, x = [], float(WIDTH - RIGHT)
-    for name, i in reversed(names):
-        parts.append(f"<text class='name c{i % COLOURS}' x='{x:.0f}' y='{y}' text-anchor='end'>{escape(name)}</text>")
-        x -= LETTER * len(name) + 14
+    for s in reversed(row):
+        parts.append(f"<text class='name c{s.colour}' x='{x:.0f}' y='{y}' text-anchor='end'>{escape(s.name)}</text>")
+        x -= LETTER * letters(s)
+        if s.dash:
+            parts.append(f"<path class='sample {look(s)}' d='M{x:.0f} {y - 4}h{SAMPLE - 6}'/>")
+        x -= 14
     return "".join(parts)
 
 
@@ -182,9 +210,9 @@ def path(series: Series, x_axis: Axis, y_axis: Axis) -> str:
     return "M" + "L".join(f"{x_axis(x):.1f} {y_axis(y):.1f}" for x, y in zip(series.x, series.y, strict=True))
 
 
-def dots(series: Series, x_axis: Axis, y_axis: Axis, colour: str) -> str:
+def dots(series: Series, x_axis: Axis, y_axis: Axis) -> str:
     return "".join(
-        f"<circle class='dot {colour}' cx='{x_axis(x):.1f}' cy='{y_axis(y):.1f}' r='3.2'>"
+        f"<circle class='dot c{series.colour}' cx='{x_axis(x):.1f}' cy='{y_axis(y):.1f}' r='3.2'>"
         f"<title>{escape(series.name)}: {x:.4g}, {y:.4g}</title></circle>"
         for x, y in zip(series.x, series.y, strict=True)
     )
@@ -214,11 +242,22 @@ def log_ticks(low: float, high: float, about: int = 8) -> list[float]:
     return marks if len(marks) > 1 else [x for x in ticks(10**low, 10**high) if x > 0]
 
 
-def number(value: float) -> str:
-    for size, prefix in ((1e6, " M"), (1e4, " k")):
-        if abs(value) >= size:
-            return f"{value / (1e3 if prefix == ' k' else size):g}{prefix}"
-    return f"{value:.6g}"
+def numbers(values: Sequence[float]) -> list[str]:
+    """Each as it is written at an axis, all alike: in full, or by powers of ten if one is too small or large."""
+    low, high = PLAIN
+    if all(not value or low <= abs(value) < high for value in values):
+        return [f"{value:.6g}" for value in values]
+    return [by_powers(value) for value in values]
+
+
+def by_powers(value: float) -> str:
+    """3e-05 as 3×10⁻⁵, and 1e-05 as 10⁻⁵."""
+    if not value:
+        return "0"
+    digits, _, exponent = f"{value:.5e}".partition("e")
+    power = "10" + str(int(exponent)).translate(RAISED)
+    factor = f"{float(digits):g}"
+    return power if factor == "1" else f"{factor}×{power}"
 
 
 def drawable(series: Series, log_x: bool, log: bool) -> Series:
@@ -228,12 +267,12 @@ def drawable(series: Series, log_x: bool, log: bool) -> Series:
         for x, y in zip(series.x, series.y, strict=True)
         if math.isfinite(x) and math.isfinite(y) and (x > 0 or not log_x) and (y > 0 or not log)
     ]
-    return Series(series.name, [x for x, _ in kept], [y for _, y in kept])
+    return replace(series, x=[x for x, _ in kept], y=[y for _, y in kept])
 
 
 def thinned(series: Series) -> Series:
     every = -(-len(series.x) // POINTS)
-    return Series(series.name, series.x[::every], series.y[::every])
+    return replace(series, x=series.x[::every], y=series.y[::every])
 
 
 def smooth(series: Series) -> Series:
@@ -243,4 +282,4 @@ def smooth(series: Series) -> Series:
     for i in range(len(series.y)):
         window = series.y[max(0, i - min(reach, i // 2)) : i + 1]
         means.append(sum(window) / len(window))
-    return Series(series.name, series.x, means)
+    return replace(series, y=means)

@@ -12,11 +12,20 @@ from typing import Any
 from ..errors import LumigraphError
 from ..names import meant
 
+# A method that is added comes behind these, so that no colour of theirs changes from one release to the next.
+COLOURED = ("gaussian-splatting", "instant-ngp", "mip-nerf", "nerf", "fourier-features")
+
 
 def available() -> list[str]:
     """The methods that are installed, as the user types them: instant_ngp.py is `instant-ngp`."""
     modules = (module.name for module in pkgutil.iter_modules(__path__))
     return sorted(name.replace("_", "-") for name in modules if not name.startswith("_"))
+
+
+def colour(name: str) -> int:
+    """The number of the colour that every chart draws a method in: that of COLOURED, or one behind them."""
+    order = [*COLOURED, *(other for other in available() if other not in COLOURED)]
+    return order.index(name) if name in order else len(order)
 
 
 def summary(name: str) -> str:

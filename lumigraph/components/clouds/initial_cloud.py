@@ -66,14 +66,12 @@ def with_dense_points(
     inside = (found.positions.abs().amax(-1) <= scene.frame.reach).nonzero()[:, 0]
     if len(inside) < FEW:
         return means, colours
-    none_before = not len(means)
-    chosen = inside[torch.randperm(len(inside), generator=generator)[: most - len(means)]]
-    means, colours = torch.cat([means, found.positions[chosen]]), torch.cat([colours, found.colours[chosen]])
-    if none_before and scene.frame.reach > 1:
-        far = backdrop(scene.frame, min(int(BACKDROP * count), most - len(means)), generator)
-        means = torch.cat([means, far])
-        colours = torch.cat([colours, torch.rand(len(far), 3, generator=generator)])
-    return means, colours
+    far = torch.zeros(0, 3)
+    if not len(means) and scene.frame.reach > 1:
+        far = backdrop(scene.frame, min(int(BACKDROP * count), most // 2), generator)
+    chosen = inside[torch.randperm(len(inside), generator=generator)[: most - len(means) - len(far)]]
+    guessed = torch.rand(len(far), 3, generator=generator)
+    return torch.cat([means, found.positions[chosen], far]), torch.cat([colours, found.colours[chosen], guessed])
 
 
 def backdrop(frame: Frame, count: int, generator: torch.Generator) -> Float[Tensor, "point 3"]:

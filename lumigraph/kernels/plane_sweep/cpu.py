@@ -26,8 +26,9 @@ def _place(warp, h, y, rows, columns, u, v):
     for x in range(len(u)):
         centre = np.float32(x) + HALF
         s = across_s * centre + s0
-        inverse = ONE / s if s > LEAST else ZERO
-        u[x] = min(max((across_u * centre + u0) * inverse + HALF, ZERO), right) if s > LEAST else ZERO
+        before = s > LEAST
+        inverse = ONE / s if before else ZERO
+        u[x] = min(max((across_u * centre + u0) * inverse + HALF, ZERO), right) if before else ZERO
         v[x] = min(max((across_v * centre + v0) * inverse + HALF, ZERO), bottom)
 
 

@@ -5,7 +5,7 @@ By name: the engine, the function, what stands there, and what is put in its pla
 
 FAULTS = {
     "half a pixel aside": ("cpu", "_place", "v0) * inverse + HALF", "v0) * inverse"),
-    "what lies behind is seen": ("cpu", "_place", "right) if s > LEAST else ZERO", "right)"),
+    "what lies behind is seen": ("cpu", "_place", "before = s > LEAST", "before = s != ZERO"),
     "trust forgotten": ("cpu", "_products", "w, wb = trust[x] * seen[x], trust[x]", "w, wb = trust[x] * seen[x], ONE"),
     "the most instead of the least": ("cpu", "_keep_least", "= max(c, lower)", "= min(c, lower)"),
     "a row of long ago": ("cpu", "_sweep", "sums[:] = ZERO", "pass"),
