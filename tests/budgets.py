@@ -2,7 +2,7 @@
 
 What counts is the lesser of a test's seconds and its processors' seconds, without what Numba compiled for the first
 time: so neither a busy machine nor a fresh clone makes a file costly. It is divided by how slow the machine proves to
-be. `pytest_terminal_summary` prints the table and the files beyond their shares. A file beyond three times its share
+be. `pytest_terminal_summary` prints the table and the files beyond their shares. A file beyond four times its share
 ends the session with code 1: less than that is within what one machine differs from another.
 """
 
@@ -22,32 +22,39 @@ BUDGETS: dict[str, float] = {
     "kernels": 150,
     "nouns, capture": 75,
     "exports, viewer, web": 75,
-    "runs, commands, benchmark": 75,
-    "methods": 100,
+    "runs, commands, benchmark": 90,
+    "methods": 120,
     "house": 10,
 }
 EACH = 5.0
 SHARES: dict[str, tuple[str, float]] = {
+    "test_display": ("runs, commands, benchmark", 8),
+    "test_fewer_views": ("runs, commands, benchmark", 8),
+    "test_old_runs": ("runs, commands, benchmark", 10),
+    "test_scores": ("runs, commands, benchmark", 10),
+    "test_budget": ("runs, commands, benchmark", 8),
+    "test_dense_start": ("methods", 8),
+    "test_schedule": ("methods", 25),
     "test_kernels": ("kernels", 80),
     "test_bounds": ("kernels", 60),
     "test_seeded_faults": ("kernels", 40),
     "test_gpu_compiles": ("kernels", 10),
     "test_capture_motion": ("nouns, capture", 20),
     "test_capture": ("nouns, capture", 10),
-    "test_mesh": ("exports, viewer, web", 15),
+    "test_mesh": ("exports, viewer, web", 25),
     "test_web": ("exports, viewer, web", 15),
     "test_viewer_page": ("exports, viewer, web", 20),
     "test_viewer": ("exports, viewer, web", 10),
     "test_panorama": ("exports, viewer, web", 8),
     "test_benchmark": ("runs, commands, benchmark", 20),
-    "test_cli": ("runs, commands, benchmark", 12),
+    "test_cli": ("runs, commands, benchmark", 18),
     "test_run": ("runs, commands, benchmark", 8),
     "test_train": ("runs, commands, benchmark", 8),
-    "test_signals": ("runs, commands, benchmark", 8),
+    "test_signals": ("runs, commands, benchmark", 15),
     "test_nerf": ("methods", 16),
     "test_instant_ngp": ("methods", 10),
     "test_gaussian_splatting": ("methods", 10),
-    "test_fourier_features": ("methods", 8),
+    "test_fourier_features": ("methods", 12),
 }
 A_METHOD = 6.0  # by contract, of each method, beside what its own file takes
 GROUPS: dict[str, str] = {
@@ -56,21 +63,15 @@ GROUPS: dict[str, str] = {
         "test_export test_viewer_controls test_viewer_crop test_exchange test_explain_ray test_keyframes".split(),
         "exports, viewer, web",
     ),
-    **dict.fromkeys("test_browser".split(), "exports, viewer, web"),
+    "test_browser": "exports, viewer, web",
     **dict.fromkeys(
-        "test_locks test_old_runs test_opened test_composed test_scores test_memory test_progress".split(),
+        "test_locks test_opened test_composed test_memory test_progress test_charts test_multiscale test_verdict".split(),
         "runs, commands, benchmark",
     ),
-    **dict.fromkeys(
-        "test_charts test_multiscale test_fewer_views test_budget test_verdict test_display".split(),
-        "runs, commands, benchmark",
-    ),
-    **dict.fromkeys(
-        "test_coordinate_network test_density_control test_schedule test_gaussians test_encodings".split(), "methods"
-    ),
+    **dict.fromkeys("test_coordinate_network test_density_control test_gaussians test_encodings".split(), "methods"),
     **dict.fromkeys("test_house test_budgets".split(), "house"),
 }  # the others are of nouns and capture
-MUCH, TOO_MUCH = 1.5, 3.0  # times its share: what is told, and what fails
+MUCH, TOO_MUCH = 1.5, 4.0  # times its share: what is told, and what fails
 CALIBRATION = 0.021  # processor seconds that `probe` takes on the machine that the budgets were set on
 
 
