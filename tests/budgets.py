@@ -64,10 +64,8 @@ GROUPS: dict[str, str] = {
         "exports, viewer, web",
     ),
     "test_browser": "exports, viewer, web",
-    **dict.fromkeys(
-        "test_locks test_opened test_composed test_memory test_progress test_charts test_multiscale test_verdict".split(),
-        "runs, commands, benchmark",
-    ),
+    **dict.fromkeys("test_locks test_opened test_composed test_memory".split(), "runs, commands, benchmark"),
+    **dict.fromkeys("test_progress test_charts test_multiscale test_verdict".split(), "runs, commands, benchmark"),
     **dict.fromkeys("test_coordinate_network test_density_control test_gaussians test_encodings".split(), "methods"),
     **dict.fromkeys("test_house test_budgets".split(), "house"),
 }  # the others are of nouns and capture
