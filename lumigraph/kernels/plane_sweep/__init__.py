@@ -91,7 +91,7 @@ def benchmark_case(generator: torch.Generator, size: int = 2**18):
 
 def _inputs(size, its_size, count, planes, window, best, generator):
     """A smooth picture with more than one brightness, and neighbours that see about the same a little aside."""
-    height, width = size
+    (height, width), (its_height, its_width) = size, its_size
 
     def wave(rows, columns, shift, phase):
         y, x = torch.meshgrid(torch.arange(rows), torch.arange(columns), indexing="ij")
@@ -102,11 +102,11 @@ def _inputs(size, its_size, count, planes, window, best, generator):
 
     phase = 6 * uniform(1)
     reference = wave(height, width, 0.0, phase)
-    neighbours = torch.stack([wave(*its_size, 1.0 + k, phase + 0.2 * k) for k in range(count)])
+    neighbours = torch.stack([wave(its_height, its_width, 1.0 + k, phase + 0.2 * k) for k in range(count)])
     trust = (1.3 * uniform(height, width)).clamp(max=1)
-    its_trust = (1.3 * uniform(count, *its_size)).clamp(max=1)
+    its_trust = (1.3 * uniform(count, its_height, its_width)).clamp(max=1)
     trust[: height // 3, : width // 3] = 0
-    its_trust[:, -1:, : its_size[1] // 2] = 0
+    its_trust[:, -1:, : its_width // 2] = 0
     warps = torch.eye(3, 4).repeat(count, 1, 1) + 0.02 * (uniform(count, 3, 4) - 0.5)
     warps[:, 2, :2] *= 0.1
     warps[:, :, 3] = torch.tensor([-1.0, 0.1, 0.01]) * (1 + uniform(count, 1))
