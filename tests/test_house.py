@@ -18,7 +18,7 @@ FLOORS: list[set[str]] = [
     {"console", "errors", "processes", "quality", "signals"},
     {
         *("blending", "budget", "choice", "controls", "geometry", "loops"),
-        *("memory", "names", "progress", "readers", "srgb", "threads"),
+        *("memory", "names", "progress", "ranges", "readers", "srgb", "threads"),
     },
     {"files", "plain", "lens", "rays"},
     {"camera", "crop", "images", "kernels", "figures", "locks", "metrics"},
