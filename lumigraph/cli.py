@@ -28,6 +28,7 @@ from .commands.explain import Explain
 from .commands.export import Export
 from .commands.info import Info
 from .commands.methods import Methods
+from .commands.options import RULES, held
 from .commands.render import Render
 from .commands.report import Report
 from .commands.resume import Resume
@@ -119,7 +120,9 @@ def parse(arguments: list[str]) -> Any:
     union: Any = kinds[0]
     for kind in kinds[1:]:
         union |= kind
-    return tyro.cli(union, prog="lumigraph", description=DESCRIPTION, args=arguments or ["--help"])
+    return held(
+        tyro.cli(union, prog="lumigraph", description=DESCRIPTION, args=arguments or ["--help"], registry=RULES)
+    )
 
 
 def brief(kind: type) -> str:

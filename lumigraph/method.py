@@ -201,7 +201,7 @@ class Method(nn.Module, ABC):
     def random(self, number: int) -> torch.Generator:
         """Random numbers that depend on the config's seed and a number alone, the step for example, so that a resumed
         run draws the same."""
-        return torch.Generator().manual_seed((self.config.seed << 40) + (number % (1 << 40)))
+        return torch.Generator().manual_seed(((self.config.seed << 40) + (number % (1 << 40))) % (1 << 64))
 
     @property
     def device(self) -> torch.device:

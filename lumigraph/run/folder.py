@@ -134,7 +134,7 @@ class Run(Opened):
             )
         kind = methods.find(self.method_name)
         with understood(self._config):
-            config = self.settings.method_config(kind)
+            config = self.settings.method_config(kind, self._config)
         return build(kind, self.frame, config, torch.device(device), self.settings.seed)
 
     def method(self, device: torch.device | str = "cpu") -> Method:
