@@ -83,10 +83,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 0
     except OSError as error:
         return refuse(refusal(Path(error.filename or "A file"), error))
-    except RuntimeError as error:
-        if type(error).__name__ != "OutOfMemoryError":
+    except (MemoryError, RuntimeError) as error:
+        from .memory import want_of_memory  # with PyTorch, which is there where its memory is short
+
+        if (sentence := want_of_memory(error)) is None:
             raise
-        return refuse("The device's memory is full; use a larger --downscale, or --device cpu")
+        return refuse(sentence)
 
 
 @contextlib.contextmanager

@@ -73,6 +73,12 @@ class Method(nn.Module, ABC):
         """The Config to use where the user chose none: the paper's on a GPU, on a CPU what learns most in a minute."""
         return cls.Config()
 
+    @classmethod
+    def further_bytes(cls, frame: Frame, config: Any, learning: bool) -> int:
+        """Bytes that will be needed at least, beside what is built at first: grids that are refined; where it is
+        learning, what a step keeps for its gradients."""
+        return 0
+
     # Learning
 
     def steps_per_pass(self, data: Any) -> float:

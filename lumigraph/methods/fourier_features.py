@@ -114,4 +114,4 @@ def frequencies(config: Config) -> Float[Tensor, "frequency 2"] | None:
         case "positional":
             return torch.kron(torch.eye(2), (scale ** (torch.arange(count // 2) / (count // 2)))[:, None])
         case "gaussian":
-            return scale * torch.randn(count, 2, generator=generator)
+            return scale * torch.randn(count, 2, generator=generator, device="cpu")

@@ -167,7 +167,7 @@ class GaussianSplatting(Method):
 
     def begin(self, scene: Scene) -> None:
         config = self.config
-        counts = config.initial_gaussians, config.max_gaussians
+        counts = min(config.initial_gaussians, self._most()), self._most()
         found = initial_cloud(scene, config.initialization, *counts, config.sh_degree, self.random(1))
         self.cloud.replace(found, self._optimizer)
         self.density_control.begin(len(found))

@@ -20,6 +20,7 @@ from ..components.training.corrections import Exposure, PoseRefinement
 from ..components.training.lazy_adam import LazyAdam
 from ..components.training.schedules import falling
 from ..controls import Control
+from ..errors import LumigraphError
 from ..method import RayMethod
 from ..ranges import Layers, LearningRate, NonNegative, PositiveShare, Seed, Share, Steps, Width, between
 from ..rays import Look, Rays, Rendering, Samples
@@ -57,6 +58,18 @@ class Config:
     exposure_correction: bool = False  # learn a gain per photograph
     refine_cameras: bool = False  # learn a correction of each photograph's pose
     seed: Seed = 0
+
+    def __post_init__(self) -> None:
+        if self.base_resolution > self.max_resolution:
+            raise LumigraphError(
+                f"The coarsest level cannot be finer than the finest: --base-resolution {self.base_resolution:,} is "
+                f"above --max-resolution {self.max_resolution:,}"
+            )
+        if self.levels << min(self.log2_hashmap_size, 64) >= 1 << 32:
+            raise LumigraphError(
+                f"Tables of {self.levels} levels with up to 2^{self.log2_hashmap_size} entries are beyond what 32 bits "
+                f"count; give a smaller --log2-hashmap-size"
+            )
 
 
 # Coarse to fine: share of the budget from which on, and which part of occupancy_resolution and steps_per_diagonal.
@@ -180,6 +193,12 @@ class InstantNGP(RayMethod):
             exposure_correction=True,
             refine_cameras=True,
         )
+
+    @classmethod
+    def further_bytes(cls, frame: Frame, config: Any, learning: bool) -> int:
+        hidden = config.hidden_width * (config.density_layers + config.colour_layers)
+        step = 4 * config.samples_per_step * (config.levels * config.features_per_level + hidden)
+        return OccupancyGrid.bytes_of(frame.reach, config.occupancy_resolution) + step * learning
 
     def rays_in_a_step(self, data: Scene) -> float:
         return self.config.samples_per_step / SAMPLES_OF_A_RAY

@@ -127,6 +127,13 @@ class MipNeRF(RayMethod):
             warmup=0.1,
         )
 
+    @classmethod
+    def further_bytes(cls, frame: Frame, config: Any, learning: bool) -> int:
+        asked = (
+            0 if config.occupancy_resolution else config.rays_per_step * (config.coarse_samples + config.fine_samples)
+        )
+        return 2 * asked * config.depth * config.hidden_width * learning
+
     def begin(self, scene: Scene) -> None:
         self.empty.begin(scene)
 

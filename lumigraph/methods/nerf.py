@@ -60,6 +60,13 @@ class Config:
     bfloat16: bool = True  # multiply in bfloat16 where the machine is fast at it
     seed: Seed = 0
 
+    def __post_init__(self) -> None:
+        if self.networks == 2 and not self.coarse_loss_weight:
+            raise LumigraphError(
+                "The first of two networks learns from --coarse-loss-weight alone, so --networks 2 with "
+                "--coarse-loss-weight 0 cannot be; give --networks 1, or a weight above 0"
+            )
+
 
 class NeRF(RayMethod):
     """Coarse samples evenly along each ray, fine ones where the coarse ones found something (section 5.2)."""
@@ -80,11 +87,6 @@ class NeRF(RayMethod):
 
     def __init__(self, frame: Frame, config: Any = None):
         config = config or Config()
-        if config.networks not in (1, 2) or (config.networks == 2 and not config.coarse_loss_weight):
-            raise LumigraphError(
-                f"nerf has 1 or 2 networks, and the first of 2 learns from --coarse-loss-weight alone; --networks "
-                f"{config.networks} with --coarse-loss-weight {config.coarse_loss_weight:g} cannot be"
-            )
         super().__init__(frame, config)
         self.space = space_of(frame)
         self.encode_position = FrequencyEncoding(3, config.position_frequencies, keep_input=False)
@@ -133,6 +135,13 @@ class NeRF(RayMethod):
             transmittance_threshold=1e-3,
             warmup=0.1,
         )
+
+    @classmethod
+    def further_bytes(cls, frame: Frame, config: Any, learning: bool) -> int:
+        asked = (
+            0 if config.occupancy_resolution else config.rays_per_step * (config.coarse_samples + config.fine_samples)
+        )
+        return 2 * asked * config.depth * config.hidden_width * learning
 
     def begin(self, scene: Scene) -> None:
         self.empty.begin(scene)

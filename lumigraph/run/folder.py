@@ -35,6 +35,7 @@ from ..method import Method
 from ..plain import understood
 from ..scene import Frame, Scene
 from .checkpoint import WEIGHTS, Checkpoints, State
+from .needs import check_memory
 from .opened import Opened
 from .settings import Settings, Source
 
@@ -274,7 +275,11 @@ class Run(Opened):
 
 
 def build(kind: type[Method], frame: Frame, config: Any, device: torch.device, seed: int) -> Method:
-    """A fresh method whose initial weights depend on the seed alone."""
+    """A fresh method whose initial weights depend on the seed alone.
+
+    Raises LumigraphError where memory does not hold it.
+    """
+    check_memory(kind, frame, config, device)
     with torch.random.fork_rng():
         torch.manual_seed(seed)
         method = kind(frame, config)
