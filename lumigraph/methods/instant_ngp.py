@@ -59,7 +59,8 @@ class Config:
     refine_cameras: bool = False  # learn a correction of each photograph's pose
     seed: Seed = 0
 
-    def __post_init__(self) -> None:
+    def check(self) -> None:
+        """Raises LumigraphError for numbers that contradict each other."""
         if self.base_resolution > self.max_resolution:
             raise LumigraphError(
                 f"The coarsest level cannot be finer than the finest: --base-resolution {self.base_resolution:,} is "

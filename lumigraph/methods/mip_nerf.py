@@ -10,7 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import max_pool1d, pad, softplus
 
-from ..components.fields.coordinate_network import CoordinateNetwork
+from ..components.fields.coordinate_network import CoordinateNetwork, bytes_kept
 from ..components.fields.dense import in_chunks
 from ..components.fields.encodings import FrequencyEncoding, IntegratedEncoding
 from ..components.sampling.frustums import frustum_moments
@@ -129,10 +129,7 @@ class MipNeRF(RayMethod):
 
     @classmethod
     def further_bytes(cls, frame: Frame, config: Any, learning: bool) -> int:
-        asked = (
-            0 if config.occupancy_resolution else config.rays_per_step * (config.coarse_samples + config.fine_samples)
-        )
-        return 2 * asked * config.depth * config.hidden_width * learning
+        return bytes_kept(config) if learning else 0
 
     def begin(self, scene: Scene) -> None:
         self.empty.begin(scene)

@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from ..components.fields.coordinate_network import CoordinateNetwork
+from ..components.fields.coordinate_network import CoordinateNetwork, bytes_kept
 from ..components.fields.dense import in_chunks
 from ..components.fields.encodings import FrequencyEncoding
 from ..components.sampling.occupancy_mask import OccupancyMask
@@ -60,7 +60,8 @@ class Config:
     bfloat16: bool = True  # multiply in bfloat16 where the machine is fast at it
     seed: Seed = 0
 
-    def __post_init__(self) -> None:
+    def check(self) -> None:
+        """Raises LumigraphError for numbers that contradict each other."""
         if self.networks == 2 and not self.coarse_loss_weight:
             raise LumigraphError(
                 "The first of two networks learns from --coarse-loss-weight alone, so --networks 2 with "
@@ -138,10 +139,7 @@ class NeRF(RayMethod):
 
     @classmethod
     def further_bytes(cls, frame: Frame, config: Any, learning: bool) -> int:
-        asked = (
-            0 if config.occupancy_resolution else config.rays_per_step * (config.coarse_samples + config.fine_samples)
-        )
-        return 2 * asked * config.depth * config.hidden_width * learning
+        return bytes_kept(config) if learning else 0
 
     def begin(self, scene: Scene) -> None:
         self.empty.begin(scene)

@@ -33,6 +33,7 @@ from ..locks import NAME as LOCK
 from ..locks import held
 from ..method import Method
 from ..plain import understood
+from ..ranges import check
 from ..scene import Frame, Scene
 from .checkpoint import WEIGHTS, Checkpoints, State
 from .needs import check_memory
@@ -274,12 +275,16 @@ class Run(Opened):
         return files.read_json(path) if path.exists() else None
 
 
-def build(kind: type[Method], frame: Frame, config: Any, device: torch.device, seed: int) -> Method:
+def build(
+    kind: type[Method], frame: Frame, config: Any, device: torch.device, seed: int, learning: bool = False
+) -> Method:
     """A fresh method whose initial weights depend on the seed alone.
 
-    Raises LumigraphError where memory does not hold it.
+    learning: whether it is to learn, which takes more memory than looking
+    Raises LumigraphError for numbers beyond their ranges, and where memory does not hold it.
     """
-    check_memory(kind, frame, config, device)
+    check(config, methods.name_of(kind))
+    check_memory(kind, frame, config, device, learning)
     with torch.random.fork_rng():
         torch.manual_seed(seed)
         method = kind(frame, config)
