@@ -94,7 +94,7 @@ def test_an_absurd_number_in_a_run_ends_in_a_sentence(method, field, value, rang
     assert "config.json" in told and f"{field} is {value}" in told and range in told and "\n" not in told
 
 
-@pytest.mark.parametrize("value", ["16", 16.0, True, None, [16], {"n": 16}, 10**5000])
+@pytest.mark.parametrize("value", ["16", 16.0, True, None, [16], {"n": 16}, 10**400])
 def test_what_is_no_number_is_refused(value, tmp_path):
     run = tiny.new_run(tmp_path / "run")
     settings = dataclasses.replace(run.settings, method="nerf", config={"depth": value})
@@ -109,10 +109,9 @@ def test_a_number_that_no_method_has_is_refused(tmp_path):
         Run(run.folder).new_method()
 
 
-@pytest.mark.parametrize(
-    "number", ["size=0", "size=100000", "views=0", "seed=99999999999", f"size={'9' * 5000}", "size=-1"]
-)
+@pytest.mark.parametrize("number", ["size=0", "size=100000", "views=0", "seed=99999999999", "size=-1", "size=9..."])
 def test_numbers_of_procedural_scenes_have_ranges(number, capsys):
+    number = number.replace("...", "9" * 5000)
     assert main(["info", f"procedural:still-life,{number}"]) == 2
     told = capsys.readouterr().err
     assert number.partition("=")[0] in told and told.count("\n") == 1
