@@ -17,7 +17,8 @@ from lumigraph.cli import COMMANDS, main
 from lumigraph.errors import LumigraphError
 from lumigraph.files import write_json
 from lumigraph.ranges import Count, Share, between, check, domain, hints, numbers, outside, typed
-from lumigraph.run import Run
+from lumigraph.run import Run, build
+from lumigraph.train import fit
 
 OURS = list(methods.COLOURED)
 
@@ -51,6 +52,23 @@ def test_presets_are_within_their_ranges(name):
     kind = methods.find(name)
     for config in (kind.Config(), kind.smallest(), *(kind.preset(torch.device(on)) for on in ("cpu", "cuda"))):
         check(config, name)
+
+
+@pytest.mark.parametrize("name", OURS)
+def test_the_least_of_each_number_learns(name):
+    """Each number at the least that its range allows: a step is taken, or a sentence says what it disagrees with."""
+    kind = methods.find(name)
+    frame = dataclasses.replace(tiny.scene().frame, reach=2.0)  # beyond an object, so that no hull is carved
+    scene = dataclasses.replace(tiny.scene(), frame=frame)
+    for field, annotation in hints(kind.Config).items():
+        for number, range in numbers(annotation):
+            config = dataclasses.replace(kind.smallest(), **{field: number(range.ge)})
+            try:
+                method = build(kind, frame, config, torch.device("cpu"), 0)
+            except LumigraphError as told:
+                assert f"--{field.replace('_', '-')}" in str(told)
+                continue
+            assert fit(method, scene, steps=1, show=False, rehearsal=False).finished, field
 
 
 # Method, flag, value, and what the sentence says beside the flag. Names of version 0.1 where the attack used them.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated, Any, ClassVar
+from typing import Any, ClassVar
 
 import torch
 from jaxtyping import Float
@@ -19,19 +19,7 @@ from ..components.sampling.sampling import inverse_transform, stratified
 from ..components.sampling.spaces import space_of
 from ..components.training.schedules import falling
 from ..method import RayMethod
-from ..ranges import (
-    BatchSize,
-    Cells,
-    Layers,
-    LearningRate,
-    NonNegative,
-    Octaves,
-    RaySamples,
-    Seed,
-    Share,
-    Width,
-    between,
-)
+from ..ranges import BatchSize, Cells, Depth, Layers, LearningRate, NonNegative, Octaves, RaySamples, Seed, Share, Width
 from ..rays import Look, Rays, Rendering, Samples
 from ..scene import Frame, Scene
 from ..volume import composite, weights_of
@@ -41,7 +29,7 @@ from ..volume import composite, weights_of
 class Config:
     """The paper's numbers, with where it gives them; below them what saves time and keeps the mathematics."""
 
-    depth: Annotated[int, between(2, 64)] = 8  # hidden layers before density, as NeRF's
+    depth: Depth = 8  # hidden layers before density, as NeRF's
     hidden_width: Width = 256  # channels of a layer, as NeRF's
     skip_layer: Layers = 5  # the layer whose activation the input joins again, as NeRF's
     position_frequencies: Octaves = 16  # L for frustums, section 4: with cones, more do no harm

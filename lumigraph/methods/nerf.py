@@ -21,6 +21,7 @@ from ..method import RayMethod
 from ..ranges import (
     BatchSize,
     Cells,
+    Depth,
     Layers,
     LearningRate,
     NonNegative,
@@ -40,7 +41,7 @@ from ..volume import composite, weights_of
 class Config:
     """The paper's numbers, with where it gives them; below them what saves time and keeps the mathematics."""
 
-    depth: Annotated[int, between(2, 64)] = 8  # hidden layers before density, appendix A
+    depth: Depth = 8  # hidden layers before density, appendix A
     hidden_width: Width = 256  # channels of a layer, appendix A
     skip_layer: Layers = 5  # the layer whose activation the input joins again, figure 7
     position_frequencies: Octaves = 10  # L for points, section 5.1
