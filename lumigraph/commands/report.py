@@ -8,7 +8,6 @@ from typing import Annotated
 
 from tyro.conf import Positional
 
-from ..progress import counting
 from .common import needed, show
 
 
@@ -23,6 +22,7 @@ class Report:
     """Folder of the run."""
 
     def run(self) -> int:
+        from ..progress import counting
         from ..report import write_report
         from ..run import Run
 

@@ -9,7 +9,6 @@ from typing import Annotated, Any, Literal
 from tyro.conf import Positional
 
 from ...errors import LumigraphError
-from ...progress import counting
 from ...ranges import between
 from ..common import choose_device, needed, option, say, show
 from ..controls import Set, tell
@@ -49,6 +48,7 @@ class ExplainRay:
         from ...explain.ray_figure import ray_figure
         from ...figures.charts import standalone
         from ...files import write_bytes, write_json
+        from ...progress import counting
         from ...run import Run
 
         run = Run(self.run_folder)
