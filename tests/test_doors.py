@@ -32,7 +32,7 @@ REFUSED = {
     "a negative finest level": lambda: HashLevels(finest=-1),
     "a finest level beyond 32 bits": lambda: HashLevels(finest=10**12),
     "tables beyond 32 bits": lambda: HashLevels(levels=64, log2_entries=30, coarsest=2000),
-    "another pyramid's table": lambda: hash_encode(POINTS, TABLE, replace(LEVELS, finest=20)),
+    "another pyramid's table": lambda: hash_encode(POINTS, TABLE, replace(LEVELS, coarsest=1)),
     "a table of other features": lambda: hash_encode(POINTS, TABLE[:, :1], LEVELS),
     "flat points": lambda: hash_encode(POINTS[:, :2], TABLE, LEVELS),
     "points of another type": lambda: hash_encode(POINTS.double(), TABLE, LEVELS),

@@ -28,7 +28,7 @@ def dataclasses_of(kind: Any) -> set[type]:
     found, fresh = set(), [kind]
     while fresh:
         kind = fresh.pop()
-        if dataclasses.is_dataclass(kind) and kind not in found:
+        if isinstance(kind, type) and dataclasses.is_dataclass(kind) and kind not in found:
             found.add(kind)
             fresh += hints(kind).values()
         fresh += typing.get_args(kind)
