@@ -12,6 +12,7 @@ import torch
 
 from lumigraph import memory, methods
 from lumigraph.errors import LumigraphError
+from lumigraph.export.film import film
 from lumigraph.memory import peak_memory, want_of_memory
 from lumigraph.run import build
 from lumigraph.run.needs import bytes_of
@@ -21,6 +22,7 @@ TAKE = """
 import torch
 from lumigraph import memory, methods
 from lumigraph.errors import LumigraphError
+from lumigraph.export.film import film
 from lumigraph.memory import peak_memory, want_of_memory
 from lumigraph.run import build
 from lumigraph.run.needs import bytes_of
@@ -107,3 +109,11 @@ def test_the_estimate_is_what_a_method_takes(name):
     looking = bytes_of(kind, frame, config, learning=False) - kind.further_bytes(frame, config, learning=False)
     learning = bytes_of(kind, frame, config, learning=True) - kind.further_bytes(frame, config, learning=True)
     assert looking == weights + held and learning == 4 * weights + held
+
+
+def test_a_picture_that_memory_does_not_hold_is_told(ball_run, tmp_path, monkeypatch):
+    monkeypatch.setattr(memory, "free_memory", lambda: 1_000_000)
+    camera = ball_run.cameras()["test"][0].resized(8.0)
+    with pytest.raises(LumigraphError, match="A picture of 192 x 192 pixels would need .* give a smaller --size"):
+        film(ball_run.method(), camera, tmp_path / "film.mp4")
+    assert list(tmp_path.iterdir()) == []

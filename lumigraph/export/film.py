@@ -16,6 +16,7 @@ from ..choice import evenly
 from ..controls import Value
 from ..figures import Range, colour_depth, depth_range, to_bytes
 from ..files import replacing, write_json
+from ..memory import ask_for_picture
 from ..method import Method
 from ..progress import track
 from .video import open_video
@@ -35,6 +36,7 @@ def film(method: Method | Sequence[Method], cameras: Camera, path: Path, fps: fl
     assert len(shown) == len(cameras), f"{len(shown)} methods for {len(cameras)} frames"
     for one in shown:
         one.eval()
+    ask_for_picture(*cameras.size[0].tolist(), shown[0].device)
     within = film_depth_range(shown, cameras)
     with contextlib.ExitStack() as stack:
         targets = [stack.enter_context(open_video(x, fps)) for x in (path, path.with_stem(f"{path.stem}-depth"))]

@@ -23,6 +23,7 @@ from ..figures import to_image
 from ..files import replacing
 from ..geometry import look_at
 from ..lens import Equirectangular, Pinhole
+from ..memory import ask_for_picture
 from ..method import Method
 from ..paths import Surroundings
 from ..progress import track
@@ -56,6 +57,7 @@ def sphere(method: Method, camera: Camera, name: str, columns: int | None = None
     """
     method.eval()
     width, height = camera.size[0].tolist()
+    ask_for_picture(width, height, method.device)
     if method.any_lens:
         step = max(1, AT_ONCE // width)
         tops = range(0, height, step)

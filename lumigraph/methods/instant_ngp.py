@@ -68,8 +68,8 @@ class Config:
             )
         if self.levels << self.log2_hashmap_size >= 1 << 32:
             raise LumigraphError(
-                f"--levels {self.levels} with --log2-hashmap-size {self.log2_hashmap_size} make more entries than 32 bits "
-                f"count; give a smaller one"
+                f"--levels {self.levels} with --log2-hashmap-size {self.log2_hashmap_size} make more entries than "
+                f"32 bits count; give a smaller one"
             )
 
 
