@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import warnings
 from dataclasses import dataclass
 from typing import Any, ClassVar, Literal
@@ -65,6 +66,7 @@ class Config:
     seed: int = 0
 
 
+SWEEPING = 0.08  # of the budget: the share that looking for points to begin at may take
 NEAR = 0.1  # times the scene's near distance: the near plane of splats
 SMALLEST = 64  # pixels of a photograph's shorter side that are kept when it is reduced
 ENOUGH = 2400  # steps, with which sizes and colours need not hurry
@@ -164,10 +166,11 @@ class GaussianSplatting(Method):
         if self.config.initialization == "dense":
             compile_sweep()
 
-    def begin(self, scene: Scene) -> None:
+    def begin(self, scene: Scene, seconds: float = math.inf) -> None:
         config = self.config
         counts = config.initial_gaussians, config.max_gaussians
-        found = initial_cloud(scene, config.initialization, *counts, config.sh_degree, self.random(1))
+        sweeping = SWEEPING * seconds
+        found = initial_cloud(scene, config.initialization, *counts, config.sh_degree, self.random(1), sweeping)
         self.cloud.replace(found, self._optimizer)
         self.density_control.begin(len(found))
         self.began.fill_(len(found))

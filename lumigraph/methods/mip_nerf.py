@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -114,7 +115,7 @@ class MipNeRF(RayMethod):
             warmup=0.1,
         )
 
-    def begin(self, scene: Scene) -> None:
+    def begin(self, scene: Scene, seconds: float = math.inf) -> None:
         self.empty.begin(scene)
 
     @property

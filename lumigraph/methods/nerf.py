@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -121,7 +122,7 @@ class NeRF(RayMethod):
             warmup=0.1,
         )
 
-    def begin(self, scene: Scene) -> None:
+    def begin(self, scene: Scene, seconds: float = math.inf) -> None:
         self.empty.begin(scene)
 
     @property
