@@ -165,3 +165,10 @@ def test_a_short_budget_asks_fewer_photographs(monkeypatch):
     for seconds in (2.0, 8.0, math.inf):
         dense_points.dense_points(ball(), seconds)
     assert swept == [3, 3, 4, 4, COUNT, COUNT]  # twice each, as no point is known
+
+
+def test_a_near_distance_that_is_much_too_small_keeps_the_neighbours():
+    scene = ball()
+    found = dense_points.dense_points(replace(scene, frame=replace(scene.frame, near=0.05)))
+    assert len(found.positions) > 0.5 * len(dense().positions)
+    assert off_surface(found.positions).median() < 0.01

@@ -67,8 +67,9 @@ def compile_sweep() -> None:
 
 
 def everywhere(view: FlatView, scene: Scene) -> tuple[float, float]:
-    """From the scene's near distance to where it ends."""
-    return scene.frame.near, float(view.pose[:, 3].norm()) + math.sqrt(3) * scene.frame.reach
+    """From where the scene begins before a view to where it ends."""
+    away, radius = float(view.pose[:, 3].norm()), math.sqrt(3) * scene.frame.reach
+    return max(scene.frame.near, away - radius), away + radius
 
 
 def around(view: FlatView, known: Float[Tensor, "point 3"]) -> tuple[float, float] | None:
@@ -166,7 +167,7 @@ def best_neighbours(
     view = views[i]
     height, width = view.trust.shape
     grid = view.rays[height // 10 :: height // 5 + 1, width // 10 :: width // 5 + 1].reshape(-1, 3)
-    depths = 1 / torch.linspace(1 / span[0], 1 / span[1], 6)[1:-1]
+    depths = torch.logspace(math.log10(span[0]), math.log10(span[1]), 6)[1:-1]
     places = view.pose[:, 3] + (grid * depths[:, None, None]).reshape(-1, 3)
     here = torch.nn.functional.normalize(places - view.pose[:, 3], dim=-1)
     scores = torch.zeros(len(views))
