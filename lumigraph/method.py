@@ -74,6 +74,12 @@ class Method(nn.Module, ABC):
         """The Config to use where the user chose none: the paper's on a GPU, on a CPU what learns most in a minute."""
         return cls.Config()
 
+    @classmethod
+    def further_bytes(cls, frame: Frame, config: Any, learning: bool) -> int:
+        """Bytes that will be needed at least, beside what is built at first: grids that are refined; where it is
+        learning, what a step keeps for its gradients."""
+        return 0
+
     # Learning
 
     def steps_per_pass(self, data: Any) -> float:
@@ -205,7 +211,7 @@ class Method(nn.Module, ABC):
     def random(self, number: int) -> torch.Generator:
         """Random numbers that depend on the config's seed and a number alone, the step for example, so that a resumed
         run draws the same."""
-        return torch.Generator().manual_seed((self.config.seed << 40) + (number % (1 << 40)))
+        return torch.Generator().manual_seed(((self.config.seed << 40) + (number % (1 << 40))) % (1 << 64))
 
     @property
     def device(self) -> torch.device:
