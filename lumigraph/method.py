@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from typing import Any, ClassVar, Protocol, runtime_checkable
@@ -122,8 +123,11 @@ class Method(nn.Module, ABC):
         """Whether there is nothing left to learn, whatever the budget: after the last photograph of a fusion, say."""
         return False
 
-    def begin(self, data: Any) -> None:
-        """Called once, ahead of the first step of a new run: what the data tell without any learning."""
+    def begin(self, data: Any, seconds: float = math.inf) -> None:
+        """Called once, ahead of the first step of a new run: what the data tell without any learning.
+
+        seconds: the whole budget, of which a small share may be used; infinite where steps are counted
+        """
 
     def rehearse_begin(self) -> None:
         """Called on a copy before the clock starts: compile what `begin` needs and no step does."""

@@ -111,7 +111,7 @@ def fit(
         clock, step, watched = Clock(state.seconds), state.step, 0.0
         if step == 0:
             with display.aside():
-                method.begin(data)
+                method.begin(data, budget.seconds or math.inf)
         display.ready(methods.name_of(method), method, budget, step, clock.seconds)
         next_save = clock.seconds + min(FIRST_SAVE, save_every)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import warnings
 from dataclasses import dataclass
 from typing import Annotated, Any, ClassVar, Literal
@@ -66,6 +67,7 @@ class Config:
     seed: Seed = 0
 
 
+SWEEPING = 0.08  # of the budget: the share that looking for points to begin at may take
 NEAR = 0.1  # times the scene's near distance: the near plane of splats
 SMALLEST = 64  # pixels of a photograph's shorter side that are kept when it is reduced
 ENOUGH = 2400  # steps, with which sizes and colours need not hurry
@@ -141,7 +143,7 @@ class GaussianSplatting(Method):
             initialization="dense",
             max_gaussians=120_000,
             initial_gaussians=20_000,
-            half_resolution_until=0.3,
+            half_resolution_until=0.7,
             joining_per_step=120.0,
             most_haste=4.0,
         )
@@ -165,10 +167,11 @@ class GaussianSplatting(Method):
         if self.config.initialization == "dense":
             compile_sweep()
 
-    def begin(self, scene: Scene) -> None:
+    def begin(self, scene: Scene, seconds: float = math.inf) -> None:
         config = self.config
         counts = min(config.initial_gaussians, self._most()), self._most()
-        found = initial_cloud(scene, config.initialization, *counts, config.sh_degree, self.random(1))
+        sweeping = SWEEPING * seconds
+        found = initial_cloud(scene, config.initialization, *counts, config.sh_degree, self.random(1), sweeping)
         self.cloud.replace(found, self._optimizer)
         self.density_control.begin(len(found))
         self.began.fill_(len(found))

@@ -204,7 +204,7 @@ class InstantNGP(RayMethod):
     def rays_in_a_step(self, data: Scene) -> float:
         return self.config.samples_per_step / SAMPLES_OF_A_RAY
 
-    def begin(self, scene: Scene) -> None:
+    def begin(self, scene: Scene, seconds: float = math.inf) -> None:
         if scene.images.has_alpha and self.frame.reach == 1:
             self.occupancy.rule_out(visual_hull(scene, self.config.occupancy_resolution)[None])
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -119,7 +120,7 @@ class MipNeRF(RayMethod):
     def further_bytes(cls, frame: Frame, config: Any, learning: bool) -> int:
         return bytes_kept(config) if learning else 0
 
-    def begin(self, scene: Scene) -> None:
+    def begin(self, scene: Scene, seconds: float = math.inf) -> None:
         self.empty.begin(scene)
 
     @property
