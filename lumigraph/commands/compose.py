@@ -9,7 +9,8 @@ from typing import Annotated
 from tyro.conf import Positional, arg
 
 from ..errors import LumigraphError
-from .common import needed, option, show, typed
+from ..files import claim
+from .common import Overwrite, needed, option, show, typed
 
 Triple = tuple[float, float, float]
 
@@ -39,8 +40,7 @@ class Compose:
         tuple[Triple, Triple] | None, arg(metavar="X Y Z X Y Z", help_behavior_hint="(default: all of it)")
     ] = None
     """Show only what lies between two corners of the part, in its scene's frame: `lumigraph info` tells its bounds."""
-    overwrite: bool = False
-    """Replace the file if it is there."""
+    overwrite: Overwrite = False
 
     def run(self) -> int:
         import torch
@@ -53,8 +53,7 @@ class Compose:
 
         if self.output.suffix.lower() != ".json":
             raise LumigraphError(f"{self.output} should end in .json, as compositions do; rename it")
-        if self.output.exists() and not self.overwrite:
-            raise LumigraphError(f"{self.output} is there already; give --overwrite to replace it, or another --output")
+        claim(self.output, "composition", self.overwrite)
         if self.scale is not None and not 0 < self.scale < float("inf"):
             raise LumigraphError(f"Nothing can be {self.scale:g} times as large; give --scale a number above 0")
         if self.box is not None and not all(a < b for a, b in zip(*self.box, strict=True)):

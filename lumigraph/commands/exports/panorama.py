@@ -8,7 +8,8 @@ from typing import Annotated
 
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
-from ..common import needed, option, show
+from ...files import claim
+from ..common import Overwrite, needed, option, show
 from ..controls import Set, open_method
 from ..keeping import Keeping
 
@@ -37,6 +38,7 @@ class ExportPanorama:
     """Where to stand, in the frame of the photographs."""
     size: Annotated[int, option("PIXELS")] = 2048
     """Width; the height is half of it."""
+    overwrite: Overwrite = False
     part: OmitArgPrefixes[Keeping] = Keeping()
     told: Set = ()
     device: Annotated[str, option("NAME")] = "auto"
@@ -48,6 +50,7 @@ class ExportPanorama:
         picture_format(self.output)
         sphere_size(self.size)
         self.part.check()
+        claim(self.output, "panorama", self.overwrite)
         opened, method, cameras = open_method(self.source, self.device, self.told)
         method = self.part.of_method(method)
         place, heading, where = standpoint(cameras["train"], opened.frame, self.place)

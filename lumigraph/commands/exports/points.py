@@ -9,7 +9,8 @@ from typing import Annotated
 from tyro.conf import OmitArgPrefixes, Positional
 
 from ...errors import LumigraphError
-from ..common import needed, option, show
+from ...files import claim
+from ..common import Overwrite, needed, option, show
 from ..controls import Set, open_method
 from ..keeping import Keeping
 
@@ -31,6 +32,7 @@ class ExportPoints:
     """Longer side of the pictures that the points come from; at most that of the photographs."""
     views: Annotated[int, option("N")] = 64
     """Number of these pictures at most."""
+    overwrite: Overwrite = False
     part: OmitArgPrefixes[Keeping] = Keeping()
     told: Set = ()
     device: Annotated[str, option("NAME")] = "auto"
@@ -43,6 +45,7 @@ class ExportPoints:
             raise LumigraphError(f"A cloud cannot have {self.count} points; give --count a number above 0")
         check_pictures(self.size, self.views)
         self.part.check()
+        claim(self.output, "points", self.overwrite)
         from ...export.points import extract_points, write_points
 
         opened, method, cameras = open_method(self.source, self.device, self.told)

@@ -9,7 +9,8 @@ from typing import Annotated
 from tyro.conf import OmitArgPrefixes, Positional
 
 from ...errors import LumigraphError
-from ..common import needed, option, show
+from ...files import claim
+from ..common import Overwrite, needed, option, show
 from ..controls import Set, open_method
 from ..keeping import Keeping
 from .panorama import Place
@@ -34,6 +35,7 @@ class ExportStereo:
     """Distance between the eyes, in the units of the photographs' frame."""
     size: Annotated[int, option("PIXELS")] = 2048
     """Width, and height of both halves together."""
+    overwrite: Overwrite = False
     part: OmitArgPrefixes[Keeping] = Keeping()
     told: Set = ()
     device: Annotated[str, option("NAME")] = "auto"
@@ -46,6 +48,7 @@ class ExportStereo:
         picture_format(self.output)
         sphere_size(self.size)
         self.part.check()
+        claim(self.output, "panorama", self.overwrite)
         if self.interpupillary is not None and not 0 < self.interpupillary < float("inf"):
             raise LumigraphError(
                 f"Eyes cannot be {self.interpupillary:g} apart; give --interpupillary a length above 0"

@@ -10,7 +10,8 @@ from typing import Annotated, Any, Literal
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from ...errors import LumigraphError
-from ..common import needed, option, show
+from ...files import claim
+from ..common import Overwrite, needed, option, show
 from ..controls import Set, open_method
 from ..keeping import Keeping
 
@@ -44,6 +45,7 @@ class ExportWeb:
     """Pictures in a page of views."""
     size: Annotated[int, option("PIXELS")] = 640
     """Longer side of these pictures."""
+    overwrite: Overwrite = False
     part: OmitArgPrefixes[Keeping] = Keeping()
     told: Set = ()
     device: Annotated[str, option("NAME")] = "auto"
@@ -60,6 +62,7 @@ class ExportWeb:
         if not 16 <= self.size <= 4096:
             raise LumigraphError(f"A view cannot be {self.size} pixels large; give --size a number from 16 to 4096")
         self.part.check()
+        claim(self.output, "page", self.overwrite)
         opened, method, cameras = open_method(self.source, self.device, self.told)
         whole = self._kind(method) != "views" and not self.part.crops
         behind = backdrop(method, cameras["train"]) if whole else None
