@@ -29,9 +29,9 @@ def conduct(
     Cells that are done are kept, half-trained ones go on, failed ones are tried again. A cell that fails is a row that
     says why. tell: hears which cell is next. Returns the signal's exit code if one stopped it, otherwise 0.
     """
-    claim(output, cells, settings)
     for cell in cells:
         claim_log(log_of(cell, output))
+    claim(output, cells, settings)
     with held(output, "worked in"):
         return carry_on(cells, settings, output, tell, launch)
 
