@@ -104,7 +104,7 @@ def replacing(path: Path, kind: Kind = "file", ours: bool = False) -> Iterator[P
 
 @contextlib.contextmanager
 def replacing_folder(path: Path, kind: Kind | None = None, ours: bool = False) -> Iterator[Path]:
-    """An empty folder to fill, otherwise as `replacing`; without a kind it replaces nothing, nor is it ever replaced."""
+    """An empty folder to fill; otherwise as `replacing`. Without a kind it replaces nothing, now or later."""
     if not ours:
         claim_folder(path, kind)
     with explained(path):

@@ -14,7 +14,7 @@ import tiny
 import viser
 from test_viewer import subject
 from viewer_client import Client
-from websockets.exceptions import InvalidStatus
+from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
 
 from lumigraph.paths.keyframes import CameraPath, Keyframe
@@ -28,9 +28,8 @@ TOKEN = "a-token-nobody-guesses"
 
 @pytest.fixture(scope="module")
 def viewer(ball_run, tmp_path_factory):
-    with Viewer(
-        ball_run.method(), subject(tiny.scene(), tmp_path_factory.mktemp("run")), choose_address(port=0)
-    ) as made:
+    about = subject(tiny.scene(), tmp_path_factory.mktemp("run"))
+    with Viewer(ball_run.method(), about, choose_address(port=0)) as made:
         yield made
 
 
@@ -98,7 +97,7 @@ def test_another_page_is_refused(viewer, origin):
 
 @pytest.mark.parametrize(
     "host",
-    ["evil.example:{}", "localhost.evil.example:{}", "192.0.2.7:{}", "[::2]:{}", "", "127.0.0.1:{}@evil", "a:b:c"],
+    ["evil.example:{}", "localhost.evil.example:{}", "192.0.2.7:{}", "[::2]:{}", "", "127.0.0.1:{}@evil", "a:b"],
 )
 def test_another_name_of_this_machine_is_refused(viewer, host):
     """As after DNS rebinding, where Origin and Host agree."""
@@ -174,7 +173,7 @@ def packed(value) -> bytes:
 
 NONSENSE = [
     *("text", b"", b"\x00", b"\xff" * 99, b"\x91" * 5000, packed([1]), packed({"type": 3}), packed({}), packed(None)),
-    *(packed({"type": name}) for name in ("ViewerCameraMessage", "GuiUpdateMessage", "Message", "ShareUrlRequest", "x")),
+    *(packed({"type": name}) for name in ("ViewerCameraMessage", "GuiUpdateMessage", "Message", "x")),
     *(packed(camera(position=x)) for x in ([math.nan, 0, 0], [math.inf] * 3, [1e300] * 3, [0], "abc", None, [[0]] * 3)),
     *(packed(camera(wxyz=x)) for x in ([0, 0, 0, 0], [5, 0, 0, 0], [1.0, 0, 0])),
     *(packed(camera(fov=x)) for x in (0, -1, 4, "wide")),
@@ -218,10 +217,7 @@ def test_nonsense_harms_nobody(viewer, capfd):
     for junk in (b"\x16\x03\x01\x02\x00", b"GET\r\n\r\n", b"POST / HTTP/1.1\r\n\r\n", os.urandom(500) + b"\r\n\r\n"):
         with socket.create_connection(("127.0.0.1", viewer.address.port), 10) as place:
             place.sendall(junk)
-    with (
-        pytest.raises(Exception, match="1002|updated|no close"),
-        connect(viewer.address.url.replace("http", "ws")) as old,
-    ):
+    with connect(viewer.address.url.replace("http", "ws")) as old, pytest.raises(ConnectionClosed, match="updated"):
         old.recv(10)
     other.look_from((0.0, -3.0, 0.5))
     assert other.picture().shape[2] == 3 and page(viewer.address).status == 200
@@ -230,13 +226,13 @@ def test_nonsense_harms_nobody(viewer, capfd):
     assert told.out == "" and told.err == ""
 
 
-def test_a_path_that_is_not_in_the_list_is_not_opened(viewer, tmp_path):
+def test_a_path_that_is_not_in_the_list_is_not_opened(viewer):
     row = (1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0)
     outside = viewer.subject.paths.parent / "secret.json"
     CameraPath((Keyframe(row, 40.0, 0.0),)).save(outside)
     client = Client(viewer.address.url)
     client.picture()
-    panel = list(viewer._everyone())[-1].path_panel
+    panel = list(viewer._everyone())[-1].path
     client.turn(panel._saved, "../secret")
     list(client.messages(0.5))
     assert panel._saved.value != "../secret"

@@ -3,8 +3,8 @@
 A browser sends requests to any address that any page names, so that a foreign page could look at the scene and press
 buttons; but it says truly which page asks (Origin) and by which name it found the server (Host). A page of another
 site has another Origin; one whose name was turned to this machine after it was loaded (DNS rebinding) has a Host that
-is none of ours. Where other machines can reach the server, an unguessable token in the address is asked for besides: the
-page keeps it as a cookie, so that its websocket has it too.
+is none of ours. Where other machines can reach the server, an unguessable token in the address is asked for besides;
+the page keeps it as a cookie, so that its websocket has it too.
 """
 
 from __future__ import annotations
@@ -12,10 +12,10 @@ from __future__ import annotations
 import hmac
 import ipaddress
 import socket
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from http import HTTPStatus
 from http.cookies import CookieError, SimpleCookie
-from typing import Any, Protocol
+from typing import Any
 from urllib.parse import parse_qs, urlsplit
 
 from websockets.datastructures import Headers
@@ -34,8 +34,7 @@ ALOOF = {
 }
 
 
-class Answers(Protocol):
-    def __call__(self, connection: Any, request: Request) -> Response | None: ...
+Answers = Callable[[Any, Request], Response | None]  # of a server: to a connection and its request
 
 
 class Guard:
