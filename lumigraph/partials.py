@@ -10,7 +10,6 @@ from __future__ import annotations
 import contextlib
 import os
 import re
-import secrets
 import shutil
 import sys
 from collections.abc import Iterator
@@ -26,7 +25,7 @@ def partial(folder: Path, is_folder: bool = False) -> Iterator[Path]:
     """An empty file or folder to fill; what still has this name when the block ends is deleted."""
     sweep(folder)
     while True:
-        path, lock = folder / f".lumigraph-{secrets.token_hex(8)}.partial", None
+        path, lock = folder / f".lumigraph-{os.urandom(8).hex()}.partial", None
         try:
             path.mkdir() if is_folder else path.touch(exist_ok=False)
             lock = locked(path)

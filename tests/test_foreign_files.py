@@ -45,10 +45,10 @@ WRITES: dict[str, tuple[str, tuple[str, ...]]] = {
     "bench kernels": ("bench kernels --output speed.json", ("speed.json",)),
     "bench methods": (
         "bench methods --methods voxel-grid --scenes photographs --output bench --steps 1",
-        ("bench/results.json", "bench/results.md", "bench/settings.json", "bench/views.png")
+        ("bench/results.json", "bench/results.md", "bench/settings.json", "bench/views.png", "bench/lock.json")
         + ("bench/runs/photographs-voxel-grid-1steps-seed0.log",),
     ),
-    "train": ("train voxel-grid photographs --steps 1 --output learnt", ("learnt/", "learnt")),
+    "train": ("train voxel-grid photographs --steps 1 --output learnt", ("learnt/", "learnt", "learnt/lock.json")),
     "demo": ("demo --seconds 1 --output shown", ("shown/", "shown")),
     "capture": ("capture photographs --output placed", ("placed/",)),
 }
@@ -161,7 +161,7 @@ def test_a_file_of_another_kind_stays(home):
     assert everything(home) == before
 
 
-def test_saving_in_the_viewer_replaces_its_own_alone(home):
+def test_saving_in_the_viewer_replaces_nothing(home):
     from lumigraph.commands.view import saver
     from lumigraph.run import open_any
 
@@ -169,9 +169,11 @@ def test_saving_in_the_viewer_replaces_its_own_alone(home):
     (home / "mine.ply").write_text("precious")
     with pytest.raises(LumigraphError, match=r"mine\.ply is there already"):
         save("mine.ply", None, {})
-    with pytest.raises(LumigraphError, match="is not an empty folder"):
+    with pytest.raises(LumigraphError, match="photographs is there already"):
         save("photographs", None, {})
     assert (home / "mine.ply").read_text() == "precious" and save("ours.ply", None, {}).endswith("ours.ply")
+    with pytest.raises(LumigraphError, match="is there already"):
+        save("ours.ply", None, {})
 
 
 def test_what_lies_among_checkpoints_stays(ball_run, tmp_path):

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from .. import files
 from ..errors import LumigraphError
-from ..locks import held
+from ..locks import check_place, held
 from ..progress import clock, counting
 from .cell import Cell, Settings, claim, evaluation, training
 from .launch import STOPPED, Launch, claim_log, launch, reason
@@ -29,6 +29,7 @@ def conduct(
     Cells that are done are kept, half-trained ones go on, failed ones are tried again. A cell that fails is a row that
     says why. tell: hears which cell is next. Returns the signal's exit code if one stopped it, otherwise 0.
     """
+    check_place(output)
     for cell in cells:
         claim_log(log_of(cell, output))
     claim(output, cells, settings)

@@ -30,7 +30,7 @@ from ..dataset import Dataset
 from ..errors import LumigraphError
 from ..lens import Lens
 from ..locks import NAME as LOCK
-from ..locks import held
+from ..locks import check_place, held
 from ..marks import NAME as RECORD
 from ..method import Method
 from ..plain import understood
@@ -292,6 +292,7 @@ def check_new(folder: Path) -> None:
     with files.explained(folder):
         if folder.exists() and (not folder.is_dir() or {path.name for path in folder.iterdir()} - {LOCK, RECORD}):
             raise LumigraphError(f"{folder} is not an empty folder; choose another --output")
+    check_place(folder)
 
 
 def cameras_to_json(scene: Scene) -> dict[str, Any]:
