@@ -6,6 +6,7 @@ import http.client
 import math
 import os
 import socket
+import time
 from urllib.parse import urlsplit
 
 import msgspec
@@ -41,7 +42,7 @@ def guarded(ball_run, tmp_path_factory):
         yield made
 
 
-def page(address: Address, path: str = "/", **headers: str) -> http.client.HTTPResponse:
+def got(address: Address, path: str = "/", **headers: str) -> http.client.HTTPResponse:
     """What a GET gives; header names with _ for -. Host=... stands for the address's own."""
     connection = http.client.HTTPConnection("127.0.0.1", address.port, timeout=10)
     connection.putrequest("GET", path, skip_host=True)
@@ -70,7 +71,7 @@ def is_let_in(address: Address, **options) -> bool:
 @pytest.mark.parametrize("host", ["127.0.0.1:{}", "localhost:{}", "LocalHost:{}", "[::1]:{}", "localhost:9000"])
 def test_our_own_page_is_let_in_by_all_our_names_and_through_a_tunnel(viewer, host):
     host = host.format(viewer.address.port)
-    assert page(viewer.address, Host=host).status == 200
+    assert got(viewer.address, Host=host).status == 200
     assert is_let_in(viewer.address, host=host.lower(), origin=f"http://{host.lower()}")
 
 
@@ -92,7 +93,7 @@ def test_programs_need_no_origin(viewer):
 def test_another_page_is_refused(viewer, origin):
     origin = origin.format(viewer.address.port)
     assert not is_let_in(viewer.address, origin=origin)
-    assert page(viewer.address, Origin=origin).status == 403
+    assert got(viewer.address, Origin=origin).status == 403
 
 
 @pytest.mark.parametrize(
@@ -102,8 +103,8 @@ def test_another_page_is_refused(viewer, origin):
 def test_another_name_of_this_machine_is_refused(viewer, host):
     """As after DNS rebinding, where Origin and Host agree."""
     host = host.format(viewer.address.port)
-    assert page(viewer.address, Host=host).status == 403
-    assert page(viewer.address, Host=host, Origin=f"http://{host}").status == 403
+    assert got(viewer.address, Host=host).status == 403
+    assert got(viewer.address, Host=host, Origin=f"http://{host}").status == 403
 
 
 def test_a_name_that_was_rebound_gets_no_websocket(viewer):
@@ -118,7 +119,7 @@ def test_two_hosts_are_refused(viewer):
 
 
 def test_no_page_frames_ours(viewer):
-    answer = page(viewer.address)
+    answer = got(viewer.address)
     assert (
         answer.headers["X-Frame-Options"] == "SAMEORIGIN"
         and "frame-ancestors" in answer.headers["Content-Security-Policy"]
@@ -129,18 +130,18 @@ def test_with_a_token_nobody_is_let_in_without(guarded):
     address = guarded.address
     assert address.url.endswith(f"/?token={TOKEN}")
     for path in ("/", "/?token=", "/?token=wrong", f"/?token={TOKEN}x", f"/?tokens={TOKEN}"):
-        assert page(address, path).status == 403 and not is_let_in(address, path=path)
+        assert got(address, path).status == 403 and not is_let_in(address, path=path)
     assert not is_let_in(address, additional_headers={"Cookie": f"lumigraph-{address.port}=wrong"})
     assert not is_let_in(address, additional_headers={"Cookie": f"other={TOKEN}"})
 
 
 def test_the_token_is_kept_as_a_cookie(guarded):
     address = guarded.address
-    answer = page(address, urlsplit(address.url).path + "?" + urlsplit(address.url).query)
+    answer = got(address, urlsplit(address.url).path + "?" + urlsplit(address.url).query)
     said = answer.headers["Set-Cookie"]
     assert answer.status == 200 and "HttpOnly" in said and "SameSite=Strict" in said
     cookie = said.partition(";")[0]
-    assert page(address, Cookie=f"a=b; {cookie}").status == 200
+    assert got(address, Cookie=f"a=b; {cookie}").status == 200
     own = f"http://127.0.0.1:{address.port}"
     assert is_let_in(address, origin=own, additional_headers={"Cookie": cookie})
     assert not is_let_in(address, origin="http://evil.example", additional_headers={"Cookie": cookie})
@@ -149,9 +150,9 @@ def test_the_token_is_kept_as_a_cookie(guarded):
 
 def test_a_phone_finds_it_by_number_and_rebound_names_do_not(guarded):
     port, query = guarded.address.port, f"/?token={TOKEN}"
-    assert page(guarded.address, query, Host=f"192.168.1.20:{port}").status == 200
-    assert page(guarded.address, query, Host=f"{socket.gethostname()}:{port}").status == 200
-    assert page(guarded.address, query, Host=f"evil.example:{port}").status == 403
+    assert got(guarded.address, query, Host=f"192.168.1.20:{port}").status == 200
+    assert got(guarded.address, query, Host=f"{socket.gethostname()}:{port}").status == 200
+    assert got(guarded.address, query, Host=f"evil.example:{port}").status == 403
 
 
 def test_a_host_that_others_reach_has_a_token():
@@ -220,7 +221,7 @@ def test_nonsense_harms_nobody(viewer, capfd):
     with connect(viewer.address.url.replace("http", "ws")) as old, pytest.raises(ConnectionClosed, match="updated"):
         old.recv(10)
     other.look_from((0.0, -3.0, 0.5))
-    assert other.picture().shape[2] == 3 and page(viewer.address).status == 200
+    assert other.picture().shape[2] == 3 and got(viewer.address).status == 200
     other.close()
     told = capfd.readouterr()
     assert told.out == "" and told.err == ""
@@ -240,3 +241,28 @@ def test_a_path_that_is_not_in_the_list_is_not_opened(viewer):
     panel._open()
     assert panel._stops == []
     client.close()
+
+
+def test_our_own_browser_opens_it_and_a_foreign_page_does_not(guarded, chromium):
+    """With the token once, afterwards by the cookie; a page of another origin gets no socket even so."""
+    context, port = chromium.new_context(), guarded.address.port
+    sheet = context.new_page()
+    for address in (guarded.address.url, f"http://127.0.0.1:{port}/"):
+        known = len(guarded._everyone())
+        assert sheet.goto(address).status == 200
+        end = time.monotonic() + 30
+        while len(guarded._everyone()) <= known:
+            assert time.monotonic() < end, "no socket was opened"
+            sheet.wait_for_timeout(50)
+        sheet.goto("about:blank")
+        while guarded._everyone():
+            sheet.wait_for_timeout(50)
+    opened = """address => new Promise(done => {
+        const socket = new WebSocket(address, "%s");
+        socket.onopen = () => done("open"); socket.onerror = () => done("refused"); })"""
+    opened %= f"viser-v{viser.__version__}"
+    assert sheet.evaluate(opened, f"ws://127.0.0.1:{port}/?token={TOKEN}") == "refused"  # of about:blank
+    stranger = chromium.new_context().new_page()
+    assert stranger.goto(f"http://127.0.0.1:{port}/").status == 403 and "token" in stranger.content()
+    for one in (context, stranger.context):
+        one.close()

@@ -40,7 +40,8 @@ class Door:
     """What stands between the network and viser, which has no place of its own for it."""
 
     def __init__(self, address: Address):
-        self._guard, self.server = Guard(address), None
+        self._guard = Guard(address)
+        self.server: Any = None
 
     @contextlib.contextmanager
     def built_in(self) -> Iterator[None]:
