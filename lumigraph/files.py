@@ -14,7 +14,7 @@ import json
 import os
 import re
 import stat
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -31,14 +31,17 @@ Seen = tuple[int, ...]  # by which a file is known to be the same, unchanged
 _granted: dict[Path, Seen | None] = {}  # what lay there when this process was allowed to write there
 
 
-def claim(path: Path, kind: Kind, overwrite: bool | None = None) -> None:
+def claim(path: Path, kind: Kind, overwrite: bool | None = None, reads: Iterable[Path] = ()) -> None:
     """Raise LumigraphError unless a file may be written there. For whoever has work to do first: before it.
 
     kind:      what it will be; in the place of anything else it does not go
     overwrite: whether the user wants whatever file lies there replaced; None where there is no option to say so
+    reads:     what the work begins with, which stays in any case
     """
     place = Path(os.path.abspath(path))
     with explained(path):
+        if any(one.exists() and path.exists() and one.samefile(path) for one in reads):
+            raise LumigraphError(f"{path} would be replaced, and is what the command reads; choose another name")
         there = seen(path)
         if place in _granted and _granted[place] == there:
             return

@@ -161,6 +161,22 @@ def test_a_file_of_another_kind_stays(home):
     assert everything(home) == before
 
 
+def test_what_a_command_reads_stays_even_where_it_may_overwrite(home, capsys):
+    assert main("export splats gs own.ply".split()) == 0
+    assert main("compose own.ply gs --output own.json".split()) == 0
+    before = everything(home)
+    for command in (
+        "clean own.ply --output own.ply",
+        "export splats own.ply own.ply",
+        "export points own.ply own.ply",
+        "compose own.json gs --output own.json",
+        "render own.json --frames 2 --size 16 --output own.gif",
+    ):
+        capsys.readouterr()
+        assert main([*command.split(), "--overwrite"]) == 2 and "is what the command reads" in capsys.readouterr().err
+    assert everything(home) == before
+
+
 def test_saving_in_the_viewer_replaces_nothing(home):
     from lumigraph.commands.view import saver
     from lumigraph.run import open_any

@@ -43,10 +43,10 @@ class Clean:
 
         self.part.check()
         opened, device = open_any(self.source), choose_device(self.device)
-        check_output(opened, self.output, self.overwrite)
+        check_output(opened, self.output, self.overwrite, [self.source])
         beside = self.output.with_name(f"{self.output.name}.png")
         picture = beside if is_splat_file(self.output) else self.output / "clean.png"
-        claim(picture, "comparison", self.overwrite)
+        claim(picture, "comparison", self.overwrite, [self.source])
         gaussians = needs(opened.method(device), HasGaussians).gaussians()
         reasons = self.part.unwanted(gaussians, self.part.crop(opened.frame))
         which = gone(reasons)

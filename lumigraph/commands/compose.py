@@ -53,7 +53,7 @@ class Compose:
 
         if self.output.suffix.lower() != ".json":
             raise LumigraphError(f"{self.output} should end in .json, as compositions do; rename it")
-        claim(self.output, "composition", self.overwrite)
+        claim(self.output, "composition", self.overwrite, [self.lead, self.part])
         if self.scale is not None and not 0 < self.scale < float("inf"):
             raise LumigraphError(f"Nothing can be {self.scale:g} times as large; give --scale a number above 0")
         if self.box is not None and not all(a < b for a, b in zip(*self.box, strict=True)):

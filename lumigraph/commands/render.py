@@ -52,16 +52,14 @@ class Render:
         check_film(self.frames, 30.0 if self.fps is None else self.fps, self.size)
         flight = None if self.path in PATHS else read_path(self.path, self.fps)
         fps = self.fps or (flight.fps if flight else 30.0)
+        reads = [self.source, *([Path(self.path)] if flight else [])]
         if self.output is not None:
             kind_of(self.output, fps)
-            claim_film(self.output, self.overwrite)
+            claim_film(self.output, self.overwrite, reads)
         opened, method, views = open_method(self.source, self.device, self.told)
         output = self.output or opened.renders / f"{Path(self.path).stem}.mp4"
         kind_of(output, fps)
-        for read in [self.source, *([Path(self.path)] if flight else [])]:
-            if output.with_suffix(".json").resolve() == read.resolve():
-                raise LumigraphError(f"{read} would be replaced by what goes beside the film; give another --output")
-        claim_film(output, self.overwrite)
+        claim_film(output, self.overwrite, reads)
         cameras = film_cameras(views, opened.frame, flight or self.path, self.frames, self.size)
         about = film(animate(opened, method, self.animated, len(cameras)), cameras, output, fps)
         width, height = about["size"]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from pathlib import Path
 
 import torch
@@ -36,10 +37,10 @@ def write_page(folder: Path, comparison: Comparison) -> None:
     write_bytes(folder / "index.html", page(f"{name} · encodings", "".join(sections), comparison.source), "figure")
 
 
-def claim_page(folder: Path, overwrite: bool | None = None) -> None:
+def claim_page(folder: Path, overwrite: bool | None = None, reads: Iterable[Path] = ()) -> None:
     """Raise LumigraphError unless all that `write_page` writes may be written; see `files.claim`."""
     for name in ("index.html", "scales.svg", "spectrum.svg", "comparison.png", "figures.json"):
-        claim(folder / name, "figure", overwrite)
+        claim(folder / name, "figure", overwrite, reads)
 
 
 def header(name: str, comparison: Comparison) -> str:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -67,11 +67,11 @@ def film(method: Method | Sequence[Method], cameras: Camera, path: Path, fps: fl
     return about
 
 
-def claim_film(path: Path, overwrite: bool | None = None) -> None:
+def claim_film(path: Path, overwrite: bool | None = None, reads: Collection[Path] = ()) -> None:
     """Raise LumigraphError unless a film, and all that goes beside it, may be written there; see `files.claim`."""
-    claim(path, "film", overwrite)
-    claim(depth_beside(path), "film of depth", overwrite)
-    claim(path.with_suffix(".json"), "cameras of a film", overwrite)
+    claim(path, "film", overwrite, reads)
+    claim(depth_beside(path), "film of depth", overwrite, reads)
+    claim(path.with_suffix(".json"), "cameras of a film", overwrite, reads)
     claim_folder(path.with_suffix(""), "pictures of a film")
 
 

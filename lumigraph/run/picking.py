@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -22,7 +23,7 @@ from .opened import Opened
 from .splat_file import SplatFile
 
 
-def check_output(opened: Opened, output: Path, overwrite: bool | None = None) -> None:
+def check_output(opened: Opened, output: Path, overwrite: bool | None = None, reads: Iterable[Path] = ()) -> None:
     """Raises LumigraphError unless what is picked may go there: to a file, see `files.claim`, or of a run to a new
     folder."""
     if not is_splat_file(output):
@@ -33,7 +34,7 @@ def check_output(opened: Opened, output: Path, overwrite: bool | None = None) ->
             )
         check_new(output)
     else:
-        files.claim(output, "splats", overwrite)
+        files.claim(output, "splats", overwrite, reads)
 
 
 def save_picked(opened: Opened, keep: Bool[Tensor, " gaussian"], output: Path, why: dict[str, Any]) -> None:

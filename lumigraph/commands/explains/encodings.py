@@ -52,7 +52,7 @@ class ExplainEncodings:
         if not single_image.recognises(self.picture.expanduser()):
             raise LumigraphError(f"{self.picture} is no image file; name one picture, as in photograph.png")
         folder = self.output or Path("explained") / f"{scene_name(str(self.picture))}-encodings"
-        claim_page(folder, self.overwrite)
+        claim_page(folder, self.overwrite, [self.picture.expanduser()])
         device = choose_device(self.device)
         scene = open_scene(self.picture, self.downscale)
         config = replace(FourierFeatures.preset(device), seed=self.seed)

@@ -66,7 +66,7 @@ class ExportMesh:
         from ...export.mesh_file import ending, write_mesh
 
         for_phones = ending(self.output) == ".usdz"
-        claim(self.output, "mesh", self.overwrite)
+        claim(self.output, "mesh", self.overwrite, [self.source])
         opened, method, cameras = open_method(self.source, self.device, self.told)
         mesh = extract_mesh(
             self.part.without_floaters(method),

@@ -45,7 +45,7 @@ class ExportPoints:
             raise LumigraphError(f"A cloud cannot have {self.count} points; give --count a number above 0")
         check_pictures(self.size, self.views)
         self.part.check()
-        claim(self.output, "points", self.overwrite)
+        claim(self.output, "points", self.overwrite, [self.source])
         from ...export.points import extract_points, write_points
 
         opened, method, cameras = open_method(self.source, self.device, self.told)

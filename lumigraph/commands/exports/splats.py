@@ -40,7 +40,7 @@ class ExportSplats:
 
         self.part.check()
         check_ending(self.output)
-        claim(self.output, "splats", self.overwrite)
+        claim(self.output, "splats", self.overwrite, [self.source])
         if is_splat_file(self.source):
             if self.told:
                 raise LumigraphError(f"{self.source} is a file of Gaussians, which has no controls; leave out --set")

@@ -48,7 +48,7 @@ class ExportStereo:
         picture_format(self.output)
         sphere_size(self.size)
         self.part.check()
-        claim(self.output, "panorama", self.overwrite)
+        claim(self.output, "panorama", self.overwrite, [self.source])
         if self.interpupillary is not None and not 0 < self.interpupillary < float("inf"):
             raise LumigraphError(
                 f"Eyes cannot be {self.interpupillary:g} apart; give --interpupillary a length above 0"

@@ -62,7 +62,7 @@ class ExportWeb:
         if not 16 <= self.size <= 4096:
             raise LumigraphError(f"A view cannot be {self.size} pixels large; give --size a number from 16 to 4096")
         self.part.check()
-        claim(self.output, "page", self.overwrite)
+        claim(self.output, "page", self.overwrite, [self.source])
         opened, method, cameras = open_method(self.source, self.device, self.told)
         whole = self._kind(method) != "views" and not self.part.crops
         behind = backdrop(method, cameras["train"]) if whole else None
