@@ -10,9 +10,10 @@ from tyro.conf import Positional, arg
 
 from ..errors import LumigraphError
 from ..files import claim
+from ..ranges import Coordinate, Positive, between
 from .common import Overwrite, needed, option, show, typed
 
-Triple = tuple[float, float, float]
+Triple = tuple[Coordinate, Coordinate, Coordinate]
 
 
 @dataclass(frozen=True)
@@ -32,9 +33,9 @@ class Compose:
     """The new file. It names its parts by their paths from where it lies."""
     at: Annotated[Triple | None, arg(metavar="X Y Z", help_behavior_hint="(default: the lead's foot)")] = None
     """Where the middle of the part's foot stands, in the frame of the lead's photographs."""
-    scale: Annotated[float | None, option("TIMES", "1")] = None
+    scale: Annotated[Positive | None, option("TIMES", "1")] = None
     """Size of the part: units of the lead's photographs to one of its own."""
-    turn: Annotated[float | None, option("DEGREES", "0")] = None
+    turn: Annotated[Annotated[float, between(-1e6, 1e6)] | None, option("DEGREES", "0")] = None
     """About the vertical, counterclockwise from above."""
     box: Annotated[
         tuple[Triple, Triple] | None, arg(metavar="X Y Z X Y Z", help_behavior_hint="(default: all of it)")
@@ -54,8 +55,6 @@ class Compose:
         if self.output.suffix.lower() != ".json":
             raise LumigraphError(f"{self.output} should end in .json, as compositions do; rename it")
         claim(self.output, "composition", self.overwrite, [self.lead, self.part])
-        if self.scale is not None and not 0 < self.scale < float("inf"):
-            raise LumigraphError(f"Nothing can be {self.scale:g} times as large; give --scale a number above 0")
         if self.box is not None and not all(a < b for a, b in zip(*self.box, strict=True)):
             raise LumigraphError("The box holds nothing; give --box its lower corner first, then its upper one")
         lead, part = open_any(self.lead), open_any(self.part)

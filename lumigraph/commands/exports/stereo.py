@@ -10,6 +10,7 @@ from tyro.conf import OmitArgPrefixes, Positional
 
 from ...errors import LumigraphError
 from ...files import claim
+from ...ranges import Positive, SphereSize
 from ..common import Overwrite, needed, option, show
 from ..controls import Set, open_method
 from ..keeping import Keeping
@@ -31,9 +32,9 @@ class ExportStereo:
     """The new picture."""
     place: Place = None
     """Where the middle between the eyes is, in the frame of the photographs."""
-    interpupillary: Annotated[float | None, option("LENGTH", "1/50 of the median distance to what is around")] = None
+    interpupillary: Annotated[Positive | None, option("LENGTH", "1/50 of the median distance to what is around")] = None
     """Distance between the eyes, in the units of the photographs' frame."""
-    size: Annotated[int, option("PIXELS")] = 2048
+    size: Annotated[SphereSize, option("PIXELS")] = 2048
     """Width, and height of both halves together."""
     overwrite: Overwrite = False
     part: OmitArgPrefixes[Keeping] = Keeping()
@@ -49,10 +50,6 @@ class ExportStereo:
         sphere_size(self.size)
         self.part.check()
         claim(self.output, "panorama", self.overwrite, [self.source])
-        if self.interpupillary is not None and not 0 < self.interpupillary < float("inf"):
-            raise LumigraphError(
-                f"Eyes cannot be {self.interpupillary:g} apart; give --interpupillary a length above 0"
-            )
         opened, method, cameras = open_method(self.source, self.device, self.told)
         method = self.part.of_method(method)
         place, heading, where = standpoint(cameras["train"], opened.frame, self.place)

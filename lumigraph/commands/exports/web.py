@@ -11,6 +11,7 @@ from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from ...errors import LumigraphError
 from ...files import claim
+from ...ranges import between
 from ..common import Overwrite, needed, option, show
 from ..controls import Set, open_method
 from ..keeping import Keeping
@@ -41,9 +42,9 @@ class ExportWeb:
         str | None, option("#RRGGBB", "the one it was trained with; outdoors the colours of its sky and ground")
     ] = None
     """Colour behind splats or the mesh."""
-    views: Annotated[int, option("N")] = 72
+    views: Annotated[int, between(2, 1000), option("N")] = 72
     """Pictures in a page of views."""
-    size: Annotated[int, option("PIXELS")] = 640
+    size: Annotated[int, between(16, 4096), option("PIXELS")] = 640
     """Longer side of these pictures."""
     overwrite: Overwrite = False
     part: OmitArgPrefixes[Keeping] = Keeping()
@@ -57,10 +58,6 @@ class ExportWeb:
 
         if self.output.suffix.lower() not in (".html", ".htm"):
             raise LumigraphError(f"{self.output} should end in .html, as pages do; rename it")
-        if not 2 <= self.views <= 1000:
-            raise LumigraphError(f"A page cannot hold {self.views} views; give --views a number from 2 to 1000")
-        if not 16 <= self.size <= 4096:
-            raise LumigraphError(f"A view cannot be {self.size} pixels large; give --size a number from 16 to 4096")
         self.part.check()
         claim(self.output, "page", self.overwrite, [self.source])
         opened, method, cameras = open_method(self.source, self.device, self.told)
