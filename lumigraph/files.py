@@ -100,7 +100,8 @@ def replacing(path: Path, kind: Kind = "file", ours: bool = False) -> Iterator[P
                 target = place_now(path, lambda: claim(path, kind))
                 marks.note(target, kind, new)
             os.replace(new, target)
-            _granted[Path(os.path.abspath(target))] = seen(target)
+            if not ours:
+                _granted[Path(os.path.abspath(target))] = seen(target)
             sync_folder(path.parent)
         tell_if_moved(path, target)
 
