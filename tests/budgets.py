@@ -45,6 +45,8 @@ SHARES: dict[str, tuple[str, float]] = {
     "test_web": ("exports, viewer, web", 15),
     "test_viewer_page": ("exports, viewer, web", 20),
     "test_viewer": ("exports, viewer, web", 10),
+    "test_viewer_guard": ("exports, viewer, web", 5),
+    "test_foreign_files": ("runs, commands, benchmark", 15),
     "test_panorama": ("exports, viewer, web", 8),
     "test_benchmark": ("runs, commands, benchmark", 20),
     "test_cli": ("runs, commands, benchmark", 18),

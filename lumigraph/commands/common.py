@@ -43,6 +43,15 @@ ReaderOption = Annotated[
 ]
 
 
+Overwrite = Annotated[
+    bool,
+    tyro.conf.arg(
+        help="Replace files that are there, whoever wrote them. What Lumigraph wrote and nobody changed is replaced "
+        "anyway; folders with anything else in them never are."
+    ),
+]
+
+
 def choose_device(name: str) -> Any:
     """A torch.device by name; `auto` takes a GPU where there is one. Raises LumigraphError if it is not there."""
     import torch

@@ -197,7 +197,7 @@ def save_sphere(path: Path, rgb: Float[Tensor, "height width 3"], whole: bool) -
         about["xmp"] = gpano(width, height).encode()
     if path.suffix.lower() != ".png":
         about |= {"quality": JPEG_QUALITY, "subsampling": 0}
-    with replacing(path) as partial:
+    with replacing(path, "panorama") as partial:
         image.save(partial, picture_format(path), **about)
 
 
