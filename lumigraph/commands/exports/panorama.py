@@ -48,7 +48,6 @@ class ExportPanorama:
 
         picture_format(self.output)
         sphere_size(self.size)
-        self.part.check()
         opened, method, cameras = open_method(self.source, self.device, self.told)
         method = self.part.of_method(method)
         place, heading, where = standpoint(cameras["train"], opened.frame, self.place)

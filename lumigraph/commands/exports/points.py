@@ -40,7 +40,6 @@ class ExportPoints:
     def run(self) -> int:
         if self.output.suffix.lower() != ".ply":
             raise LumigraphError(f"{self.output} should end in .ply, the one kind of point cloud there is; rename it")
-        self.part.check()
         from ...export.points import extract_points, write_points
 
         opened, method, cameras = open_method(self.source, self.device, self.told)

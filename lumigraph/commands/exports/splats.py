@@ -36,7 +36,6 @@ class ExportSplats:
         from ...run import open_any
         from ...run.splat_file import frame_of
 
-        self.part.check()
         if is_splat_file(self.source):
             if self.told:
                 raise LumigraphError(f"{self.source} is a file of Gaussians, which has no controls; leave out --set")

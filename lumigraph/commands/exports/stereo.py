@@ -46,7 +46,6 @@ class ExportStereo:
 
         picture_format(self.output)
         sphere_size(self.size)
-        self.part.check()
         opened, method, cameras = open_method(self.source, self.device, self.told)
         method = self.part.of_method(method)
         place, heading, where = standpoint(cameras["train"], opened.frame, self.place)

@@ -56,7 +56,6 @@ class ExportWeb:
 
         if self.output.suffix.lower() not in (".html", ".htm"):
             raise LumigraphError(f"{self.output} should end in .html, as pages do; rename it")
-        self.part.check()
         opened, method, cameras = open_method(self.source, self.device, self.told)
         whole = self._kind(method) != "views" and not self.part.crops
         behind = backdrop(method, cameras["train"]) if whole else None
