@@ -25,12 +25,10 @@ def check_memory(kind: type[Method], frame: Frame, config: Any, device: torch.de
 
     def remedy() -> str:
         smaller = {name: needed(less) for name, less in halved(config)}
-        name = min(smaller, key=smaller.__getitem__, default="")
-        return (
-            f"give a smaller --{name.replace('_', '-')} than {getattr(config, name):,}"
-            if name
-            else "end other programs"
-        )
+        if not smaller:
+            return "end other programs"
+        name = min(smaller, key=smaller.__getitem__)
+        return f"give a smaller --{name.replace('_', '-')} than {getattr(config, name):,}"
 
     ask_for(needed(config), device, f"{methods.name_of(kind)} with these numbers", remedy)
 
