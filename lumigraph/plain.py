@@ -74,7 +74,7 @@ def understood(path: Path) -> Iterator[None]:
     """Turn the ways in which a file can fail to hold what was expected into one sentence."""
     try:
         yield
-    except (KeyError, TypeError, ValueError, AttributeError, RuntimeError) as error:
+    except (LookupError, TypeError, ValueError, AttributeError, RuntimeError, ArithmeticError) as error:
         raise LumigraphError(
             f"{path} does not hold what it should ({type(error).__name__}: {error}); it was edited, "
             f"or written by another version"

@@ -17,10 +17,10 @@ import lumigraph
 FLOORS: list[set[str]] = [
     {"console", "errors", "processes", "quality", "signals"},
     {
-        *("blending", "budget", "choice", "controls", "geometry", "loops"),
+        *("blending", "choice", "controls", "geometry", "loops"),
         *("memory", "names", "progress", "ranges", "readers", "srgb", "threads"),
     },
-    {"files", "plain", "lens", "rays"},
+    {"budget", "files", "plain", "lens", "rays"},
     {"camera", "crop", "images", "kernels", "figures", "locks", "metrics"},
     {"volume", "scene"},
     {"dataset", "gaussians", "mesh"},

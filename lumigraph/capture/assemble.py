@@ -14,6 +14,7 @@ from torch import Tensor
 
 from ..camera import Camera
 from ..errors import LumigraphError, LumigraphWarning
+from ..geometry import RIGID
 from ..images import ImageSource, ImageStore
 from ..lens import Equirectangular, Lens, Pinhole
 from ..names import natural
@@ -26,7 +27,6 @@ from .normalise import Place, find_place
 from .pictures import Chosen, check_downscale, choose
 
 HOLD_OUT = 8  # every 8th photograph by name, starting with the first, where nothing is published
-RIGID = 0.01  # how far a pose's axes may be from unit length and right angles
 NAMED = 20  # missing files at most in a warning; further ones are counted
 
 

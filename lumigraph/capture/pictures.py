@@ -13,6 +13,7 @@ import numpy as np
 from PIL import Image, ImageOps
 
 from ..errors import LumigraphError
+from ..files import is_file
 from ..images import ImageSource, resized
 from .capture import Plane, Shot
 from .numbers import TIFF_SUFFIXES, Kind, as_bytes, colours, kind_of, read_numbers, tiff_tags, turned
@@ -29,9 +30,9 @@ Size = tuple[int, int]
 
 def find_file(path: Path) -> Path:
     """The file itself, or where it was named without a suffix, the image of that name. The file may not exist."""
-    if path.is_file():
+    if is_file(path) or not path.name:
         return path
-    return next((p for s in SUFFIXES if (p := path.with_name(path.name + s)).is_file()), path)
+    return next((p for s in SUFFIXES if is_file(p := path.with_name(path.name + s))), path)
 
 
 def list_images(folder: Path) -> list[str]:
