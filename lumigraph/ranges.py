@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, Any
 
 import msgspec
 
 from .errors import LumigraphError
 
-Kind = TypeVar("Kind")
 PLACE = re.compile(r" - at `(?:key` in `)?\$?(.*)`$")  # where in a file msgspec found a fault
 
 
@@ -30,7 +29,7 @@ Numbers3 = tuple[Length, Length, Length]
 Numbers4 = tuple[Length, Length, Length, Length]
 
 
-def typed(kind: type[Kind], value: Any, where: Path | str, closed: bool = False) -> Kind:
+def typed(kind: Any, value: Any, where: Path | str, closed: bool = False) -> Any:
     """Plain JSON as a value of a kind: a dataclass, a tuple, a dictionary, a union; ranges and types are checked.
 
     where:  the file or option to name

@@ -110,7 +110,10 @@ def normals_of(path: Path) -> Float[np.ndarray, "point 3"] | None:
     """The normals of a cloud of points, of unit length; None where its file has none."""
     if path.suffix.lower() != ".ply":
         return None
-    table = PlyData.read(path)["vertex"].data
+    try:
+        table = PlyData.read(path)["vertex"].data
+    except Exception:  # read by another library before, which knows of no normals either
+        return None
     if not {"nx", "ny", "nz"} <= set(table.dtype.names):
         return None
     found = np.stack([table[axis].astype(np.float64) for axis in ("nx", "ny", "nz")], -1)

@@ -23,7 +23,7 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -34,7 +34,7 @@ from ..camera import Camera
 from ..composition import Placed, compose, frame_around
 from ..crop import Box
 from ..errors import LumigraphError
-from ..geometry import Rows, Similarity, Vector, is_similarity, to_matrix, to_quaternion
+from ..geometry import Similarity, Vector, is_similarity, to_matrix, to_quaternion
 from ..method import Method
 from ..ranges import Name, Numbers3, Numbers4, between, typed
 from .opened import Opened
@@ -117,12 +117,15 @@ class PlaceSaid:
     translation: Numbers3 = (0.0, 0.0, 0.0)
 
 
+Placing = PlaceSaid | tuple[Numbers4, Numbers4, Numbers4, Numbers4]
+
+
 @dataclass(frozen=True)
 class PartSaid:
-    """A part as the file says it."""
+    """A part as the file says it. place: see `Placing`"""
 
     source: Name
-    place: PlaceSaid | tuple[Numbers4, Numbers4, Numbers4, Numbers4] = PlaceSaid()
+    place: Any = field(default_factory=dict)
     box: tuple[Numbers3, Numbers3] | None = None
 
 
@@ -144,7 +147,7 @@ def read_composition(path: Path) -> tuple[list[Part], int]:
     if found.lead not in range(len(found.parts)):
         raise LumigraphError(f"{path}: part {found.lead} should lead, and there are {len(found.parts)}; correct it")
     return [
-        Part(part.source, place_of(part.place, path), None if part.box is None else box_of(part.box, path))
+        Part(part.source, place_from_json(part.place, path), None if part.box is None else box_of(part.box, path))
         for part in found.parts
     ], found.lead
 
@@ -178,21 +181,22 @@ def box_of(corners: tuple[Vector, Vector], where: Path | str) -> Box:
     return Box(*corners)
 
 
-def place_of(said: PlaceSaid | Rows, where: Path | str) -> Similarity:
+def place_from_json(said: Any, where: Path | str = "a composition") -> Similarity:
     """A similarity from a matrix, or from what it is made of. Raises LumigraphError, naming `where`, for none."""
-    if not isinstance(said, PlaceSaid):
-        matrix = torch.tensor(said, dtype=torch.float64)
+    place: Placing = typed(Placing, said, where, closed=True)  # type: ignore[arg-type]
+    if not isinstance(place, PlaceSaid):
+        matrix = torch.tensor(place, dtype=torch.float64)
         if not is_similarity(matrix):
             raise LumigraphError(f"{where}: the place {said} does more than move, turn and scale; correct it")
         return Similarity(matrix)
-    turn = said.rotation
+    turn = place.rotation
     if not isinstance(turn, tuple):
         half = 0.5 * math.radians(turn)
         turn = (math.cos(half), 0.0, 0.0, math.sin(half))
     if not any(turn):
         raise LumigraphError(f"{where}: the quaternion {turn} turns nothing; correct it or leave it out")
     rotation = to_matrix(torch.tensor([turn], dtype=torch.float64))[0]
-    return Similarity.make(said.scale, rotation, torch.tensor(said.translation, dtype=torch.float64))
+    return Similarity.make(place.scale, rotation, torch.tensor(place.translation, dtype=torch.float64))
 
 
 def rounded(number: float) -> float:

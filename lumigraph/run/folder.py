@@ -48,7 +48,7 @@ class Run(Opened):
 
     def __init__(self, folder: Path | str):
         self.path = self.folder = Path(folder)
-        if not self._config.exists():
+        if not files.is_file(self._config):
             raise LumigraphError(f"{self.folder} is not a run: it holds no config.json; `lumigraph train` makes runs")
         self.settings = Settings.read(self._config)
         self.frame = self.settings.frame

@@ -34,6 +34,13 @@ class Protocol:
     views: Count | None = None
     shapes: Count | None = None
     members: Count | None = None
+    resolution: str | list[str] = ""
+    background: list[float] | None = None
+    masked: bool = False
+
+    def __post_init__(self) -> None:
+        if self.views is None and self.shapes is None:
+            raise ValueError("should say how many `views` or `shapes` were compared")
 
 
 @dataclass(frozen=True)
@@ -94,4 +101,4 @@ def read_evaluation(path: Path) -> dict[str, Any]:
     """What eval.json says. Raises LumigraphError, naming the file, for what no evaluation says."""
     said = files.read_json(path)
     typed(Evaluation, said, path)
-    return {"lpips": None} | said
+    return {"lpips": None, "evaluated_on": "unknown"} | {key: x for key, x in said.items() if x is not None}

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import shutil
 from collections.abc import Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -33,6 +34,14 @@ NAMES = {
 }
 
 
+@dataclass(frozen=True)
+class Made:
+    """Of capture.json, what the scene was made from."""
+
+    sources: list[str] = field(default_factory=list)
+    key: str = ""
+
+
 def claim(folder: Path, sources: Sequence[Path]) -> Path:
     """Make or recognise the folder of these photographs' scene; gives the folder to work in.
 
@@ -41,7 +50,7 @@ def claim(folder: Path, sources: Sequence[Path]) -> Path:
     work, wanted = folder / WORK, [str(path.resolve()) for path in sources]
     for path in sources:
         if (path / WORK / OWNER).is_file():
-            began = " ".join(read_json(path / WORK / OWNER))
+            began = " ".join(read_json(path / WORK / OWNER, list[str]))
             raise LumigraphError(
                 f"{path} is an unfinished capture; go on with: lumigraph capture {began} --output {path}"
             )
@@ -50,9 +59,9 @@ def claim(folder: Path, sources: Sequence[Path]) -> Path:
     if folder.is_dir() and any(folder.iterdir()):
         owner, result = work / OWNER, folder / RESULT
         if owner.is_file():
-            made_of = read_json(owner)
+            made_of = read_json(owner, list[str])
         elif result.is_file():
-            made_of = read_json(result).get("sources")
+            made_of = read_json(result, Made).sources
         else:
             raise LumigraphError(f"{folder} exists and is no capture; name another folder by --output")
         if made_of != wanted:

@@ -120,7 +120,7 @@ def finished(folder: Path, key: str) -> dict[str, Any] | None:
     if not all((folder / name).exists() for name in needed):
         return None
     known = read_json(folder / RESULT)
-    return known if isinstance(known, dict) and known.get("key") == key else None
+    return known if typed(Made, known, folder / RESULT).key == key else None
 
 
 @dataclass
