@@ -136,7 +136,9 @@ class Lens(ABC):
                 found[name] = torch.tensor(typed(rows, data[name], f"{where}: {name}"), dtype=torch.float32)
         lacking = [x.name for x in fields(cls) if x.name not in found and x.default is MISSING]  # type: ignore[arg-type]
         if lacking or len({len(values) for values in found.values()}) != 1:
-            raise LumigraphError(f"{where} has lenses without all the numbers of their kind, {data['kind']}; correct it")
+            raise LumigraphError(
+                f"{where} has lenses without all the numbers of their kind, {data['kind']}; correct it"
+            )
         lens = cls(**found)
         if (fault := lens.fault()) is not None:
             raise LumigraphError(f"{where} has a lens whose {fault}; correct it")

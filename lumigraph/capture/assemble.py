@@ -72,7 +72,7 @@ def assemble(
         if (fault := shot.lens.fault()) is not None:
             raise LumigraphError(f"{capture.source}: the lens of {shot.name} has a fault: its {fault}; correct it")
     capture, lost = without_stray_points(capture)
-    told += lost + oddities(capture, shots, poses)
+    told += capture.told + lost + oddities(capture, shots, poses)
     chosen = [choose(shot, downscale) for shot in track(shots, "Looking at photographs", len(shots))]
     told += about_small(capture.source, chosen) if downscale else []
     for warning in told:

@@ -10,7 +10,6 @@ from jaxtyping import Float
 
 from ..errors import LumigraphError
 from .capture import Capture, Shot
-from .leaps import in_steps, jumps
 from .normalise import CONVERGING, SAMPLED_POINTS
 
 ONE_PLACE = 1e-9  # spread of cameras, as a share of their distance from the origin, that tells nothing
@@ -24,13 +23,7 @@ def oddities(capture: Capture, shots: list[Shot], poses: Float[np.ndarray, "came
     """Sentences about a capture that its source says nothing of; none where it says where everything is."""
     if capture.bounds is not None:
         return []
-    found = [
-        about_double(shots),
-        about_places(poses),
-        about_leaps(shots, poses),
-        about_gaze(capture, poses),
-        about_angles(shots),
-    ]
+    found = [about_double(shots), about_places(poses), about_gaze(capture, poses), about_angles(shots)]
     return [f"{capture.source} {sentence}" for sentence in found if sentence]
 
 
@@ -45,8 +38,7 @@ def about_double(shots: list[Shot]) -> str | None:
 
 
 def about_places(poses: Float[np.ndarray, "camera 3 4"]) -> str | None:
-    """Cameras in one place, and units in which no capture is measured. LumigraphError where nobody can count in them.
-    """
+    """Cameras in one place, and units in which nothing is measured. LumigraphError where nobody can count in them."""
     place = poses[:, :, 3]
     spread = float(np.linalg.norm(place - place.mean(0), axis=-1).max())
     if spread <= ONE_PLACE * float(np.abs(place).max()):
@@ -60,18 +52,6 @@ def about_places(poses: Float[np.ndarray, "camera 3 4"]) -> str | None:
     if not TINY < spread < HUGE:
         return f"has cameras {spread:.3g} units apart at most; check the unit of its poses"
     return None
-
-
-def about_leaps(shots: list[Shot], poses: Float[np.ndarray, "camera 3 4"]) -> str | None:
-    """A model that may be folded: neighbours by name that look the same way from far apart, where others are near."""
-    found = jumps(poses) if in_steps(poses[:, :, 3]) else []
-    if not found:
-        return None
-    i, times = max(found, key=lambda leap: leap[1])
-    return (
-        f"has cameras that leap, {shots[i + 1].name} {times:.0f} times as far from {shots[i].name} as is usual for "
-        "neighbours: where they belong together, the model is folded, so look at the cameras in the viewer"
-    )
 
 
 def about_gaze(capture: Capture, poses: Float[np.ndarray, "camera 3 4"]) -> str | None:

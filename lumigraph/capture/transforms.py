@@ -7,7 +7,7 @@ val_filenames.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -58,6 +58,15 @@ class Whole:
     train_filenames: list[str] | None = None
     val_filenames: list[str] | None = None
     test_filenames: list[str] | None = None
+
+
+@dataclass(frozen=True)
+class Made:
+    """Of capture.json, what a scene was made from, by which name its making is known, and what was said of it."""
+
+    sources: list[str] = field(default_factory=list)
+    key: str = ""
+    warnings: list[str] = field(default_factory=list)
 
 
 @dataclass(frozen=True)
@@ -127,7 +136,15 @@ def read(folder: Path) -> Capture:
         missing,
         reach=reach,
         up=whole.up,
+        told=folded(folder),
     )
+
+
+def folded(folder: Path) -> list[str]:
+    """What `lumigraph capture` said of folds, where it made the folder: it has seen what photographs share."""
+    path = folder / "capture.json"
+    said = read_json(path, Made).warnings if path.is_file() else []
+    return [f"{folder}: {warning}" for warning in said if "folded" in warning]
 
 
 def read_frames_file(path: Path) -> tuple[Whole, Json]:

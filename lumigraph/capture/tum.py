@@ -82,7 +82,7 @@ def read_rows(path: Path, columns: int) -> list[list[str]]:
                 raise ValueError("a quaternion of zero is no rotation")
     except ValueError as fault:
         raise LumigraphError(
-            f"{path} holds {' '.join(row)[:200]!r}, where {columns} columns from a moment on were looked for ({fault}); "
+            f"{path} holds {' '.join(row)[:200]!r}, where {columns} columns were looked for ({fault}); "
             "correct that line"
         ) from fault
     return [row[:columns] for row in rows]

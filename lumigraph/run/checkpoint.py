@@ -144,7 +144,9 @@ class Checkpoints:
         about = self._about(checkpoint)
         structure = about.optimizers
         if about.files.get(STRUCTURE, found := checksum(json.dumps(structure).encode())) != found:
-            raise LumigraphError(f"{checkpoint / 'state.json'} is damaged: its optimizers are not those that were saved")
+            raise LumigraphError(
+                f"{checkpoint / 'state.json'} is damaged: its optimizers are not those that were saved"
+            )
         with understood(checkpoint):
             generator.set_state(tensors["generator"])
             for optimizer, saved in zip(optimizers, unflatten(structure, tensors), strict=True):
@@ -203,7 +205,9 @@ def take_shapes(method: nn.Module, tensors: dict[str, Tensor]) -> None:
             if saved is None:
                 continue
             sizes.add(saved.shape if own.dim() == GRID else saved.shape[:1])
-            if saved.shape[1:] == own.shape[1:] or (saved.dim() == own.dim() == GRID and saved.shape[0] == own.shape[0]):
+            if saved.shape[1:] == own.shape[1:] or (
+                saved.dim() == own.dim() == GRID and saved.shape[0] == own.shape[0]
+            ):
                 sized = own.detach().new_empty(saved.shape)
                 setattr(module, name, nn.Parameter(sized) if isinstance(own, nn.Parameter) else sized)
         if len(sizes) > 1:

@@ -177,7 +177,9 @@ def part_to_json(part: Part) -> dict[str, Any]:
 def box_of(corners: tuple[Vector, Vector], where: Path | str) -> Box:
     """Raises LumigraphError, naming `where`, for corners that hold nothing."""
     if not all(a < b for a, b in zip(*corners, strict=True)):
-        raise LumigraphError(f"{where}: the box {corners} has nothing between its lower and its upper corner; correct it")
+        raise LumigraphError(
+            f"{where}: the box {corners} has nothing between its lower and its upper corner; correct it"
+        )
     return Box(*corners)
 
 

@@ -14,7 +14,7 @@ from ..ranges import Count, Seconds, typed
 
 @dataclass(frozen=True)
 class Row:
-    """A line of metrics.jsonl, as far as anybody relies on it. Not every method has a PSNR, and older lines say less."""
+    """A line of metrics.jsonl, as far as anybody relies on it. Not every method has a PSNR; older lines say less."""
 
     step: Count
     seconds: Seconds

@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import shutil
 from collections.abc import Sequence
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +19,7 @@ from ..masks import MASKS as MASKS
 from ..photos import Photo
 from ..photos.track import Track
 from ..pictures import list_images, read_grey
-from ..transforms import OPENCV_FROM_OPENGL
+from ..transforms import OPENCV_FROM_OPENGL, Made
 
 WORK = "work"
 RESULT = "capture.json"
@@ -32,14 +31,6 @@ NAMES = {
     "SIMPLE_RADIAL": ("fl_x", "cx", "cy", "k1"),
     "OPENCV": ("fl_x", "fl_y", "cx", "cy", "k1", "k2", "p1", "p2"),
 }
-
-
-@dataclass(frozen=True)
-class Made:
-    """Of capture.json, what the scene was made from."""
-
-    sources: list[str] = field(default_factory=list)
-    key: str = ""
 
 
 def claim(folder: Path, sources: Sequence[Path]) -> Path:

@@ -17,9 +17,11 @@ from ...files import read_json, remove, replacing, write_bytes, write_json
 from ...locks import held
 from ...names import natural
 from ...progress import counting
+from ...ranges import typed
 from ..library import pycolmap
 from ..photos import Intake, Photo, gather
 from ..photos.track import Track, untracked
+from ..transforms import Made
 from .diagnosis import FEW_FEATURES, Diagnosis, Matches, counted, diagnose, folds, read_matches
 from .drawings import draw_capture, draw_photographs
 from .folder import MASKS, RESULT, claim, copy_masks, copy_photographs, stamp, write_model
