@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from .errors import LumigraphError
-from .ranges import Count, Seconds, Share, typed
+from .ranges import Lasted, Seconds, Share, Steps, typed
 
 # Where schedules go on, at the earliest, once a run is extended. Coarse beginnings (small photographs, few cells,
 # warm-up) lie before it in every method, and are not repeated on what has become fine.
@@ -24,10 +24,10 @@ class Budget:
              schedules went on
     """
 
-    steps: Count | None = None
+    steps: Steps | None = None
     seconds: Seconds | None = None
     quality: str | None = None
-    joined: tuple[Seconds, Share] | None = None
+    joined: tuple[Lasted, Share] | None = None
 
     def __post_init__(self) -> None:
         if (self.steps is None) == (self.seconds is None):

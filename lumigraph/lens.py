@@ -132,8 +132,8 @@ class Lens(ABC):
         found = {}
         for name, shape in typing.get_type_hints(cls).items():
             if name in data and hasattr(shape, "dim_str"):  # as in "camera 2"
-                rows = list[tuple[(float,) * int(shape.dim_str.split()[-1])]]  # type: ignore[misc]
-                found[name] = torch.tensor(typed(rows, data[name], f"{where}: {name}"), dtype=torch.float32)
+                row: Any = tuple[(float,) * int(shape.dim_str.split()[-1])]  # type: ignore[misc]
+                found[name] = torch.tensor(typed(list[row], data[name], f"{where}: {name}"), dtype=torch.float32)
         lacking = [x.name for x in fields(cls) if x.name not in found and x.default is MISSING]  # type: ignore[arg-type]
         if lacking or len({len(values) for values in found.values()}) != 1:
             raise LumigraphError(

@@ -19,7 +19,7 @@ from .errors import LumigraphError
 from .geometry import Similarity, is_similarity
 from .geometry import Vector as Vector
 from .images import UNNAMED, ImageStore, Layer, cosines, resized
-from .ranges import Length, Numbers3, Numbers4, Share, between, typed
+from .ranges import Coordinate, Point, Row, Share, between, typed
 from .rays import Rays
 
 # How values of a layer are reduced, by its name (see `resized`); all others are picked, not averaged.
@@ -38,7 +38,7 @@ class Forward:
     near:  distance of that plane from the mean camera; what is to be modelled lies beyond
     """
 
-    pose: tuple[Numbers4, ...]
+    pose: tuple[Row, ...]
     scale: tuple[Size, Size]
     near: Size
 
@@ -61,20 +61,20 @@ class Frame:
                  for any other, and where all were taken at once
     """
 
-    bounds: tuple[Numbers3, Numbers3] = ((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0))
+    bounds: tuple[Point, Point] = ((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0))
     reach: Size = 1.0
     near: Size = 0.05
     background: tuple[Share, Share, Share] = (0.0, 0.0, 0.0)
     has_alpha: bool = False
     image_count: Annotated[int, between(0, 10**6)] = 0
-    source_from_scene: tuple[Numbers4, ...] = (
+    source_from_scene: tuple[Row, ...] = (
         (1.0, 0.0, 0.0, 0.0),
         (0.0, 1.0, 0.0, 0.0),
         (0.0, 0.0, 1.0, 0.0),
         (0.0, 0.0, 0.0, 1.0),
     )
     forward: Forward | None = None
-    times: tuple[Length, Length] | None = None
+    times: tuple[Coordinate, Coordinate] | None = None
 
     @property
     def to_source(self) -> Similarity:
@@ -147,7 +147,7 @@ class Photograph:
     extra: dict[str, Tensor] = field(default_factory=dict)
 
     def __len__(self) -> int:
-        """Pixels."""
+        """Side."""
         return self.rgb.shape[0] * self.rgb.shape[1]
 
     def before(self, background: Float[Tensor, " 3"] | Vector) -> Float[Tensor, "height width 3"]:

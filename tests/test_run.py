@@ -17,7 +17,8 @@ import torch
 from lumigraph import methods
 from lumigraph.errors import LumigraphError
 from lumigraph.files import replacing, write_json
-from lumigraph.plain import alike, flatten, from_plain, unflatten
+from lumigraph.plain import alike, flatten, unflatten
+from lumigraph.ranges import typed
 from lumigraph.run import Run, State
 from lumigraph.train import fit
 
@@ -245,7 +246,7 @@ class Outer:
 
 @pytest.mark.parametrize("value", [Outer(), Outer(Inner((3,)), Inner(()), (0.5, "x"))])
 def test_a_config_survives_json(value):
-    assert from_plain(Outer, json.loads(json.dumps(asdict(value)))) == value
+    assert typed(Outer, json.loads(json.dumps(asdict(value))), "a config") == value
 
 
 def test_numbers_are_alike_up_to_a_tolerance():

@@ -12,7 +12,7 @@ import msgspec
 from .. import files
 from ..budget import Budget
 from ..metrics import Score
-from ..ranges import Count, Seconds, typed
+from ..ranges import Lasted, Tally, typed
 from ..run import Run
 from ..run.measured import Protocol, View
 from .cell import Cell, Settings, train_command
@@ -45,7 +45,7 @@ class Begun:
     budget: dict[str, Any]
     seed: int
     run: Annotated[str, msgspec.Meta(pattern=r"\Aruns/[^/\\\x00]+\Z")]
-    views: Count | None = None
+    views: Tally | None = None
     failed: str | None = None
 
 
@@ -54,18 +54,18 @@ class Measured:
     """And of those that did not fail."""
 
     protocol: Protocol
-    train_views: Count
-    model_bytes: Count
-    peak_memory: Count
-    steps: Count
-    training_seconds: Seconds
-    compile_seconds: Seconds
+    train_views: Tally
+    model_bytes: Tally
+    peak_memory: Tally
+    steps: Tally
+    training_seconds: Lasted
+    compile_seconds: Lasted
     trained_on: str
     psnr: float | None = None
     ssim: float | None = None
     lpips: float | None = None
     scores: list[Score] = field(default_factory=list)
-    seconds_per_view: Seconds | None = None
+    seconds_per_view: Lasted | None = None
     shown: View | None = None
     published: Published | None = None
 

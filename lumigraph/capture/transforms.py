@@ -17,7 +17,7 @@ import torch
 from ..errors import LumigraphError
 from ..files import is_file, read_json
 from ..lens import Equirectangular, Fisheye, Lens, OpenCV, Pinhole
-from ..ranges import Length, Name, Numbers3, Numbers4, between, typed
+from ..ranges import Coordinate, Name, Point, Positive, Row, between, typed
 from . import colmap
 from .capture import Capture, Plane, Shot
 from .pictures import EXIF_SIDEWAYS, find_file, measure, reductions, versions
@@ -38,12 +38,11 @@ FACTS = ("exposure", "boxes", "body")  # of a photograph
 NOTHING = (1e10, 65504.0)  # depth that Blender writes where nothing is, in floats and in halves
 
 Json = dict[str, Any]
-Side = Annotated[float, between(1, 1e5)]  # pixels
+Across = Annotated[float, between(1, 1e5)]  # pixels
 Focal = Annotated[float, between(1e-2, 1e7)]  # pixels
 Centre = Annotated[float, between(-1e7, 1e7)]  # pixels
 Bend = Annotated[float, between(-1e4, 1e4)]
 Angle = Annotated[float, between(1e-6, 3.14159)]  # radians
-Positive = Annotated[float, between(1e-9, 1e9)]
 
 
 @dataclass(frozen=True)
@@ -53,7 +52,7 @@ class Whole:
     frames: list[Json]
     aabb_scale: Positive | None = None
     scale: Positive = NGP_SCALE
-    up: Numbers3 | None = None
+    up: Point | None = None
     ply_file_path: Name | None = None
     train_filenames: list[str] | None = None
     val_filenames: list[str] | None = None
@@ -74,9 +73,9 @@ class Posed:
     """A frame, with what the file says of all frames."""
 
     file_path: Name
-    transform_matrix: list[Numbers4]
-    w: Side | None = None
-    h: Side | None = None
+    transform_matrix: list[Row]
+    w: Across | None = None
+    h: Across | None = None
     camera_model: str = "OPENCV"
     is_fisheye: bool | float | None = None
     fl_x: Focal | None = None
@@ -93,7 +92,7 @@ class Posed:
     k6: Bend | None = None
     p1: Bend | None = None
     p2: Bend | None = None
-    time: Length | None = None
+    time: Coordinate | None = None
     mask_path: Name | None = None
     depth_file_path: Name | None = None
     depth_path: Name | None = None

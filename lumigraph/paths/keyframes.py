@@ -24,7 +24,7 @@ from ..errors import LumigraphError
 from ..files import read_json, write_json
 from ..geometry import RIGID, is_similarity, to_matrix, to_quaternion
 from ..lens import Lens, Pinhole
-from ..ranges import Length, Numbers4, Pixels, between, typed
+from ..ranges import Coordinate, Row, Side, between, typed
 from ..scene import Frame
 
 FORMAT = "lumigraph camera path 1"
@@ -43,22 +43,22 @@ class Keyframe:
     time:    the moment of a moving scene that is seen then; None leaves it to the method
     """
 
-    pose: tuple[Numbers4, Numbers4, Numbers4]
+    pose: tuple[Row, Row, Row]
     fov: float
-    seconds: Length
-    time: Length | None = None
+    seconds: Coordinate
+    time: Coordinate | None = None
 
 
 @dataclass(frozen=True)
 class Film:
     """What the JSON beside a film says of its cameras: see `export.film`."""
 
-    poses: list[tuple[Numbers4, Numbers4, Numbers4]]
+    poses: list[tuple[Row, Row, Row]]
     lens: dict[str, Any]
-    size: tuple[Pixels, Pixels]
-    source_from_scene: tuple[Numbers4, ...]
+    size: tuple[Side, Side]
+    source_from_scene: tuple[Row, ...]
     fps: Fps
-    times: list[Length] | None = None
+    times: list[Coordinate] | None = None
 
 
 @dataclass(frozen=True)
@@ -95,7 +95,7 @@ class CameraPath:
 
     @property
     def duration(self) -> float:
-        """Seconds from the first keyframe to the last; back to the first, if it loops."""
+        """Lasted from the first keyframe to the last; back to the first, if it loops."""
         count, between = len(self.keyframes), self.keyframes[-1].seconds - self.keyframes[0].seconds
         return between * count / (count - 1) if self.loop and count > 1 else between
 
@@ -245,7 +245,7 @@ def keys_of_film(film: Film, lens: Lens) -> tuple[Keyframe, ...]:
     """Every frame of a film as a keyframe. Raises LumigraphError where its parts do not fit together."""
     if not isinstance(lens, Pinhole):
         raise LumigraphError("The film was made through a bent lens, and paths are flown behind a flat picture")
-    times = film.times or [None] * len(film.poses)
+    times: list[Any] = film.times or [None] * len(film.poses)
     to_source = torch.tensor(film.source_from_scene, dtype=torch.double)
     if len(times) != len(film.poses) or len(lens) not in (1, len(film.poses)) or not is_similarity(to_source):
         raise LumigraphError("The film's poses, lenses, times and source_from_scene do not fit together")
@@ -256,6 +256,6 @@ def keys_of_film(film: Film, lens: Lens) -> tuple[Keyframe, ...]:
     fov = 2 * torch.atan(0.5 * size[side] / lens.focal[:, side].double()).rad2deg()
     rows = zip(source.tolist(), fov.expand(len(poses)).tolist(), times, strict=True)
     return tuple(
-        Keyframe((tuple(a), tuple(b), tuple(c)), angle, i / film.fps, time)  # type: ignore[arg-type]
+        Keyframe((tuple(a), tuple(b), tuple(c)), angle, i / film.fps, time)
         for i, ((a, b, c), angle, time) in enumerate(rows)
     )

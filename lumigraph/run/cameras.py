@@ -13,7 +13,7 @@ from ..errors import LumigraphError
 from ..files import read_json
 from ..geometry import RIGID
 from ..lens import Lens
-from ..ranges import Length, Numbers4, Pixels
+from ..ranges import Coordinate, Row, Side
 from ..scene import Scene
 
 MOST_PIXELS = 10**9  # of one picture
@@ -25,10 +25,10 @@ class Cameras:
 
     names: list[str]
     splits: dict[str, list[int]]
-    pose: list[tuple[Numbers4, Numbers4, Numbers4]]
+    pose: list[tuple[Row, Row, Row]]
     lens: dict[str, Any]
-    size: list[tuple[Pixels, Pixels]]
-    time: list[Length] | None = None
+    size: list[tuple[Side, Side]]
+    time: list[Coordinate] | None = None
 
 
 def to_json(scene: Scene) -> dict[str, Any]:

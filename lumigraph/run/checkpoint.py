@@ -24,7 +24,7 @@ from .. import files
 from ..errors import LumigraphError
 from ..method import Method
 from ..plain import flatten, understood, unflatten
-from ..ranges import Count, Seconds, typed
+from ..ranges import Lasted, Tally, typed
 
 FORMAT = "lumigraph checkpoint 1"
 GRID = 4  # axes of a grid of cells, of which the first says which of several grids
@@ -50,8 +50,8 @@ class State:
 class Sum:
     """By which a file's bytes are known."""
 
-    bytes: Count
-    crc32: Count
+    bytes: Tally
+    crc32: Tally
 
 
 @dataclass(frozen=True)
@@ -63,13 +63,13 @@ class Saved:
     """
 
     method: str
-    step: Count
-    seconds: Seconds
-    compile_seconds: Seconds
+    step: Tally
+    seconds: Lasted
+    compile_seconds: Lasted
     files: dict[str, Sum]
     optimizers: list[Any]
-    peak_memory: Count = 0
-    passes: Seconds = 0.0
+    peak_memory: Tally = 0
+    passes: Lasted = 0.0
 
 
 class Checkpoints:

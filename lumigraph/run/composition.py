@@ -36,7 +36,7 @@ from ..crop import Box
 from ..errors import LumigraphError
 from ..geometry import Similarity, Vector, is_similarity, to_matrix, to_quaternion
 from ..method import Method
-from ..ranges import Name, Numbers3, Numbers4, between, typed
+from ..ranges import Name, Point, Row, between, typed
 from .opened import Opened
 
 FORMAT = "lumigraph composition 1"
@@ -113,11 +113,11 @@ class PlaceSaid:
     """A place as the file may say it; a matrix of four rows is the other way."""
 
     scale: Annotated[float, between(1e-9, 1e9)] = 1.0
-    rotation: Annotated[float, between(-1e6, 1e6)] | Numbers4 = 0.0
-    translation: Numbers3 = (0.0, 0.0, 0.0)
+    rotation: Annotated[float, between(-1e6, 1e6)] | Row = 0.0
+    translation: Point = (0.0, 0.0, 0.0)
 
 
-Placing = PlaceSaid | tuple[Numbers4, Numbers4, Numbers4, Numbers4]
+Placing = PlaceSaid | tuple[Row, Row, Row, Row]
 
 
 @dataclass(frozen=True)
@@ -126,7 +126,7 @@ class PartSaid:
 
     source: Name
     place: Any = field(default_factory=dict)
-    box: tuple[Numbers3, Numbers3] | None = None
+    box: tuple[Point, Point] | None = None
 
 
 @dataclass(frozen=True)
@@ -185,7 +185,7 @@ def box_of(corners: tuple[Vector, Vector], where: Path | str) -> Box:
 
 def place_from_json(said: Any, where: Path | str = "a composition") -> Similarity:
     """A similarity from a matrix, or from what it is made of. Raises LumigraphError, naming `where`, for none."""
-    place: Placing = typed(Placing, said, where, closed=True)  # type: ignore[arg-type]
+    place: Placing = typed(Placing, said, where, closed=True)
     if not isinstance(place, PlaceSaid):
         matrix = torch.tensor(place, dtype=torch.float64)
         if not is_similarity(matrix):

@@ -9,15 +9,15 @@ from typing import Any
 from .. import files
 from ..errors import LumigraphError
 from ..metrics import Score
-from ..ranges import Count, Seconds, typed
+from ..ranges import Lasted, Tally, typed
 
 
 @dataclass(frozen=True)
-class Row:
+class Line:
     """A line of metrics.jsonl, as far as anybody relies on it. Not every method has a PSNR; older lines say less."""
 
-    step: Count
-    seconds: Seconds
+    step: Tally
+    seconds: Lasted
     terms: dict[str, float] = field(default_factory=dict)
     statistics: dict[str, float] = field(default_factory=dict)
     psnr: float = 0.0
@@ -30,10 +30,10 @@ class Protocol:
     """How views or shapes were compared, as far as anybody relies on it: how many of how many, of which split."""
 
     split: str
-    of: Count = 0
-    views: Count | None = None
-    shapes: Count | None = None
-    members: Count | None = None
+    of: Tally = 0
+    views: Tally | None = None
+    shapes: Tally | None = None
+    members: Tally | None = None
     resolution: str | list[str] = ""
     background: list[float] | None = None
     masked: bool = False
@@ -57,7 +57,7 @@ class View:
 class Size:
     """The scores of all views of one size, of which there are so many."""
 
-    views: Count
+    views: Tally
     psnr: float | None = None
     ssim: float | None = None
     lpips: float | None = None
@@ -68,15 +68,15 @@ class Evaluation:
     """Of all that was compared, as far as anybody relies on it. scores: of newer files, where they have names"""
 
     protocol: Protocol
-    steps: Count
+    steps: Tally
     views: list[View] = field(default_factory=list)
     by_resolution: dict[str, Size] = field(default_factory=dict)
     scores: list[Score] = field(default_factory=list)
     psnr: float | None = None
     ssim: float | None = None
     lpips: float | None = None
-    seconds_per_view: Seconds | None = None
-    training_seconds: Seconds | None = None
+    seconds_per_view: Lasted | None = None
+    training_seconds: Lasted | None = None
     evaluated_on: str = "unknown"
 
 
@@ -90,7 +90,7 @@ def read_rows(path: Path) -> list[dict[str, Any]]:
     for line in lines:
         try:
             row = files.from_json(line, path)
-            typed(Row, row, path)
+            typed(Line, row, path)
         except LumigraphError:
             continue
         rows.append({"terms": {}, "statistics": {}} | row)

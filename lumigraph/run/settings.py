@@ -10,8 +10,8 @@ from .. import files
 from ..budget import Budget
 from ..errors import LumigraphError
 from ..method import Method
-from ..plain import alike, from_plain, renamed
-from ..ranges import Count, Name, between, typed
+from ..plain import alike, renamed
+from ..ranges import Count, Downscale, Name, Scales, Tally, between, typed
 from ..scene import Frame, Scene
 
 FORMAT = "lumigraph run 1"
@@ -21,10 +21,10 @@ FORMAT = "lumigraph run 1"
 class Options:
     """What a run may tell `open_dataset` besides its source: see `capture.open_scene`."""
 
-    downscale: Annotated[int, between(1, 10**4)] | None = None
+    downscale: Downscale | None = None
     reader: str | None = None
-    views: Annotated[int, between(1, 10**6)] | None = None
-    scales: Annotated[int, between(1, 16)] | None = None
+    views: Count | None = None
+    scales: Scales | None = None
 
 
 @dataclass(frozen=True)
@@ -57,7 +57,7 @@ class Settings:
     config: dict[str, Any]
     frame: Frame
     scene: Source
-    splits: dict[str, Count] = field(default_factory=dict)
+    splits: dict[str, Tally] = field(default_factory=dict)
     seed: Annotated[int, between(-(2**63), 2**63 - 1)] = 0
     budget: dict[str, Any] = field(default_factory=dict)
     device: str = "cpu"
@@ -92,9 +92,12 @@ class Settings:
         """The same with another budget."""
         return replace(self, budget=budget)
 
-    def method_config(self, kind: type[Method]) -> Any:
-        """The numbers as the Config of a kind of method; those with a former name arrive under today's."""
-        return from_plain(kind.Config, renamed(self.config, kind.formerly))
+    def method_config(self, kind: type[Method], file: Path) -> Any:
+        """The numbers as the Config of a kind of method; those with a former name arrive under today's.
+
+        file: to name where a number is unknown, of another type, or beyond its range
+        """
+        return typed(kind.Config, renamed(self.config, kind.formerly), file, closed=True)
 
     def agrees(self, frame: Frame) -> bool:
         """Whether a frame is the run's, up to rounding. Older runs know fewer numbers of a frame than newer ones."""

@@ -17,7 +17,7 @@ from typing import Any
 from ...errors import LumigraphError
 from ...files import read_json, write_json
 from ...processes import start
-from ...ranges import Seconds
+from ...ranges import Lasted
 
 WORKER = Path(__file__).with_name("worker.py")
 
@@ -33,7 +33,7 @@ class Mark:
 
     key: str
     done: bool
-    seconds: Seconds
+    seconds: Lasted
 
 
 class Stages:

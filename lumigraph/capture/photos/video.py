@@ -25,7 +25,7 @@ from PIL import Image
 
 from ...errors import LumigraphError, LumigraphWarning
 from ...files import is_file, read_json, replacing, write_json
-from ...ranges import Seconds
+from ...ranges import Lasted
 from .judge import SAME, WORKING, sharpness, signature
 from .movement import Odometer
 from .track import Track, untracked
@@ -51,7 +51,7 @@ class Index:
     modified: int = 0
     bytes: int = 0
     asked: int | None = None
-    frames: dict[str, Seconds] = field(default_factory=dict)
+    frames: dict[str, Lasted] = field(default_factory=dict)
 
 
 def is_video(path: Path) -> bool:
@@ -190,7 +190,7 @@ def speed(film: InputContainer) -> float:
 
 
 def duration(film: InputContainer) -> float:
-    """Seconds, as the file says; 0 where it does not."""
+    """Lasted, as the file says; 0 where it does not."""
     stream = film.streams.video[0]
     if stream.duration is not None and stream.time_base is not None:
         return float(stream.duration * stream.time_base)
