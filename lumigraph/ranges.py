@@ -117,6 +117,7 @@ def typed(kind: Any, value: Any, where: Path | str, closed: bool = False) -> Any
 
     where:  the file or option to name
     closed: refuse keys that no dataclass has, where a misspelt one would go unnoticed; else they are passed over
+    No union in a kind may have both a range and a tuple of fixed length: msgspec 0.22 crashes on those.
     Raises LumigraphError that says which value is wrong, and what it should be.
     """
     try:

@@ -113,7 +113,7 @@ class PlaceSaid:
     """A place as the file may say it; a matrix of four rows is the other way."""
 
     scale: Annotated[float, between(1e-9, 1e9)] = 1.0
-    rotation: Annotated[float, between(-1e6, 1e6)] | Row = 0.0
+    rotation: float | Row = 0.0
     translation: Point = (0.0, 0.0, 0.0)
 
 
