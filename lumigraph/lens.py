@@ -20,7 +20,7 @@ from torch import Tensor
 
 from . import loops
 from .errors import LumigraphError
-from .ranges import typed
+from .ranges import Tally, typed
 
 FOLD_SAMPLES = 1024  # angles from the axis at which a distortion is tested for folding over
 WIDEST_FLAT = math.radians(89.0)  # flat image planes end here: tan is still harmless in float32
@@ -44,7 +44,7 @@ class MixedParts:
     """Of lenses of several kinds in a file; see `Mixed`."""
 
     parts: list[Any]
-    part: list[int]
+    part: list[Tally]
 
 
 class Lens(ABC):

@@ -123,6 +123,8 @@ def typed(kind: Any, value: Any, where: Path | str, closed: bool = False) -> Any
     try:
         made = msgspec.convert(value, kind)
         key = surplus(value, msgspec.to_builtins(made)) if closed else None
+    except LumigraphError as error:  # from a dataclass that looks at itself
+        raise LumigraphError(f"{where}: {str(error)[:1].lower()}{str(error)[1:]}") from error
     except (ValueError, TypeError, OverflowError, RecursionError) as error:
         fault, _, path = " ".join(str(error).split()).partition(" - at `$")
         name = path.rstrip("`").lstrip(".")

@@ -147,7 +147,7 @@ class Photograph:
     extra: dict[str, Tensor] = field(default_factory=dict)
 
     def __len__(self) -> int:
-        """Side."""
+        """Pixels."""
         return self.rgb.shape[0] * self.rgb.shape[1]
 
     def before(self, background: Float[Tensor, " 3"] | Vector) -> Float[Tensor, "height width 3"]:

@@ -63,7 +63,7 @@ def about_gaze(capture: Capture, poses: Float[np.ndarray, "camera 3 4"]) -> str 
     meeting = np.linalg.solve(across.sum(0), (across @ place[:, :, None]).sum(0))[:, 0]
     towards = meeting - place
     miss = np.linalg.norm((across @ towards[:, :, None])[:, :, 0], axis=-1)
-    if ((towards * forward).sum(-1) > 0).any() or (miss > ASIDE * np.linalg.norm(towards, axis=-1)).any():
+    if ((towards * forward).sum(-1) > -NOTHING).any() or (miss > ASIDE * np.linalg.norm(towards, axis=-1)).any():
         return None
     if capture.points is not None and len(capture.points):
         points = capture.points[:: -(-len(capture.points) // SAMPLED_POINTS)]

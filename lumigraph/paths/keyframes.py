@@ -95,7 +95,7 @@ class CameraPath:
 
     @property
     def duration(self) -> float:
-        """Lasted from the first keyframe to the last; back to the first, if it loops."""
+        """Seconds from the first keyframe to the last; back to the first, if it loops."""
         count, between = len(self.keyframes), self.keyframes[-1].seconds - self.keyframes[0].seconds
         return between * count / (count - 1) if self.loop and count > 1 else between
 

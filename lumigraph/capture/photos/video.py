@@ -190,7 +190,7 @@ def speed(film: InputContainer) -> float:
 
 
 def duration(film: InputContainer) -> float:
-    """Lasted, as the file says; 0 where it does not."""
+    """Seconds, as the file says; 0 where it does not."""
     stream = film.streams.video[0]
     if stream.duration is not None and stream.time_base is not None:
         return float(stream.duration * stream.time_base)
