@@ -143,7 +143,7 @@ class GaussianSplatting(Method):
             initialization="dense",
             max_gaussians=120_000,
             initial_gaussians=20_000,
-            half_resolution_until=0.3,
+            half_resolution_until=0.7,
             joining_per_step=120.0,
             most_haste=4.0,
         )
