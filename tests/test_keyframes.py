@@ -167,11 +167,11 @@ def with_key(**change):
 NONSENSE = {
     "an old version": (lambda data: data.update(format="lumigraph camera path 0"), "no camera path"),
     "empty": (lambda data: data.update(keyframes=[]), "no keyframe"),
-    "no list": (lambda data: data.update(keyframes=7), "`keyframes` should be `array`, got `int`"),
+    "no list": (lambda data: data.update(keyframes=7), "keyframes is 7, and should be `array`"),
     "missing": (lambda data: data.pop("keyframes"), "lacks `keyframes`"),
-    "a strange key": (with_key(zoom=2), "nothing is known of a 'zoom'"),
+    "a strange key": (with_key(zoom=2), "nothing is known of 'zoom'"),
     "not a number": (with_key(fov=math.nan), "cannot be read as JSON"),
-    "words": (with_key(seconds="soon"), "seconds` should be `float`, got `str`"),
+    "words": (with_key(seconds="soon"), "seconds is 'soon', and should be `float`"),
     "scaled": (with_key(pose=[[2, 0, 0, 0], [0, 2, 0, 0], [0, 0, 2, 0]]), "keyframe 3 has a pose that is no rotation"),
     "mirrored": (with_key(pose=[[-1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]]), "no rotation"),
     "too small a pose": (with_key(pose=[[1, 0, 0], [0, 1, 0], [0, 0, 1]]), "length 4, got 3"),
@@ -179,10 +179,10 @@ NONSENSE = {
     "too wide": (with_key(fov=200), "sees 200 degrees"),
     "no angle": (with_key(fov=0), "sees 0 degrees"),
     "back in time": (with_key(seconds=0.0), "keyframe 3 is at 0 s, not after"),
-    "endless": (with_key(seconds=1e12), "seconds` should be `float` <="),
-    "no fps": (lambda data: data.update(fps=0), "`fps` should be `float` >= 0.001"),
-    "fps of words": (lambda data: data.update(fps="many"), "`fps` should be `float`, got `str`"),
-    "loop of words": (lambda data: data.update(loop="no"), "`loop` should be `bool`, got `str`"),
+    "endless": (with_key(seconds=1e12), "seconds is 1000000000000.0, and should be from -1e9 to 1e9"),
+    "no fps": (lambda data: data.update(fps=0), "fps is 0, and should be from 0.001 to 1,000"),
+    "fps of words": (lambda data: data.update(fps="many"), "fps is 'many', and should be `float`"),
+    "loop of words": (lambda data: data.update(loop="no"), "loop is 'no', and should be `bool`"),
 }
 
 

@@ -160,7 +160,7 @@ def damage(run: Run, name: str, change) -> None:
             "a run of gauss, a method that is not installed; there are",
         ),
         ("config.json", lambda data: data.replace(b'"rays"', b'"beams"'), "config.json does not hold what it should"),
-        ("config.json", lambda data: data.replace(b'"reach"', b'"grasp"'), "nothing is known of a 'grasp'"),
+        ("config.json", lambda data: data.replace(b'"reach"', b'"grasp"'), "nothing is known of 'grasp'"),
         (
             "config.json",
             lambda data: data.replace(b'"cells": 12', b'"cells": 13'),
