@@ -28,6 +28,7 @@ from lumigraph.capture import blender, open_scene
 from lumigraph.capture import transforms as transforms_reader
 from lumigraph.capture.assemble import checked_pose
 from lumigraph.capture.capture import Capture, Shot
+from lumigraph.capture.meshes import read_shape
 from lumigraph.capture.motion.folder import claim
 from lumigraph.capture.motion.stages import Stages
 from lumigraph.capture.oddities import oddities
@@ -508,3 +509,21 @@ def test_a_list_longer_than_its_file_takes_no_time(tmp_path):
     assert walk_frames(struct.pack("<Q", 0), tmp_path) == 8
     with pytest.raises(struct.error):
         walk_frames(struct.pack("<Q", 2**40), tmp_path)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 9\n",
+        "OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 -2\n",
+        "OFF\n3 1 0\n0 0 1e300\n1 0 0\n0 1 0\n3 0 1 2\n",
+        "OFF\n1000000000 1 0\n0 0 0\n",
+        "ply\nformat ascii 1.0\nelement vertex 999999999999\nproperty float x\nend_header\n0\n",
+    ],
+    ids=["no such corner", "a corner before the first", "far", "a billion corners", "a PLY of a million million"],
+)
+def test_meshes_that_cannot_be(text, tmp_path):
+    path = tmp_path / f"mesh.{text[:3].lower()}"
+    path.write_text(text)
+    with pytest.raises(LumigraphError, match=r"mesh\."):
+        read_shape(path, "mesh")

@@ -70,6 +70,8 @@ def read_shape(path: Path, name: str) -> Shape:
     clouds = [part for part in parts if len(getattr(part, "vertices", ()))]
     if not meshes and not clouds:
         raise LumigraphError(f"{path} holds neither triangles nor points; name another file")
+    if not all(map(is_sound, meshes or clouds[:1])):
+        raise LumigraphError(f"{path} has corners without three numbers, or triangles of corners that it has not")
     made = joined(meshes) if meshes else cloud(clouds[0])
     if not (np.abs(made.vertices) <= FARTHEST).all() or not np.ptp(made.vertices, 0).max() > NOTHING:
         raise LumigraphError(
@@ -79,6 +81,13 @@ def read_shape(path: Path, name: str) -> Shape:
     return normalised(
         name, made, None if meshes else normals_of(path), None if path.suffix.lower() in STANDING else Y_UP
     )
+
+
+def is_sound(part: Any) -> bool:
+    """Whether each corner has three numbers, and each triangle three of the corners that there are."""
+    vertices, faces = np.asarray(part.vertices), np.asarray(getattr(part, "faces", np.zeros((0, 3), np.int64)))
+    threes = vertices.ndim == faces.ndim == 2 and vertices.shape[1] == faces.shape[1] == 3
+    return threes and not (len(faces) and (faces.min() < 0 or faces.max() >= len(vertices)))
 
 
 def joined(parts: list[Any]) -> Mesh:
