@@ -29,6 +29,7 @@ SMALL_STEP = 3e-5  # the error left after one this small is about its square
 # What the numbers of lenses that exist lie between; in pixels, but for distortion and for the offset of an eye.
 SOUND = {"focal": (1e-2, 1e7), "centre": (-1e7, 1e7), "size": (1.0, 1e7), "distortion": (-1e4, 1e4)}
 SOUND |= {"offset": (-1e6, 1e6)}
+ANY = (-1e9, 1e9)  # of what a new kind may have besides
 NO_INDEX = torch.empty(0, dtype=torch.int64)
 
 
@@ -147,7 +148,7 @@ class Lens(ABC):
     def fault(self) -> str | None:
         """What no lens can have among its numbers, in a few words; None if all are sound."""
         for name, values in self._numbers().items():
-            least, most = SOUND[name]
+            least, most = SOUND.get(name, ANY)
             bad = ~((values >= least) & (values <= most))
             if bad.any():
                 return f"{name} is {float(values[bad][0]):g}, which is not between {least:g} and {most:g}"
