@@ -37,7 +37,7 @@ from lumigraph.exchange import read_gaussians
 from lumigraph.lens import Equirectangular, Fisheye, Lens, OpenCV, Pinhole, mix
 from lumigraph.metrics import scores_of
 from lumigraph.paths.keyframes import CameraPath
-from lumigraph.ranges import annotations
+from lumigraph.ranges import hints
 from lumigraph.report import header
 from lumigraph.run import Run
 from lumigraph.run.composition import read_composition
@@ -303,7 +303,7 @@ def test_no_layout_mixes_ranges_and_tuples():
     for room in rooms.split():
         module = importlib.import_module(f"lumigraph.{room}")
         for layout in (x for x in vars(module).values() if isinstance(x, type) and is_dataclass(x)):
-            for members in (one for kind in annotations(layout).values() for one in unions(kind)):
+            for members in (one for kind in hints(layout).values() for one in unions(kind)):
                 ranged = any(get_origin(x) is Annotated for x in members)
                 fixed = any(get_origin(x) is tuple and Ellipsis not in get_args(x) for x in members)
                 assert not (ranged and fixed), f"{layout}: {members}"

@@ -12,6 +12,8 @@ from ..budget import Budget
 from ..errors import LumigraphError
 from ..run import Run
 
+SHEET = "views.png"
+
 
 @dataclass(frozen=True)
 class Settings:
@@ -133,7 +135,8 @@ class Claim:
 
 
 def claim(output: Path, cells: Sequence[Cell], settings: Settings) -> None:
-    """Note in the output's folder what its cells share. Raises LumigraphError if they shared something else so far."""
+    """Note in the output's folder what its cells share. Raises LumigraphError if they shared something else so far, or
+    if somebody else's files lie where the results go."""
     path = output / "settings.json"
     shared = {name: getattr(settings, name) for name in ("downscale", "reader", "scales", "preset", "device")}
     known = asdict(files.read_json(path, Claim) if path.exists() else Claim(shared, {}))
@@ -149,4 +152,6 @@ def claim(output: Path, cells: Sequence[Cell], settings: Settings) -> None:
                 f"Two scenes are called {cell.scene}: {known['scenes'][cell.scene]} and {cell.source}; "
                 "rename a folder, or choose another --output"
             )
-    files.write_json(path, known)
+    for name in ("results.json", "results.md", SHEET, *(chart.name for chart in output.glob("*-over-*.svg"))):
+        files.claim(output / name, "benchmark")
+    files.write_json(path, known, ours=True)

@@ -70,6 +70,13 @@ class Measured:
     published: Published | None = None
 
 
+@dataclass(frozen=True)
+class Results:
+    """And of all of them."""
+
+    cells: list[Row] = field(default_factory=list)
+
+
 def row_of(cell: Cell, output: Path, settings: Settings, failure: str | None) -> Row:
     """A cell's figures out of its run's folder, under the names that eval.json has for them; or why there are none."""
     folder = output / "runs" / cell.name
@@ -111,7 +118,7 @@ def read_rows(output: Path) -> dict[str, Row]:
     path = output / "results.json"
     if not path.exists():
         return {}
-    rows = files.read_json(path, dict[str, list[Row]]).get("cells", [])
+    rows = files.read_json(path, Results).cells
     for row in typed(list[Begun], rows, path):
         Budget.from_json(row.budget, f"{path}: {row.run}")
     typed(list[Measured], [row for row in rows if not row.get("failed")], path)

@@ -9,6 +9,7 @@ that whoever reads passes over. So there is a complete state whenever there was 
 from __future__ import annotations
 
 import json
+import os
 import re
 import zlib
 from collections.abc import Iterable
@@ -23,12 +24,16 @@ from torch import Tensor, nn
 from .. import files
 from ..errors import LumigraphError
 from ..method import Method
+from ..partials import partial
 from ..plain import flatten, understood, unflatten
 from ..ranges import Lasted, Tally, typed
 
 FORMAT = "lumigraph checkpoint 1"
 GRID = 4  # axes of a grid of cells, of which the first says which of several grids
-WEIGHTS, OPTIMIZER, STRUCTURE = "weights.safetensors", "optimizer.safetensors", "optimizers"
+WEIGHTS, OPTIMIZER, STATE = "weights.safetensors", "optimizer.safetensors", "state.json"
+STRUCTURE = "optimizers"
+NAME = re.compile(r"\d+")
+OLD_PARTIAL = re.compile(r"\d+(\.partial)+")  # what older versions had begun to write or to delete
 
 
 @dataclass(frozen=True)
@@ -110,18 +115,17 @@ class Checkpoints:
             return
         tensors: dict[str, Tensor] = {"generator": generator.get_state()}
         structure = flatten([optimizer.state_dict() for optimizer in optimizers], tensors)
-        with files.replacing(folder) as partial:
-            partial.mkdir()
+        with files.replacing_folder(folder) as new:
             sums = {
-                name: write_tensors(partial / name, content)
+                name: write_tensors(new / name, content)
                 for name, content in ((WEIGHTS, method.state_dict()), (OPTIMIZER, tensors))
             }
             sums[STRUCTURE] = checksum(json.dumps(structure).encode())
             known = {name: asdict(total) for name, total in sums.items()}
             about = {"format": FORMAT, "method": self.method, **asdict(state), "files": known}
-            (partial / "state.json").write_text(json.dumps({**about, STRUCTURE: structure}), "utf-8")
+            (new / STATE).write_text(json.dumps({**about, STRUCTURE: structure}), "utf-8")
         for path in self.folder.iterdir():
-            if path != folder:
+            if path != folder and is_state(path):
                 retire(path)
 
     def load_weights(self, method: Method) -> None:
@@ -157,11 +161,11 @@ class Checkpoints:
                 check_moments(optimizer)
 
     def _all(self) -> list[Path]:
-        found = [x for x in self.folder.iterdir() if re.fullmatch(r"\d+", x.name)] if self.folder.is_dir() else []
+        found = [x for x in self.folder.iterdir() if NAME.fullmatch(x.name)] if self.folder.is_dir() else []
         return sorted(found, key=lambda x: int(x.name))
 
     def _about(self, checkpoint: Path) -> Saved:
-        said = files.read_json(path := checkpoint / "state.json")
+        said = files.read_json(path := checkpoint / STATE)
         if not isinstance(said, dict) or said.get("format") != FORMAT:
             raise LumigraphError(f"{checkpoint} is not a checkpoint that Lumigraph wrote; restore it from a copy")
         about = typed(Saved, said, path)
@@ -243,9 +247,15 @@ def checksum(data: bytes) -> Sum:
     return Sum(len(data), zlib.crc32(data))
 
 
+def is_state(path: Path) -> bool:
+    """Whether a folder is a state or a part of one, and holds nothing that somebody else has put there."""
+    named = NAME.fullmatch(path.name) or OLD_PARTIAL.fullmatch(path.name)
+    if not named or path.is_symlink() or not path.is_dir():
+        return False
+    return all(file.name in (WEIGHTS, OPTIMIZER, STATE) and not file.is_dir() for file in path.iterdir())
+
+
 def retire(path: Path) -> None:
     """Delete a checkpoint so that a half-deleted one cannot be taken for a whole one."""
-    with files.explained(path):
-        if not path.name.endswith(files.PARTIAL):
-            path = path.rename(path.with_name(path.name + files.PARTIAL))
-        files.remove(path)
+    with files.explained(path), partial(path.parent, is_folder=True) as aside:
+        os.replace(path, aside / path.name)

@@ -79,7 +79,7 @@ class Settings:
         return replace(settings, frame=frame, said=said)
 
     def write(self, file: Path) -> None:
-        files.write_json(file, self.to_json())
+        files.write_json(file, self.to_json(), ours=True)
 
     def to_json(self) -> dict[str, Any]:
         """What config.json says: under the same names, and a frame as it was read if it is still that one."""

@@ -70,7 +70,7 @@ class Stages:
 
     def mark(self, stage: str, key: str, done: bool, seconds: float) -> None:
         self.marks[stage] = Mark(key, done, round(seconds, 2))
-        write_json(self.path, {name: asdict(mark) for name, mark in self.marks.items()})
+        write_json(self.path, {name: asdict(mark) for name, mark in self.marks.items()}, ours=True)
 
     def colmap(self, total: int, **job: Any) -> Generator[int, None, None]:
         """Do a job of `worker.py`; gives a number for each of `total` things that becomes ready, as it does.

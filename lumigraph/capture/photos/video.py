@@ -24,7 +24,7 @@ from jaxtyping import Float
 from PIL import Image
 
 from ...errors import LumigraphError, LumigraphWarning
-from ...files import is_file, read_json, replacing, write_json
+from ...files import is_file, read_json, replacing_folder, write_json
 from ...ranges import Lasted
 from .judge import SAME, WORKING, sharpness, signature
 from .movement import Odometer
@@ -75,10 +75,9 @@ def extract(path: Path, folder: Path, frames: int | None = None, track: Track = 
     complete = all(Path(name).name == name and is_file(folder / name) for name in known.frames)
     if not complete or replace(known, frames={}) != wanted:
         chosen = choose(*judge(path, frames, track), frames)
-        with replacing(folder) as partial:
-            partial.mkdir()
+        with replacing_folder(folder, ours=True) as partial:
             written = write(path, partial, chosen, track)
-            write_json(partial / "frames.json", asdict(replace(wanted, frames=written)))
+            write_json(partial / "frames.json", asdict(replace(wanted, frames=written)), ours=True)
         known = read_json(index, Index)
     return [(folder / name, seconds) for name, seconds in known.frames.items()]
 
@@ -133,7 +132,7 @@ def write(path: Path, folder: Path, chosen: Sequence[int], track: Track) -> dict
         new = signature(image.convert("L"))
         if not any(new @ old > SAME for old in signatures):
             name = f"{number:06d}.jpg"
-            save(image, folder / name)
+            save(image, folder / name, ".jpg")
             signatures.append(new)
             written[name] = seconds
     return written
