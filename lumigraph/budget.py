@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, fields, replace
+from pathlib import Path
 from typing import Any
 
 from .errors import LumigraphError
+from .ranges import Lasted, Seconds, Share, Steps, typed
 
 # Where schedules go on, at the earliest, once a run is extended. Coarse beginnings (small photographs, few cells,
 # warm-up) lie before it in every method, and are not repeated on what has become fine.
@@ -22,10 +24,10 @@ class Budget:
              schedules went on
     """
 
-    steps: int | None = None
-    seconds: float | None = None
+    steps: Steps | None = None
+    seconds: Seconds | None = None
     quality: str | None = None
-    joined: tuple[float, float] | None = None
+    joined: tuple[Lasted, Share] | None = None
 
     def __post_init__(self) -> None:
         if (self.steps is None) == (self.seconds is None):
@@ -65,10 +67,9 @@ class Budget:
         return said | ({"joined": list(self.joined)} if self.joined else {})
 
     @staticmethod
-    def from_json(said: dict[str, Any]) -> Budget:
-        """What a run says. Raises LumigraphError for a run that says nothing."""
-        joined = said.get("joined")
-        return Budget(said.get("steps"), said.get("seconds"), said.get("quality"), joined and (joined[0], joined[1]))
+    def from_json(said: dict[str, Any], where: Path | str = "a run's budget") -> Budget:
+        """What a run says. Raises LumigraphError, naming `where`, for a run that says nothing, or no budget."""
+        return typed(Budget, said, where)
 
     def __str__(self) -> str:
         """For people: "60 s of training", "3,720 steps (quality: good)"."""

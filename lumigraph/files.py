@@ -15,16 +15,22 @@ import os
 import re
 import stat
 from collections.abc import Callable, Iterable, Iterator
+from itertools import accumulate
 from pathlib import Path
 from typing import Any
+
+import msgspec
 
 from . import marks
 from .errors import LumigraphError
 from .marks import Kind as Kind
 from .partials import partial
 from .partials import remove as remove
+from .ranges import typed
 
 NUMBERS = re.compile(r"\[[-+.eE\d,\s]*\]")
+DEEPEST = 100  # levels that JSON may nest; whoever walks through it again has room for them
+BUT_BRACKETS = bytes(set(range(256)) - set(b"[]{}"))
 
 Seen = tuple[int, ...]  # by which a file is known to be the same, unchanged
 
@@ -194,13 +200,52 @@ def write_json(path: Path, value: Any, kind: Kind = "file", ours: bool = False) 
     write_bytes(path, text.encode() + b"\n", kind, ours)
 
 
-def read_json(path: Path) -> Any:
-    """Raises LumigraphError if the file is missing or is no JSON."""
+def read_json(path: Path, kind: Any = Any) -> Any:
+    """What a file of JSON says, as a value of a kind (see `ranges.typed`); as it stands there if none is named.
+
+    Raises LumigraphError, naming the file, if it is missing, is no JSON (NaN, infinity and numbers of hundreds of
+    digits are none either), nests deeper than anything sound does, or does not hold what the kind says.
+    """
     with explained(path):
-        try:
-            return json.loads(path.read_text("utf-8"))
-        except (UnicodeDecodeError, json.JSONDecodeError) as error:
-            raise LumigraphError(f"{path} cannot be read as JSON ({error}); restore it from a copy") from error
+        return typed(kind, from_json(path.read_bytes(), path), path)
+
+
+def from_json(data: bytes, where: Path | str) -> Any:
+    """Plain values of JSON. where: what to name in a LumigraphError; see `read_json`."""
+    nesting = accumulate(1 if bracket in b"[{" else -1 for bracket in data.translate(None, BUT_BRACKETS))
+    if max(nesting, default=0) > DEEPEST:
+        raise LumigraphError(f"{where} nests deeper than {DEEPEST} levels, as no sound file does; restore it")
+    try:
+        return msgspec.json.decode(data)
+    except (ValueError, RecursionError) as error:
+        at = re.search(r"byte (\d+)", str(error))
+        line = f", line {1 + data.count(bytes([10]), 0, int(at[1]))}" if at else ""
+        reason = str(error).partition(" (byte")[0]
+        raise LumigraphError(f"{where} cannot be read as JSON ({reason}{line}); restore it from a copy") from error
+
+
+def is_file(path: Path) -> bool:
+    """Whether a file lies there; none does under a name that the system takes for no name."""
+    try:
+        return path.is_file()
+    except (OSError, ValueError):
+        return False
+
+
+def exists(path: Path) -> bool:
+    """Whether something lies there; nothing does under a name that the system takes for no name."""
+    try:
+        return path.exists()
+    except (OSError, ValueError):
+        return False
+
+
+def expanded(name: Path | str) -> Path:
+    """A path with the home folder for its ~, or as it stands where nobody is called so."""
+    try:
+        return Path(name).expanduser()
+    except RuntimeError:
+        return Path(name)
 
 
 def sync(path: Path) -> None:

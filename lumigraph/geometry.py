@@ -13,6 +13,8 @@ from torch import Tensor
 
 Vector = tuple[float, float, float]
 Rows = tuple[tuple[float, float, float, float], ...]  # of a 4x4 matrix, as plain numbers
+ROUNDING = 1e-3  # by which a matrix may fail to be a similarity
+RIGID = 0.01  # how far the axes of a pose may be from unit length and right angles
 
 
 def unit(vectors: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
@@ -162,3 +164,14 @@ def _nearer_difference(
     onward, back = place.clamp(max=len(place) - 2), (place - 1).clamp_min(0)
     nearer = jump.index_select(axis, onward) <= jump.index_select(axis, back)
     return torch.where(nearer[..., None], step.index_select(axis, onward), step.index_select(axis, back))
+
+
+def is_similarity(matrix: Tensor) -> bool:
+    """Whether a tensor is a 4 x 4 matrix that moves, turns and scales, up to rounding, and does not mirror."""
+    if matrix.shape != (4, 4) or not matrix.isfinite().all() or matrix[3].tolist() != [0.0, 0.0, 0.0, 1.0]:
+        return False
+    linear, one = matrix[:3, :3], torch.eye(3, dtype=torch.float64)
+    size = float(torch.linalg.det(linear))
+    if size <= 0:
+        return False
+    return bool((linear @ linear.T / size ** (2 / 3) - one).abs().max() <= ROUNDING)

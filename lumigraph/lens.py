@@ -7,9 +7,10 @@ camera of a batch. A new kind of lens is a new subclass with `unproject` and `pr
 from __future__ import annotations
 
 import math
+import typing
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import MISSING, dataclass, field, fields, replace
 from functools import cached_property
 from typing import Any, ClassVar
 
@@ -18,12 +19,33 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from . import loops
+from .errors import LumigraphError
+from .ranges import Tally, typed
 
 FOLD_SAMPLES = 1024  # angles from the axis at which a distortion is tested for folding over
 WIDEST_FLAT = math.radians(89.0)  # flat image planes end here: tan is still harmless in float32
 NEWTON_STEPS = 20  # usually three are enough; more only beside a fold
 SMALL_STEP = 3e-5  # the error left after one this small is about its square
+# What the numbers of lenses that exist lie between; in pixels, but for distortion and for the offset of an eye.
+SOUND = {"focal": (1e-2, 1e7), "centre": (-1e7, 1e7), "size": (1.0, 1e7), "distortion": (-1e4, 1e4)}
+SOUND |= {"offset": (-1e6, 1e6)}
+ANY = (-1e9, 1e9)  # of what a new kind may have besides
 NO_INDEX = torch.empty(0, dtype=torch.int64)
+
+
+@dataclass(frozen=True)
+class Named:
+    """Of a lens in a file, what all kinds have."""
+
+    kind: str
+
+
+@dataclass(frozen=True)
+class MixedParts:
+    """Of lenses of several kinds in a file; see `Mixed`."""
+
+    parts: list[Any]
+    part: list[Tally]
 
 
 class Lens(ABC):
@@ -99,12 +121,38 @@ class Lens(ABC):
         return {"kind": type(self).__name__.lower(), **{k: v.tolist() for k, v in self._numbers().items()}}
 
     @staticmethod
-    def from_json(data: dict[str, Any]) -> Lens:
-        return Lens.kinds[data["kind"]]._from_json(data)
+    def from_json(data: Any, where: Any = "a lens") -> Lens:
+        """What a file says of the lenses of its cameras. Raises LumigraphError, naming `where`, for what are none."""
+        kind = Lens.kinds.get(typed(Named, data, where).kind)
+        if kind is None:
+            raise LumigraphError(f"{where} has a lens of kind {data['kind']!r}; there are {', '.join(Lens.kinds)}")
+        return kind._from_json(data, where)
 
     @classmethod
-    def _from_json(cls, data: dict[str, Any]) -> Lens:
-        return cls(**{k: torch.tensor(v, dtype=torch.float32) for k, v in data.items() if k != "kind"})
+    def _from_json(cls, data: dict[str, Any], where: Any) -> Lens:
+        found = {}
+        for name, shape in typing.get_type_hints(cls).items():
+            if name in data and hasattr(shape, "dim_str"):  # as in "camera 2"
+                row: Any = tuple[(float,) * int(shape.dim_str.split()[-1])]  # type: ignore[misc]
+                found[name] = torch.tensor(typed(list[row], data[name], f"{where}: {name}"), dtype=torch.float32)
+        lacking = [x.name for x in fields(cls) if x.name not in found and x.default is MISSING]  # type: ignore[arg-type]
+        if lacking or len({len(values) for values in found.values()}) != 1:
+            raise LumigraphError(
+                f"{where} has lenses without all the numbers of their kind, {data['kind']}; correct it"
+            )
+        lens = cls(**found)
+        if (fault := lens.fault()) is not None:
+            raise LumigraphError(f"{where} has a lens whose {fault}; correct it")
+        return lens
+
+    def fault(self) -> str | None:
+        """What no lens can have among its numbers, in a few words; None if all are sound."""
+        for name, values in self._numbers().items():
+            least, most = SOUND.get(name, ANY)
+            bad = ~((values >= least) & (values <= most))
+            if bad.any():
+                return f"{name} is {float(values[bad][0]):g}, which is not between {least:g} and {most:g}"
+        return None
 
     @staticmethod
     def cat(lenses: Sequence[Lens]) -> Lens:
@@ -391,8 +439,15 @@ class Mixed(Lens):
         return {"kind": "mixed", "parts": [lens.to_json() for lens in self.parts], "part": self.part.tolist()}
 
     @classmethod
-    def _from_json(cls, data):
-        return cls(tuple(Lens.from_json(part) for part in data["parts"]), torch.tensor(data["part"]))
+    def _from_json(cls, data, where):
+        parts = tuple(Lens.from_json(part, where) for part in typed(MixedParts, data, where).parts)
+        part = torch.tensor(typed(MixedParts, data, where).part, dtype=torch.int64)
+        if sorted(part.tolist()) != [k for k, lens in enumerate(parts) for _ in range(len(lens))]:
+            raise LumigraphError(f"{where} has lenses of several kinds that do not fit together; correct it")
+        return cls(parts, part)
+
+    def fault(self):
+        return next(filter(None, (lens.fault() for lens in self.parts)), None)
 
     def __len__(self) -> int:
         return len(self.part)

@@ -13,17 +13,27 @@ import socket
 import sys
 import time
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TextIO
+from typing import TextIO
 
 from .errors import LumigraphError
-from .files import explained
+from .files import explained, read_json
 
 NAME = "lock.json"  # in the folder: who holds it, for people; what counts is the system's lock on this file
 BEGINS = b'{"process": '
 FAR = 1 << 30  # byte that Windows locks, for it lets nobody read what is locked
 
 _ours: set[Path] = set()  # held by this process
+
+
+@dataclass(frozen=True)
+class Holder:
+    """What the file says."""
+
+    process: int
+    host: str
+    since: str
 
 
 @contextlib.contextmanager
@@ -113,7 +123,7 @@ def lock(file: TextIO) -> bool:
 def holder(place: Path) -> str:
     """Who holds a lock, in words."""
     try:
-        said: Any = json.loads(place.read_text("utf-8"))
-        return f"process {said['process']} on {said['host']} since {said['since']}"
-    except (OSError, ValueError, LookupError, TypeError):  # it is being written just now
+        said = read_json(place, Holder)
+    except LumigraphError:  # it is being written just now
         return "another process"
+    return f"process {said.process} on {said.host} since {said.since}"

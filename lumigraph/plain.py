@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-import typing
 from collections.abc import Iterator
-from dataclasses import is_dataclass
 from pathlib import Path
 from typing import Any
 
@@ -44,21 +42,6 @@ def unflatten(value: Any, tensors: dict[str, Tensor]) -> Any:
     return value
 
 
-def from_plain(kind: Any, value: Any) -> Any:
-    """A dataclass again from what `asdict` and JSON made of it: nested dataclasses and tuples are restored."""
-    if is_dataclass(kind):
-        hints = typing.get_type_hints(kind)
-        return typing.cast(type, kind)(**{name: from_plain(hints[name], x) for name, x in value.items()})
-    if typing.get_origin(kind) is tuple and isinstance(value, list):
-        inner = typing.get_args(kind)
-        each = inner[:1] * len(value) if inner[-1] is Ellipsis else inner
-        return tuple(from_plain(k, x) for k, x in zip(each, value, strict=True))
-    choices = [x for x in typing.get_args(kind) if is_dataclass(x) or typing.get_origin(x) is tuple]
-    if choices and value is not None:
-        return from_plain(choices[0], value)
-    return value
-
-
 def renamed(value: dict[str, Any], formerly: dict[str, str]) -> dict[str, Any]:
     """A dictionary under today's keys. Raises ValueError where one has its former name and today's.
 
@@ -74,7 +57,7 @@ def understood(path: Path) -> Iterator[None]:
     """Turn the ways in which a file can fail to hold what was expected into one sentence."""
     try:
         yield
-    except (KeyError, TypeError, ValueError, AttributeError, RuntimeError) as error:
+    except (LookupError, TypeError, ValueError, AttributeError, RuntimeError, ArithmeticError) as error:
         raise LumigraphError(
             f"{path} does not hold what it should ({type(error).__name__}: {error}); it was edited, "
             f"or written by another version"

@@ -16,13 +16,11 @@ from collections.abc import Iterator
 from dataclasses import fields, is_dataclass
 from functools import cache
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar, get_args, get_origin
+from typing import Annotated, Any, Literal, get_args, get_origin
 
 import msgspec
 
 from .errors import LumigraphError
-
-Kind = TypeVar("Kind")
 
 
 def between(least: float, most: float) -> msgspec.Meta:
@@ -55,6 +53,14 @@ FramesPerSecond = Annotated[float, between(0.01, 1000)]
 Downscale = Annotated[int, between(1, 1024)]
 Scales = Annotated[int, between(1, 12)]  # of a picture, each half as large as the one before
 Port = Annotated[int, between(1, 65_535)]
+
+# What files hold besides.
+Tally = Annotated[int, between(0, 10**12)]  # how many there were of something
+Lasted = Annotated[float, between(0, 1e12)]  # seconds that something took
+Side = Annotated[int, between(1, 10**5)]  # of a picture, pixels
+Name = Annotated[str, msgspec.Meta(min_length=1, max_length=4096, pattern=r"\A[^\x00]*\Z")]  # of a file
+Point = tuple[Coordinate, Coordinate, Coordinate]
+Row = tuple[Coordinate, Coordinate, Coordinate, Coordinate]  # of a matrix
 
 
 def numbers(kind: Any) -> Iterator[tuple[type, msgspec.Meta | None]]:
@@ -119,24 +125,45 @@ def check(value: Any, where: Path | str) -> None:
     coherent(value)
 
 
-def typed(kind: type[Kind], value: Any, where: Path | str) -> Kind:
+def typed(kind: Any, value: Any, where: Path | str, closed: bool = False) -> Any:
     """Plain JSON as a value of a kind: a dataclass, a tuple, a dictionary, a union; ranges and types are checked.
 
-    where: the file or option to name. Raises LumigraphError that says which value is wrong, and what it should be.
+    where:  the file or option to name
+    closed: refuse keys that no dataclass has, where a misspelt one would go unnoticed; else they are passed over
+    No union in a kind may have both a range and a tuple of fixed length: msgspec 0.22 crashes on those.
+    Raises LumigraphError that says which value is wrong, and what it should be.
     """
     try:
         made = msgspec.convert(value, kind)
-    except (msgspec.ValidationError, ValueError, TypeError) as error:
-        fault, _, path = str(error).partition(" - at `$")
+        if is_dataclass(made):
+            coherent(made)
+        key = surplus(value, msgspec.to_builtins(made)) if closed else None
+    except LumigraphError as error:  # from a dataclass that looks at itself
+        raise LumigraphError(f"{where}: {str(error)[:1].lower()}{str(error)[1:]}") from error
+    except (ValueError, TypeError, OverflowError, RecursionError) as error:
+        fault, _, path = " ".join(str(error).split()).partition(" - at `$")
         name = path.rstrip("`").lstrip(".")
-        found, wanted = found_at(kind, value, name) if name else (value, kind)
-        what = f"{name} is {shown(found)}" if name else f"it holds {shown(found)}"
-        beyond = domain(wanted) and re.match(r"Expected `\w+` [<>]", fault)
-        should = f"and should be from {domain(wanted)}" if beyond else fault[:1].lower() + fault[1:]
-        raise LumigraphError(f"{where} does not hold what it should: {what}, {should}") from error
-    if is_dataclass(made):
-        coherent(made)
+        if lacking := re.match(r"Object missing required field (`\w+`)", fault):
+            what = f"{name or 'it'} lacks {lacking[1]}"
+        else:
+            found, wanted = found_at(kind, value, name) if name else (value, kind)
+            ranged = domain(wanted) if re.match(r"Expected `\w+` [<>]", fault) else ""
+            should = f"be from {ranged}" if ranged else fault.replace("Expected", "be", 1)
+            what = f"{name or 'it'} is {shown(found)}, and should {should}"
+        raise LumigraphError(f"{where} does not hold what it should: {what}") from error
+    if key is not None:
+        raise LumigraphError(f"{where} does not hold what it should: nothing is known of {key!r}")
     return made
+
+
+def surplus(said: Any, known: Any) -> str | None:
+    """A key of plain JSON that its typed value, made plain again, has not; None if there is none."""
+    if isinstance(said, dict) and isinstance(known, dict):
+        new = next((key for key in said if key not in known), None)
+        return new or next(filter(None, (surplus(value, known[key]) for key, value in said.items())), None)
+    if isinstance(said, list | tuple) and isinstance(known, list | tuple):
+        return next(filter(None, map(surplus, said, known)), None)
+    return None
 
 
 def found_at(kind: Any, value: Any, path: str) -> tuple[Any, Any]:

@@ -15,6 +15,7 @@ from PIL import Image
 
 from . import __version__, methods
 from .budget import Budget
+from .capture.pictures import readable
 from .figures.charts import STYLE as CHARTS
 from .figures.charts import Series, bar_chart, line_chart
 from .files import claim, write_bytes
@@ -236,7 +237,8 @@ def plain(value: Any) -> str:
 def jpeg(path: Path) -> str:
     """A picture as a JPEG small enough to embed in a page."""
     file = io.BytesIO()
-    Image.open(path).convert("RGB").save(file, "JPEG", quality=90, optimize=True)
+    with readable(path), Image.open(path) as image:
+        image.convert("RGB").save(file, "JPEG", quality=90, optimize=True)
     return f"data:image/jpeg;base64,{base64.b64encode(file.getvalue()).decode()}"
 
 

@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
-from typing import Any, ClassVar
+from pathlib import Path
+from typing import Annotated, Any, ClassVar
 
 import numpy as np
 import torch
@@ -15,14 +16,17 @@ from torch import Tensor
 from .blending import before
 from .camera import Camera
 from .errors import LumigraphError
-from .geometry import Similarity
+from .geometry import Similarity, is_similarity
 from .geometry import Vector as Vector
 from .images import UNNAMED, ImageStore, Layer, cosines, resized
-from .plain import from_plain
+from .ranges import Coordinate, Point, Row, Share, between, typed
 from .rays import Rays
 
 # How values of a layer are reduced, by its name (see `resized`); all others are picked, not averaged.
 AVERAGED = {"colours": "sRGB", "raw": "linear", "albedo": "linear", "flow": "pixels"}
+
+
+Size = Annotated[float, between(1e-9, 1e9)]  # scene units
 
 
 @dataclass(frozen=True)
@@ -34,9 +38,9 @@ class Forward:
     near:  distance of that plane from the mean camera; what is to be modelled lies beyond
     """
 
-    pose: tuple[tuple[float, float, float, float], ...]
-    scale: tuple[float, float]
-    near: float
+    pose: tuple[Row, ...]
+    scale: tuple[Size, Size]
+    near: Size
 
 
 @dataclass(frozen=True)
@@ -57,20 +61,20 @@ class Frame:
                  for any other, and where all were taken at once
     """
 
-    bounds: tuple[Vector, Vector] = ((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0))
-    reach: float = 1.0
-    near: float = 0.05
-    background: Vector = (0.0, 0.0, 0.0)
+    bounds: tuple[Point, Point] = ((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0))
+    reach: Size = 1.0
+    near: Size = 0.05
+    background: tuple[Share, Share, Share] = (0.0, 0.0, 0.0)
     has_alpha: bool = False
-    image_count: int = 0
-    source_from_scene: tuple[tuple[float, float, float, float], ...] = (
+    image_count: Annotated[int, between(0, 10**6)] = 0
+    source_from_scene: tuple[Row, ...] = (
         (1.0, 0.0, 0.0, 0.0),
         (0.0, 1.0, 0.0, 0.0),
         (0.0, 0.0, 1.0, 0.0),
         (0.0, 0.0, 0.0, 1.0),
     )
     forward: Forward | None = None
-    times: tuple[float, float] | None = None
+    times: tuple[Coordinate, Coordinate] | None = None
 
     @property
     def to_source(self) -> Similarity:
@@ -82,8 +86,17 @@ class Frame:
         return asdict(self)
 
     @staticmethod
-    def from_json(data: dict[str, Any]) -> Frame:
-        return from_plain(Frame, data)
+    def from_json(data: Any, where: Path | str = "a frame") -> Frame:
+        """What a run says of its frame. Raises LumigraphError, naming `where`, for what is none."""
+        frame = typed(Frame, data, where, closed=True)
+        low, high = frame.bounds
+        if not all(a < b for a, b in zip(low, high, strict=True)):
+            raise LumigraphError(f"{where}: bounds from {low} to {high} hold nothing; correct them")
+        if not is_similarity(torch.tensor(frame.source_from_scene, dtype=torch.float64)):
+            raise LumigraphError(f"{where}: source_from_scene does more than move, turn and scale; correct it")
+        if frame.forward is not None and len(frame.forward.pose) != 3:
+            raise LumigraphError(f"{where}: forward.pose should be 3 rows of 4 numbers; correct it")
+        return frame
 
 
 @dataclass(frozen=True)

@@ -223,16 +223,17 @@ def test_a_part_stands_upright_on_the_spot():
 @pytest.mark.parametrize(
     ("said", "words"),
     [
-        ({"scale": -1.0}, "more than move, turn and scale"),
-        ({"scale": 0.0}, "more than move, turn and scale"),
+        ({"scale": -1.0}, "scale is -1.0, and should be from 1e-9 to 1e9"),
+        ({"scale": 0.0}, "scale is 0.0, and should be from 1e-9 to 1e9"),
         ([[1, 0, 0, 0], [0, 2, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]], "more than move, turn and scale"),
-        ([[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]], "more than move, turn and scale"),
-        ({"rotation": [0.0, 1.0]}, "neither degrees nor a quaternion"),
-        ({"scales": 2.0}, "nothing is known of a place's 'scales'"),
+        ([[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]], "should be `array` of length 4, got 3"),
+        ({"rotation": [0.0, 1.0]}, r"rotation is \[0.0, 1.0\], and should be `array` of length 4"),
+        ({"rotation": [0, 0, 0, 0]}, "turns nothing"),
+        ({"scales": 2.0}, "nothing is known of 'scales'"),
     ],
 )
 def test_places_that_are_none(said, words):
-    with pytest.raises(ValueError, match=words):
+    with pytest.raises(LumigraphError, match=words):
         place_from_json(said)
 
 
@@ -282,10 +283,10 @@ def test_a_file_opens_as_it_was_written(folder):
         ({"parts": [{"source": "self.json"}]}, "holds itself, by way of its parts"),
         ({"parts": []}, "part 0 should lead, and there are 0"),
         ({"parts": [{"source": "red.ply"}], "lead": 1}, "part 1 should lead, and there are 1"),
-        ({"parts": [{"source": "red.ply", "plaice": {}}]}, "nothing is known of a part's 'plaice'"),
+        ({"parts": [{"source": "red.ply", "plaice": {}}]}, "nothing is known of 'plaice'"),
         ({"parts": [{"source": "red.ply", "box": [[0, 0, 0], [0, 1, 1]]}]}, "has nothing between"),
-        ({"parts": [{"source": "red.ply", "place": [[1]]}]}, "more than move, turn and scale"),
-        ({}, "does not hold what it should"),
+        ({"parts": [{"source": "red.ply", "place": [[1]]}]}, "should be `array` of length 4, got 1"),
+        ({}, "does not hold what it should: it lacks `parts`"),
         ({"format": "lumigraph camera path 1"}, "is no composition: it does not say"),
     ],
 )

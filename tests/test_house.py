@@ -17,10 +17,10 @@ import lumigraph
 FLOORS: list[set[str]] = [
     {"console", "errors", "processes", "quality", "signals"},
     {
-        *("blending", "budget", "choice", "controls", "geometry", "loops", "marks"),
+        *("blending", "choice", "controls", "geometry", "loops", "marks"),
         *("memory", "names", "partials", "progress", "ranges", "readers", "srgb", "threads"),
     },
-    {"files", "plain", "lens", "rays"},
+    {"budget", "files", "plain", "lens", "rays"},
     {"camera", "crop", "images", "kernels", "figures", "locks", "metrics"},
     {"volume", "scene"},
     {"dataset", "gaussians", "mesh"},

@@ -18,7 +18,8 @@ from listing import names
 from lumigraph import methods
 from lumigraph.errors import LumigraphError
 from lumigraph.files import replacing, write_json
-from lumigraph.plain import alike, flatten, from_plain, unflatten
+from lumigraph.plain import alike, flatten, unflatten
+from lumigraph.ranges import typed
 from lumigraph.run import Run, State
 from lumigraph.train import fit
 
@@ -160,7 +161,7 @@ def damage(run: Run, name: str, change) -> None:
             "a run of gauss, a method that is not installed; there are",
         ),
         ("config.json", lambda data: data.replace(b'"rays"', b'"beams"'), "config.json does not hold what it should"),
-        ("config.json", lambda data: data.replace(b'"reach"', b'"grasp"'), "config.json does not hold what it should"),
+        ("config.json", lambda data: data.replace(b'"reach"', b'"grasp"'), "nothing is known of 'grasp'"),
         (
             "config.json",
             lambda data: data.replace(b'"cells": 12', b'"cells": 13'),
@@ -246,7 +247,7 @@ class Outer:
 
 @pytest.mark.parametrize("value", [Outer(), Outer(Inner((3,)), Inner(()), (0.5, "x"))])
 def test_a_config_survives_json(value):
-    assert from_plain(Outer, json.loads(json.dumps(asdict(value)))) == value
+    assert typed(Outer, json.loads(json.dumps(asdict(value))), "a config") == value
 
 
 def test_numbers_are_alike_up_to_a_tolerance():

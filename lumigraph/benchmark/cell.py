@@ -118,11 +118,20 @@ def evaluated(folder: Path, settings: Settings) -> bool:
     if result is None or result["steps"] != run.state.step:
         return False
     protocol = result["protocol"]
-    wanted = min(settings.eval_views or protocol["of"], protocol["of"])
+    there = protocol.get("of", 0)
+    wanted = min(settings.eval_views or there, there)
     if "views" not in protocol:
-        return protocol["shapes"] == wanted
+        return protocol.get("shapes") == wanted
     kept = (folder / "eval").is_dir() and (result["lpips"] is not None or not settings.lpips)
     return kept and protocol["views"] == wanted
+
+
+@dataclass(frozen=True)
+class Claim:
+    """What settings.json says: what all cells share, and where each scene is."""
+
+    settings: dict[str, str | int | None]
+    scenes: dict[str, str]
 
 
 def claim(output: Path, cells: Sequence[Cell], settings: Settings) -> None:
@@ -130,9 +139,7 @@ def claim(output: Path, cells: Sequence[Cell], settings: Settings) -> None:
     if somebody else's files lie where the results go."""
     path = output / "settings.json"
     shared = {name: getattr(settings, name) for name in ("downscale", "reader", "scales", "preset", "device")}
-    known = files.read_json(path) if path.exists() else {"settings": shared, "scenes": {}}
-    if not (isinstance(known, dict) and all(isinstance(known.get(part), dict) for part in ("settings", "scenes"))):
-        raise LumigraphError(f"{path} is not of a benchmark, and would be replaced; choose another --output")
+    known = asdict(files.read_json(path, Claim) if path.exists() else Claim(shared, {}))
     for name, value in shared.items():
         begun = known["settings"].get(name, getattr(Settings, name))  # older folders know fewer options
         if begun != value:

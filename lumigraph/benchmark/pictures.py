@@ -14,6 +14,7 @@ from PIL import Image
 from torch import Tensor
 
 from .. import files, methods
+from ..capture.pictures import readable
 from ..evaluate import file_name
 from ..figures import Row as Line
 from ..figures import contact_sheet, save_picture
@@ -113,4 +114,5 @@ def photograph(row: Row, output: Path) -> Float[Tensor, "height width 3"]:
 def rendering(row: Row, output: Path) -> Float[Tensor, "height width 3"]:
     """A run's rendering of a view, as the evaluation kept it."""
     path = output / row["run"] / "eval" / f"{file_name(row['shown']['name'])}.png"
-    return torch.from_numpy(np.array(Image.open(path).convert("RGB"))).float() / 255
+    with readable(path), Image.open(path) as image:
+        return torch.from_numpy(np.array(image.convert("RGB"))).float() / 255

@@ -3,14 +3,20 @@
 from __future__ import annotations
 
 import shlex
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
+
+import msgspec
 
 from .. import files
+from ..budget import Budget
+from ..metrics import Score
+from ..ranges import Lasted, Tally, typed
 from ..run import Run
+from ..run.measured import Protocol, View
 from .cell import Cell, Settings, train_command
-from .published import published
+from .published import Published, published
 
 Row = dict[str, Any]
 MEASURED = (
@@ -28,6 +34,47 @@ MEASURED = (
     "evaluated_on",
     "versions",
 )
+
+
+@dataclass(frozen=True)
+class Begun:
+    """What results.json says of every cell, as far as anybody relies on it. run: its folder, within the output's"""
+
+    method: str
+    scene: str
+    budget: dict[str, Any]
+    seed: int
+    run: Annotated[str, msgspec.Meta(pattern=r"\Aruns/[^/\\\x00]+\Z")]
+    views: Tally | None = None
+    failed: str | None = None
+
+
+@dataclass(frozen=True)
+class Measured:
+    """And of those that did not fail."""
+
+    protocol: Protocol
+    train_views: Tally
+    model_bytes: Tally
+    peak_memory: Tally
+    steps: Tally
+    training_seconds: Lasted
+    compile_seconds: Lasted
+    trained_on: str
+    psnr: float | None = None
+    ssim: float | None = None
+    lpips: float | None = None
+    scores: list[Score] = field(default_factory=list)
+    seconds_per_view: Lasted | None = None
+    shown: View | None = None
+    published: Published | None = None
+
+
+@dataclass(frozen=True)
+class Results:
+    """And of all of them."""
+
+    cells: list[Row] = field(default_factory=list)
 
 
 def row_of(cell: Cell, output: Path, settings: Settings, failure: str | None) -> Row:
@@ -50,7 +97,7 @@ def row_of(cell: Cell, output: Path, settings: Settings, failure: str | None) ->
     figure = published(cell.method, cell.scene) if cell.views is None and settings.scales == 1 else None
     row |= {name: result[name] for name in MEASURED if name in result}
     row |= {
-        "train_views": run.settings.splits["train"] // settings.scales,
+        "train_views": run.settings.splits.get("train", 0) // settings.scales,
         "model_bytes": run.model_bytes,
         "published": figure and asdict(figure),
     }
@@ -69,4 +116,10 @@ def public(cell: Cell) -> str:
 def read_rows(output: Path) -> dict[str, Row]:
     """The rows so far by their runs, earlier commands' among them."""
     path = output / "results.json"
-    return {row["run"]: row for row in files.read_json(path)["cells"]} if path.exists() else {}
+    if not path.exists():
+        return {}
+    rows = files.read_json(path, Results).cells
+    for row in typed(list[Begun], rows, path):
+        Budget.from_json(row.budget, f"{path}: {row.run}")
+    typed(list[Measured], [row for row in rows if not row.get("failed")], path)
+    return {row["run"]: row for row in rows}

@@ -12,6 +12,7 @@ from typing import Any
 from ..collection import Collection
 from ..dataset import Dataset
 from ..errors import LumigraphError
+from ..files import exists, expanded
 from ..names import natural
 from ..readers import LISTED, NAMES
 from ..scene import Scene
@@ -38,7 +39,7 @@ def open_dataset(source: str | Path, wanted: type[Any] | None = None, **options:
     options: what `open_scene` is told of photographs, of those in a collection too
     Raises LumigraphError for anything that keeps the source from becoming a dataset.
     """
-    kind, path = kind_of(source, wanted), Path(source).expanduser()
+    kind, path = kind_of(source, wanted), expanded(source)
     if kind is Collection:
         return Collection.of(
             {name: partial(open_dataset, place, **options) for name, place in members_of(path).items()}, str(source)
@@ -58,10 +59,10 @@ def kind_of(source: str | Path, wanted: type[Any] | None = None) -> type[Any]:
     scene itself, or where one is wanted. Everything else is left to the readers of photographs. Raises LumigraphError
     for a path that does not exist.
     """
-    path = Path(source).expanduser()
+    path = expanded(source)
     if str(source).startswith(PROCEDURAL):
         return Scene
-    if not path.exists():
+    if not exists(path):
         raise LumigraphError(f"{path} does not exist; check the path")
     if wanted is Collection and members_of(path):
         return Collection
@@ -112,7 +113,7 @@ def open_scene(
         from . import procedural
 
         capture = procedural.read(str(source).removeprefix(PROCEDURAL))
-    elif single_image.recognises(path := Path(source).expanduser()):
+    elif single_image.recognises(path := expanded(source)):
         capture, downscale = single_image.read(path, downscale), 1  # it is reduced by now
     else:
         capture = with_masks(choose_reader(path, reader).read(path), path)
@@ -124,7 +125,7 @@ def open_scene(
 
 def choose_reader(folder: Path, name: str | None = None) -> ModuleType:
     """The reader that knows what lies in a folder. Raises LumigraphError if none does."""
-    if not folder.exists():
+    if not exists(folder):
         raise LumigraphError(f"{folder} does not exist; check the path")
     if not folder.is_dir():
         raise LumigraphError(

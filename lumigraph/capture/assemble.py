@@ -14,6 +14,7 @@ from torch import Tensor
 
 from ..camera import Camera
 from ..errors import LumigraphError, LumigraphWarning
+from ..geometry import RIGID
 from ..images import ImageSource, ImageStore
 from ..lens import Equirectangular, Lens, Pinhole
 from ..names import natural
@@ -23,10 +24,11 @@ from .beside import make_about, make_layers
 from .capture import Capture, Shot
 from .forward import find_forward
 from .normalise import Place, find_place
+from .oddities import oddities
 from .pictures import Chosen, check_downscale, choose
 
 HOLD_OUT = 8  # every 8th photograph by name, starting with the first, where nothing is published
-RIGID = 0.01  # how far a pose's axes may be from unit length and right angles
+FARTHEST = 1e8  # units of the source that anything may be from its origin; maps in metres reach 1e7
 NAMED = 20  # missing files at most in a warning; further ones are counted
 
 
@@ -66,6 +68,11 @@ def assemble(
         )
     splits = split(capture.source, shots)
     poses = np.stack([checked_pose(shot, capture.source) for shot in shots])
+    for shot in shots:
+        if (fault := shot.lens.fault()) is not None:
+            raise LumigraphError(f"{capture.source}: the lens of {shot.name} has a fault: its {fault}; correct it")
+    capture, lost = without_stray_points(capture)
+    told += capture.told + lost + oddities(capture, shots, poses)
     chosen = [choose(shot, downscale) for shot in track(shots, "Looking at photographs", len(shots))]
     told += about_small(capture.source, chosen) if downscale else []
     for warning in told:
@@ -91,8 +98,8 @@ def assemble(
     if place.reach > 1:
         train = splits["train"]
         forward = find_forward(capture, [shots[i] for i in train.tolist()], cameras[train], matrix, place.near)
-    layers, lost = make_layers(shots, chosen, images, matrix)
-    for warning in lost:
+    layers, left_out = make_layers(shots, chosen, images, matrix)
+    for warning in left_out:
         warnings.warn(warning, LumigraphWarning, stacklevel=3)
     points = None if capture.points is None else torch.from_numpy(capture.points @ matrix[:3, :3].T + matrix[:3, 3])
     return Scene(
@@ -104,7 +111,7 @@ def assemble(
         capture.source,
         None if points is None else points.float(),
         None if capture.point_colours is None else torch.from_numpy(np.ascontiguousarray(capture.point_colours)),
-        told + lost,
+        told + left_out,
         layers,
         make_about(shots),
         torch.tensor([c.calibrated for c in chosen]),
@@ -138,6 +145,8 @@ def checked_pose(shot: Shot, source: str) -> Float[np.ndarray, "3 4"]:
     axes = shot.pose[:, :3]
     if not np.isfinite(shot.pose).all():
         fault = "holds NaN or infinite numbers"
+    elif np.abs(shot.pose[:, 3]).max() > FARTHEST:
+        fault = f"is {np.abs(shot.pose[:, 3]).max():.3g} units from the origin, and {FARTHEST:g} are the most"
     elif np.abs(axes.T @ axes - np.eye(3)).max() > RIGID:
         fault = "is not rigid, for its axes are not of unit length and at right angles"
     elif np.linalg.det(axes) < 0:
@@ -146,6 +155,23 @@ def checked_pose(shot: Shot, source: str) -> Float[np.ndarray, "3 4"]:
         u, _, vt = np.linalg.svd(axes)
         return np.concatenate([u @ vt, shot.pose[:, 3:]], -1)
     raise LumigraphError(f"{source}: the pose of {shot.name} {fault}; correct it or remove that photograph")
+
+
+def without_stray_points(capture: Capture) -> tuple[Capture, list[str]]:
+    """The capture without points that are nowhere or farther off than anything can be, and a sentence about them."""
+    if capture.points is None:
+        return capture, []
+    near = (np.abs(capture.points) <= FARTHEST).all(-1)
+    if near.all():
+        return capture, []
+    kept = replace(
+        capture,
+        points=capture.points[near],
+        point_colours=None if capture.point_colours is None else capture.point_colours[near],
+        sightings=None if capture.sightings is None else capture.sightings[near],
+    )
+    stray = counted(int((~near).sum()), "point")
+    return kept, [f"{capture.source} has {stray} that are not finite or {FARTHEST:g} units away; using the others"]
 
 
 def fitted_lens(shot: Shot, chosen: Chosen) -> Lens:

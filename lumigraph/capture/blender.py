@@ -26,7 +26,7 @@ def read(folder: Path) -> Capture:
     missing: list[str] = []
     for file, split in files.items():
         path = folder / f"transforms_{file}.json"
-        found, absent = read_shots(path, read_frames_file(path), split if held_out else None)
+        found, absent = read_shots(path, read_frames_file(path)[1], split if held_out else None)
         shots += found
         missing += absent
     return Capture(str(folder), shots, missing=missing)

@@ -90,6 +90,7 @@ class Capture:
     near:     distance within which nothing is, source's units
     background: colour behind everything
     up:       which way is up, source's frame, any length
+    told:     what its user should know, one sentence each
     """
 
     source: str
@@ -103,3 +104,4 @@ class Capture:
     near: float | None = None
     background: tuple[float, float, float] | None = None
     up: tuple[float, float, float] | None = None
+    told: list[str] = field(default_factory=list)

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import struct
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +19,7 @@ from .pictures import reductions, versions
 from .points import SparsePoints, read_points3d
 
 PLACES = ("sparse/0", "sparse", "colmap/sparse/0", "colmap/sparse", "colmap", ".")
+LARGEST_SIDE = 10**5  # pixels
 LOOKED_FOR = "sparse/0 with cameras, images and points3D, .bin or .txt (COLMAP)"
 
 # COLMAP's list of parameters begins with one focal length or two and the centre. For each model, which it is, and where
@@ -85,8 +88,10 @@ def read_model(place: Path) -> pycolmap.Reconstruction:
     """Raises LumigraphError for what is no whole model."""
     try:
         if (place / "images.bin").is_file():
-            check_whole(place / "images.bin")
+            check_whole(place)
             read_points3d(place / "points3D.bin")
+        else:
+            check_text(place / "images.txt")
         model = pycolmap.Reconstruction(place)
         if (place / "cameras.bin").is_file():
             wanted = 8 + sum(24 + 8 * len(camera.params) for camera in model.cameras.values())
@@ -100,22 +105,74 @@ def read_model(place: Path) -> pycolmap.Reconstruction:
         raise LumigraphError(f"{place} holds no readable COLMAP model ({reason}); make or copy it again") from fault
 
 
-def check_whole(path: Path) -> None:
-    """Walk through images.bin: pycolmap would ask for all the memory there is to read a file that ends early.
+def check_whole(place: Path) -> None:
+    """Walk through a binary model: pycolmap would ask for all the memory there is, or go on for hours, to read lists
+    that are longer than their file.
 
-    Per image an id, a pose of seven numbers, a camera, a name that ends in zero, and a list of (x, y, point).
+    Raises LumigraphError for a list that ends early, and for a rotation that is none.
     """
-    data = path.read_bytes()
-    try:
-        (count,), offset = struct.unpack_from("<Q", data), 8
-        for _ in range(count):
-            name_ends = data.index(b"\0", offset + 64)
-            (features,) = struct.unpack_from("<Q", data, name_ends + 1)
-            offset = name_ends + 9 + 24 * features
-        if offset > len(data):
-            raise ValueError("it ends early")
-    except (struct.error, ValueError) as fault:
-        raise LumigraphError(f"{path} is truncated; make or copy the model again") from fault
+    for name, walk in (("images.bin", walk_images), ("frames.bin", walk_frames), ("rigs.bin", walk_rigs)):
+        path = place / name
+        if not path.is_file():
+            continue
+        data = path.read_bytes()
+        try:
+            if walk(data, path) > len(data):
+                raise ValueError("it ends early")
+        except (struct.error, ValueError) as fault:
+            raise LumigraphError(f"{path} is truncated; make or copy the model again") from fault
+
+
+def walk_images(data: bytes, path: Path) -> int:
+    """Per image an id, a pose of seven numbers, a camera, a name that ends in zero, and a list of (x, y, point).
+
+    Returns where the list ends, as the other walks do."""
+    (count,), offset = struct.unpack_from("<Q", data), 8
+    for _ in range(count):
+        quaternion = struct.unpack_from("<4d", data, offset + 4)
+        name_ends = data.index(b"\0", offset + 64)
+        check_turn(quaternion, data[offset + 64 : name_ends].decode("utf-8", "replace"), path)
+        (features,) = struct.unpack_from("<Q", data, name_ends + 1)
+        offset = name_ends + 9 + 24 * features
+    return offset
+
+
+def walk_frames(data: bytes, path: Path) -> int:
+    """Per frame its id and its rig's, a pose of seven numbers, and a list of (sensor's kind, sensor, image)."""
+    (count,), offset = struct.unpack_from("<Q", data), 8
+    for _ in range(count):
+        check_turn(struct.unpack_from("<4d", data, offset + 8), "a frame", path)
+        (images,) = struct.unpack_from("<I", data, offset + 64)
+        offset += 68 + 16 * images
+    return offset
+
+
+def walk_rigs(data: bytes, path: Path) -> int:
+    """Per rig an id and a number of sensors: the first, then others, each with a pose or without."""
+    (count,), offset = struct.unpack_from("<Q", data), 8
+    for _ in range(count):
+        (sensors,), offset = struct.unpack_from("<I", data, offset + 4), offset + 8
+        offset += 8 if sensors else 0
+        for _ in range(sensors - 1):
+            (posed,) = struct.unpack_from("<B", data, offset + 8)
+            offset += 65 if posed else 9
+    return offset
+
+
+def check_turn(quaternion: Sequence[float], name: str, path: Path) -> None:
+    if not any(quaternion):
+        raise LumigraphError(f"{path}: the quaternion of {name} is zero, which is no rotation; make the model again")
+
+
+def check_text(path: Path) -> None:
+    """Look at the rotations of images.txt: a line for each image, which another of its details follows."""
+    lines = iter(path.read_text("utf-8", errors="replace").splitlines())
+    for line in lines:
+        words = line.split()
+        if words and not words[0].startswith("#"):
+            next(lines, "")
+            with contextlib.suppress(ValueError):  # pycolmap says what is wrong with it
+                check_turn([float(word) for word in words[1:5]] or [1.0], words[-1], path)
 
 
 def positions(model: pycolmap.Reconstruction) -> dict[str, np.ndarray]:
@@ -136,6 +193,11 @@ def read_points(place: Path, model: pycolmap.Reconstruction) -> SparsePoints:
 
 def read_lens(camera: pycolmap.Camera, place: Path) -> Lens:
     kind, p = camera.model.name, torch.tensor(camera.params, dtype=torch.float32)
+    if not (1 <= camera.width <= LARGEST_SIDE and 1 <= camera.height <= LARGEST_SIDE):
+        raise LumigraphError(
+            f"{place}: camera {camera.camera_id} has pictures of {camera.width}x{camera.height} pixels; make or copy "
+            "the model again"
+        )
     if kind == "EQUIRECTANGULAR":
         return Equirectangular(torch.tensor([[camera.width, camera.height]], dtype=torch.float32))
     if kind not in PLANAR and kind not in FISHEYE:
@@ -145,8 +207,6 @@ def read_lens(camera: pycolmap.Camera, place: Path) -> Lens:
         )
     focals, bends = (PLANAR | FISHEYE)[kind]
     four = p[list(FOCAL_AND_CENTRE[focals])]
-    if not (p.isfinite().all() and (four[:2] > 0).all()):
-        raise LumigraphError(f"{place}: camera {camera.camera_id} has unusable parameters {camera.params_to_string()}")
     distortion = torch.zeros(1, 8 if kind in PLANAR else 4)
     distortion[0, : len(bends)] = p[list(bends)]
     if kind in FISHEYE:

@@ -14,6 +14,7 @@ import torch
 from ..errors import LumigraphError
 from ..lens import Pinhole
 from .capture import Capture, Shot
+from .numbers import load_array
 from .pictures import list_images, reductions, versions
 from .points import read_points3d
 
@@ -31,9 +32,11 @@ def read(folder: Path) -> Capture:
     """
     path = folder / "poses_bounds.npy"
     try:
-        table = np.load(path, allow_pickle=False)
-        assert table.ndim == 2 and table.shape[1] == 17 and table.dtype.kind == "f"
-    except (OSError, ValueError, EOFError, AssertionError) as fault:
+        table = np.array(load_array(path))
+        if table.ndim != 2 or table.shape[1] != 17 or table.dtype.kind != "f":
+            raise ValueError(f"it has shape {table.shape} of {table.dtype}")
+        table = table.astype(np.float64)
+    except Exception as fault:  # np.load keeps no list of what it raises
         raise LumigraphError(
             f"{path} is not LLFF's table of 17 numbers for each image; make or copy it again"
         ) from fault
@@ -47,7 +50,7 @@ def read(folder: Path) -> Capture:
     for name, files, line in zip(names, versions(folders, names), table, strict=True):
         matrix, depths = line[:15].reshape(3, 5), line[15:]
         down, right, backward, position, (height, width, focal) = matrix.T
-        if not (np.isfinite(line).all() and min(height, width, focal) > 0):
+        if not (np.isfinite(line).all() and 1 <= min(height, width) and max(height, width) <= 1e5 and focal > 0):
             raise LumigraphError(f"{path} has no usable numbers for image {name}; make or copy it again")
         size = (round(width), round(height))
         lens = Pinhole(torch.tensor([[focal, focal]]).float(), torch.tensor([[width / 2, height / 2]]).float())

@@ -12,6 +12,7 @@ from plyfile import PlyData
 
 from ..dataset import splits_of
 from ..errors import LumigraphError, LumigraphWarning
+from ..memory import free_memory
 from ..mesh import Mesh
 from ..names import natural
 from ..progress import track
@@ -20,6 +21,7 @@ from ..shapes import Shape, Shapes, normalised
 SUFFIXES = (".obj", ".ply", ".off", ".stl", ".glb", ".gltf")
 STANDING = (".stl", ".off")  # by custom with +z up; the others have +y up
 Y_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])  # to +z
+FARTHEST, NOTHING = 1e12, 1e-12  # units of a file that points may be from its origin, and that are no distance
 GREY = 160  # of what has no colour
 
 
@@ -56,6 +58,8 @@ def read_shape(path: Path, name: str) -> Shape:
     """All that one file holds, as one shape. Raises LumigraphError if that is nothing."""
     import trimesh  # which takes a while
 
+    if path.stat().st_size > free_memory():
+        raise LumigraphError(f"{path} is larger than the memory that is free; make it smaller")
     try:
         loaded: Any = trimesh.load(path, process=False, file_type=path.suffix[1:].lower())
         parts = loaded.dump() if isinstance(loaded, trimesh.Scene) else [loaded]
@@ -66,12 +70,24 @@ def read_shape(path: Path, name: str) -> Shape:
     clouds = [part for part in parts if len(getattr(part, "vertices", ()))]
     if not meshes and not clouds:
         raise LumigraphError(f"{path} holds neither triangles nor points; name another file")
+    if not all(map(is_sound, meshes or clouds[:1])):
+        raise LumigraphError(f"{path} has corners without three numbers, or triangles of corners that it has not")
     made = joined(meshes) if meshes else cloud(clouds[0])
-    if not np.isfinite(made.vertices).all() or not np.ptp(made.vertices, 0).max() > 0:
-        raise LumigraphError(f"{path} has points that are not finite, or all in one place; name another file")
+    if not (np.abs(made.vertices) <= FARTHEST).all() or not np.ptp(made.vertices, 0).max() > NOTHING:
+        raise LumigraphError(
+            f"{path} has points that are not finite or farther than {FARTHEST:g} units, or all in one place; name "
+            "another file"
+        )
     return normalised(
         name, made, None if meshes else normals_of(path), None if path.suffix.lower() in STANDING else Y_UP
     )
+
+
+def is_sound(part: Any) -> bool:
+    """Whether each corner has three numbers, and each triangle three of the corners that there are."""
+    vertices, faces = np.asarray(part.vertices), np.asarray(getattr(part, "faces", np.zeros((0, 3), np.int64)))
+    threes = vertices.ndim == faces.ndim == 2 and vertices.shape[1] == faces.shape[1] == 3
+    return threes and not (len(faces) and (faces.min() < 0 or faces.max() >= len(vertices)))
 
 
 def joined(parts: list[Any]) -> Mesh:
@@ -110,7 +126,10 @@ def normals_of(path: Path) -> Float[np.ndarray, "point 3"] | None:
     """The normals of a cloud of points, of unit length; None where its file has none."""
     if path.suffix.lower() != ".ply":
         return None
-    table = PlyData.read(path)["vertex"].data
+    try:
+        table = PlyData.read(path)["vertex"].data
+    except Exception:  # read by another library before, which knows of no normals either
+        return None
     if not {"nx", "ny", "nz"} <= set(table.dtype.names):
         return None
     found = np.stack([table[axis].astype(np.float64) for axis in ("nx", "ny", "nz")], -1)

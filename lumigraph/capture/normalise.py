@@ -30,6 +30,7 @@ BOX_SHARE = 0.5  # of the distance from which things are looked at: half-size of
 SAME_WAY = 0.5  # length of the mean viewing direction, below which cameras look around themselves rather than one way
 BEFORE_NEAREST = 0.4  # rays begin at this share of the distance to the nearest thing seen
 SMALLEST_NEAR = 1e-3
+SAME_PLACE = 1e-9  # units of the source that are nothing
 SAMPLED_POINTS, SAMPLED_CAMERAS = 5000, 64
 
 
@@ -146,7 +147,7 @@ def find_gaze(capture: Capture, cameras: Camera, upright: np.ndarray) -> Gaze:
     else:
         away = np.linalg.norm(position - meeting, axis=-1) if converging else None
         spread = np.linalg.norm(position - position.mean(0), axis=-1).mean()
-        middle = np.median(away) if away is not None else 3 * spread or 1.0
+        middle = np.median(away) if away is not None else 3 * spread if spread > SAME_PLACE else 1.0
         nearest = 0.25 * (away.min() if away is not None else middle)
     if converging:
         centre, distance = meeting, float(np.median(np.linalg.norm(position - meeting, axis=-1)))
@@ -222,7 +223,7 @@ def where_axes_meet(position: np.ndarray, forward: np.ndarray) -> tuple[np.ndarr
     if np.linalg.eigvalsh(across.mean(0))[0] < CONVERGING:
         return position.mean(0), False
     meeting = np.linalg.solve(across.sum(0), (across @ position[:, :, None]).sum(0))[:, 0]
-    in_front = ((meeting - position) * forward).sum(-1) > 0
+    in_front = ((meeting - position) * forward).sum(-1) > SAME_PLACE
     return meeting, bool(in_front.mean() > 0.8)
 
 

@@ -6,6 +6,7 @@ Pillow keeps 16 bits of grey only, so colours of 16 bits and EXR go through FFmp
 from __future__ import annotations
 
 import struct
+import zipfile
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,6 +16,7 @@ import av
 import numpy as np
 from PIL import ExifTags, Image, TiffImagePlugin
 
+from ..memory import free_memory
 from ..srgb import srgb_from_linear
 
 Tag = ExifTags.Base
@@ -22,6 +24,7 @@ PNG, EXR = b"\x89PNG\r\n\x1a\n", b"\x76\x2f\x31\x01"  # how these files begin
 EXR_HALF = 1  # among the types of its channels
 PNG_CHANNELS = {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}  # by PNG's colour type
 TIFF_SUFFIXES, TIFF_FLOAT = (".tif", ".tiff"), 3  # and its sample format
+LARGEST_SIDE, COPIES = 10**5, 4  # pixels; and how often one is held while it is decoded, turned and reduced
 PLANES = ("g", "b", "r", "a")  # in which FFmpeg keeps floating point
 ARRAYS = {"labels": ("labels", "ids", "semantics")}  # what an .npz may call them
 
@@ -40,6 +43,9 @@ class Kind:
     channels: int
     linear: bool = False
 
+    def __post_init__(self) -> None:
+        check_pixels(self.size, self.dtype.itemsize * self.channels)
+
     @property
     def deep(self) -> bool:
         """Whether eight bits do not hold it, and this file can give more."""
@@ -51,6 +57,35 @@ class Kind:
         if not self.linear:
             return "sRGB"
         return "linear premultiplied" if self.dtype.kind == "f" and self.channels == 4 else "linear"
+
+
+def check_pixels(size: tuple[int, int], each: int = 4) -> None:
+    """Raise ValueError for a declared picture that nothing has, or that takes more memory to read than is free.
+
+    each: bytes of a pixel
+    """
+    width, height = size
+    if not (1 <= width <= LARGEST_SIDE and 1 <= height <= LARGEST_SIDE):
+        raise ValueError(f"it says that it has {width}x{height} pixels")
+    needed, free = COPIES * each * width * height, free_memory()
+    if needed > free:
+        raise ValueError(
+            f"its {width}x{height} pixels take {needed / 1e9:.1f} GB to read, and {free / 1e9:.1f} GB are free"
+        )
+
+
+def load_array(path: Path) -> Any:
+    """What np.load gives of a file, never pickled, without asking for more memory than its bytes or the machine have.
+
+    Raises ValueError, and what np.load raises.
+    """
+    if not zipfile.is_zipfile(path):
+        return np.load(path, mmap_mode="r", allow_pickle=False)
+    with zipfile.ZipFile(path) as packed:
+        unpacked = sum(member.file_size for member in packed.infolist())
+    if unpacked > free_memory():
+        raise ValueError(f"it unpacks to {unpacked / 1e9:.1f} GB, more than is free")
+    return np.load(path, allow_pickle=False)
 
 
 def kind_of(path: Path, name: str = "") -> Kind:
@@ -106,6 +141,8 @@ def exr_kind(path: Path) -> Kind:
         (size,) = struct.unpack_from("<i", data, type_ends + 1)
         found[data[at:name_ends].decode()] = data[type_ends + 5 : type_ends + 5 + size]
         at = type_ends + 5 + size
+    left, top, right, bottom = struct.unpack("<4i", found["dataWindow"])
+    check_pixels((right - left + 1, bottom - top + 1))
     left, top, right, bottom = struct.unpack("<4i", found["displayWindow"])
     names, types, at = [], [], 0
     while (channels := found["channels"])[at]:
@@ -134,7 +171,7 @@ def read_numbers(path: Path, name: str = "") -> np.ndarray:
 
 def read_array(path: Path, name: str) -> np.ndarray:
     """The array of a NumPy file; of several the one that is called so."""
-    found = np.load(path, allow_pickle=False)
+    found = load_array(path)
     if isinstance(found, np.ndarray):
         array = found
     else:
@@ -144,6 +181,8 @@ def read_array(path: Path, name: str) -> np.ndarray:
                 raise ValueError(f"it holds {', '.join(found.files)}, and none is called {name}")
             array = found[wanted[0]]
     array = array[..., 0] if array.ndim == 3 and array.shape[2] == 1 else array
+    if array.dtype.kind not in "biuf":
+        raise ValueError(f"it holds {array.dtype}, where a picture has numbers")
     if array.ndim not in (2, 3):
         raise ValueError(f"it holds an array of {array.ndim} axes, where a picture has two or three")
     return array

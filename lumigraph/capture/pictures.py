@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 import zlib
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -13,9 +14,10 @@ import numpy as np
 from PIL import Image, ImageOps
 
 from ..errors import LumigraphError
+from ..files import is_file
 from ..images import ImageSource, resized
 from .capture import Plane, Shot
-from .numbers import TIFF_SUFFIXES, Kind, as_bytes, colours, kind_of, read_numbers, tiff_tags, turned
+from .numbers import TIFF_SUFFIXES, Kind, as_bytes, check_pixels, colours, kind_of, read_numbers, tiff_tags, turned
 
 LONGEST_SIDE = 1100  # pixels that a photograph is reduced to, where the user asks for nothing
 SUFFIXES = (".png", ".jpg", ".jpeg", ".JPG", ".JPEG", ".PNG", ".webp", ".tif", ".tiff", ".bmp", ".exr")
@@ -25,13 +27,14 @@ EXIF_UPRIGHT = (None, 0, 1)
 EXIF_SIDEWAYS = (5, 6, 7, 8)
 
 Size = tuple[int, int]
+warnings.filterwarnings("ignore", category=Image.DecompressionBombWarning)  # `check_pixels` knows what is too much
 
 
 def find_file(path: Path) -> Path:
     """The file itself, or where it was named without a suffix, the image of that name. The file may not exist."""
-    if path.is_file():
+    if is_file(path) or not path.name:
         return path
-    return next((p for s in SUFFIXES if (p := path.with_name(path.name + s)).is_file()), path)
+    return next((p for s in SUFFIXES if is_file(p := path.with_name(path.name + s))), path)
 
 
 def list_images(folder: Path) -> list[str]:
@@ -191,6 +194,7 @@ def measure(path: Path) -> tuple[Size, int | None]:
         if path.suffix.lower() in TIFF_SUFFIXES:
             return kind_of(path).size, tiff_tags(path).get(EXIF_ORIENTATION)
         with Image.open(path) as image:
+            check_pixels(image.size)
             return image.size, image.getexif().get(EXIF_ORIENTATION)
 
 

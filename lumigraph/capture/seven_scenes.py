@@ -62,7 +62,8 @@ def read(folder: Path) -> Capture:
 
 def read_matrix(path: Path, size: int) -> np.ndarray:
     try:
-        matrix = np.array([line.split() for line in path.read_text().splitlines() if line.strip()], np.float64)
+        lines = path.read_text(errors="replace").splitlines()
+        matrix = np.array([line.split() for line in lines if line.strip()], np.float64)
         assert matrix.shape == (size, size)
     except (ValueError, AssertionError) as fault:
         raise LumigraphError(f"{path} holds no {size}x{size} matrix; correct or remove it") from fault

@@ -7,16 +7,17 @@ val_filenames.
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import torch
 
 from ..errors import LumigraphError
-from ..files import read_json
+from ..files import is_file, read_json
 from ..lens import Equirectangular, Fisheye, Lens, OpenCV, Pinhole
+from ..ranges import Coordinate, Name, Point, Positive, Row, between, typed
 from . import colmap
 from .capture import Capture, Plane, Shot
 from .pictures import EXIF_SIDEWAYS, find_file, measure, reductions, versions
@@ -25,6 +26,7 @@ from .points import SparsePoints, read_ply, similarity
 LOOKED_FOR = "transforms.json (instant-ngp, nerfstudio)"
 OPENCV_FROM_OPENGL = np.array([1.0, -1.0, -1.0])  # signs of the camera's axes
 NGP_SCALE = 0.33  # instant-ngp's unit cube is 1 / 0.33 of the file's units wide
+LARGEST_FACT = 10_000  # numbers that may be known of one photograph
 
 # Of a layer, what a frame may call its file: nerfstudio's name or instant-ngp's, and what annotated captures say.
 PLANES = {
@@ -36,6 +38,70 @@ FACTS = ("exposure", "boxes", "body")  # of a photograph
 NOTHING = (1e10, 65504.0)  # depth that Blender writes where nothing is, in floats and in halves
 
 Json = dict[str, Any]
+Across = Annotated[float, between(1, 1e5)]  # pixels
+Focal = Annotated[float, between(1e-2, 1e7)]  # pixels
+Centre = Annotated[float, between(-1e7, 1e7)]  # pixels
+Bend = Annotated[float, between(-1e4, 1e4)]
+Angle = Annotated[float, between(1e-6, 3.14159)]  # radians
+
+
+@dataclass(frozen=True)
+class Whole:
+    """What a file says beside lenses. Paths may lead anywhere: many captures name ../images, some absolute paths."""
+
+    frames: list[Json]
+    aabb_scale: Positive | None = None
+    scale: Positive = NGP_SCALE
+    up: Point | None = None
+    ply_file_path: Name | None = None
+    train_filenames: list[str] | None = None
+    val_filenames: list[str] | None = None
+    test_filenames: list[str] | None = None
+
+
+@dataclass(frozen=True)
+class Made:
+    """Of capture.json, what a scene was made from, by which name its making is known, and what was said of it."""
+
+    sources: list[str] = field(default_factory=list)
+    key: str = ""
+    warnings: list[str] = field(default_factory=list)
+
+
+@dataclass(frozen=True)
+class Posed:
+    """A frame, with what the file says of all frames."""
+
+    file_path: Name
+    transform_matrix: list[Row]
+    w: Across | None = None
+    h: Across | None = None
+    camera_model: str = "OPENCV"
+    is_fisheye: bool | float | None = None
+    fl_x: Focal | None = None
+    fl_y: Focal | None = None
+    camera_angle_x: Angle | None = None
+    camera_angle_y: Angle | None = None
+    cx: Centre | None = None
+    cy: Centre | None = None
+    k1: Bend | None = None
+    k2: Bend | None = None
+    k3: Bend | None = None
+    k4: Bend | None = None
+    k5: Bend | None = None
+    k6: Bend | None = None
+    p1: Bend | None = None
+    p2: Bend | None = None
+    time: Coordinate | None = None
+    mask_path: Name | None = None
+    depth_file_path: Name | None = None
+    depth_path: Name | None = None
+    labels_file_path: Name | None = None
+    semantics_path: Name | None = None
+    normals_file_path: Name | None = None
+    depth_unit_scale_factor: Positive | None = None
+    integer_depth_scale: Positive | None = None
+    is_euclidean_depth: bool | float | None = None
 
 
 def recognises(folder: Path) -> bool:
@@ -48,16 +114,18 @@ def read(folder: Path) -> Capture:
     Raises LumigraphError for malformed JSON, frames without a usable pose, and unknown lenses.
     """
     path = folder / "transforms.json"
-    whole = read_frames_file(path)
+    whole, plain = read_frames_file(path)
     splits = published_splits(whole)
-    shots, missing = read_shots(path, whole)
+    shots, missing = read_shots(path, plain)
     if splits:
         shots = [replace(shot, split=splits[shot.name]) for shot in shots if shot.name in splits]
         missing = [name for name in missing if name in splits]
     points = find_points(folder, whole, shots, missing)
     reach = None
-    if points is None and "aabb_scale" in whole:
-        reach = 0.5 * float(whole["aabb_scale"]) / float(whole.get("scale", NGP_SCALE))
+    if points is None and whole.aabb_scale is not None:
+        reach = 0.5 * whole.aabb_scale / whole.scale
+    if whole.up is not None and not any(whole.up):
+        raise LumigraphError(f'{path}: "up" points nowhere; correct it or remove it')
     return Capture(
         str(folder),
         shots,
@@ -66,82 +134,96 @@ def read(folder: Path) -> Capture:
         None if points is None else points.sightings,
         missing,
         reach=reach,
-        up=read_up(path, whole),
+        up=whole.up,
+        told=folded(folder),
     )
 
 
-def read_up(path: Path, whole: Json) -> tuple[float, float, float] | None:
-    """Which way is up, where the file says so, as instant-ngp's may."""
-    if "up" not in whole:
-        return None
-    try:
-        x, y, z = (float(value) for value in whole["up"])
-    except (TypeError, ValueError):
-        x = y = z = math.nan
-    if not 0 < math.hypot(x, y, z) < math.inf:
-        raise LumigraphError(f'{path}: "up" should be three numbers, and is {whole["up"]!r}; correct it or remove it')
-    return x, y, z
+def folded(folder: Path) -> list[str]:
+    """What `lumigraph capture` said of folds, where it made the folder: it has seen what photographs share."""
+    path = folder / "capture.json"
+    said = read_json(path, Made).warnings if path.is_file() else []
+    return [f"{folder}: {warning}" for warning in said if "folded" in warning]
 
 
-def read_frames_file(path: Path) -> Json:
-    whole = read_json(path)
-    if not isinstance(whole, dict) or not isinstance(whole.get("frames"), list):
-        raise LumigraphError(f'{path} has no list called "frames"; it is not a file of camera poses')
-    return whole
+def read_frames_file(path: Path) -> tuple[Whole, Json]:
+    """What a file says, with types for what concerns all of it, and as it stands there."""
+    plain = read_json(path)
+    return typed(Whole, plain, path), plain
 
 
 def read_shots(path: Path, whole: Json, split: str | None = None) -> tuple[list[Shot], list[str]]:
-    """The photographs that a file lists and that exist, and the names of those that do not."""
+    """The photographs that a file lists and that exist, and the names of those that do not.
+
+    whole: the file as it stands. What it says of a lens holds for every frame that says nothing else.
+    """
     folder, shots, missing = path.parent, [], []
-    for number, frame in enumerate(whole["frames"]):
-        if not isinstance(frame, dict) or not isinstance(frame.get("file_path"), str):
-            raise LumigraphError(f'{path}: frame {number} has no "file_path"; add it or remove the frame')
-    names = [frame["file_path"] for frame in whole["frames"]]
-    for name, frame, files in zip(names, whole["frames"], find_versions(folder, names), strict=True):
+    shared = {name: value for name, value in whole.items() if name != "frames"}
+    said = [typed(Posed, shared | frame, f"{path}: {called(frame, i)}") for i, frame in enumerate(whole["frames"])]
+    names = [about.file_path for about in said]
+    for name, frame, about, files in zip(names, whole["frames"], said, find_versions(folder, names), strict=True):
         if not files:
             missing.append(name)
             continue
-        about, where = {**whole, **frame}, f"{path}: frame {name}"
-        size = stated_size(about, where) or upright_size(files)
+        where = f"{path}: {called(frame)}"
+        size = stated_size(about) or upright_size(files)
+        lens = read_lens(about, size, where)
         shots.append(
             Shot(
                 name=name,
-                pose=read_pose(frame, where),
-                lens=read_lens(about, size, where),
+                pose=read_pose(about, where),
+                lens=lens,
                 size=size,
                 image=files,
-                mask=folder / about["mask_path"] if isinstance(about.get("mask_path"), str) else None,
+                mask=None if about.mask_path is None else folder / about.mask_path,
                 split=split,
-                time=number_or_none(about, "time", where),
-                planes=read_planes(path.parent, about, read_lens(about, size, where), where, missing),
-                about={name: about[name] for name in FACTS if name in frame},
+                time=about.time,
+                planes=read_planes(folder, about, lens, missing),
+                about={name: fact(frame[name], name, where) for name in FACTS if frame.get(name) is not None},
             )
         )
     return shots, missing
 
 
-def read_planes(folder: Path, about: Json, lens: Lens, where: str, missing: list[str]) -> dict[str, Plane]:
+def called(frame: Json, number: int = 0) -> str:
+    """A frame's name for people."""
+    return f"frame {frame.get('file_path', number)}"
+
+
+def fact(value: Any, name: str, where: str) -> np.ndarray:
+    """What is known of a photograph: a number, or a small array of them. Raises LumigraphError for anything else."""
+    try:
+        numbers = np.asarray(value, np.float64)
+    except (ValueError, TypeError, OverflowError) as fault:
+        raise LumigraphError(f'{where} has "{name}", which is no number and no array of them; correct it') from fault
+    if numbers.size > LARGEST_FACT:
+        raise LumigraphError(f'{where} has "{name}" of {numbers.size} numbers; {LARGEST_FACT} are the most')
+    return numbers
+
+
+def read_planes(folder: Path, about: Posed, lens: Lens, missing: list[str]) -> dict[str, Plane]:
     """Depth, labels and normals whose files a frame names; what it names and is not there joins `missing`."""
     found = {}
-    for name, keys in PLANES.items():
-        key = next((key for key in keys if isinstance(about.get(key), str)), None)
+    for kind, keys in PLANES.items():
+        key = next((key for key in keys if getattr(about, key) is not None), None)
         if key is None:
             continue
-        file = find_file(folder / about[key])
-        if not file.is_file():
-            missing.append(about[key])
-        elif name == "depth":
-            found[name] = depth_plane(file, key, about, lens, where)
+        name = getattr(about, key)
+        file = find_file(folder / name)
+        if not is_file(file):
+            missing.append(name)
+        elif kind == "depth":
+            found[kind] = depth_plane(file, key, about, lens)
         else:
-            found[name] = Plane(file, {"labels": "index", "normals": "direction"}[name])
+            found[kind] = Plane(file, {"labels": "index", "normals": "direction"}[kind])
     return found
 
 
-def depth_plane(file: Path, key: str, about: Json, lens: Lens, where: str) -> Plane:
+def depth_plane(file: Path, key: str, about: Posed, lens: Lens) -> Plane:
     """Depth as nerfstudio stores it, thousandths of a unit unless the file says otherwise, or as instant-ngp does."""
-    stated = number_or_none(about, "integer_depth_scale" if key == "depth_path" else "depth_unit_scale_factor", where)
+    stated = about.integer_depth_scale if key == "depth_path" else about.depth_unit_scale_factor
     scale = stated if stated is not None else 1.0 if file.suffix.lower() == ".exr" else 1e-3
-    along_ray = isinstance(lens, Equirectangular) or bool(about.get("is_euclidean_depth"))
+    along_ray = isinstance(lens, Equirectangular) or bool(about.is_euclidean_depth)
     whole = file.suffix.lower() in (".png", ".tif", ".tiff")
     unknown, empty = ((0.0, 65535.0), ()) if whole else ((0.0,), NOTHING)
     return Plane(file, "distance" if along_ray else "z-depth", scale, unknown, empty)
@@ -150,7 +232,7 @@ def depth_plane(file: Path, key: str, about: Json, lens: Lens, where: str) -> Pl
 def find_versions(folder: Path, names: list[str]) -> list[dict[int, Path]]:
     """Each photograph's own file, and reduced ones where it lies in `images` and there are images_2, images_4..."""
     files = [find_file(folder / name) for name in names]
-    found = [{1: path} if path.is_file() else {} for path in files]
+    found = [{1: path} if is_file(path) else {} for path in files]
     inside = [i for i, path in enumerate(files) if path.parent == folder / "images"]
     for i, more in zip(inside, versions(reductions(folder / "images"), [files[i].name for i in inside]), strict=True):
         found[i] |= more
@@ -163,46 +245,21 @@ def upright_size(files: dict[int, Path]) -> tuple[int, int]:
     return (height, width) if orientation in EXIF_SIDEWAYS else (width, height)
 
 
-def read_pose(frame: Json, where: str) -> np.ndarray:
-    try:
-        pose = np.array(frame["transform_matrix"], np.float64)
-        assert pose.shape in ((4, 4), (3, 4))
-    except (KeyError, ValueError, TypeError, AssertionError) as fault:
-        raise LumigraphError(
-            f"{where} has no 4x4 transform_matrix of numbers; correct it or remove the frame"
-        ) from fault
-    pose = pose[:3].copy()
+def read_pose(about: Posed, where: str) -> np.ndarray:
+    if len(about.transform_matrix) not in (3, 4):
+        raise LumigraphError(f"{where} has no 4x4 transform_matrix of numbers; correct it or remove the frame")
+    pose = np.array(about.transform_matrix[:3], np.float64)
     pose[:, :3] *= OPENCV_FROM_OPENGL
     return pose
 
 
-def number_or_none(about: Json, key: str, where: str) -> float | None:
-    value = about.get(key)
-    if value is None:
-        return None
-    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-        raise LumigraphError(f'{where} has "{key}": {value!r}, which is no number; correct it')
-    return float(value)
+def stated_size(about: Posed) -> tuple[int, int] | None:
+    return None if about.w is None or about.h is None else (round(about.w), round(about.h))
 
 
-def stated_size(about: Json, where: str) -> tuple[int, int] | None:
-    width, height = (number_or_none(about, key, where) for key in "wh")
-    if width is None or height is None:
-        return None
-    if width < 1 or height < 1:
-        raise LumigraphError(f"{where} has a picture of {width:g}x{height:g} pixels; correct w and h")
-    return round(width), round(height)
-
-
-def read_lens(about: Json, size: tuple[int, int], where: str) -> Lens:
-    def get(key: str, otherwise: float | None = None) -> float:
-        value = number_or_none(about, key, where)
-        if value is None and otherwise is None:
-            raise LumigraphError(f'{where} has neither "fl_x" nor "camera_angle_x"; add the focal length in pixels')
-        return otherwise if value is None else value  # type: ignore[return-value]
-
+def read_lens(about: Posed, size: tuple[int, int], where: str) -> Lens:
     width, height = size
-    model = "OPENCV_FISHEYE" if about.get("is_fisheye") else str(about.get("camera_model", "OPENCV")).upper()
+    model = "OPENCV_FISHEYE" if about.is_fisheye else about.camera_model.upper()
     if model in ("EQUIRECTANGULAR", "SPHERICAL"):
         return Equirectangular(row(width, height))
     if model not in ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE", "OPENCV_FISHEYE"):
@@ -210,36 +267,31 @@ def read_lens(about: Json, size: tuple[int, int], where: str) -> Lens:
             f"{where} has camera_model {model}; only PINHOLE, OPENCV, OPENCV_FISHEYE and EQUIRECTANGULAR are known, "
             f"so undistort the photographs first"
         )
-    focal_x = focal_from_angle(about, "camera_angle_x", width, where) if about.get("fl_x") is None else get("fl_x")
-    focal_y = get("fl_y", focal_from_angle(about, "camera_angle_y", height, where) or focal_x)
-    focal_x = get("fl_x", focal_x)
-    if min(focal_x, focal_y) <= 0:
-        raise LumigraphError(f"{where} has focal length {focal_x:g} x {focal_y:g}; it must be positive")
-    focal, centre = row(focal_x, focal_y), row(get("cx", width / 2), get("cy", height / 2))
+    focal_x = about.fl_x or focal_from_angle(about.camera_angle_x, width)
+    if focal_x is None:
+        raise LumigraphError(f'{where} has neither "fl_x" nor "camera_angle_x"; add the focal length in pixels')
+    focal_y = about.fl_y or focal_from_angle(about.camera_angle_y, height) or focal_x
+    centre_x, centre_y = (half if x is None else x for x, half in ((about.cx, width / 2), (about.cy, height / 2)))
+    focal, centre = row(focal_x, focal_y), row(centre_x, centre_y)
     if model == "OPENCV_FISHEYE":
-        return Fisheye(focal, centre, row(*(get(f"k{i}", 0) for i in (1, 2, 3, 4))))
-    bends = [get(key, 0) for key in ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")]
+        return Fisheye(focal, centre, row(*(getattr(about, f"k{i}") or 0.0 for i in (1, 2, 3, 4))))
+    bends = [getattr(about, key) or 0.0 for key in ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")]
     if model == "OPENCV" and any(bends):
         return OpenCV(focal, centre, row(*bends))
     return Pinhole(focal, centre)
 
 
-def focal_from_angle(about: Json, key: str, pixels: int, where: str) -> float | None:
-    angle = number_or_none(about, key, where)
-    if angle is None:
-        return None
-    if not 0 < angle < math.pi:
-        raise LumigraphError(f'{where} has "{key}": {angle:g}, which is no field of view in radians; correct it')
-    return 0.5 * pixels / math.tan(0.5 * angle)
+def focal_from_angle(angle: float | None, pixels: int) -> float | None:
+    return None if angle is None else 0.5 * pixels / math.tan(0.5 * angle)
 
 
 def row(*numbers: float) -> torch.Tensor:
     return torch.tensor([numbers], dtype=torch.float32)
 
 
-def published_splits(whole: Json) -> dict[str, str]:
+def published_splits(whole: Whole) -> dict[str, str]:
     """nerfstudio's lists of file names, as name to split."""
-    lists = {split: whole.get(f"{split}_filenames") for split in ("train", "val", "test")}
+    lists = {"train": whole.train_filenames, "val": whole.val_filenames, "test": whole.test_filenames}
     if not any(lists.values()):
         return {}
     if not lists["test"]:
@@ -247,10 +299,10 @@ def published_splits(whole: Json) -> dict[str, str]:
     return {name: split for split, names in lists.items() for name in names or []}
 
 
-def find_points(folder: Path, whole: Json, shots: list[Shot], missing: list[str]) -> SparsePoints | None:
+def find_points(folder: Path, whole: Whole, shots: list[Shot], missing: list[str]) -> SparsePoints | None:
     """The points a file names, else those of a COLMAP model of the same photographs, turned into this file's frame."""
-    if isinstance(name := whole.get("ply_file_path"), str):
-        if (folder / name).is_file():
+    if (name := whole.ply_file_path) is not None:
+        if is_file(folder / name):
             return read_ply(folder / name)
         missing.append(name)
     place = colmap.model_folder(folder)

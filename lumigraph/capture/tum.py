@@ -7,12 +7,14 @@ the colours: 16 bits, 5000 to a metre along the optical axis, 0 where nothing wa
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 
 import numpy as np
 import torch
 
 from ..errors import LumigraphError
+from ..files import is_file
 from ..geometry import to_matrix
 from ..lens import Lens, OpenCV, Pinhole
 from .capture import Capture, Plane, Shot
@@ -21,6 +23,7 @@ from .depth_points import depth_points
 LOOKED_FOR = "rgb.txt and groundtruth.txt (TUM's RGB-D benchmark)"
 APART = 0.02  # seconds that two moments may differ by and still be one, as in the benchmark's own tools
 METRE = 5000  # in numbers of a depth picture
+POSE_COLUMNS = 8  # of a trajectory
 SIZE = (640, 480)
 # What the benchmark publishes, with pixel centres at whole numbers, for the camera that a folder's name tells: focal
 # length, centre, k1 k2 p1 p2 k3. A folder's own camera.txt has the same nine numbers, or the first four.
@@ -38,7 +41,7 @@ def recognises(folder: Path) -> bool:
 
 def read(folder: Path) -> Capture:
     """Photographs without a pose of their moment are left out. Raises LumigraphError for lists that hold no numbers."""
-    poses = read_rows(folder / "groundtruth.txt", 8)
+    poses = read_rows(folder / "groundtruth.txt", POSE_COLUMNS)
     moments = np.array([float(row[0]) for row in poses])
     pictures = read_rows(folder / "rgb.txt", 2)
     depths = read_rows(folder / "depth.txt", 2) if (folder / "depth.txt").is_file() else []
@@ -48,13 +51,13 @@ def read(folder: Path) -> Capture:
         pose, depth = nearest(moments, float(moment)), nearest(depth_moments, float(moment))
         if pose is None:
             continue
-        if not (folder / name).is_file():
+        if not is_file(folder / name):
             missing.append(name)
             continue
         planes = {}
         if depth is not None:
             path = folder / depths[depth][1]
-            if path.is_file():
+            if is_file(path):
                 planes["depth"] = Plane(path, "z-depth", 1 / METRE, unknown=(0, 65535))
             else:
                 missing.append(depths[depth][1])
@@ -72,11 +75,15 @@ def read_rows(path: Path, columns: int) -> list[list[str]]:
     rows = [line.split() for line in path.read_text(errors="replace").splitlines() if line.strip()[:1] not in ("", "#")]
     try:
         for row in rows:
-            assert len(row) >= columns
-            [float(x) for x in (row[:columns] if columns > 2 else row[:1])]
-    except (ValueError, AssertionError) as fault:
+            numbers = [float(x) for x in (row[:columns] if columns > 2 else row[:1])]
+            if len(row) < columns or not all(map(math.isfinite, numbers)):
+                raise ValueError("a number is missing or not finite")
+            if columns == POSE_COLUMNS and not any(numbers[4:]):
+                raise ValueError("a quaternion of zero is no rotation")
+    except ValueError as fault:
         raise LumigraphError(
-            f"{path} holds {' '.join(row)!r}, where {columns} columns after a moment were looked for; correct that line"
+            f"{path} holds {' '.join(row)[:200]!r}, where {columns} columns were looked for ({fault}); "
+            "correct that line"
         ) from fault
     return [row[:columns] for row in rows]
 
@@ -92,7 +99,7 @@ def read_lens(folder: Path) -> Lens:
     numbers: tuple[float, ...] = next((c for name, c in CAMERAS.items() if name in folder.resolve().name), ANY_CAMERA)
     if path.is_file():
         try:
-            numbers = tuple(float(x) for x in path.read_text().split())
+            numbers = tuple(float(x) for x in path.read_text(errors="replace").split())
             assert len(numbers) in (4, 9)
         except (ValueError, AssertionError) as fault:
             raise LumigraphError(

@@ -5,8 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 
 from ..errors import LumigraphError
-from ..files import claim, explained
+from ..files import claim, exists, expanded, explained
 from ..gaussians import Gaussians
+from ..memory import free_memory
 from ..progress import counting
 from . import compressed_ply, ply, splat, spz
 from .checks import checked
@@ -22,12 +23,14 @@ def read_gaussians(path: Path | str) -> Gaussians:
     Which of its two layouts a PLY file has, its header says. Infinite logits of opacity become ±20, rotations of
     length zero none at all. Raises LumigraphError for anything else that keeps the file from being a sound cloud.
     """
-    path = Path(path).expanduser()
+    path = expanded(path)
     suffix = check_ending(path)
     with explained(path):
         _refuse_folder(path)
         if path.stat().st_size == 0:
             raise LumigraphError(f"{path} is empty; copy or download it again")
+        if path.stat().st_size > free_memory():
+            raise LumigraphError(f"{path} is larger than the memory that is free; take a larger machine")
         with counting(f"Reading {path.name}"):
             gaussians = _read(path, suffix)
     return checked(gaussians, str(path), "restore it from a copy, or remove them with an editor of splats")
@@ -40,7 +43,7 @@ def write_gaussians(path: Path | str, gaussians: Gaussians) -> None:
     Gaussians and not their order, `.splat` neither harmonics beyond the plain colour nor `antialiased`. Raises
     LumigraphError where the suffix is none of SUFFIXES, the cloud is not sound or the disk refuses.
     """
-    path = Path(path).expanduser()
+    path = expanded(path)
     write = WRITERS[check_ending(path)]
     claim(path, "splats")
     with counting(f"Writing {path.name}"):
@@ -49,7 +52,7 @@ def write_gaussians(path: Path | str, gaussians: Gaussians) -> None:
 
 def is_splat_file(path: Path | str) -> bool:
     """Whether a name is one that `read_gaussians` takes: known by its suffix, whether there or not, but no folder."""
-    path = Path(path).expanduser()
+    path = expanded(path)
     return path.name.lower().endswith(SUFFIXES) and not path.is_dir()
 
 
@@ -71,6 +74,6 @@ def check_ending(path: Path) -> str:
 
 
 def _refuse_folder(path: Path) -> None:
-    if path.exists() and not path.is_file():
+    if exists(path) and not path.is_file():
         what = "a folder" if path.is_dir() else "no ordinary file"
         raise LumigraphError(f"{path} is {what}; name a file that ends in {', '.join(SUFFIXES)}")

@@ -3,14 +3,37 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import torch
 
 from ..errors import LumigraphError
 from ..gaussians import Gaussians
+from ..memory import free_memory
 
 SPOKEN = {"means": "means", "quaternions": "rotations", "log_scales": "scales", "harmonics": "colours"}
 CERTAIN = 20.0  # a logit whose sigmoid is 1 in float32
+WORKING = 28  # bytes that each number of a Gaussian takes while its file is read: itself, and what it is made from
+PLAUSIBLE, SMALL = 100, 1 << 26  # times that clouds can be packed, and unpacked bytes up to which any share is believed
+
+
+def check_room(path: Path, count: int, harmonics: int = 1, packed: int | None = None, unpacked: int = 0) -> None:
+    """Raise LumigraphError for a cloud that the machine cannot hold, or that its file can only pretend to hold.
+
+    count, harmonics: Gaussians that the file promises, and coefficients of each
+    packed, unpacked: bytes of a compressed file, and what they would become
+    """
+    if packed is not None and unpacked > max(SMALL, PLAUSIBLE * packed):
+        raise LumigraphError(
+            f"{path} promises {count:,} Gaussians in {packed:,} bytes, which no cloud can be packed into; "
+            "copy or download it again"
+        )
+    needed, free = WORKING * (11 + 3 * harmonics) * count, free_memory()
+    if needed > free:
+        raise LumigraphError(
+            f"{path} promises {count:,} Gaussians, which take {needed / 1e9:.1f} GB to read, and {free / 1e9:.1f} GB "
+            "are free; reduce it with an editor of splats, or take a larger machine"
+        )
 
 
 def checked(gaussians: Gaussians, subject: str, way_out: str) -> Gaussians:

@@ -24,6 +24,7 @@ from jaxtyping import Float, Int
 from ..errors import LumigraphError
 from ..gaussians import Gaussians
 from ..kernels.spherical_harmonics import K00
+from .checks import check_room
 from .codes import LOGITS, alpha_to_byte, array, cloud, to_byte, with_largest, without_largest
 from .morton import morton_order
 from .ply import by_channel, by_coefficient, rest_names, save
@@ -61,6 +62,7 @@ def read(path: Path, header: Header | None = None) -> Gaussians:
             f"which need one for every {CHUNK} and for each; export it again"
         )
     rest = rest_names(path, header.properties.get("sh", []))
+    check_room(path, count, 1 + len(rest) // 3)
     rows = read_rows(path)
     chunk_of = np.arange(count) // CHUNK
     ends = {span: [columns(rows["chunk"], names)[chunk_of].astype(float) for names in RANGES[span]] for span in spans}

@@ -16,6 +16,7 @@ from jaxtyping import Float
 from ..errors import LumigraphError
 from ..files import replacing
 from ..gaussians import Gaussians
+from .checks import check_room
 from .codes import array, cloud
 from .ply_header import ANTIALIASED, Header, columns, read_header, read_rows
 
@@ -40,6 +41,7 @@ def read(path: Path, header: Header | None = None) -> Gaussians:
     if missing:
         raise LumigraphError(f"{path} lacks {', '.join(missing)} and so is no cloud of Gaussians; export it again")
     rest = rest_names(path, here)
+    check_room(path, header.counts["vertex"], 1 + len(rest) // 3)
     rows = read_rows(path)["vertex"]
     return cloud(
         columns(rows, MEAN),

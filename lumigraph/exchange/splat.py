@@ -18,6 +18,7 @@ from ..errors import LumigraphError
 from ..files import write_bytes
 from ..gaussians import Gaussians
 from ..kernels.spherical_harmonics import K00
+from .checks import check_room
 from .codes import LOGITS, alpha_to_byte, array, cloud, to_byte, unit
 
 RECORD = np.dtype(
@@ -28,6 +29,7 @@ THIN, WIDE = np.finfo(np.float32).tiny, np.finfo(np.float32).max  # what a scale
 
 def read(path: Path) -> Gaussians:
     """Raises LumigraphError for what is no whole number of records, and for text. A cut between two goes unnoticed."""
+    check_room(path, path.stat().st_size // RECORD.itemsize)
     data = path.read_bytes()
     if not data[:1024].strip(string.printable.encode()):
         raise LumigraphError(f"{path} is text and holds no Gaussians; name another file")

@@ -32,6 +32,7 @@ from jaxtyping import Float, UInt8
 from ..errors import LumigraphError
 from ..files import write_bytes
 from ..gaussians import Gaussians
+from .checks import check_room
 from .codes import LOGITS, alpha_to_byte, array, cloud, to_byte, with_largest, without_largest
 
 HEADER = struct.Struct("<4sIIBBBB")  # magic, version, count, degree, bits behind the point, flags, reserved
@@ -123,6 +124,7 @@ def _decode(path: Path, stream: io.BufferedIOBase, limit: int) -> Gaussians:
     widths = _widths(path, version, degree)
     if count * sum(widths) > limit:
         raise EOFError(f"{count} Gaussians are promised and cannot be there")
+    check_room(path, count, (degree + 1) ** 2, limit // DENSEST, count * sum(widths))
     columns = [np.frombuffer(_take(stream, count * width), np.uint8).reshape(count, width) for width in widths]
     behind = stream.read(LONGEST_EXTENSIONS + 1)  # to the end, where gzip's checksum is
     if len(behind) > (LONGEST_EXTENSIONS if flags & EXTENDED else 0):
@@ -138,6 +140,7 @@ def _decode_tabled(path: Path, data: bytes) -> Gaussians:
     widths = _widths(path, version, degree)
     if streams < len([width for width in widths if width]) or table + streams * STREAM.size > len(data):
         raise EOFError(f"it has no table of {streams} streams")
+    check_room(path, count, (degree + 1) ** 2, len(data), count * sum(widths))
     entries = [STREAM.unpack_from(data, table + i * STREAM.size) for i in range(streams)]
     at, columns = table + streams * STREAM.size, []
     for width, (packed, unpacked) in zip(widths, [*entries, (0, 0)], strict=False):

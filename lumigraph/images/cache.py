@@ -16,6 +16,7 @@ from typing import TypeVar
 import numpy as np
 
 from ..errors import LumigraphError
+from ..files import is_file
 
 FORMAT = 2  # of the cache's files
 MARK = "store.json"  # written last: a folder that holds it is whole
@@ -64,6 +65,12 @@ def new_file(path: Path, dtype: np.dtype | type, shape: tuple[int, ...]) -> np.m
     with open(path, "wb") as file:
         reserve(file, size)
     return np.memmap(path, dtype, "r+", shape=shape)
+
+
+def check_size(path: Path, size: int) -> None:
+    """Raise LumigraphError unless a file of the cache has so many bytes."""
+    if not is_file(path) or path.stat().st_size != size:
+        raise LumigraphError(f"{path} is damaged; delete the folder {path.parent}, which is made again when needed")
 
 
 def reserve(file, size: int) -> None:

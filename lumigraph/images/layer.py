@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from .cache import MARK, cache_folder, filled, in_parallel, key, new_file
+from .cache import MARK, cache_folder, check_size, filled, in_parallel, key, new_file
 from .resize import resized
 from .store import ImageStore
 
@@ -169,6 +169,7 @@ class Layer:
                 in_parallel(lambda image: self._fill(values, image), range(len(self._planes)))
                 values.flush()
                 (part / MARK).write_text(json.dumps({"dtype": self.dtype.str, "channels": self.channels}))
+        check_size(folder / "values", int(np.prod(shape)) * self.dtype.itemsize)
         found = np.memmap(folder / "values", self.dtype, "c", shape=shape)
         if nameless:
             shutil.rmtree(folder, ignore_errors=True)

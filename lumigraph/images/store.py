@@ -15,13 +15,22 @@ import torch
 from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
+from ..files import read_json
 from ..loops import look_up
 from ..memory import memory_for_images
-from .cache import MARK, cache_folder, filled, in_parallel, key, new_file
+from .cache import MARK, cache_folder, check_size, filled, in_parallel, key, new_file
 from .order import Runs, shuffled_order, spread
 
 PIECES = 64  # a batch from a file comes in about so many reads
 SHORTEST_PIECE, LONGEST_PIECE = 64, 1024  # pixels; the longest fills a page
+
+
+@dataclass(frozen=True)
+class Mark:
+    """What the mark of a store in a file says."""
+
+    has_alpha: bool
+    trusted: bool
 
 
 @dataclass(frozen=True)
@@ -113,14 +122,17 @@ class ImageStore:
         folder = (cache or cache_folder() / "images") / called
         if not (folder / MARK).exists():
             write_store(folder, total, pictures, progress)
-        about = json.loads((folder / MARK).read_text())
-        trusted = Runs(*map(torch.from_numpy, np.load(folder / "trusted.npz").values())) if about["trusted"] else None
+        about = read_json(folder / MARK, Mark)
+        check_size(folder / "pixels", 4 * total)
+        trusted = None
+        if about.trusted:
+            trusted = Runs(*map(torch.from_numpy, np.load(folder / "trusted.npz", allow_pickle=False).values()))
         # Copy on write: PyTorch wants a writable array, and the file must stay as it is.
         rgba = np.memmap(folder / "pixels", np.int32, "c")
         if nameless:
             shutil.rmtree(folder, ignore_errors=True)  # nobody can ask for it again; what is mapped stays
         name = None if nameless else f"{called} shuffled"
-        return cls(torch.from_numpy(rgba), sizes, about["has_alpha"], trusted, True, name, memory, cache)
+        return cls(torch.from_numpy(rgba), sizes, about.has_alpha, trusted, True, name, memory, cache)
 
     @classmethod
     def from_arrays(cls, images: Sequence[np.ndarray], masks: Sequence[np.ndarray | None] | None = None) -> ImageStore:

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
+
+from ..ranges import between
 
 # As files have them that were written before scores had names: key, name, unit, better, digits.
 KEYS = (("psnr", "PSNR", "dB", "higher", 2), ("ssim", "SSIM", "", "higher", 4), ("lpips", "LPIPS", "", "lower", 4))
@@ -22,7 +24,7 @@ class Score:
     value: float
     unit: str
     better: Literal["higher", "lower"]
-    digits: int = 4
+    digits: Annotated[int, between(0, 16)] = 4
 
     def __str__(self) -> str:
         return f"{self.value:.{self.digits}f} {self.unit}".rstrip()

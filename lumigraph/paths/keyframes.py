@@ -12,7 +12,7 @@ import math
 from dataclasses import asdict, dataclass
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import torch
@@ -22,17 +22,15 @@ from torch import Tensor
 from ..camera import Camera
 from ..errors import LumigraphError
 from ..files import read_json, write_json
-from ..geometry import to_matrix, to_quaternion
+from ..geometry import RIGID, is_similarity, to_matrix, to_quaternion
 from ..lens import Lens, Pinhole
-from ..plain import from_plain
+from ..ranges import Coordinate, Row, Side, between, typed
 from ..scene import Frame
 
 FORMAT = "lumigraph camera path 1"
 NARROWEST, WIDEST = 1.0, 170.0  # degrees that a flat picture can show
-RIGID = 1e-3  # how far a rotation may be from one
 LONGEST = 100_000  # frames of a film
-
-Row = tuple[float, float, float, float]
+Fps = Annotated[float, between(1e-3, 1000)]
 
 
 @dataclass(frozen=True)
@@ -47,8 +45,20 @@ class Keyframe:
 
     pose: tuple[Row, Row, Row]
     fov: float
-    seconds: float
-    time: float | None = None
+    seconds: Coordinate
+    time: Coordinate | None = None
+
+
+@dataclass(frozen=True)
+class Film:
+    """What the JSON beside a film says of its cameras: see `export.film`."""
+
+    poses: list[tuple[Row, Row, Row]]
+    lens: dict[str, Any]
+    size: tuple[Side, Side]
+    source_from_scene: tuple[Row, ...]
+    fps: Fps
+    times: list[Coordinate] | None = None
 
 
 @dataclass(frozen=True)
@@ -61,7 +71,7 @@ class CameraPath:
 
     keyframes: tuple[Keyframe, ...]
     loop: bool = False
-    fps: float = 30.0
+    fps: Fps = 30.0
 
     def __post_init__(self) -> None:
         if not self.keyframes:
@@ -103,21 +113,21 @@ class CameraPath:
 
         Raises LumigraphError for a file that holds neither.
         """
-        data = read_json(path)
+        said = read_json(path)
+        if not isinstance(said, dict):
+            said = {}
         try:
-            if isinstance(data, dict) and data.get("format") == FORMAT:
-                keys = tuple(from_plain(Keyframe, key) for key in data["keyframes"])
-                if not isinstance(data["loop"], bool):
-                    raise TypeError("loop must be true or false")
-                return cls(keys, data["loop"], data["fps"])
-            if isinstance(data, dict) and {"poses", "lens", "size", "source_from_scene"} <= data.keys():
-                return cls(keys_of_film(data), fps=data["fps"])
+            if said.get("format") == FORMAT:
+                rest = {name: value for name, value in said.items() if name != "format"}
+                return typed(cls, rest, path, closed=True)
+            if {"poses", "lens", "size", "source_from_scene"} <= said.keys():
+                film = typed(Film, said, path)
+                return cls(keys_of_film(film, Lens.from_json(film.lens, path)), fps=film.fps)
         except LumigraphError as error:
-            raise LumigraphError(f"{path} is no camera path: {str(error)[:1].lower()}{str(error)[1:]}") from error
-        except (LookupError, TypeError, ValueError, AttributeError, ArithmeticError, RuntimeError) as error:
-            raise LumigraphError(
-                f"{path} is a damaged camera path ({type(error).__name__}: {first_line(error)}); save it again"
-            ) from error
+            text = str(error)
+            if text.startswith(str(path)):
+                raise
+            raise LumigraphError(f"{path} is no camera path: {text[:1].lower()}{text[1:]}") from error
         raise LumigraphError(
             f"{path} holds no camera path that this version knows; save one in the viewer, "
             "or take the JSON beside a film"
@@ -231,22 +241,21 @@ def check(key: Keyframe, name: str) -> None:
         raise LumigraphError(f"{name} sees {key.fov:g} degrees; a flat picture shows from {NARROWEST:g} to {WIDEST:g}")
 
 
-def keys_of_film(about: dict[str, Any]) -> tuple[Keyframe, ...]:
-    """Every frame of a film as a keyframe, from the JSON beside it."""
-    lens, size = Lens.from_json(about["lens"]), torch.tensor(about["size"]).double()
+def keys_of_film(film: Film, lens: Lens) -> tuple[Keyframe, ...]:
+    """Every frame of a film as a keyframe. Raises LumigraphError where its parts do not fit together."""
     if not isinstance(lens, Pinhole):
         raise LumigraphError("The film was made through a bent lens, and paths are flown behind a flat picture")
-    poses = torch.tensor(about["poses"], dtype=torch.double)
-    there = Camera(poses, lens, size.long().expand(len(poses), 2))
-    source = there.transformed(torch.tensor(about["source_from_scene"], dtype=torch.double)).pose
+    times: list[Any] = film.times or [None] * len(film.poses)
+    to_source = torch.tensor(film.source_from_scene, dtype=torch.double)
+    if len(times) != len(film.poses) or len(lens) not in (1, len(film.poses)) or not is_similarity(to_source):
+        raise LumigraphError("The film's poses, lenses, times and source_from_scene do not fit together")
+    size = torch.tensor(film.size)
+    poses = torch.tensor(film.poses, dtype=torch.double).reshape(-1, 3, 4)
+    source = Camera(poses, lens, size.expand(len(poses), 2)).transformed(to_source).pose
     side = int(size.argmin())
     fov = 2 * torch.atan(0.5 * size[side] / lens.focal[:, side].double()).rad2deg()
-    times = about.get("times") or [None] * len(poses)
+    rows = zip(source.tolist(), fov.expand(len(poses)).tolist(), times, strict=True)
     return tuple(
-        from_plain(Keyframe, {"pose": pose, "fov": angle, "seconds": i / about["fps"], "time": time})
-        for i, (pose, angle, time) in enumerate(zip(source.tolist(), fov.tolist(), times, strict=True))
+        Keyframe((tuple(a), tuple(b), tuple(c)), angle, i / film.fps, time)
+        for i, ((a, b, c), angle, time) in enumerate(rows)
     )
-
-
-def first_line(error: Exception) -> str:
-    return str(error).partition("\n")[0].rstrip(".")

@@ -26,9 +26,12 @@ from ..errors import LumigraphError
 from ..method import Method
 from ..partials import partial
 from ..plain import flatten, understood, unflatten
+from ..ranges import Lasted, Tally, typed
 
 FORMAT = "lumigraph checkpoint 1"
+GRID = 4  # axes of a grid of cells, of which the first says which of several grids
 WEIGHTS, OPTIMIZER, STATE = "weights.safetensors", "optimizer.safetensors", "state.json"
+STRUCTURE = "optimizers"
 NAME = re.compile(r"\d+")
 OLD_PARTIAL = re.compile(r"\d+(\.partial)+")  # what older versions had begun to write or to delete
 
@@ -46,6 +49,32 @@ class State:
     compile_seconds: float = 0.0
     peak_memory: int = 0
     passes: float = 0.0
+
+
+@dataclass(frozen=True)
+class Sum:
+    """By which a file's bytes are known."""
+
+    bytes: Tally
+    crc32: Tally
+
+
+@dataclass(frozen=True)
+class Saved:
+    """state.json: how far training had come, as in `State`; what all files should sum to; and the optimizers' state.
+
+    files:      by name; newer ones sum up the optimizers' state too
+    optimizers: see `flatten`; their tensors lie beside
+    """
+
+    method: str
+    step: Tally
+    seconds: Lasted
+    compile_seconds: Lasted
+    files: dict[str, Sum]
+    optimizers: list[Any]
+    peak_memory: Tally = 0
+    passes: Lasted = 0.0
 
 
 class Checkpoints:
@@ -74,10 +103,8 @@ class Checkpoints:
     @property
     def state(self) -> State:
         """How far the latest complete state has come."""
-        checkpoint = self.latest
-        about = {"peak_memory": 0, "passes": 0.0} | self._about(checkpoint)  # older runs do not tell it
-        with understood(checkpoint):
-            return State(**{field.name: about[field.name] for field in fields(State)})
+        about = self._about(self.latest)
+        return State(**{field.name: getattr(about, field.name) for field in fields(State)})
 
     def save(
         self, state: State, method: Method, optimizers: Iterable[torch.optim.Optimizer], generator: torch.Generator
@@ -93,8 +120,10 @@ class Checkpoints:
                 name: write_tensors(new / name, content)
                 for name, content in ((WEIGHTS, method.state_dict()), (OPTIMIZER, tensors))
             }
-            about = {"format": FORMAT, "method": self.method, **asdict(state), "files": sums}
-            (new / STATE).write_text(json.dumps({**about, "optimizers": structure}), "utf-8")
+            sums[STRUCTURE] = checksum(json.dumps(structure).encode())
+            known = {name: asdict(total) for name, total in sums.items()}
+            about = {"format": FORMAT, "method": self.method, **asdict(state), "files": known}
+            (new / STATE).write_text(json.dumps({**about, STRUCTURE: structure}), "utf-8")
         for path in self.folder.iterdir():
             if path != folder and is_state(path):
                 retire(path)
@@ -104,8 +133,9 @@ class Checkpoints:
         checkpoint = self.latest
         tensors = self._read_tensors(checkpoint, WEIGHTS)
         tensors = renamed_weights(tensors, method.formerly_weights)
-        take_shapes(method, tensors)
         try:
+            take_shapes(method, tensors)
+            check_kinds(method.state_dict(), tensors)
             method.load_state_dict(tensors)
         except RuntimeError as error:
             reason = " ".join(str(error).split())
@@ -115,7 +145,12 @@ class Checkpoints:
         """Give optimizers and random numbers the latest state."""
         checkpoint = self.latest
         tensors = self._read_tensors(checkpoint, OPTIMIZER)
-        structure = self._about(checkpoint)["optimizers"]
+        about = self._about(checkpoint)
+        structure = about.optimizers
+        if about.files.get(STRUCTURE, found := checksum(json.dumps(structure).encode())) != found:
+            raise LumigraphError(
+                f"{checkpoint / 'state.json'} is damaged: its optimizers are not those that were saved"
+            )
         with understood(checkpoint):
             generator.set_state(tensors["generator"])
             for optimizer, saved in zip(optimizers, unflatten(structure, tensors), strict=True):
@@ -123,29 +158,34 @@ class Checkpoints:
                 optimizer.load_state_dict(saved)
                 for group, own in zip(optimizer.param_groups, fresh, strict=True):
                     group |= own | group  # older runs know fewer entries of a group
+                check_moments(optimizer)
 
     def _all(self) -> list[Path]:
         found = [x for x in self.folder.iterdir() if NAME.fullmatch(x.name)] if self.folder.is_dir() else []
         return sorted(found, key=lambda x: int(x.name))
 
-    def _about(self, checkpoint: Path) -> dict[str, Any]:
-        about = files.read_json(checkpoint / STATE)
-        if not isinstance(about, dict) or about.get("format") != FORMAT:
+    def _about(self, checkpoint: Path) -> Saved:
+        said = files.read_json(path := checkpoint / STATE)
+        if not isinstance(said, dict) or said.get("format") != FORMAT:
             raise LumigraphError(f"{checkpoint} is not a checkpoint that Lumigraph wrote; restore it from a copy")
-        if about["method"] != self.method:
+        about = typed(Saved, said, path)
+        if about.method != self.method:
             raise LumigraphError(
-                f"{checkpoint} belongs to a run of {about['method']}, not of {self.method}; restore it from a copy"
+                f"{checkpoint} belongs to a run of {about.method}, not of {self.method}; restore it from a copy"
             )
         return about
 
     def _read_tensors(self, checkpoint: Path, name: str) -> dict[str, Tensor]:
         path = checkpoint / name
-        expected = self._about(checkpoint)["files"].get(name)
+        expected = self._about(checkpoint).files.get(name)
         with files.explained(path):
             data = path.read_bytes()
         if checksum(data) != expected:
             raise LumigraphError(f"{path} is damaged: its checksum is not the one it was saved with; restore a copy")
-        return safetensors.torch.load(data)
+        try:
+            return safetensors.torch.load(data)
+        except Exception as error:  # of a library that keeps no list of them
+            raise LumigraphError(f"{path} holds no tensors ({error}); restore it from a copy") from error
 
 
 def renamed_weights(tensors: dict[str, Tensor], formerly: dict[str, str]) -> dict[str, Tensor]:
@@ -158,24 +198,53 @@ def renamed_weights(tensors: dict[str, Tensor], formerly: dict[str, str]) -> dic
 
 
 def take_shapes(method: nn.Module, tensors: dict[str, Tensor]) -> None:
-    """Give parameters and buffers the sizes that saved ones have, where their module says that they grow."""
+    """Give parameters and buffers the sizes that saved ones have, where their module says that they grow.
+
+    Tables grow by rows, grids by cells, and all of one module alike; raises RuntimeError where they do not.
+    """
     for place, module in method.named_modules():
+        sizes = set()
         for name in getattr(module, "grows", ()):
             saved, own = tensors.get(f"{place}.{name}" if place else name), getattr(module, name)
-            if saved is not None and saved.shape != own.shape:
+            if saved is None:
+                continue
+            sizes.add(saved.shape if own.dim() == GRID else saved.shape[:1])
+            if saved.shape[1:] == own.shape[1:] or (
+                saved.dim() == own.dim() == GRID and saved.shape[0] == own.shape[0]
+            ):
                 sized = own.detach().new_empty(saved.shape)
                 setattr(module, name, nn.Parameter(sized) if isinstance(own, nn.Parameter) else sized)
+        if len(sizes) > 1:
+            raise RuntimeError(f"the tensors of {place} are not of one size")
 
 
-def write_tensors(path: Path, tensors: dict[str, Tensor]) -> dict[str, int]:
+def check_kinds(own: dict[str, Tensor], saved: dict[str, Tensor]) -> None:
+    """Raise RuntimeError for a saved tensor of another kind of numbers than the method's own of that name."""
+    for name, tensor in saved.items():
+        if name in own and tensor.is_floating_point() != own[name].is_floating_point():
+            raise RuntimeError(f"{name} holds {tensor.dtype}, not {own[name].dtype}")
+
+
+def check_moments(optimizer: torch.optim.Optimizer) -> None:
+    """Raise ValueError unless what an optimizer remembers of each parameter fits it: a number, or one for each of its
+    rows or elements. Compiled loops rely on it."""
+    for group in optimizer.param_groups:
+        for parameter in group["params"]:
+            for name, value in optimizer.state.get(parameter, {}).items():
+                if isinstance(value, Tensor) and value.shape != parameter.shape[: value.dim()]:
+                    shape, own = list(value.shape), list(parameter.shape)
+                    raise ValueError(f"the optimizer's {name} has shape {shape}, for a parameter of {own}")
+
+
+def write_tensors(path: Path, tensors: dict[str, Tensor]) -> Sum:
     """Write a safetensors file; gives its checksum."""
     data = safetensors.torch.save({name: x.detach().cpu().contiguous().clone() for name, x in tensors.items()})
     path.write_bytes(data)
     return checksum(data)
 
 
-def checksum(data: bytes) -> dict[str, int]:
-    return {"bytes": len(data), "crc32": zlib.crc32(data)}
+def checksum(data: bytes) -> Sum:
+    return Sum(len(data), zlib.crc32(data))
 
 
 def is_state(path: Path) -> bool:

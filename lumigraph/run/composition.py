@@ -23,26 +23,23 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import torch
-from torch import Tensor
 
 from .. import files
 from ..camera import Camera
 from ..composition import Placed, compose, frame_around
 from ..crop import Box
 from ..errors import LumigraphError
-from ..geometry import Similarity, to_matrix, to_quaternion
+from ..geometry import Similarity, Vector, is_similarity, to_matrix, to_quaternion
 from ..method import Method
-from ..plain import understood
+from ..ranges import Name, Point, Row, between, typed
 from .opened import Opened
 
 FORMAT = "lumigraph composition 1"
-PLACE = ("scale", "rotation", "translation")
-ROUNDING = 1e-3  # by which a matrix may fail to be a similarity
 
 
 @dataclass(frozen=True)
@@ -83,8 +80,8 @@ class Composition(Opened):
         self.frame = replace(frame_around(first, others), source_from_scene=to_source.rows)
 
     def _found(self, part: Part) -> Path:
-        path = self.path.parent / Path(part.source).expanduser()
-        if not path.exists():
+        path = self.path.parent / files.expanded(part.source)
+        if not files.exists(path):
             raise LumigraphError(f"{self.path} names {part.source} as a part, but there is no {path}; correct its path")
         return path
 
@@ -111,16 +108,48 @@ class Composition(Opened):
         return self.opened[self.lead].view_names()
 
 
+@dataclass(frozen=True)
+class PlaceSaid:
+    """A place as the file may say it; a matrix of four rows is the other way."""
+
+    scale: Annotated[float, between(1e-9, 1e9)] = 1.0
+    rotation: float | Row = 0.0
+    translation: Point = (0.0, 0.0, 0.0)
+
+
+Placing = PlaceSaid | tuple[Row, Row, Row, Row]
+
+
+@dataclass(frozen=True)
+class PartSaid:
+    """A part as the file says it. place: see `Placing`"""
+
+    source: Name
+    place: Any = field(default_factory=dict)
+    box: tuple[Point, Point] | None = None
+
+
+@dataclass(frozen=True)
+class Said:
+    """The file."""
+
+    parts: list[PartSaid]
+    lead: int = 0
+    format: str = FORMAT
+
+
 def read_composition(path: Path) -> tuple[list[Part], int]:
     """The parts that a file names, and the number of the one that leads. Opens none of them."""
     said = files.read_json(path)
     if not isinstance(said, dict) or said.get("format") != FORMAT:
         raise LumigraphError(f"{path} is no composition: it does not say {FORMAT!r}; `lumigraph compose` makes one")
-    with understood(path):
-        parts, lead = [part_from_json(part) for part in said["parts"]], said.get("lead", 0)
-        if lead not in range(len(parts)):
-            raise ValueError(f"part {lead} should lead, and there are {len(parts)}")
-    return parts, lead
+    found = typed(Said, said, path, closed=True)
+    if found.lead not in range(len(found.parts)):
+        raise LumigraphError(f"{path}: part {found.lead} should lead, and there are {len(found.parts)}; correct it")
+    return [
+        Part(part.source, place_from_json(part.place, path), None if part.box is None else box_of(part.box, path))
+        for part in found.parts
+    ], found.lead
 
 
 def write_composition(path: Path, parts: Sequence[Part], lead: int = 0) -> None:
@@ -137,12 +166,6 @@ def relative(source: Path, file: Path) -> str:
         return str(source.resolve())
 
 
-def part_from_json(said: dict[str, Any]) -> Part:
-    if unknown := said.keys() - {"source", "place", "box"}:
-        raise ValueError(f"nothing is known of a part's {sorted(unknown)[0]!r}")
-    return Part(str(said["source"]), place_from_json(said.get("place", {})), box_from_json(said.get("box")))
-
-
 def part_to_json(part: Part) -> dict[str, Any]:
     said: dict[str, Any] = {"source": part.source}
     if place := place_to_json(part.place):
@@ -152,46 +175,31 @@ def part_to_json(part: Part) -> dict[str, Any]:
     return said
 
 
-def box_from_json(said: Any) -> Box | None:
-    if said is None:
-        return None
-    (ax, ay, az), (bx, by, bz) = ([float(x) for x in corner] for corner in said)
-    if not (ax < bx and ay < by and az < bz):
-        raise ValueError(f"the box {said} has nothing between its lower and its upper corner")
-    return Box((ax, ay, az), (bx, by, bz))
+def box_of(corners: tuple[Vector, Vector], where: Path | str) -> Box:
+    """Raises LumigraphError, naming `where`, for corners that hold nothing."""
+    if not all(a < b for a, b in zip(*corners, strict=True)):
+        raise LumigraphError(
+            f"{where}: the box {corners} has nothing between its lower and its upper corner; correct it"
+        )
+    return Box(*corners)
 
 
-def place_from_json(said: Any) -> Similarity:
-    """A similarity from a matrix, or from what it is made of. Raises ValueError for one that shears or mirrors."""
-    if isinstance(said, dict):
-        if unknown := said.keys() - set(PLACE):
-            raise ValueError(f"nothing is known of a place's {sorted(unknown)[0]!r}; there are {', '.join(PLACE)}")
-        turn = said.get("rotation", 0.0)
-        if not isinstance(turn, list):
-            half = 0.5 * math.radians(turn)
-            turn = [math.cos(half), 0.0, 0.0, math.sin(half)]
-        if len(turn) != 4:
-            raise ValueError(f"the rotation {turn} is neither degrees nor a quaternion w, x, y, z")
-        rotation = to_matrix(torch.tensor([turn], dtype=torch.float64))[0]
-        x, y, z = (float(x) for x in said.get("translation", (0.0, 0.0, 0.0)))
-        translation = torch.tensor([x, y, z], dtype=torch.float64)
-        matrix = Similarity.make(float(said.get("scale", 1.0)), rotation, translation).matrix
-    else:
-        matrix = torch.tensor(said, dtype=torch.float64)
-    if not is_similarity(matrix):
-        raise ValueError(f"the place {said} does more than move, turn and scale")
-    return Similarity(matrix)
-
-
-def is_similarity(matrix: Tensor) -> bool:
-    """Whether a tensor is a 4 x 4 matrix that moves, turns and scales, up to rounding, and does not mirror."""
-    if matrix.shape != (4, 4) or not matrix.isfinite().all() or matrix[3].tolist() != [0.0, 0.0, 0.0, 1.0]:
-        return False
-    linear, one = matrix[:3, :3], torch.eye(3, dtype=torch.float64)
-    size = float(torch.linalg.det(linear))
-    if size <= 0:
-        return False
-    return bool((linear @ linear.T / size ** (2 / 3) - one).abs().max() <= ROUNDING)
+def place_from_json(said: Any, where: Path | str = "a composition") -> Similarity:
+    """A similarity from a matrix, or from what it is made of. Raises LumigraphError, naming `where`, for none."""
+    place: Placing = typed(Placing, said, where, closed=True)
+    if not isinstance(place, PlaceSaid):
+        matrix = torch.tensor(place, dtype=torch.float64)
+        if not is_similarity(matrix):
+            raise LumigraphError(f"{where}: the place {said} does more than move, turn and scale; correct it")
+        return Similarity(matrix)
+    turn = place.rotation
+    if not isinstance(turn, tuple):
+        half = 0.5 * math.radians(turn)
+        turn = (math.cos(half), 0.0, 0.0, math.sin(half))
+    if not any(turn):
+        raise LumigraphError(f"{where}: the quaternion {turn} turns nothing; correct it or leave it out")
+    rotation = to_matrix(torch.tensor([turn], dtype=torch.float64))[0]
+    return Similarity.make(place.scale, rotation, torch.tensor(place.translation, dtype=torch.float64))
 
 
 def rounded(number: float) -> float:

@@ -28,7 +28,6 @@ from .. import files, methods
 from ..camera import Camera, ring
 from ..dataset import Dataset
 from ..errors import LumigraphError
-from ..lens import Lens
 from ..locks import NAME as LOCK
 from ..locks import check_place, held
 from ..marks import NAME as RECORD
@@ -36,7 +35,9 @@ from ..method import Method
 from ..plain import understood
 from ..ranges import check
 from ..scene import Frame, Scene
+from . import cameras
 from .checkpoint import WEIGHTS, Checkpoints, State
+from .measured import read_evaluation, read_rows
 from .needs import check_memory
 from .opened import Opened
 from .settings import Settings, Source
@@ -50,7 +51,7 @@ class Run(Opened):
 
     def __init__(self, folder: Path | str):
         self.path = self.folder = Path(folder)
-        if not self._config.exists():
+        if not files.is_file(self._config):
             raise LumigraphError(f"{self.folder} is not a run: it holds no config.json; `lumigraph train` makes runs")
         self.settings = Settings.read(self._config)
         self.frame = self.settings.frame
@@ -91,7 +92,7 @@ class Run(Opened):
         with held(folder, "made a run"):
             check_new(folder)  # again, for somebody else may have been quicker
             if isinstance(data, Scene):
-                files.write_json(folder / "cameras.json", cameras_to_json(data), ours=True)
+                files.write_json(folder / "cameras.json", cameras.to_json(data), ours=True)
             settings.write(folder / "config.json")  # last: a folder with it is a run
         return cls(folder)
 
@@ -107,6 +108,10 @@ class Run(Opened):
     @property
     def _config(self) -> Path:
         return self.folder / "config.json"
+
+    @property
+    def _cameras(self) -> Path:
+        return self.folder / "cameras.json"
 
     # What was trained on what
 
@@ -168,10 +173,11 @@ class Run(Opened):
         from ..capture import KINDS, Before, open_dataset
 
         source = source or self.settings.scene.source
+        if self.kind not in KINDS:
+            raise LumigraphError(f"{self._config}: nothing learns from {self.kind!r}; there are {', '.join(KINDS)}")
         options = {name: value for name, value in self.settings.scene.options.items() if value is not None}
         if self.photographed:
-            with understood(self.folder / "cameras.json"):
-                names = files.read_json(self.folder / "cameras.json")["names"]
+            names = cameras.read(self._cameras).names
             options["before"] = Before(names, self.frame.to_source.rotation.T.numpy())
         data = open_dataset(source, KINDS[self.kind], **options)
         if not self.settings.agrees(data.frame):
@@ -190,16 +196,14 @@ class Run(Opened):
         """The photographs' cameras by split, in the run's frame; a ring around the bounds where there were none."""
         if not self.photographed:
             return {"train": ring(self.frame.bounds)}
-        with understood(self.folder / "cameras.json"):
-            return cameras_from_json(files.read_json(self.folder / "cameras.json"), self.frame.image_count)
+        return cameras.cameras(self._cameras, self.frame.image_count)
 
     def view_names(self) -> dict[str, list[str]]:
         """What the photographs are called, by split, in the order of `cameras`; nothing where there were none."""
         if not self.photographed:
             return {}
-        with understood(self.folder / "cameras.json"):
-            data = files.read_json(self.folder / "cameras.json")
-            return {split: [data["names"][i] for i in index] for split, index in data["splits"].items()}
+        said = cameras.read(self._cameras)
+        return {split: [said.names[i] for i in index] for split, index in said.splits.items()}
 
     # Its state
 
@@ -248,15 +252,8 @@ class Run(Opened):
             file.write(json.dumps(row) + "\n")
 
     def metrics(self) -> list[dict[str, Any]]:
-        """The lines of metrics.jsonl; one that a kill cut short is left out."""
-        path = self.folder / "metrics.jsonl"
-        rows = []
-        for line in path.read_text("utf-8", errors="replace").splitlines() if path.exists() else []:
-            try:
-                rows.append(json.loads(line))
-            except json.JSONDecodeError:
-                continue
-        return rows
+        """The lines of metrics.jsonl; what is damaged, as one that a kill cut short, is left out."""
+        return read_rows(self.folder / "metrics.jsonl")
 
     def forget_after(self, step: int) -> None:
         """Drop lines and previews of steps after the saved state: they will be taken again."""
@@ -274,7 +271,7 @@ class Run(Opened):
     def evaluation(self) -> dict[str, Any] | None:
         """What eval.json says, if the run has been evaluated."""
         path = self.folder / "eval.json"
-        return files.read_json(path) if path.exists() else None
+        return read_evaluation(path) if path.exists() else None
 
 
 def build(
@@ -303,28 +300,6 @@ def check_new(folder: Path) -> None:
         if folder.exists() and (not folder.is_dir() or {path.name for path in folder.iterdir()} - {LOCK, RECORD}):
             raise LumigraphError(f"{folder} is not an empty folder; choose another --output")
     check_place(folder)
-
-
-def cameras_to_json(scene: Scene) -> dict[str, Any]:
-    camera = scene.cameras.to("cpu")
-    return {
-        "names": list(scene.names),
-        "splits": {name: index.tolist() for name, index in scene.splits.items()},
-        "pose": camera.pose.tolist(),
-        "lens": camera.lens.to_json(),
-        "size": camera.size.tolist(),
-        "time": None if camera.time is None else camera.time.tolist(),
-    }
-
-
-def cameras_from_json(data: dict[str, Any], photographs: int) -> dict[str, Camera]:
-    """Cameras by split. photographs: how many there are; further cameras took smaller copies of the same ones."""
-    time = None if data["time"] is None else torch.tensor(data["time"])
-    image_index = torch.arange(len(data["pose"])) % max(photographs, 1)
-    camera = Camera(
-        torch.tensor(data["pose"]), Lens.from_json(data["lens"]), torch.tensor(data["size"]), time, image_index
-    )
-    return {name: camera[torch.tensor(index, dtype=torch.int64)] for name, index in data["splits"].items()}
 
 
 def versions() -> dict[str, str]:

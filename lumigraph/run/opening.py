@@ -6,6 +6,7 @@ from pathlib import Path
 
 from ..errors import LumigraphError
 from ..exchange import is_splat_file
+from ..files import is_file
 from .composition import Composition
 from .folder import Run
 from .opened import Opened
@@ -23,6 +24,6 @@ def open_any(path: Path | str, within: tuple[Path, ...] = ()) -> Opened:
         return SplatFile(path)
     if path.suffix.lower() == ".json" and not path.is_dir():
         return Composition(path, open_any, within)
-    if path.is_file():
+    if is_file(path):
         raise LumigraphError(f"{path} is none of the files that open: a splat file, or a composition's JSON")
     return Run(path)

@@ -2,26 +2,36 @@
 
 from __future__ import annotations
 
-import typing
 from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 from .. import files
+from ..budget import Budget
 from ..errors import LumigraphError
 from ..method import Method
-from ..plain import alike, from_plain, renamed, understood
-from ..ranges import hints, typed
+from ..plain import alike, renamed
+from ..ranges import Count, Downscale, Name, Scales, Tally, between, typed
 from ..scene import Frame, Scene
 
 FORMAT = "lumigraph run 1"
 
 
 @dataclass(frozen=True)
+class Options:
+    """What a run may tell `open_dataset` besides its source: see `capture.open_scene`."""
+
+    downscale: Downscale | None = None
+    reader: str | None = None
+    views: Count | None = None
+    scales: Scales | None = None
+
+
+@dataclass(frozen=True)
 class Source:
     """Where a dataset came from, what else `open_dataset` was told to open it, and of which kind it is."""
 
-    source: str
+    source: Name
     options: dict[str, Any] = field(default_factory=dict)
     kind: str = Scene.kind
 
@@ -47,8 +57,8 @@ class Settings:
     config: dict[str, Any]
     frame: Frame
     scene: Source
-    splits: dict[str, int] = field(default_factory=dict)
-    seed: int = 0
+    splits: dict[str, Tally] = field(default_factory=dict)
+    seed: Annotated[int, between(-(2**63), 2**63 - 1)] = 0
     budget: dict[str, Any] = field(default_factory=dict)
     device: str = "cpu"
     processor: str = "unknown"
@@ -61,11 +71,12 @@ class Settings:
         said = files.read_json(file)
         if not isinstance(said, dict) or said.get("format") != FORMAT:
             raise LumigraphError(f"{file} was not written by this version of Lumigraph; open it with the one that did")
-        with understood(file):
-            made = {"frame": Frame.from_json(said["frame"]), "scene": from_plain(Source, said["scene"]), "said": said}
-            plain = {x.name: said[x.name] for x in fields(Settings) if x.name in said and x.name not in made}
-            check_types(plain)
-            return Settings(**plain | made)
+        settings = typed(Settings, said, file)
+        frame = Frame.from_json(said["frame"], f"{file}: frame")
+        typed(Options, settings.scene.options, f"{file}: scene.options", closed=True)
+        if settings.budget:
+            Budget.from_json(settings.budget, f"{file}: budget")
+        return replace(settings, frame=frame, said=said)
 
     def write(self, file: Path) -> None:
         files.write_json(file, self.to_json(), ours=True)
@@ -86,21 +97,9 @@ class Settings:
 
         file: to name where a number is unknown, of another type, or beyond its range
         """
-        given = renamed(self.config, kind.formerly)
-        if unknown := sorted(given.keys() - hints(kind.Config).keys()):
-            raise ValueError(f"{self.method} has no {unknown[0]}")
-        return typed(kind.Config, given, file)
+        return typed(kind.Config, renamed(self.config, kind.formerly), file, closed=True)
 
     def agrees(self, frame: Frame) -> bool:
         """Whether a frame is the run's, up to rounding. Older runs know fewer numbers of a frame than newer ones."""
         mine, other = self.to_json()["frame"], frame.to_json()
         return alike({name: other.get(name) for name in mine}, mine)
-
-
-def check_types(said: dict[str, Any]) -> None:
-    """Raise TypeError for a value, of those that JSON says as they are, which is not of its field's type."""
-    hints = typing.get_type_hints(Settings)
-    for name, value in said.items():
-        kind = typing.get_origin(hints[name]) or hints[name]
-        if not isinstance(value, kind):
-            raise TypeError(f"{name} should be of type {kind.__name__}, and is {value!r}")

@@ -3,20 +3,21 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import torch
 from torch import nn
 
 from lumigraph.method import RayMethod
-from lumigraph.ranges import BatchSize, LearningRate, RaySamples
+from lumigraph.ranges import BatchSize, Layers, LearningRate, RaySamples, between
 from lumigraph.rays import Look, Rendering, Samples
 from lumigraph.volume import composite
 
 
 @dataclass(frozen=True)
 class Grids:
-    cells: int = 12
-    channels: tuple[int, ...] = (1, 3)
+    cells: Annotated[int, between(1, 64)] = 12
+    channels: tuple[Layers, Layers] = (1, 3)
 
 
 @dataclass(frozen=True)

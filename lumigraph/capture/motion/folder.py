@@ -21,7 +21,7 @@ from ..masks import MASKS as MASKS
 from ..photos import Photo
 from ..photos.track import Track
 from ..pictures import list_images, read_grey
-from ..transforms import OPENCV_FROM_OPENGL
+from ..transforms import OPENCV_FROM_OPENGL, Made
 
 WORK = "work"
 RESULT = "capture.json"
@@ -45,7 +45,7 @@ def claim(folder: Path, sources: Sequence[Path]) -> Path:
     work, wanted = folder / WORK, [str(path.resolve()) for path in sources]
     for path in sources:
         if (path / WORK / OWNER).is_file():
-            began = " ".join(read_json(path / WORK / OWNER))
+            began = " ".join(read_json(path / WORK / OWNER, list[str]))
             raise LumigraphError(
                 f"{path} is an unfinished capture; go on with: lumigraph capture {began} --output {path}"
             )
@@ -54,9 +54,9 @@ def claim(folder: Path, sources: Sequence[Path]) -> Path:
     if folder.is_dir() and any(folder.iterdir()):
         owner, result = work / OWNER, folder / RESULT
         if owner.is_file():
-            made_of = read_json(owner)
+            made_of = read_json(owner, list[str])
         elif result.is_file():
-            made_of = read_json(result).get("sources")
+            made_of = read_json(result, Made).sources
         else:
             raise LumigraphError(f"{folder} exists and is no capture; name another folder by --output")
         if made_of != wanted:

@@ -18,9 +18,11 @@ from ...files import read_json, remove, replacing, replacing_folder, write_bytes
 from ...locks import held
 from ...names import natural
 from ...progress import counting
+from ...ranges import typed
 from ..library import pycolmap
 from ..photos import Intake, Photo, gather
 from ..photos.track import Track, untracked
+from ..transforms import Made
 from .diagnosis import FEW_FEATURES, Diagnosis, Matches, counted, diagnose, folds, read_matches
 from .drawings import draw_capture, draw_photographs
 from .folder import DRAWN, MASKS, RESULT, claim, claim_results, copy_masks, copy_photographs, stamp, write_model
@@ -121,7 +123,7 @@ def finished(folder: Path, key: str) -> dict[str, Any] | None:
     if not all((folder / name).exists() for name in needed):
         return None
     known = read_json(folder / RESULT)
-    return known if isinstance(known, dict) and known.get("key") == key else None
+    return known if typed(Made, known, folder / RESULT).key == key else None
 
 
 @dataclass

@@ -10,12 +10,14 @@ import sys
 import time
 from collections.abc import Generator, Iterator
 from contextlib import contextmanager
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 from ...errors import LumigraphError
 from ...files import read_json, write_json
 from ...processes import start
+from ...ranges import Lasted
 
 WORKER = Path(__file__).with_name("worker.py")
 
@@ -25,30 +27,38 @@ def key_of(*parts: Any) -> str:
     return hashlib.blake2b(json.dumps(parts, sort_keys=True).encode(), digest_size=12).hexdigest()
 
 
+@dataclass(frozen=True)
+class Mark:
+    """Of a stage: what it was made from, whether it is done, and how long it took."""
+
+    key: str
+    done: bool
+    seconds: Lasted
+
+
 class Stages:
     """Marks in a folder's stages.json: which stages were begun and done, from what, and in how many seconds."""
 
     def __init__(self, folder: Path):
         self.path = folder / "stages.json"
         self.log = folder / "colmap.log"
-        self.marks: dict[str, Any] = read_json(self.path) if self.path.is_file() else {}
+        self.marks: dict[str, Mark] = read_json(self.path, dict[str, Mark]) if self.path.is_file() else {}
 
     def is_done(self, stage: str, key: str) -> bool:
-        mark = self.marks.get(stage, {})
-        return mark.get("key") == key and mark["done"]
+        return self.was_begun(stage, key) and self.marks[stage].done
 
     def was_begun(self, stage: str, key: str) -> bool:
         """Whether work that is not done may go on: it was begun with the same things."""
-        return self.marks.get(stage, {}).get("key") == key
+        return stage in self.marks and self.marks[stage].key == key
 
     def seconds(self) -> dict[str, float]:
         """How long each stage took, interruptions left out."""
-        return {stage: mark["seconds"] for stage, mark in self.marks.items()}
+        return {stage: mark.seconds for stage, mark in self.marks.items()}
 
     @contextmanager
     def working(self, stage: str, key: str) -> Iterator[None]:
         """Mark a stage as begun, and once the block ends well, as done."""
-        spent = self.marks[stage]["seconds"] if self.was_begun(stage, key) else 0.0
+        spent = self.marks[stage].seconds if self.was_begun(stage, key) else 0.0
         self.mark(stage, key, False, spent)
         begun = time.perf_counter()
         try:
@@ -59,8 +69,8 @@ class Stages:
         self.mark(stage, key, True, spent + time.perf_counter() - begun)
 
     def mark(self, stage: str, key: str, done: bool, seconds: float) -> None:
-        self.marks[stage] = {"key": key, "done": done, "seconds": round(seconds, 2)}
-        write_json(self.path, self.marks, ours=True)
+        self.marks[stage] = Mark(key, done, round(seconds, 2))
+        write_json(self.path, {name: asdict(mark) for name, mark in self.marks.items()}, ours=True)
 
     def colmap(self, total: int, **job: Any) -> Generator[int, None, None]:
         """Do a job of `worker.py`; gives a number for each of `total` things that becomes ready, as it does.

@@ -13,6 +13,7 @@ import contextlib
 import math
 import warnings
 from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
 import av
@@ -23,7 +24,8 @@ from jaxtyping import Float
 from PIL import Image
 
 from ...errors import LumigraphError, LumigraphWarning
-from ...files import read_json, replacing_folder, write_json
+from ...files import is_file, read_json, replacing_folder, write_json
+from ...ranges import Lasted
 from .judge import SAME, WORKING, sharpness, signature
 from .movement import Odometer
 from .track import Track, untracked
@@ -39,6 +41,17 @@ TIME = 0.2  # share of the clock in what counts as even
 MIDDLE = 0.3  # how much sharper (log) than in the middle of its stretch a frame at its end must be, lest two ends meet
 WHOLE = 0.9  # share of its length that a film must have, else it has been cut short
 WATCHED = 192  # pixels, the longer side of what movement is seen in
+
+
+@dataclass(frozen=True)
+class Index:
+    """frames.json: which film the frames beside it are of, how many were asked for, and when each was seen."""
+
+    video: str = ""
+    modified: int = 0
+    bytes: int = 0
+    asked: int | None = None
+    frames: dict[str, Lasted] = field(default_factory=dict)
 
 
 def is_video(path: Path) -> bool:
@@ -57,17 +70,16 @@ def extract(path: Path, folder: Path, frames: int | None = None, track: Track = 
     if frames is not None and frames < 2:
         raise LumigraphError(f"{frames} frames of {path} are too few to find cameras for; ask for 2 at least")
     stat = path.stat()
-    identity = {"video": path.name, "modified": stat.st_mtime_ns, "bytes": stat.st_size, "asked": frames}
-    index = folder / "frames.json"
-    known = read_json(index) if index.is_file() else {}
-    complete = all((folder / name).is_file() for name in known.get("frames", ()))
-    if not complete or {key: known.get(key) for key in identity} != identity:
+    wanted, index = Index(path.name, stat.st_mtime_ns, stat.st_size, frames), folder / "frames.json"
+    known = read_json(index, Index) if index.is_file() else Index()
+    complete = all(Path(name).name == name and is_file(folder / name) for name in known.frames)
+    if not complete or replace(known, frames={}) != wanted:
         chosen = choose(*judge(path, frames, track), frames)
         with replacing_folder(folder, ours=True) as partial:
             written = write(path, partial, chosen, track)
-            write_json(partial / "frames.json", {**identity, "frames": written}, ours=True)
-        known = read_json(index)
-    return [(folder / name, seconds) for name, seconds in known["frames"].items()]
+            write_json(partial / "frames.json", asdict(replace(wanted, frames=written)), ours=True)
+        known = read_json(index, Index)
+    return [(folder / name, seconds) for name, seconds in known.frames.items()]
 
 
 def judge(
