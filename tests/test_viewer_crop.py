@@ -66,9 +66,9 @@ def test_a_cloud_is_cropped_cleaned_and_saved(cloud_viewer):
     assert 10 < len(inside) < 190
     until(lambda: len(visitor._splats.buffer) == len(inside))
 
-    client.turn(panel._floaters["min_opacity"], 0.7)
+    client.turn(panel._floaters["min_opacity"], 0.5)
     client.turn(panel._clean, True)
-    floaters = {"min_opacity": 0.7, "max_scale": MAX_SCALE, "isolation": ISOLATION}
+    floaters = {"min_opacity": 0.5, "max_scale": MAX_SCALE, "isolation": ISOLATION}
     until(lambda: dict(visitor.request().floaters) == floaters)
     solid = cleaned(cloud, visitor.request().crop, **floaters)
     assert 0 < len(solid) < len(inside)
