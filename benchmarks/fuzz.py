@@ -21,12 +21,12 @@ import sys
 import tempfile
 import time
 from collections import Counter, defaultdict
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import tyro
-from fuzzing.inputs import KINDS, make, shares
+from fuzzing.inputs import KINDS, controls, make, shares
 from fuzzing.templates import prepared
 from fuzzing.verdict import BAD, FINE, Verdict, judged
 from fuzzing.watched import Limits
@@ -40,6 +40,7 @@ class Options:
     seed: int = 0
     only: tuple[str, ...] = ()  # classes; all of them if none is named
     number: int | None = None  # of the one input that is tried of each class
+    control: bool = False  # try files as they should be, with every command, instead
     limit: float = 60.0  # seconds
     memory: float = 4.0  # GiB
     processes: int = 2
@@ -68,8 +69,7 @@ def main(options: Options) -> int:
 def verdicts(options: Options, work: Path) -> Iterator[Verdict]:
     """What every input came to, as they end."""
     planned = shares(options.count, options.only)
-    chosen = [options.number] if options.number is not None else None
-    tasks = [(kind, n, options, work) for kind, count in planned.items() for n in chosen or range(count)]
+    tasks = [(kind, n, options, work) for kind, count in planned.items() for n in numbers(kind, count, options)]
     tasks.sort(key=lambda task: task[1])
     if options.processes == 1:
         yield from map(one, tasks)
@@ -80,6 +80,13 @@ def verdicts(options: Options, work: Path) -> Iterator[Verdict]:
                 told = f"{verdict.kind} {verdict.number}: {verdict.outcome} {verdict.where}" if verdict.is_bad else ""
                 print(f"{count} of {len(tasks)} {told}"[:200], file=sys.stderr, flush=True)
             yield verdict
+
+
+def numbers(kind: str, count: int, options: Options) -> Iterable[int]:
+    """Which inputs of a class are tried."""
+    if options.control:
+        return range(-len(controls(kind)), 0)
+    return range(count) if options.number is None else [options.number]
 
 
 def one(task: tuple[str, int, Options, Path]) -> Verdict:
@@ -106,6 +113,10 @@ def show(found: list[Verdict], seconds: float) -> None:
     for verdict in found:
         if verdict.is_bad:
             alike[verdict.outcome, "" if verdict.outcome in ("hang", "memory") else verdict.where].append(verdict)
+    if any(v.number < 0 and v.outcome != "fine" for v in found):
+        print("\nNot fine, with files as they should be:")
+        for verdict in (v for v in found if v.number < 0 and v.outcome != "fine"):
+            print(f"  {verdict.kind!r} {verdict.number}: {verdict.where} {line_of(verdict.command)}")
     for (outcome, where), some in sorted(alike.items(), key=lambda item: -len(item[1])):
         print(f"\n{len(some)} times {outcome}: {where}")
         for verdict in some[:TOLD]:

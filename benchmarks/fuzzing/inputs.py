@@ -57,7 +57,7 @@ def run(name: str, share: float, *files: str) -> Kind:
         f"eval {folder} --views 1",
         f"report {folder}",
         f"resume {folder} --steps 4",
-        f"export web {folder} out/new.html --views 1 --size 16",
+        f"export web {folder} out/new.html --views 2 --size 16",
         f"export points {folder} out/new.ply --size 16 --views 2",
         f"explain ray {folder} --output out/new.svg" if is_grid else f"export splats {folder} out/new.splat",
     )
@@ -124,11 +124,17 @@ class Input:
 
 
 def make(kind: str, number: int, seed: int, templates: Path, folder: Path) -> Input:
-    """Write the home folder of an input to `folder`, which must not exist."""
+    """Write the home folder of an input to `folder`, which must not exist.
+
+    A number below 0 is one of the class's commands, -1 the first, with files that are as they should be.
+    """
     chance, about = random.Random(f"{seed} {kind} {number}"), KINDS[kind]
     shutil.copytree(templates / about.home, folder, symlinks=True)
     bent, patient = "options", False
-    if kind == "flags":
+    if number < 0:
+        command = controls(kind)[-1 - number]
+        bent = "nothing"
+    elif kind == "flags":
         command, patient = flags.command(chance)
     elif kind == "method-flags":
         command, patient = flags.method_command(chance)
@@ -136,11 +142,18 @@ def make(kind: str, number: int, seed: int, templates: Path, folder: Path) -> In
         files = sorted((folder / "given").glob(chance.choice(about.files)))
         file = chance.choice([path for path in files if path.is_file()])
         bent = f"{file.relative_to(folder)}: {bend(file, chance)}"
-        words = chance.choice(about.commands).split()
-        command = [str(file.relative_to(folder)) if word == "{file}" else word for word in words]
-    if chance.random() < 0.2:
+        command = chance.choice(about.commands).format(file=file.relative_to(folder)).split()
+    if number >= 0 and chance.random() < 0.2:
         beside(folder / "out", chance)
     return Input(command, bent, patient, allowed(command))
+
+
+def controls(kind: str) -> list[list[str]]:
+    """The commands that a class is opened by, each once, which have to go well with nothing made wrong."""
+    if kind == "flags":
+        return list(flags.COMMANDS.values())
+    first = {"camera path": "given/keys.json", "pictures": "given/picture.png", "videos": "given/clip.mp4"}.get(kind)
+    return [command.format(file=first).split() for command in dict.fromkeys(KINDS[kind].commands)]
 
 
 def beside(out: Path, chance: random.Random) -> None:

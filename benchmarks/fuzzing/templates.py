@@ -47,7 +47,7 @@ def write_all(root: Path) -> None:
     write_seven_scenes(home(root, "seven-scenes") / "given", tiny)
     write_shapes(home(root, "shapes") / "given")
     write_pictures(home(root, "pictures") / "given")
-    write_photographs(home(root, "photographs") / "given", tiny)
+    write_photographs(home(root, "photographs") / "given")
     write_video(home(root, "videos") / "given")
     write_runs(root)
 
@@ -73,9 +73,9 @@ def with_layers(folder: Path, tiny: object) -> None:
     for i, frame in enumerate(about["frames"]):
         write_png16(folder / "depth" / f"{i}.png", np.full((height, width), 3000, np.uint16))
         write_exr(folder / "normals" / f"{i}.exr", np.ones((height, width, 3), np.float32) / math.sqrt(3))
-        for name in ("masks", "labels"):
+        for name, value in (("masks", 255), ("labels", 3)):
             (folder / name).mkdir(exist_ok=True)
-            Image.fromarray(np.ones((height, width), np.uint8)).save(folder / name / f"view_{i:02d}.png")
+            Image.fromarray(np.full((height, width), value, np.uint8)).save(folder / name / f"view_{i:02d}.png")
         frame |= {"depth_file_path": f"depth/{i}.png", "normals_file_path": f"normals/{i}.exr", "time": i / 6}
         frame |= {"labels_file_path": f"labels/view_{i:02d}.png", "mask_path": f"masks/view_{i:02d}.png"}
     about |= {"up": [0.0, 0.0, 1.0], "train_filenames": [f["file_path"] for f in about["frames"][2:]]}
@@ -135,12 +135,14 @@ def write_pictures(folder: Path) -> None:
     write_exr(folder / "light.exr", colours.astype(np.float32) / 255)
 
 
-def write_photographs(folder: Path, tiny: object) -> None:
+def write_photographs(folder: Path) -> None:
     """Without poses, as cameras write them."""
     about = Image.Exif()
     about[0x010F], about[0x0112] = "A maker", 6  # make, orientation
     about.get_ifd(0x8769)[0x920A] = 35.0  # focal length
-    for i, picture in enumerate(tiny.pictures[:3]):  # type: ignore[attr-defined]
+    folder.mkdir(exist_ok=True)
+    for i in range(4):
+        picture = np.random.default_rng(i).integers(0, 256, (18, 24, 3), dtype=np.uint8)
         Image.fromarray(picture).resize((96, 72)).save(folder / f"IMG_{i}.jpg", exif=about)
 
 
