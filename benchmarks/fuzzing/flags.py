@@ -14,7 +14,18 @@ from lumigraph import methods
 from . import nasty
 from .templates import SCENE, SMALL
 
-LONG = {"--steps", "--seconds", "--frames", "--count", "--views", "--scales", "--smooth", "--fps", "--quality", "--port"}
+LONG = {
+    "--steps",
+    "--seconds",
+    "--frames",
+    "--count",
+    "--views",
+    "--scales",
+    "--smooth",
+    "--fps",
+    "--quality",
+    "--port",
+}
 LONG |= {"--seeds", "--eval-views", "--size", "--max-size", "--cell-size", "--faces", "--downscale", "--pause-at"}
 CLOUD, GRID = "given/gaussian-splatting", "given/instant-ngp"
 # A command that goes well and quickly, by its name.
@@ -36,7 +47,17 @@ COMMANDS: dict[str, list[str]] = {
     "export stereo": ["export", "stereo", CLOUD, "out/new.png", "--size", "64"],
     "export web": ["export", "web", GRID, "out/new.html", "--views", "2", "--size", "16"],
     "explain ray": ["explain", "ray", GRID, "--output", "out/new.svg"],
-    "explain encodings": ["explain", "encodings", "given/pictures/picture.png", "--steps", "1", "--scales", "1", "--output", "out/new"],
+    "explain encodings": [
+        "explain",
+        "encodings",
+        "given/pictures/picture.png",
+        "--steps",
+        "1",
+        "--scales",
+        "1",
+        "--output",
+        "out/new",
+    ],
     "bench kernels": ["bench", "kernels", "--device", "nowhere"],
     "bench methods": ["bench", "methods", "--methods", "nowhere", "--scenes", SCENE, "--output", "out/new"],
     "bench views": ["bench", "views", "--methods", "nowhere", "--scenes", SCENE, "--output", "out/new"],
@@ -102,7 +123,8 @@ def command(chance: random.Random) -> tuple[list[str], bool]:
         places = [i for i, word in enumerate(words) if "/" in word or ":" in word]
         words[chance.choice(places)] = chance.choice(nasty.FLAGS)
         return words, False
-    return with_nasty(words, of_command(name), chance)
+    words, long = with_nasty(words, of_command(name), chance)
+    return words, long or words[0] in ("bench", "demo", "view")
 
 
 def method_command(chance: random.Random) -> tuple[list[str], bool]:

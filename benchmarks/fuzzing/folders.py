@@ -19,7 +19,7 @@ OF_LOCKS = "lock.json"  # says who works in a folder; nothing rests on what it h
 
 
 def snapshot(folder: Path) -> dict[str, bytes]:
-    """A checksum of each file below a folder, by its path from there; folders are named too, and links are not followed."""
+    """A checksum of each file below a folder, by its path from there. Folders are named too; links are not followed."""
     found: dict[str, bytes] = {}
     for place, folders, files in os.walk(os.fsencode(folder)):
         inside = os.path.relpath(place, os.fsencode(folder))

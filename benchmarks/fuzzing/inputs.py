@@ -44,7 +44,9 @@ def cloud(suffix: str) -> Kind:
     name = f"given/cloud{suffix}"
     to = "ply" if suffix == ".spz" else "spz"
     uses = (f"info {name}",) * 4 + (f"export splats {name} out/new.{to}", f"clean {name} --output out/new{suffix}")
-    return Kind(f"cloud{suffix}", (f"cloud{suffix}",), (*uses, f"render {name} --frames 1 --size 16 --output out/new.mp4"))
+    return Kind(
+        f"cloud{suffix}", (f"cloud{suffix}",), (*uses, f"render {name} --frames 1 --size 16 --output out/new.mp4")
+    )
 
 
 def run(name: str, share: float, *files: str) -> Kind:

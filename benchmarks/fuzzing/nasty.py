@@ -24,16 +24,75 @@ RAW = {  # JSON that `json.dumps` does not write, by what stands for it meanwhil
 }
 NUMBERS: list[Any] = [0, -1, 1, 2, -0.0, 0.5, 1e-300, 1e30, 1e300, -1e300, float("nan"), float("inf"), -float("inf")]
 NUMBERS += [2**31 - 1, 2**31, 2**32, 2**53, 2**63, 2**64, -(2**63), 10**12, 10**400, 3.999, -7, 255, 256, 65536, 10**6]
-TEXTS = ["", " ", "text", "nan", "1", "None", "\0", "a\0b.png", "[red]bold[/red]", "[/]", 'a:"b\' c', "\n\nlumigraph: x"]
+TEXTS = [
+    "",
+    " ",
+    "text",
+    "nan",
+    "1",
+    "None",
+    "\0",
+    "a\0b.png",
+    "[red]bold[/red]",
+    "[/]",
+    "a:\"b' c",
+    "\n\nlumigraph: x",
+]
 TEXTS += ["é😀\u202e", "%s%n{0}", "$(touch pwned)", "x" * 5000, "-", "--help", "\x1b[31m"]
 PATHS = ["../outside/theirs.json", "/etc/passwd", "/dev/zero", "/dev/null", "/", ".", "..", "a/" * 3000, "~", "C:\\x"]
 PATHS += ["../" * 40 + "etc/hostname", "nowhere/to/be.seen", "/proc/self/mem", "\\\\host\\share", "x" * 300 + ".png"]
-OTHERS: list[Any] = [None, True, False, [], {}, [[]], [None], {"": None}, [[], []], [1, 2, 3], [[1, 2, 3]] * 3, {"x": 1}]
+OTHERS: list[Any] = [
+    None,
+    True,
+    False,
+    [],
+    {},
+    [[]],
+    [None],
+    {"": None},
+    [[], []],
+    [1, 2, 3],
+    [[1, 2, 3]] * 3,
+    {"x": 1},
+]
 FLAGS = ["0", "-1", "1", "2", "-0.0", "0.5", "1e-300", "1e30", "1e300", "-1e300", "nan", "inf", "-inf", "1_0", "1e3"]
 FLAGS += ["2147483648", "9223372036854775807", "9223372036854775808", "1000000", "1000000000000", "9" * 5000, "-7"]
-FLAGS += ["", " ", "text", "None", "true", "[red]x[/red]", "x" * 5000, "é😀", "--help", "../outside/theirs.json", "/", "."]
-FLAGS += ["/dev/null", "/etc/passwd", "nowhere/x.json", "a=b", "a=1:2", "cpu", "cuda:99", "meta", "cpu:7", "mps", "\udcff"]
-FLAGS += ["given", "out", "theirs/holiday.jpg", "out/new", "procedural:nothing", "procedural:still-life,size=-1", "a\nb"]
+FLAGS += [
+    "",
+    " ",
+    "text",
+    "None",
+    "true",
+    "[red]x[/red]",
+    "x" * 5000,
+    "é😀",
+    "--help",
+    "../outside/theirs.json",
+    "/",
+    ".",
+]
+FLAGS += [
+    "/dev/null",
+    "/etc/passwd",
+    "nowhere/x.json",
+    "a=b",
+    "a=1:2",
+    "cpu",
+    "cuda:99",
+    "meta",
+    "cpu:7",
+    "mps",
+    "\udcff",
+]
+FLAGS += [
+    "given",
+    "out",
+    "theirs/holiday.jpg",
+    "out/new",
+    "procedural:nothing",
+    "procedural:still-life,size=-1",
+    "a\nb",
+]
 
 
 def value(chance: random.Random, like: Any = None) -> Any:

@@ -1,5 +1,7 @@
-"""Small valid files of every kind that is opened, each kind in a home folder of its own, as `python -m lumigraph` and the
-tests' own writers make them."""
+"""Small valid files of every kind that is opened, each kind in a home folder of its own.
+
+The tests' own writers and the commands themselves make them.
+"""
 
 from __future__ import annotations
 

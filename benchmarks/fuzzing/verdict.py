@@ -15,6 +15,7 @@ from .watched import Ended, Limits, watch
 
 FINE = ("fine", "sentence", "usage", "stopped")
 BAD = ("no sentence", "traceback", "signal", "hang", "memory", "half-written", "foreign", "child left")
+PATIENCE = 15.0  # seconds after which a command that was asked for much is told to end
 TELLTALES = ("Traceback (most recent call last)", "Exception ignored in", "terminate called", "Fatal Python error")
 FRAME = re.compile(r'File "[^"]*?(lumigraph/[^"]+)", line (\d+), in (\S+)')
 
@@ -53,7 +54,8 @@ def judged(kind: str, number: int, seed: int, templates: Path, work: Path, limit
         os.environ |= {"HOME": str(work / "cache"), "XDG_CACHE_HOME": str(work / "cache")}
         return run(given.command)
 
-    ended = watch(command, home, notes, Limits(limits.seconds, limits.memory, given.patient))
+    seconds = min(limits.seconds, PATIENCE) if given.patient else limits.seconds
+    ended = watch(command, home, notes, Limits(seconds, limits.memory, given.patient))
     after = {path: data for path, data in snapshot(work).items() if Path(path).parts[0] not in ("notes", "cache")}
     ours = [f"home/{pattern}" for pattern in given.ours]
     outcome, where = outcome_of(ended)
@@ -91,6 +93,8 @@ def outcome_of(ended: Ended) -> tuple[str, str]:
 def place_of(said: str) -> str:
     """Where in our code a traceback ends, and with what."""
     frames = FRAME.findall(said)
-    last = next((line for line in reversed(said.splitlines()) if re.match(r"\w[\w.]*(Error|Exception|Warning)", line)), "")
+    last = next(
+        (line for line in reversed(said.splitlines()) if re.match(r"\w[\w.]*(Error|Exception|Warning)", line)), ""
+    )
     where = "{0}:{2}".format(*frames[-1]) if frames else "?"
     return f"{where}: {last[:140]}"

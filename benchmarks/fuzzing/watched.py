@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Literal
 
 LOOKS = 0.02  # seconds between looks at it
-GRACE = 10.0  # seconds that a command may take to heed SIGTERM
+GRACE = 20.0  # seconds that a command may take to heed SIGTERM
 PAGE = os.sysconf("SC_PAGE_SIZE")
 FARTHEST = 16 << 30  # bytes of addresses beyond those that it begins with: what asks for more at once is refused
 LARGEST = 1 << 31  # bytes of a file
