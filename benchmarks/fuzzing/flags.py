@@ -26,7 +26,7 @@ LONG = {
     "--quality",
     "--port",
 }
-LONG |= {"--seeds", "--eval-views", "--size", "--max-size", "--cell-size", "--faces", "--downscale", "--pause-at"}
+LONG |= {"--seeds", "--eval-views", "--size", "--max-size", "--cell-size", "--faces", "--downscale", "--pause-at", "--view"}
 CLOUD, GRID = "given/gaussian-splatting", "given/instant-ngp"
 # A command that goes well and quickly, by its name.
 COMMANDS: dict[str, list[str]] = {
@@ -85,7 +85,9 @@ def options(kind: Any) -> dict[str, int]:
 
 
 def width(hint: Any) -> int:
-    """How many words an option takes."""
+    """How many words an option takes; none if it is there or not."""
+    if hint is bool:
+        return 0
     parts = typing.get_args(hint)
     if typing.get_origin(hint) is tuple:
         return 1 if Ellipsis in parts else sum(map(width, parts))
@@ -119,8 +121,8 @@ def command(chance: random.Random) -> tuple[list[str], bool]:
     """A command of any kind with a nasty option or argument; and whether what it asks for may take long."""
     name = chance.choice(list(COMMANDS))
     words = list(COMMANDS[name])
-    if chance.random() < 0.15:
-        places = [i for i, word in enumerate(words) if "/" in word or ":" in word]
+    places = [i for i, word in enumerate(words) if "/" in word]
+    if places and chance.random() < 0.15:
         words[chance.choice(places)] = chance.choice(nasty.FLAGS)
         return words, False
     words, long = with_nasty(words, of_command(name), chance)
@@ -147,14 +149,13 @@ def with_nasty(words: list[str], known: dict[str, int], chance: random.Random) -
     """A command whose options are as before but for one or two."""
     long = False
     for _ in range(chance.choice((1, 1, 1, 2))):
-        flag = chance.choice(list(known))
-        values = [chance.choice(nasty.FLAGS) for _ in range(known[flag])]
-        if flag == "--output" and values[0] in ("out", ".", "given"):
+        flag = chance.choice([*known, "--nothing"])
+        values = [chance.choice(nasty.FLAGS) for _ in range(known.get(flag, 1))]
+        if flag == "--output" and values[:1] in (["out"], ["."], ["given"]):
             values = ["out/holiday.jpg"]
-        if known[flag] > 1:  # most of several are right
+        if len(values) > 1:  # most of several are right
             values = [value if chance.random() < 0.4 else str(i + 1) for i, value in enumerate(values)]
-        words = [*without(words, flag), f"{flag}={values[0]}" if known[flag] == 1 else flag]
-        words += values if known[flag] > 1 else []
+        words = without(words, flag) + ([f"{flag}={values[0]}"] if len(values) == 1 else [flag, *values])
         long = long or flag in LONG
     return words, long
 
