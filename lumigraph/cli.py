@@ -28,6 +28,7 @@ from .commands.explain import Explain
 from .commands.export import Export
 from .commands.info import Info
 from .commands.methods import Methods
+from .commands.options import RULES, held
 from .commands.render import Render
 from .commands.report import Report
 from .commands.resume import Resume
@@ -82,10 +83,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 0
     except OSError as error:
         return refuse(refusal(Path(error.filename or "A file"), error))
-    except RuntimeError as error:
-        if type(error).__name__ != "OutOfMemoryError":
+    except (MemoryError, RuntimeError) as error:
+        from .memory import want_of_memory  # with PyTorch, which is there where its memory is short
+
+        if (sentence := want_of_memory(error)) is None:
             raise
-        return refuse("The device's memory is full; use a larger --downscale, or --device cpu")
+        return refuse(sentence)
 
 
 @contextlib.contextmanager
@@ -119,7 +122,9 @@ def parse(arguments: list[str]) -> Any:
     union: Any = kinds[0]
     for kind in kinds[1:]:
         union |= kind
-    return tyro.cli(union, prog="lumigraph", description=DESCRIPTION, args=arguments or ["--help"])
+    return held(
+        tyro.cli(union, prog="lumigraph", description=DESCRIPTION, args=arguments or ["--help"], registry=RULES)
+    )
 
 
 def brief(kind: type) -> str:

@@ -6,14 +6,20 @@ import importlib
 import os
 import re
 import sys
+import traceback
+from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 
 import torch
 
+from .errors import LumigraphError
+
 STATUS = Path("/proc/self/status")
 SPARED = 0.3  # of what is free now, for everybody else
 IMAGES = 0.4  # share of the machine's memory that images may take; the rest is for training and all else that runs
+SIGNS = ("can't allocate memory", "bad_alloc", "Storage size calculation overflowed", "Cannot allocate memory")
+UNITS = {unit: 1024**power for power, unit in enumerate("bKMGTPE")}
 LIMITS = (  # of a container, and what it uses of it
     ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory.current"),
     ("/sys/fs/cgroup/memory/memory.limit_in_bytes", "/sys/fs/cgroup/memory/memory.usage_in_bytes"),
@@ -38,12 +44,43 @@ def peak_memory(device: torch.device) -> int:
 
 def room_for(size: int, device: torch.device) -> int:
     """How many more things of so many bytes may be made on a device; very many where the system does not say."""
-    if device.type == "cuda":
-        free = torch.cuda.mem_get_info(device)[0] + torch.cuda.memory_reserved(device)
-        free -= torch.cuda.memory_allocated(device)
-    else:
-        free = free_memory()
-    return int((1 - SPARED) * free) // size
+    return int((1 - SPARED) * free_on(device)) // size
+
+
+def free_on(device: torch.device) -> int:
+    """Bytes that may still be had on a device."""
+    if device.type != "cuda":
+        return free_memory()
+    reserved = torch.cuda.memory_reserved(device) - torch.cuda.memory_allocated(device)
+    return torch.cuda.mem_get_info(device)[0] + reserved
+
+
+def ask_for(size: int, device: torch.device, what: str, remedy: Callable[[], str] | str) -> None:
+    """Raise LumigraphError unless so many bytes may be had on a device: what needs them, and what needs less."""
+    if size > (free := free_on(device)):
+        less = remedy if isinstance(remedy, str) else remedy()
+        raise LumigraphError(f"{what} would need {gigabytes(size)} of memory, and {gigabytes(free)} are free; {less}")
+
+
+def gigabytes(size: float) -> str:
+    """Bytes for people: "0.3 GB", "1,234 GB"."""
+    return f"{size / 1e9:,.1f} GB" if size < 1e11 else f"{size / 1e9:,.0f} GB"
+
+
+def want_of_memory(error: BaseException) -> str | None:
+    """One sentence for a fault that is for want of memory: what asked for how much. None for any other fault."""
+    told = str(error)
+    if not (isinstance(error, MemoryError | torch.OutOfMemoryError) or any(sign in told for sign in SIGNS)):
+        return None
+    asked = re.search(r"allocate ([\d.]+) ?(bytes|[KMGTPE]iB)", told)
+    amount = "more" if asked is None else gigabytes(float(asked[1]) * UNITS[asked[2][0]])
+    frames = [x.name for x in traceback.extract_tb(error.__traceback__) if f"{os.sep}lumigraph{os.sep}" in x.filename]
+    where = f" for `{frames[-1].strip('_<>')}`" if frames else ""
+    on = "the device" if isinstance(error, torch.OutOfMemoryError) else "this machine"
+    return (
+        f"Memory is short: {amount} was asked for{where}, which {on} does not have; take smaller pictures "
+        f"(--downscale, --size) or smaller numbers, or end other programs"
+    )
 
 
 def free_memory() -> int:

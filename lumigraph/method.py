@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from typing import Any, ClassVar, Protocol, runtime_checkable
@@ -73,6 +74,12 @@ class Method(nn.Module, ABC):
         """The Config to use where the user chose none: the paper's on a GPU, on a CPU what learns most in a minute."""
         return cls.Config()
 
+    @classmethod
+    def further_bytes(cls, frame: Frame, config: Any, learning: bool) -> int:
+        """Bytes that will be needed at least, beside what is built at first: grids that are refined; where it is
+        learning, what a step keeps for its gradients."""
+        return 0
+
     # Learning
 
     def steps_per_pass(self, data: Any) -> float:
@@ -116,8 +123,11 @@ class Method(nn.Module, ABC):
         """Whether there is nothing left to learn, whatever the budget: after the last photograph of a fusion, say."""
         return False
 
-    def begin(self, data: Any) -> None:
-        """Called once, ahead of the first step of a new run: what the data tell without any learning."""
+    def begin(self, data: Any, seconds: float = math.inf) -> None:
+        """Called once, ahead of the first step of a new run: what the data tell without any learning.
+
+        seconds: the whole budget, of which a small share may be used; infinite where steps are counted
+        """
 
     def rehearse_begin(self) -> None:
         """Called on a copy before the clock starts: compile what `begin` needs and no step does."""
@@ -201,7 +211,7 @@ class Method(nn.Module, ABC):
     def random(self, number: int) -> torch.Generator:
         """Random numbers that depend on the config's seed and a number alone, the step for example, so that a resumed
         run draws the same."""
-        return torch.Generator().manual_seed((self.config.seed << 40) + (number % (1 << 40)))
+        return torch.Generator().manual_seed(((self.config.seed << 40) + (number % (1 << 40))) % (1 << 64))
 
     @property
     def device(self) -> torch.device:

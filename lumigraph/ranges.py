@@ -1,9 +1,21 @@
-"""Numbers with their ranges: declared once, in a field's annotation, and checked for flags and files alike."""
+"""Numbers with their ranges: declared once, in a field's annotation, and checked for flags and files alike.
+
+    levels: Annotated[int, between(1, 32)] = 16         of a Config, or of a command
+    frames: Annotated[Count | None, option("N")] = None
+
+`check` asks a dataclass whether it keeps to its ranges, `typed` makes one of plain JSON, `domain` says a range.
+"""
 
 from __future__ import annotations
 
+import re
+import types
+import typing
+from collections.abc import Iterator
+from dataclasses import fields, is_dataclass
+from functools import cache
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Annotated, Any, Literal, TypeVar, get_args, get_origin
 
 import msgspec
 
@@ -17,6 +29,83 @@ def between(least: float, most: float) -> msgspec.Meta:
     return msgspec.Meta(ge=least, le=most)
 
 
+# What recurs. Ranges are as wide as any use that makes sense, and no wider.
+Count = Annotated[int, between(1, 1_000_000)]  # of photographs, views, frames
+Steps = Annotated[int, between(1, 1_000_000_000)]
+Seconds = Annotated[float, between(0.001, 1e8)]  # up to three years
+Seed = Annotated[int, between(0, (1 << 32) - 1)]
+Share = Annotated[float, between(0, 1)]
+PositiveShare = Annotated[float, between(1e-6, 1)]  # a share that something is divided by
+Positive = Annotated[float, between(1e-9, 1e9)]
+Coordinate = Annotated[float, between(-1e9, 1e9)]
+NonNegative = Annotated[float, between(0, 1e6)]  # weights of losses, thresholds
+LearningRate = Annotated[float, between(0, 10)]
+Width = Annotated[int, between(2, 8192)]  # of a layer
+Layers = Annotated[int, between(1, 64)]
+RaySamples = Annotated[int, between(1, 4096)]  # of one ray
+BatchSize = Annotated[int, between(1, 1 << 22)]  # rays or pixels of one step
+Octaves = Annotated[int, between(1, 32)]
+CloudSize = Annotated[int, between(1, 100_000_000)]  # Gaussians, points
+Cells = Annotated[int, between(0, 512)]  # of a grid, along each axis; 0 for none
+Pixels = Annotated[int, between(16, 8192)]  # along the longer side
+SphereSize = Annotated[int, between(64, 16_384)]  # width of a picture of the whole sphere
+FramesPerSecond = Annotated[float, between(0.01, 1000)]
+Downscale = Annotated[int, between(1, 1024)]
+Scales = Annotated[int, between(1, 12)]  # of a picture, each half as large as the one before
+Port = Annotated[int, between(1, 65_535)]
+
+
+def numbers(kind: Any) -> Iterator[tuple[type, msgspec.Meta | None]]:
+    """Every number within an annotation, as (int or float, its range, None where it has none)."""
+    if get_origin(kind) is Annotated:
+        inner, *about = get_args(kind)
+        ranges = [x for x in about if isinstance(x, msgspec.Meta)]
+        yield from [(inner, ranges[0])] if ranges and inner in (int, float) else numbers(inner)
+    elif kind in (int, float):
+        yield kind, None
+    elif get_origin(kind) is not Literal:
+        for inner in get_args(kind):
+            yield from numbers(inner)
+
+
+def domain(kind: Any) -> str:
+    """The range of an annotation's numbers in words, "1 to 32"; "" where it has none."""
+    ranges = {(kind, x.ge, x.le): x for kind, x in numbers(kind) if x is not None}
+    return " or ".join(f"{said(x.ge)} to {said(x.le)}" for x in ranges.values())
+
+
+def said(number: Any) -> str:
+    """A number as people write it: 0.001, 1e8, 100,000,000."""
+    return f"{number:,}" if isinstance(number, int) else re.sub(r"e\+?(-?)0*", r"e\1", f"{number:g}")
+
+
+@cache
+def annotations(kind: type) -> dict[str, Any]:
+    """The fields of a dataclass with what their annotations say."""
+    hints = typing.get_type_hints(kind, include_extras=True)
+    return {field.name: hints[field.name] for field in fields(kind)}
+
+
+def outside(value: Any) -> Iterator[tuple[str, Any, Any]]:
+    """The fields of a dataclass, and of dataclasses in it, whose numbers are none or beyond their ranges, as
+    (name, annotation, value)."""
+    for name, kind in annotations(type(value)).items():
+        found = getattr(value, name)
+        if is_dataclass(found):
+            yield from outside(found)
+        elif any(range is not None for _, range in numbers(kind)):
+            try:
+                msgspec.convert(found, kind)
+            except msgspec.ValidationError:
+                yield name, kind, found
+
+
+def check(value: Any, where: Path | str) -> None:
+    """Raise LumigraphError for the first number of a dataclass beyond its range. where: what to name before it."""
+    for name, kind, found in outside(value):
+        raise LumigraphError(f"{where}: {name} cannot be {shown(found)}; it is from {domain(kind)}")
+
+
 def typed(kind: type[Kind], value: Any, where: Path | str) -> Kind:
     """Plain JSON as a value of a kind: a dataclass, a tuple, a dictionary, a union; ranges and types are checked.
 
@@ -25,4 +114,45 @@ def typed(kind: type[Kind], value: Any, where: Path | str) -> Kind:
     try:
         return msgspec.convert(value, kind)
     except (msgspec.ValidationError, ValueError, TypeError) as error:
-        raise LumigraphError(f"{where} does not hold what it should: {error}") from error
+        fault, _, path = str(error).partition(" - at `$")
+        name = path.rstrip("`").lstrip(".")
+        found, wanted = found_at(kind, value, name) if name else (value, kind)
+        what = f"{name} is {shown(found)}" if name else f"it holds {shown(found)}"
+        should = f"should be from {domain(wanted)}" if re.match(r"Expected `\w+` [<>]", fault) else fault
+        raise LumigraphError(f"{where} does not hold what it should: {what}, {should}") from error
+
+
+def found_at(kind: Any, value: Any, path: str) -> tuple[Any, Any]:
+    """The value that a path of msgspec's leads to, "grids.channels[1]", and its annotation; None where that is beyond
+    what is known here."""
+    for name, index in re.findall(r"([^.\[\]]+)|\[(\d+)\]", path):
+        kind = next((x for x in members(kind) if is_dataclass(x) or get_origin(x) is tuple), None)
+        try:
+            value = value[name or int(index)]
+        except (KeyError, IndexError, TypeError):
+            return value, None
+        if is_dataclass(kind):
+            kind = annotations(typing.cast(type, kind)).get(name)
+        elif index:
+            inner = [x for x in get_args(kind) if x is not Ellipsis]
+            kind = inner[min(int(index), len(inner) - 1)] if inner else None
+    return value, kind
+
+
+def members(kind: Any) -> Iterator[Any]:
+    """The members of a union, or the annotation itself, without what is said about them."""
+    if get_origin(kind) is Annotated:
+        yield from members(get_args(kind)[0])
+    elif get_origin(kind) in (typing.Union, types.UnionType):
+        for inner in get_args(kind):
+            yield from members(inner)
+    else:
+        yield kind
+
+
+def shown(value: Any) -> str:
+    """A value in a sentence, and no more than a line of it."""
+    if isinstance(value, int) and abs(value) > 10**60:  # Python writes out no integer of thousands of digits
+        return "an integer of more than 60 digits"
+    text = repr(value) if isinstance(value, str) else str(value)
+    return text if len(text) <= 60 else f"{text[:57]}..."

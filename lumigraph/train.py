@@ -21,7 +21,7 @@ from .errors import LumigraphError
 from .figures import save_picture
 from .memory import peak_memory
 from .method import Lesson, Method
-from .run import Run, State
+from .run import Run, State, check_memory
 from .signals import Interrupt
 from .verdict import shares_seen
 
@@ -97,6 +97,7 @@ def fit(
     """
     budget = budget or Budget(steps, seconds)
     check_kind(methods.name_of(method), method.learns_from, type(data), data.source)
+    check_memory(type(method), method.frame, method.config, method.device, learning=True)
     with run.held() if run else contextlib.nullcontext(), Interrupt() as interrupt, TrainingDisplay(show) as display:
         state = run.restore_weights(method) if run else State()
         display.begin(data)
@@ -110,7 +111,7 @@ def fit(
         clock, step, watched = Clock(state.seconds), state.step, 0.0
         if step == 0:
             with display.aside():
-                method.begin(data)
+                method.begin(data, budget.seconds or math.inf)
         display.ready(methods.name_of(method), method, budget, step, clock.seconds)
         next_save = clock.seconds + min(FIRST_SAVE, save_every)
 

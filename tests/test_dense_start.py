@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from functools import cache
 
@@ -109,7 +110,7 @@ def test_one_photograph_alone_has_no_dense_points():
 
 def test_a_cloud_begins_at_known_points_dense_ones_and_far_out(generator, monkeypatch):
     scene = ball(alpha=False)
-    monkeypatch.setattr(initial_cloud, "dense_points", lambda scene: dense(alpha=False))
+    monkeypatch.setattr(initial_cloud, "dense_points", lambda scene, seconds: dense(alpha=False))
     known = RADIUS * normalize(torch.randn(300, 3, generator=generator), dim=-1)
     begun = initial_cloud.initial_cloud(replace(scene, points=known), "dense", 200, 2000, 1, generator)
     assert len(begun) == 667  # a third
@@ -149,3 +150,25 @@ def test_a_warp_is_a_projection(generator):
     pixels = torch.tensor([[x + 0.5, 20.5, 1.0] for x in (30, 31, 32)])
     u = pixels @ warp[:, :3].T + warp[:, 3] / depth
     torch.testing.assert_close(u[:, :2] / u[:, 2:], there, rtol=1e-4, atol=1e-3)
+
+
+def test_a_short_budget_asks_fewer_photographs(monkeypatch):
+    clock, swept = iter(range(1000)), []
+
+    def alone(views, ranges):
+        swept.append(len(views))
+        return [[] for _ in views]
+
+    monkeypatch.setattr(dense_points.time, "perf_counter", lambda: next(clock))  # so that a sweep takes a second
+    monkeypatch.setattr(dense_points, "FEWEST_VIEWS", 3)
+    monkeypatch.setattr(dense_points, "choose_neighbours", alone)
+    for seconds in (2.0, 8.0, math.inf):
+        dense_points.dense_points(ball(), seconds)
+    assert swept == [3, 3, 4, 4, COUNT, COUNT]  # twice each, as no point is known
+
+
+def test_a_near_distance_that_is_much_too_small_keeps_the_neighbours():
+    scene = ball()
+    found = dense_points.dense_points(replace(scene, frame=replace(scene.frame, near=0.05)))
+    assert len(found.positions) > 0.5 * len(dense().positions)
+    assert off_surface(found.positions).median() < 0.01

@@ -10,6 +10,7 @@ from typing import Annotated, Any, Literal
 from tyro.conf import Positional
 
 from ..errors import LumigraphError
+from ..ranges import Count, between
 from .common import needed, option, say, scene_name, show, typed
 
 NAMELESS = ("images", "photos", "photographs", "pictures", "input", "frames")  # folders named after what is in them
@@ -29,7 +30,7 @@ class CaptureCommand:
     """A folder of photographs, several image files, or one video."""
     output: Annotated[Path | None, option("SCENE", "scenes/NAME")] = None
     """Folder for the scene."""
-    frames: Annotated[int | None, option("N", "by the video's length")] = None
+    frames: Annotated[Count | None, option("N", "by the video's length")] = None
     """How many frames of a video to use."""
     mapper: Literal["incremental", "global"] = "incremental"
     """One photograph after the other, or all at once, which is quicker for hundreds."""
@@ -37,7 +38,7 @@ class CaptureCommand:
     """What is compared: neighbours in order, all pairs, or those that look alike; auto goes by kind and number."""
     camera: Literal["auto", "single", "per-device", "per-image"] = "auto"
     """Which photographs share a lens; auto goes by what the files say."""
-    max_size: Annotated[int, option("PIXELS")] = 1600
+    max_size: Annotated[int, between(64, 65_536), option("PIXELS")] = 1600
     """Longer side to which photographs are reduced when details are looked for."""
 
     mask_object: bool = False

@@ -88,16 +88,6 @@ def numbers(kind: Any, quality: Quality) -> str:
     return f": each {unit} {effort.passes:g} times, at least {effort.at_least:,} steps"
 
 
-def check_film(frames: int | None, fps: float, size: int | None) -> None:
-    """Refuse films that cannot be, before anything is rendered."""
-    if frames is not None and frames < 1:
-        raise LumigraphError(f"A film cannot have {frames} frames; give --frames a number above 0")
-    if not 0 < fps <= 1000:
-        raise LumigraphError(f"A film cannot show {fps:g} frames per second; give --fps a number from 1 to 1000")
-    if size is not None and not 16 <= size <= 8192:
-        raise LumigraphError(f"A film cannot be {size} pixels large; give --size a number from 16 to 8192")
-
-
 def say(text: str) -> None:
     """To stderr, where it does not mix with results."""
     print(text, file=sys.stderr, flush=True)

@@ -9,9 +9,10 @@ from typing import Annotated
 from tyro.conf import Positional, arg
 
 from ..errors import LumigraphError
+from ..ranges import Coordinate, Positive, between
 from .common import needed, option, show, typed
 
-Triple = tuple[float, float, float]
+Triple = tuple[Coordinate, Coordinate, Coordinate]
 
 
 @dataclass(frozen=True)
@@ -31,9 +32,9 @@ class Compose:
     """The new file. It names its parts by their paths from where it lies."""
     at: Annotated[Triple | None, arg(metavar="X Y Z", help_behavior_hint="(default: the lead's foot)")] = None
     """Where the middle of the part's foot stands, in the frame of the lead's photographs."""
-    scale: Annotated[float | None, option("TIMES", "1")] = None
+    scale: Annotated[Positive | None, option("TIMES", "1")] = None
     """Size of the part: units of the lead's photographs to one of its own."""
-    turn: Annotated[float | None, option("DEGREES", "0")] = None
+    turn: Annotated[Annotated[float, between(-1e6, 1e6)] | None, option("DEGREES", "0")] = None
     """About the vertical, counterclockwise from above."""
     box: Annotated[
         tuple[Triple, Triple] | None, arg(metavar="X Y Z X Y Z", help_behavior_hint="(default: all of it)")
@@ -55,8 +56,6 @@ class Compose:
             raise LumigraphError(f"{self.output} should end in .json, as compositions do; rename it")
         if self.output.exists() and not self.overwrite:
             raise LumigraphError(f"{self.output} is there already; give --overwrite to replace it, or another --output")
-        if self.scale is not None and not 0 < self.scale < float("inf"):
-            raise LumigraphError(f"Nothing can be {self.scale:g} times as large; give --scale a number above 0")
         if self.box is not None and not all(a < b for a, b in zip(*self.box, strict=True)):
             raise LumigraphError("The box holds nothing; give --box its lower corner first, then its upper one")
         lead, part = open_any(self.lead), open_any(self.part)

@@ -8,7 +8,8 @@ from typing import Annotated
 
 from ..budget import Budget
 from ..console import bold
-from .common import check_film, choose_device, exit_code, next_free, option, say, show, typed
+from ..ranges import Count, Seconds
+from .common import choose_device, exit_code, next_free, option, say, show, typed
 
 FRAMES = 90
 
@@ -22,13 +23,13 @@ class Demo:
 
     output: Annotated[Path | None, option("RUN", "demo/run-N")] = None
     """New folder for the run."""
-    seconds: Annotated[float, option("S")] = 60.0
+    seconds: Annotated[Seconds, option("S")] = 60.0
     """How long to train."""
     method: Annotated[str, option("METHOD")] = "instant-ngp"
     """What to train."""
     scene: Annotated[str, option("SCENE")] = "procedural:still-life"
     """What to train it on."""
-    frames: Annotated[int, option("N")] = FRAMES
+    frames: Annotated[Count, option("N")] = FRAMES
     """Length of the film."""
     device: Annotated[str, option("NAME")] = "auto"
     """auto, cpu, cuda, cuda:1."""
@@ -45,7 +46,6 @@ class Demo:
         from ..train import fit
 
         budget = Budget(seconds=self.seconds)
-        check_film(self.frames, fps=30, size=None)
         kind, device = methods.find(self.method), choose_device(self.device)
         output = self.output or next_free("demo/run")
         check_new(output)

@@ -10,6 +10,7 @@ from typing import Annotated, Any, Literal
 from tyro.conf import Positional
 
 from ..console import bold
+from ..ranges import Count
 from .common import choose_device, needed, option, show
 from .controls import Set, tell
 
@@ -30,7 +31,7 @@ class Eval:
     """Folder of the run."""
     split: Literal["test", "val", "train"] = "test"
     """Which photographs, shapes or members of a collection."""
-    views: Annotated[int | None, option("N", "all")] = None
+    views: Annotated[Count | None, option("N", "all")] = None
     """Compare so many views or shapes only, evenly spread."""
     lpips: Annotated[tuple[Path, ...], option("FILE", "those in LUMIGRAPH_LPIPS, if any")] = ()
     """Files with the weights of LPIPS, .pth or .safetensors."""

@@ -9,6 +9,7 @@ from typing import Annotated, Any
 from tyro.conf import Positional
 
 from ..console import console
+from ..ranges import Downscale
 from .common import ReaderOption, needed, option
 
 LONG = 4096  # letters; a tree cuts its lines where the console ends, and folders have long names
@@ -20,7 +21,7 @@ class Info:
 
     what: Annotated[Positional[str], needed("RUN_OR_SCENE")]
     """Folder of a run, of photographs or of meshes, a picture, a mesh, procedural:NAME, a splat file, a composition."""
-    downscale: Annotated[int | None, option("N", "none, or what suits the photographs")] = None
+    downscale: Annotated[Downscale | None, option("N", "none, or what suits the photographs")] = None
     """Shrink a scene's photographs by a whole number."""
     reader: ReaderOption = None
 

@@ -9,10 +9,11 @@ from typing import Annotated, Any, Literal
 from tyro.conf import arg
 
 from ..errors import LumigraphError
+from ..ranges import Coordinate, Positive, Share
 from .common import option
 
-Six = tuple[float, float, float, float, float, float]
-Four = tuple[float, float, float, float]
+Six = tuple[Coordinate, Coordinate, Coordinate, Coordinate, Coordinate, Coordinate]
+Four = tuple[Coordinate, Coordinate, Coordinate, Positive]
 
 
 @dataclass(frozen=True)
@@ -28,11 +29,11 @@ class Keeping:
     that of the photographs, in which exports lie."""
     clean: bool = False
     """Leave out floaters, where the scene is Gaussians: faint, huge or isolated ones, as much as is safe for most."""
-    min_opacity: Annotated[float | None, option("SHARE", "0, with --clean 0.02")] = None
+    min_opacity: Annotated[Share | None, option("SHARE", "0, with --clean 0.02")] = None
     """Leave out Gaussians that are fainter."""
-    max_scale: Annotated[float | None, option("SHARE", "any, with --clean 1")] = None
+    max_scale: Annotated[Positive | None, option("SHARE", "any, with --clean 1")] = None
     """Leave out Gaussians whose standard deviation is larger, in extents of the cloud."""
-    isolation: Annotated[float | None, option("DEVIATIONS", "any, with --clean 3")] = None
+    isolation: Annotated[Positive | None, option("DEVIATIONS", "any, with --clean 3")] = None
     """Leave out Gaussians that are farther from their neighbours than most, by so many standard deviations."""
 
     @property
@@ -54,12 +55,6 @@ class Keeping:
             raise LumigraphError("--box and --sphere are two ways to crop; give one of them")
         if self.box is not None and not all(a < b for a, b in zip(self.box[:3], self.box[3:], strict=True)):
             raise LumigraphError("The box holds nothing; give --box its lower corner first, then its upper one")
-        if self.sphere is not None and not 0 < self.sphere[3] < float("inf"):
-            raise LumigraphError(f"A sphere of radius {self.sphere[3]:g} holds nothing; give it one above 0")
-        if self.min_opacity is not None and not 0 <= self.min_opacity <= 1:
-            raise LumigraphError(f"No opacity is {self.min_opacity:g}; give --min-opacity a number from 0 to 1")
-        if self.max_scale is not None and not self.max_scale > 0:
-            raise LumigraphError(f"No Gaussian is smaller than {self.max_scale:g}; give --max-scale a number above 0")
 
     def crop(self, frame: Any) -> Any:
         """The Crop, in the scene's frame; None where there is none."""

@@ -9,7 +9,8 @@ from typing import Annotated, Any
 from tyro.conf import Positional
 
 from ..errors import LumigraphError
-from .common import check_film, needed, option, show
+from ..ranges import Count, Pixels
+from .common import needed, option, show
 from .controls import Animate, Set, animate, open_method
 
 # As `paths.film` has them, which help does not wait for.
@@ -30,11 +31,11 @@ class Render:
     """Folder of the run, a splat file (.ply, .compressed.ply, .spz, .splat), or a composition (.json)."""
     path: Annotated[str, option("{" + ",".join(PATHS) + ",FILE.json}")] = "orbit"
     """Where the camera goes."""
-    frames: Annotated[int | None, option("N", "120; every held-out view; as long as keyframes say")] = None
+    frames: Annotated[Count | None, option("N", "120; every held-out view; as long as keyframes say")] = None
     """Length in frames."""
-    fps: Annotated[float | None, option("N", "30, or what the path's file says")] = None
+    fps: Annotated[FramesPerSecond | None, option("N", "30, or what the path's file says")] = None
     """Frames per second."""
-    size: Annotated[int | None, option("PIXELS", f"that of the photographs, at most {LONGEST}")] = None
+    size: Annotated[Pixels | None, option("PIXELS", f"that of the photographs, at most {LONGEST}")] = None
     """Longer side of the picture."""
     output: Annotated[Path | None, option("FILE", "RUN/renders/PATH.mp4, or renders/FILE/PATH.mp4")] = None
     """The film: .mp4, .gif or .webp. Depth (FILE-depth), FILE.json and the folder FILE of pictures go beside it."""
@@ -48,7 +49,6 @@ class Render:
         from ..export.video import kind_of
         from ..paths import film_cameras
 
-        check_film(self.frames, 30.0 if self.fps is None else self.fps, self.size)
         flight = None if self.path in PATHS else read_path(self.path, self.fps)
         fps = self.fps or (flight.fps if flight else 30.0)
         opened, method, views = open_method(self.source, self.device, self.told)

@@ -11,6 +11,7 @@ from tyro.conf import Positional
 from ..budget import Budget
 from ..errors import LumigraphError
 from ..quality import Quality
+from ..ranges import Port, Seconds, Steps
 from .common import choose_device, exit_code, needed, option, quality_budget, told_budget
 
 
@@ -24,9 +25,9 @@ class Resume:
 
     run_folder: Annotated[Positional[Path], needed("RUN")]
     """Folder of the run."""
-    seconds: Annotated[float | None, option("S", "as begun")] = None
+    seconds: Annotated[Seconds | None, option("S", "as begun")] = None
     """New total of seconds, those already trained included."""
-    steps: Annotated[int | None, option("N", "as begun")] = None
+    steps: Annotated[Steps | None, option("N", "as begun")] = None
     """New total of steps, those already done included."""
     quality: Annotated[Quality | None, option("draft|good|best", "as begun")] = None
     """New total of steps, as for `lumigraph train`."""
@@ -34,13 +35,13 @@ class Resume:
     """Where what it learns from is now, if it has moved."""
     device: Annotated[str, option("NAME", "the one it began on")] = "same"
     """auto, cpu, cuda, cuda:1."""
-    pause_at: Annotated[int | None, option("STEP", "never")] = None
+    pause_at: Annotated[Steps | None, option("STEP", "never")] = None
     """Stop at this step as if interrupted."""
     view: bool = False
     """Show the scene in the browser while it is learnt, and afterwards until Ctrl-C."""
     host: Annotated[str, option("ADDRESS", "127.0.0.1, this machine alone")] = "127.0.0.1"
     """Where --view listens; 0.0.0.0 lets other machines look too."""
-    port: Annotated[int | None, option("N", "8080, or the next that is free")] = None
+    port: Annotated[Port | None, option("N", "8080, or the next that is free")] = None
     """Port that --view listens at."""
 
     def run(self) -> int:

@@ -11,6 +11,7 @@ from tyro.conf import Fixed, OmitArgPrefixes, Positional, Suppress
 from .. import methods
 from ..budget import Budget
 from ..quality import Quality
+from ..ranges import Count, Downscale, Port, Scales, Seconds, Seed, Steps
 from .capture import posed
 from .common import (
     ReaderOption,
@@ -44,31 +45,31 @@ class Train:
     """What to train it on."""
     output: Annotated[Path | None, option("RUN", "runs/SCENE-METHOD-N")] = None
     """New folder for the run."""
-    seconds: Annotated[float | None, option("S", f"{DEFAULT_SECONDS:.0f}")] = None
+    seconds: Annotated[Seconds | None, option("S", f"{DEFAULT_SECONDS:.0f}")] = None
     """Train for so long. Compiling kernels on first use comes before and is reported beside."""
-    steps: Annotated[int | None, option("N", "as long as --seconds")] = None
+    steps: Annotated[Steps | None, option("N", "as long as --seconds")] = None
     """Train for so many steps instead."""
     quality: Annotated[Quality | None, option("draft|good|best", "as long as --seconds", about_quality())] = None
-    downscale: Annotated[int | None, option("N", "none, or what suits the photographs")] = None
+    downscale: Annotated[Downscale | None, option("N", "none, or what suits the photographs")] = None
     """Shrink photographs by a whole number."""
     reader: ReaderOption = None
-    views: Annotated[int | None, option("N", "all")] = None
+    views: Annotated[Count | None, option("N", "all")] = None
     """Learn from so many photographs only, spread evenly over the cameras."""
-    scales: Annotated[int, option("N")] = 1
+    scales: Annotated[Scales, option("N")] = 1
     """Have every photograph so many times, each half as large as the one before; evaluation counts them all."""
-    seed: Annotated[int, option("N")] = 0
+    seed: Annotated[Seed, option("N")] = 0
     """Of all random choices."""
     device: Annotated[str, option("NAME")] = "auto"
     """auto, cpu, cuda, cuda:1."""
     preset: Literal["auto", "laptop", "paper"] = "auto"
     """The method's own defaults: the paper's, or what learns most on a plain CPU; auto looks at --device."""
-    pause_at: Annotated[int | None, option("STEP", "never")] = None
+    pause_at: Annotated[Steps | None, option("STEP", "never")] = None
     """Stop at this step as if interrupted. The schedule still follows the whole budget."""
     view: bool = False
     """Show the scene in the browser while it is learnt, and afterwards until Ctrl-C."""
     host: Annotated[str, option("ADDRESS", "127.0.0.1, this machine alone")] = "127.0.0.1"
     """Where --view listens; 0.0.0.0 lets other machines look too."""
-    port: Annotated[int | None, option("N", "8080, or the next that is free")] = None
+    port: Annotated[Port | None, option("N", "8080, or the next that is free")] = None
     """Port that --view listens at."""
 
     def run(self) -> int:

@@ -11,6 +11,7 @@ from typing import Annotated, Any
 from tyro.conf import Positional
 
 from ..errors import LumigraphError
+from ..ranges import Port
 from ..signals import until_interrupted
 from .common import needed, option, show
 from .controls import Set, open_method
@@ -28,7 +29,7 @@ class ViewCommand:
     """Folder of the run, a splat file (.ply, .compressed.ply, .spz, .splat), or a composition (.json)."""
     host: Annotated[str, option("ADDRESS", "127.0.0.1, this machine alone")] = "127.0.0.1"
     """Where to listen; 0.0.0.0 lets other machines look too."""
-    port: Annotated[int | None, option("N", "8080, or the next that is free")] = None
+    port: Annotated[Port | None, option("N", "8080, or the next that is free")] = None
     """Port to listen at."""
     told: Set = ()
     device: Annotated[str, option("NAME")] = "auto"

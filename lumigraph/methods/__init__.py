@@ -63,5 +63,6 @@ def learning_from(dataset: type[Any]) -> list[str]:
 
 
 def name_of(method: Any) -> str:
-    """What the user types for a method: the name of the file that holds it."""
-    return type(method).__module__.rpartition(".")[2].replace("_", "-")
+    """What the user types for a method, or for its class: the name of the file that holds it."""
+    kind = method if isinstance(method, type) else type(method)
+    return kind.__module__.rpartition(".")[2].replace("_", "-")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 import torch
 from jaxtyping import Bool, Float
@@ -14,6 +14,7 @@ from torch import Tensor, nn
 from ..components.fields.dense import Dense
 from ..components.fields.encodings import FourierFeatures as Waves
 from ..method import RayMethod
+from ..ranges import BatchSize, LearningRate, NonNegative, Seed, Width, between
 from ..rays import Rays, Rendering
 from ..scene import Batch, Frame, Scene
 
@@ -26,14 +27,14 @@ class Config:
     """The paper's numbers for pictures (section 6.1, and its appendix on implementation); those of a step are ours."""
 
     encoding: Encoding = "gaussian"
-    scale: float = 10.0  # sigma, in cycles across the picture: gaussian's deviation, positional's highest frequency
-    frequencies: int = 256  # rows of B, for positional and gaussian
-    layers: int = 4  # the last of them gives colours
-    hidden_width: int = 256  # of the others
-    learning_rate: float = 1e-3  # Adam's
-    pixels_per_step: int = 1 << 13  # the paper takes all of them
+    scale: NonNegative = 10.0  # sigma, cycles across the picture: of gaussian the deviation, of positional the highest
+    frequencies: Annotated[int, between(2, 65_536)] = 256  # rows of B, for positional and gaussian
+    layers: Annotated[int, between(2, 64)] = 4  # the last of them gives colours
+    hidden_width: Width = 256  # of the others
+    learning_rate: LearningRate = 1e-3  # Adam's
+    pixels_per_step: BatchSize = 1 << 13  # the paper takes all of them
     exact: bool = False  # multiply in float32 even where bfloat16 is faster
-    seed: int = 0
+    seed: Seed = 0
 
 
 class FourierFeatures(RayMethod):
@@ -113,4 +114,4 @@ def frequencies(config: Config) -> Float[Tensor, "frequency 2"] | None:
         case "positional":
             return torch.kron(torch.eye(2), (scale ** (torch.arange(count // 2) / (count // 2)))[:, None])
         case "gaussian":
-            return scale * torch.randn(count, 2, generator=generator)
+            return scale * torch.randn(count, 2, generator=generator, device="cpu")

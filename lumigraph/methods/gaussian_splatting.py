@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import math
 import warnings
 from dataclasses import dataclass
-from typing import Any, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 import torch
 from jaxtyping import Bool
@@ -25,6 +26,7 @@ from ..gaussians import Gaussians
 from ..gaussians.splatting import Splatted, render, splat, view_of
 from ..memory import room_for
 from ..method import Method
+from ..ranges import CloudSize, LearningRate, NonNegative, PositiveShare, Seed, Share, Steps, between
 from ..rays import Rendering
 from ..scene import Frame, Photograph, Scene
 
@@ -33,38 +35,39 @@ from ..scene import Frame, Photograph, Scene
 class Config:
     """The paper's numbers, with where it gives them; those without a section are the authors' release's."""
 
-    sh_degree: int = 3  # of the spherical harmonics, section 5.1
-    sh_degree_interval: int = 1000  # steps, section 7.1; or the share below of the budget, if that is sooner
-    sh_degree_interval_share: float = 1 / 8
-    ssim_weight: float = 0.2  # share of D-SSIM in the loss, eq. 7
+    sh_degree: Annotated[int, between(0, 3)] = 3  # of the spherical harmonics, section 5.1
+    sh_degree_interval: Steps = 1000  # steps, section 7.1; or the share below of the budget, if that is sooner
+    sh_degree_interval_share: PositiveShare = 1 / 8
+    ssim_weight: Share = 0.2  # share of D-SSIM in the loss, eq. 7
     strategy: Literal["adaptive", "mcmc"] = "adaptive"  # density control: section 5, or Kheradmand 2024
-    max_gaussians: int = 1_000_000  # cap of the cloud's size, under either strategy
+    max_gaussians: CloudSize = 1_000_000  # cap of the cloud's size, under either strategy
     initialization: Initialization = "sparse"  # points of structure from motion, "dense" with plane sweeps' beside them
-    initial_gaussians: int = 100_000  # at random places, where nothing else is known, section 7.1
-    half_resolution_until: float = 0.0  # share of the budget at half size; the first quarter of it at a quarter
-    refine_every: int = 100  # steps between changes of the cloud, section 5.2; or the share, if that is sooner
-    refine_every_share: float = 0.1
-    refine_from: int = 500  # step; or the share of the budget, if that is sooner
-    refine_from_share: float = 0.15
-    refine_until: float = 0.5  # share of the budget; section 7.1: 15 000 of 30 000 steps
-    joining_per_step: float = 0.0  # Gaussians that mcmc has added by each step, if 5 % a change would be fewer
-    densify_grad_threshold: float = 2e-4  # gradient of a footprint's centre that asks for more Gaussians, section 5.2
-    opacity_reset_interval: int = 3000  # steps, section 5.2
-    means_lr: float = 1.6e-4  # times the extent of the cameras
-    final_means_lr: float = 1.6e-6
-    sh_lr: float = 2.5e-3  # a twentieth of it beyond the first band
-    opacities_lr: float = 0.05
-    scales_lr: float = 5e-3
-    quaternions_lr: float = 1e-3
-    most_haste: float = 1.0  # times the rates of scales and harmonics in a run of few steps, at most
-    opacity_regularization: float = 0.01  # weight of the mean opacity in the loss, for mcmc (Kheradmand 2024, eq. 11)
-    scale_regularization: float = 0.01  # weight of the mean deviation, in extents, for mcmc
-    transmittance_threshold: float = 1e-4  # at which a pixel is finished, appendix C
+    initial_gaussians: CloudSize = 100_000  # at random places, where nothing else is known, section 7.1
+    half_resolution_until: Share = 0.0  # share of the budget at half size; the first quarter of it at a quarter
+    refine_every: Steps = 100  # steps between changes of the cloud, section 5.2; or the share, if that is sooner
+    refine_every_share: PositiveShare = 0.1
+    refine_from: Steps = 500  # step; or the share of the budget, if that is sooner
+    refine_from_share: PositiveShare = 0.15
+    refine_until: Share = 0.5  # share of the budget; section 7.1: 15 000 of 30 000 steps
+    joining_per_step: NonNegative = 0.0  # Gaussians that mcmc has added by each step, if 5 % a change would be fewer
+    densify_grad_threshold: NonNegative = 2e-4  # gradient of a centre that asks for more Gaussians, section 5.2
+    opacity_reset_interval: Steps = 3000  # steps, section 5.2
+    means_lr: LearningRate = 1.6e-4  # times the extent of the cameras
+    final_means_lr: LearningRate = 1.6e-6
+    sh_lr: LearningRate = 2.5e-3  # a twentieth of it beyond the first band
+    opacities_lr: LearningRate = 0.05
+    scales_lr: LearningRate = 5e-3
+    quaternions_lr: LearningRate = 1e-3
+    most_haste: Annotated[float, between(1, 1000)] = 1.0  # times the rates of scales and harmonics, in short runs
+    opacity_regularization: NonNegative = 0.01  # of the mean opacity in the loss, for mcmc (Kheradmand 2024, eq. 11)
+    scale_regularization: NonNegative = 0.01  # of the mean deviation, in extents, for mcmc
+    transmittance_threshold: Share = 1e-4  # at which a pixel is finished, appendix C
     antialiased: bool = False  # Mip-Splatting's 2-D filter (Yu 2024, section 5.2)
     filter_3d: bool = False  # Mip-Splatting's 3-D filter (Yu 2024, section 5.1)
-    seed: int = 0
+    seed: Seed = 0
 
 
+SWEEPING = 0.08  # of the budget: the share that looking for points to begin at may take
 NEAR = 0.1  # times the scene's near distance: the near plane of splats
 SMALLEST = 64  # pixels of a photograph's shorter side that are kept when it is reduced
 ENOUGH = 2400  # steps, with which sizes and colours need not hurry
@@ -140,7 +143,7 @@ class GaussianSplatting(Method):
             initialization="dense",
             max_gaussians=120_000,
             initial_gaussians=20_000,
-            half_resolution_until=0.3,
+            half_resolution_until=0.7,
             joining_per_step=120.0,
             most_haste=4.0,
         )
@@ -164,10 +167,11 @@ class GaussianSplatting(Method):
         if self.config.initialization == "dense":
             compile_sweep()
 
-    def begin(self, scene: Scene) -> None:
+    def begin(self, scene: Scene, seconds: float = math.inf) -> None:
         config = self.config
-        counts = config.initial_gaussians, config.max_gaussians
-        found = initial_cloud(scene, config.initialization, *counts, config.sh_degree, self.random(1))
+        counts = min(config.initial_gaussians, self._most()), self._most()
+        sweeping = SWEEPING * seconds
+        found = initial_cloud(scene, config.initialization, *counts, config.sh_degree, self.random(1), sweeping)
         self.cloud.replace(found, self._optimizer)
         self.density_control.begin(len(found))
         self.began.fill_(len(found))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Annotated, Any, ClassVar
 
 import torch
 from jaxtyping import Bool, Float
@@ -18,8 +18,11 @@ from ..components.sampling.carving import visual_hull
 from ..components.sampling.occupancy import OccupancyGrid
 from ..components.training.corrections import Exposure, PoseRefinement
 from ..components.training.lazy_adam import LazyAdam
+from ..components.training.schedules import falling
 from ..controls import Control
+from ..errors import LumigraphError
 from ..method import RayMethod
+from ..ranges import Layers, LearningRate, NonNegative, PositiveShare, Seed, Share, Steps, Width, between
 from ..rays import Look, Rays, Rendering, Samples
 from ..scene import Batch, Frame, Scene
 from ..volume import composite, visible
@@ -29,32 +32,44 @@ from ..volume import composite, visible
 class Config:
     """The paper's numbers, with where it gives them; `InstantNGP.preset` says what a plain CPU does otherwise."""
 
-    levels: int = 16  # L, table 1
-    features_per_level: int = 2  # F, table 1
-    log2_hashmap_size: int = 19  # log2 T, table 1: 14 to 24
-    base_resolution: int = 16  # N_min, table 1
-    max_resolution: int = 2048  # N_max for a scene of reach 1; grows with the reach (section 5.4)
-    hidden_width: int = 64  # neurons per hidden layer, section 5.4
-    density_layers: int = 1  # hidden layers, section 5.4
-    colour_layers: int = 2  # hidden layers, section 5.4
-    geometry_features: int = 16  # from the density network to the colour network, section 5.4
-    sh_bands: int = 4  # of spherical harmonics, section 5.4
-    samples_per_step: int = 1 << 18  # section 5.4: batches are sized by samples, not by rays
-    steps_per_diagonal: int = 1024  # of the unit cascade, appendix E.1
-    cone_angle: float = 1 / 256  # a step's growth with distance in unbounded scenes, appendix E.1
-    transmittance_threshold: float = 1e-4  # at which a ray is spent, appendix E.1
-    occupancy_resolution: int = 128  # cells per axis and cascade, appendix E.2
-    occupancy_threshold: float = 0.05  # optical thickness across a cell below which it is empty; E.2's at n = 128
-    occupancy_interval: int = 16  # steps between updates of the occupancy grid, appendix E.2
-    occupancy_decay: float = 0.95  # of the densities it remembers, appendix E.2
-    learning_rate: float = 1e-2  # section 4
-    final_learning_rate: float = 1e-3  # at the end of the budget
-    decay_start: float = 0.3  # share of the budget before the learning rate begins to fall
-    hash_weight_decay: float = 0.0  # of the table, decoupled; of objects only, for it pulls density towards 1
-    huber_delta: float = 0.1  # residual at which the loss turns from square to linear
+    levels: Annotated[int, between(1, 32)] = 16  # L, table 1
+    features_per_level: Annotated[int, between(1, 16)] = 2  # F, table 1
+    log2_hashmap_size: Annotated[int, between(1, 28)] = 19  # log2 T, table 1: 14 to 24
+    base_resolution: Annotated[int, between(1, 4096)] = 16  # N_min, table 1
+    max_resolution: Annotated[int, between(1, 1 << 20)] = 2048  # N_max, times the reach (section 5.4)
+    hidden_width: Width = 64  # neurons per hidden layer, section 5.4
+    density_layers: Layers = 1  # hidden layers, section 5.4
+    colour_layers: Layers = 2  # hidden layers, section 5.4
+    geometry_features: Annotated[int, between(1, 256)] = 16  # from density to colour network, section 5.4
+    sh_bands: Annotated[int, between(1, 4)] = 4  # of spherical harmonics, section 5.4
+    samples_per_step: Annotated[int, between(64, 1 << 24)] = 1 << 18  # section 5.4: not rays
+    steps_per_diagonal: Annotated[int, between(4, 16_384)] = 1024  # of the unit cascade, appendix E.1
+    cone_angle: Share = 1 / 256  # growth of steps with distance, E.1
+    transmittance_threshold: Share = 1e-4  # at which a ray is spent, appendix E.1
+    occupancy_resolution: Annotated[int, between(4, 512)] = 128  # cells per axis and cascade, appendix E.2
+    occupancy_threshold: NonNegative = 0.05  # optical thickness across a cell below which it is empty; E.2's at n = 128
+    occupancy_interval: Steps = 16  # steps between updates of the occupancy grid, appendix E.2
+    occupancy_decay: Share = 0.95  # of the densities it remembers, appendix E.2
+    learning_rate: LearningRate = 1e-2  # section 4
+    final_learning_rate: LearningRate = 1e-3  # at the end of the budget
+    decay_start: Annotated[float, between(0, 0.99)] = 0.3  # share of the budget before the learning rate falls
+    hash_weight_decay: NonNegative = 0.0  # of the table, decoupled; of objects only, for it pulls density towards 1
+    huber_delta: PositiveShare = 0.1  # residual at which the loss turns from square to linear
     exposure_correction: bool = False  # learn a gain per photograph
     refine_cameras: bool = False  # learn a correction of each photograph's pose
-    seed: int = 0
+    seed: Seed = 0
+
+    def __post_init__(self) -> None:
+        if self.base_resolution > self.max_resolution:
+            raise LumigraphError(
+                f"The coarsest level cannot be finer than the finest: --base-resolution {self.base_resolution:,} is "
+                f"above --max-resolution {self.max_resolution:,}"
+            )
+        if self.levels << min(self.log2_hashmap_size, 64) >= 1 << 32:
+            raise LumigraphError(
+                f"Tables of {self.levels} levels with up to 2^{self.log2_hashmap_size} entries are beyond what 32 bits "
+                f"count; give a smaller --log2-hashmap-size"
+            )
 
 
 # Coarse to fine: share of the budget from which on, and which part of occupancy_resolution and steps_per_diagonal.
@@ -179,10 +194,16 @@ class InstantNGP(RayMethod):
             refine_cameras=True,
         )
 
+    @classmethod
+    def further_bytes(cls, frame: Frame, config: Any, learning: bool) -> int:
+        hidden = config.hidden_width * (config.density_layers + config.colour_layers)
+        step = 4 * config.samples_per_step * (config.levels * config.features_per_level + hidden)
+        return OccupancyGrid.bytes_of(frame.reach, config.occupancy_resolution) + step * learning
+
     def rays_in_a_step(self, data: Scene) -> float:
         return self.config.samples_per_step / SAMPLES_OF_A_RAY
 
-    def begin(self, scene: Scene) -> None:
+    def begin(self, scene: Scene, seconds: float = math.inf) -> None:
         if scene.images.has_alpha and self.frame.reach == 1:
             self.occupancy.rule_out(visual_hull(scene, self.config.occupancy_resolution)[None])
 
@@ -256,7 +277,7 @@ class InstantNGP(RayMethod):
         """Twenty steps of warm-up, then constant, then exponential decay (section 4 decays likewise)."""
         c = self.config
         fall = max(0.0, progress - c.decay_start) / (1 - c.decay_start)
-        return c.learning_rate * (c.final_learning_rate / c.learning_rate) ** fall * min(1.0, (step + 1) / 20)
+        return falling(c.learning_rate, c.final_learning_rate, fall) * min(1.0, (step + 1) / 20)
 
     def before_step(self, step: int, progress: float) -> None:
         _, cells, steps = max(stage for stage in STAGES if stage[0] <= progress)

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Annotated, Any, ClassVar
 
 import torch
 from jaxtyping import Float
@@ -19,6 +20,19 @@ from ..components.sampling.sampling import inverse_transform, stratified
 from ..components.sampling.spaces import space_of
 from ..components.training.schedules import falling
 from ..method import RayMethod
+from ..ranges import (
+    BatchSize,
+    Cells,
+    Layers,
+    LearningRate,
+    NonNegative,
+    Octaves,
+    RaySamples,
+    Seed,
+    Share,
+    Width,
+    between,
+)
 from ..rays import Look, Rays, Rendering, Samples
 from ..scene import Frame, Scene
 from ..volume import composite, weights_of
@@ -28,23 +42,23 @@ from ..volume import composite, weights_of
 class Config:
     """The paper's numbers, with where it gives them; below them what saves time and keeps the mathematics."""
 
-    depth: int = 8  # hidden layers before density, as NeRF's
-    hidden_width: int = 256  # channels of a layer, as NeRF's
-    skip_layer: int = 5  # the layer whose activation the input joins again, as NeRF's
-    position_frequencies: int = 16  # L for frustums, section 4: with cones, more do no harm
-    direction_frequencies: int = 4  # L for directions, as NeRF's
-    coarse_samples: int = 128  # frustums of a ray, section 3.2
-    fine_samples: int = 128  # of a ray, drawn where the first found something, section 3.2
-    resample_padding: float = 0.01  # alpha, weight that every frustum has at least, eq. 17
-    coarse_loss_weight: float = 0.1  # lambda, section 3.2; 0: the first look only guides the second
-    rays_per_step: int = 4096  # section 4
-    learning_rate: float = 5e-4  # section 4
-    final_learning_rate: float = 5e-6  # at the end of the budget, section 4
-    warmup: float = 0.0025  # share of the budget in which the learning rate grows, section 4
-    occupancy_resolution: int = 0  # cells per axis of a grid that tells where to sample; 0 samples everywhere
-    occupancy_threshold: float = 0.01  # optical thickness across a cell below which it is empty
+    depth: Annotated[int, between(2, 64)] = 8  # hidden layers before density, as NeRF's
+    hidden_width: Width = 256  # channels of a layer, as NeRF's
+    skip_layer: Layers = 5  # the layer whose activation the input joins again, as NeRF's
+    position_frequencies: Octaves = 16  # L for frustums, section 4: with cones, more do no harm
+    direction_frequencies: Octaves = 4  # L for directions, as NeRF's
+    coarse_samples: RaySamples = 128  # frustums of a ray, section 3.2
+    fine_samples: RaySamples = 128  # of a ray, drawn where the first found something, section 3.2
+    resample_padding: NonNegative = 0.01  # alpha, weight that every frustum has at least, eq. 17
+    coarse_loss_weight: NonNegative = 0.1  # lambda, section 3.2; 0: the first look only guides the second
+    rays_per_step: BatchSize = 4096  # section 4
+    learning_rate: LearningRate = 5e-4  # section 4
+    final_learning_rate: LearningRate = 5e-6  # at the end of the budget, section 4
+    warmup: Share = 0.0025  # share of the budget in which the learning rate grows, section 4
+    occupancy_resolution: Cells = 0  # cells per axis of a grid that tells where to sample; 0 samples everywhere
+    occupancy_threshold: NonNegative = 0.01  # optical thickness across a cell below which it is empty
     bfloat16: bool = True  # multiply in bfloat16 where the machine is fast at it
-    seed: int = 0
+    seed: Seed = 0
 
 
 PADDING = 0.001  # colours may reach so far beyond 0 and 1, so that both are within reach of the sigmoid
@@ -114,7 +128,14 @@ class MipNeRF(RayMethod):
             warmup=0.1,
         )
 
-    def begin(self, scene: Scene) -> None:
+    @classmethod
+    def further_bytes(cls, frame: Frame, config: Any, learning: bool) -> int:
+        asked = (
+            0 if config.occupancy_resolution else config.rays_per_step * (config.coarse_samples + config.fine_samples)
+        )
+        return 2 * asked * config.depth * config.hidden_width * learning
+
+    def begin(self, scene: Scene, seconds: float = math.inf) -> None:
         self.empty.begin(scene)
 
     @property

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Annotated, Any, ClassVar
 
 import torch
 from jaxtyping import Bool, Float
@@ -18,6 +19,19 @@ from ..components.sampling.spaces import space_of
 from ..components.training.schedules import falling
 from ..errors import LumigraphError
 from ..method import RayMethod
+from ..ranges import (
+    BatchSize,
+    Cells,
+    Layers,
+    LearningRate,
+    NonNegative,
+    Octaves,
+    RaySamples,
+    Seed,
+    Share,
+    Width,
+    between,
+)
 from ..rays import Look, Rays, Rendering, Samples
 from ..scene import Frame, Scene
 from ..volume import composite, weights_of
@@ -27,25 +41,32 @@ from ..volume import composite, weights_of
 class Config:
     """The paper's numbers, with where it gives them; below them what saves time and keeps the mathematics."""
 
-    depth: int = 8  # hidden layers before density, appendix A
-    hidden_width: int = 256  # channels of a layer, appendix A
-    skip_layer: int = 5  # the layer whose activation the input joins again, figure 7
-    position_frequencies: int = 10  # L for points, section 5.1
-    direction_frequencies: int = 4  # L for directions, section 5.1
-    coarse_samples: int = 64  # of a ray, appendix A
-    fine_samples: int = 128  # of a ray, drawn where the first found something, appendix A
-    rays_per_step: int = 4096  # section 5.3
-    learning_rate: float = 5e-4  # section 5.3
-    final_learning_rate: float = 5e-5  # at the end of the budget, section 5.3
-    density_noise: float = 1.0  # deviation of what is added to captures' raw density in training, appendix A
-    networks: int = 2  # one for each look; 1 looks twice with the same
-    coarse_loss_weight: float = 1.0  # weight of the first look's colours, eq. 6; 0 with one network: it only guides
-    occupancy_resolution: int = 0  # cells per axis of a grid that tells where to sample; 0 samples everywhere
-    occupancy_threshold: float = 0.01  # optical thickness across a cell below which it is empty
-    transmittance_threshold: float = 0.0  # at which a ray is spent
-    warmup: float = 0.0  # share of the budget in which the learning rate grows
+    depth: Annotated[int, between(2, 64)] = 8  # hidden layers before density, appendix A
+    hidden_width: Width = 256  # channels of a layer, appendix A
+    skip_layer: Layers = 5  # the layer whose activation the input joins again, figure 7
+    position_frequencies: Octaves = 10  # L for points, section 5.1
+    direction_frequencies: Octaves = 4  # L for directions, section 5.1
+    coarse_samples: RaySamples = 64  # of a ray, appendix A
+    fine_samples: RaySamples = 128  # of a ray, drawn where the first found something, appendix A
+    rays_per_step: BatchSize = 4096  # section 5.3
+    learning_rate: LearningRate = 5e-4  # section 5.3
+    final_learning_rate: LearningRate = 5e-5  # at the end of the budget, section 5.3
+    density_noise: NonNegative = 1.0  # deviation of what is added to captures' raw density in training, appendix A
+    networks: Annotated[int, between(1, 2)] = 2  # one for each look; 1 looks twice with the same
+    coarse_loss_weight: NonNegative = 1.0  # of the first look's colours, eq. 6; 0 with one network: it only guides
+    occupancy_resolution: Cells = 0  # cells per axis of a grid that tells where to sample; 0 samples everywhere
+    occupancy_threshold: NonNegative = 0.01  # optical thickness across a cell below which it is empty
+    transmittance_threshold: Share = 0.0  # at which a ray is spent
+    warmup: Share = 0.0  # share of the budget in which the learning rate grows
     bfloat16: bool = True  # multiply in bfloat16 where the machine is fast at it
-    seed: int = 0
+    seed: Seed = 0
+
+    def __post_init__(self) -> None:
+        if self.networks == 2 and not self.coarse_loss_weight:
+            raise LumigraphError(
+                "The first of two networks learns from --coarse-loss-weight alone, so --networks 2 with "
+                "--coarse-loss-weight 0 cannot be; give --networks 1, or a weight above 0"
+            )
 
 
 class NeRF(RayMethod):
@@ -67,11 +88,6 @@ class NeRF(RayMethod):
 
     def __init__(self, frame: Frame, config: Any = None):
         config = config or Config()
-        if config.networks not in (1, 2) or (config.networks == 2 and not config.coarse_loss_weight):
-            raise LumigraphError(
-                f"nerf has 1 or 2 networks, and the first of 2 learns from --coarse-loss-weight alone; --networks "
-                f"{config.networks} with --coarse-loss-weight {config.coarse_loss_weight:g} cannot be"
-            )
         super().__init__(frame, config)
         self.space = space_of(frame)
         self.encode_position = FrequencyEncoding(3, config.position_frequencies, keep_input=False)
@@ -121,7 +137,14 @@ class NeRF(RayMethod):
             warmup=0.1,
         )
 
-    def begin(self, scene: Scene) -> None:
+    @classmethod
+    def further_bytes(cls, frame: Frame, config: Any, learning: bool) -> int:
+        asked = (
+            0 if config.occupancy_resolution else config.rays_per_step * (config.coarse_samples + config.fine_samples)
+        )
+        return 2 * asked * config.depth * config.hidden_width * learning
+
+    def begin(self, scene: Scene, seconds: float = math.inf) -> None:
         self.empty.begin(scene)
 
     @property

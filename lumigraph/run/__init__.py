@@ -5,5 +5,6 @@ from .folder import Run as Run
 from .folder import build as build
 from .folder import check_new as check_new
 from .folder import processor as processor
+from .needs import check_memory as check_memory
 from .opened import Opened as Opened
 from .opening import open_any as open_any

@@ -35,6 +35,7 @@ from ..method import Method
 from ..plain import understood
 from ..scene import Frame, Scene
 from .checkpoint import WEIGHTS, Checkpoints, State
+from .needs import check_memory
 from .opened import Opened
 from .settings import Settings, Source
 
@@ -134,7 +135,7 @@ class Run(Opened):
             )
         kind = methods.find(self.method_name)
         with understood(self._config):
-            config = self.settings.method_config(kind)
+            config = self.settings.method_config(kind, self._config)
         return build(kind, self.frame, config, torch.device(device), self.settings.seed)
 
     def method(self, device: torch.device | str = "cpu") -> Method:
@@ -274,7 +275,11 @@ class Run(Opened):
 
 
 def build(kind: type[Method], frame: Frame, config: Any, device: torch.device, seed: int) -> Method:
-    """A fresh method whose initial weights depend on the seed alone."""
+    """A fresh method whose initial weights depend on the seed alone.
+
+    Raises LumigraphError where memory does not hold it.
+    """
+    check_memory(kind, frame, config, device)
     with torch.random.fork_rng():
         torch.manual_seed(seed)
         method = kind(frame, config)

@@ -11,6 +11,7 @@ from .. import files
 from ..errors import LumigraphError
 from ..method import Method
 from ..plain import alike, from_plain, renamed, understood
+from ..ranges import annotations, typed
 from ..scene import Frame, Scene
 
 FORMAT = "lumigraph run 1"
@@ -61,10 +62,10 @@ class Settings:
         if not isinstance(said, dict) or said.get("format") != FORMAT:
             raise LumigraphError(f"{file} was not written by this version of Lumigraph; open it with the one that did")
         with understood(file):
-            typed = {"frame": Frame.from_json(said["frame"]), "scene": from_plain(Source, said["scene"]), "said": said}
-            plain = {x.name: said[x.name] for x in fields(Settings) if x.name in said and x.name not in typed}
+            made = {"frame": Frame.from_json(said["frame"]), "scene": from_plain(Source, said["scene"]), "said": said}
+            plain = {x.name: said[x.name] for x in fields(Settings) if x.name in said and x.name not in made}
             check_types(plain)
-            return Settings(**plain | typed)
+            return Settings(**plain | made)
 
     def write(self, file: Path) -> None:
         files.write_json(file, self.to_json())
@@ -80,9 +81,15 @@ class Settings:
         """The same with another budget."""
         return replace(self, budget=budget)
 
-    def method_config(self, kind: type[Method]) -> Any:
-        """The numbers as the Config of a kind of method; those with a former name arrive under today's."""
-        return from_plain(kind.Config, renamed(self.config, kind.formerly))
+    def method_config(self, kind: type[Method], file: Path) -> Any:
+        """The numbers as the Config of a kind of method; those with a former name arrive under today's.
+
+        file: to name where a number is unknown, of another type, or beyond its range
+        """
+        given = renamed(self.config, kind.formerly)
+        if unknown := sorted(given.keys() - annotations(kind.Config).keys()):
+            raise ValueError(f"{self.method} has no {unknown[0]}")
+        return typed(kind.Config, given, file)
 
     def agrees(self, frame: Frame) -> bool:
         """Whether a frame is the run's, up to rounding. Older runs know fewer numbers of a frame than newer ones."""

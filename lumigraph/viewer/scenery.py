@@ -22,7 +22,7 @@ THUMBNAIL = 96  # pixels along the longer side
 WHITE = (1.0, 1.0, 1.0)  # behind what is see-through
 TRAIN, TEST = (86, 134, 214), (232, 140, 60)
 SHARE = 0.4  # of the distance between neighbouring cameras, as the size of a frustum
-NEARBY = 4.0  # frustum sizes
+NEARBY = 8.0  # frustum sizes: nearer, a thumbnail fills a tenth of the window or more
 NARROWEST, WIDEST = 0.03, 0.05  # of the distance to the middle of all cameras
 
 

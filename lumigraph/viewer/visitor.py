@@ -19,7 +19,7 @@ from ..errors import LumigraphError
 from ..figures import to_bytes
 from ..rays import Rendering
 from ..scene import Vector
-from .cameras import angle_for, pose_of, rows
+from .cameras import angle_for, angles, pose_of, rows
 from .controls import Controls
 from .crop_panel import CropPanel
 from .flight import Flight
@@ -81,10 +81,11 @@ class Visitor:
         )
         self._seen: tuple[Any, ...] = ()
         client.camera.on_update(self._moved)
-        wide = angle_for(shared.subject.first, client.camera.aspect)
-        if wide > client.camera.fov + WIDER:  # a narrow window shows the whole photograph too
-            client.camera.fov = wide
-        self.controls.tell_angle(client.camera.fov)
+        first = shared.subject.first
+        angle, wide = angles(first)[1], angle_for(first, client.camera.aspect)
+        if wide > angle + WIDER:  # a narrow window shows the whole photograph too
+            client.camera.fov = angle = wide
+        self.controls.tell_angle(angle)  # what the client's camera says may be from before it was told any
         if shared.scenery.has_points:
             self.controls.offer_points()
         self.painter.ask()

@@ -35,7 +35,7 @@ class Average(RayMethod):
     def smallest(cls):
         return Config(cells=16, samples=32)
 
-    def begin(self, scene):
+    def begin(self, scene, seconds=0.0):
         self.left.fill_(len(scene.splits["train"]))
 
     @property

@@ -13,12 +13,15 @@ A new scene is a new file in `scenes/`; nothing is compiled for it.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import asdict, dataclass, fields
 from functools import partial
+from typing import Annotated
 
 import numpy as np
 
 from ...camera import Camera
 from ...errors import LumigraphError
+from ...ranges import Seed, between, typed
 from ..capture import Capture, Plane, Shot
 from . import scenes as scenes
 from .blender_folder import write_blender as write_blender
@@ -35,28 +38,35 @@ from .world import Sky as Sky
 from .world import Sun as Sun
 from .world import World as World
 
-OPTIONS = ("size", "views", "seed")
+DIGITS = 20  # of a number, at most
+
+
+@dataclass(frozen=True)
+class Options:
+    """size: of the square pictures, pixels; views: number of photographs to learn from; seed: where cameras stand."""
+
+    size: Annotated[int, between(1, 8192)] = 200
+    views: Annotated[int, between(1, 10_000)] = 100
+    seed: Seed = 0
 
 
 def read(request: str) -> Capture:
-    """The capture that a name stands for, with options after commas: "still-life", "still-life,size=400,seed=1".
+    """The capture that a name stands for, with `Options` after commas: "still-life", "still-life,size=400,seed=1".
 
-    size:  of the square pictures, pixels; default 200
-    views: number of photographs to learn from; default 100
-    seed:  where the cameras stand; default 0
     Pictures are traced when somebody reads them. Raises LumigraphError for a name or an option that does not exist.
     """
     name, *rest = request.split(",")
-    options = dict(parse(request, text) for text in rest)
-    return capture(scenes.stage(name, **options), f"procedural:{request}")
+    options = typed(Options, dict(parse(request, text) for text in rest), f"procedural:{request}")
+    return capture(scenes.stage(name, **asdict(options)), f"procedural:{request}")
 
 
 def parse(request: str, text: str) -> tuple[str, int]:
     """One option, "size=400"."""
     name, _, value = text.strip().partition("=")
-    if name not in OPTIONS:
-        raise LumigraphError(f"procedural:{request}: there is no option {name!r}; there are {', '.join(OPTIONS)}")
-    if not value.isdecimal() or (name != "seed" and not int(value)):
+    known = [field.name for field in fields(Options)]
+    if name not in known:
+        raise LumigraphError(f"procedural:{request}: there is no option {name!r}; there are {', '.join(known)}")
+    if not value.isdecimal() or len(value) > DIGITS:
         raise LumigraphError(f"procedural:{request}: {name} must be a whole number, as in {name}=20; got {value!r}")
     return name, int(value)
 

@@ -9,6 +9,7 @@ from typing import Annotated, Literal
 
 from ... import methods
 from ...errors import LumigraphError
+from ...ranges import Count, Downscale, Scales, Seed
 from ..capture import posed
 from ..common import ReaderOption, choose_device, needed, option, say, scene_name, show
 from ..train import DEFAULT_SECONDS
@@ -24,16 +25,16 @@ class Cells:
     """What to train it on, as for `lumigraph train`."""
     output: Annotated[Path, needed("OUTPUT")]
     """Folder for runs, table and charts."""
-    seeds: Annotated[tuple[int, ...], option("N")] = (0,)
+    seeds: Annotated[tuple[Seed, ...], option("N")] = (0,)
     """Of all random choices; several make means with deviations."""
-    eval_views: Annotated[int | None, option("N", "all")] = None
+    eval_views: Annotated[Count | None, option("N", "all")] = None
     """Compare so many held-out views only, evenly spread."""
     lpips: Annotated[tuple[Path, ...], option("FILE", "those in LUMIGRAPH_LPIPS, if any")] = ()
     """Files with the weights of LPIPS, as for `lumigraph eval`."""
-    downscale: Annotated[int | None, option("N", "none, or what suits the photographs")] = None
+    downscale: Annotated[Downscale | None, option("N", "none, or what suits the photographs")] = None
     """Shrink photographs by a whole number."""
     reader: ReaderOption = None
-    scales: Annotated[int, option("N")] = 1
+    scales: Annotated[Scales, option("N")] = 1
     """Have every photograph so many times, each half as large as the one before; the figures count them all."""
     device: Annotated[str, option("NAME")] = "auto"
     """auto, cpu, cuda, cuda:1."""
@@ -60,8 +61,6 @@ class Cells:
         weights = tuple(path.resolve() for path in named_files(self.lpips))
         if weights:
             load_lpips(weights)  # refuses what is wrong, before anything is trained
-        if self.eval_views is not None and self.eval_views < 1:
-            raise LumigraphError(f"{self.eval_views} views cannot be compared; give --eval-views a number above 0")
         settings = Settings(
             self.downscale, self.reader, self.scales, self.preset, self.device, self.eval_views, weights
         )

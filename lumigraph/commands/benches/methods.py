@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Annotated
 
+from ...ranges import Seconds, Steps
 from ..common import option
 from .cells import Cells
 
@@ -18,9 +19,9 @@ class BenchMethods(Cells):
     Ctrl-C stops; the same command goes on.
     """
 
-    seconds: Annotated[tuple[float, ...], option("S", "60")] = ()
+    seconds: Annotated[tuple[Seconds, ...], option("S", "60")] = ()
     """Train for so long; several make a chart."""
-    steps: Annotated[tuple[int, ...], option("N", "as long as --seconds")] = ()
+    steps: Annotated[tuple[Steps, ...], option("N", "as long as --seconds")] = ()
     """Train for so many steps instead."""
 
     def run(self) -> int:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Annotated, Literal
 
-from ...errors import LumigraphError
+from ...ranges import Count, Seconds, Steps
 from ..common import option, say
 from .cells import Cells
 
@@ -18,17 +18,14 @@ class BenchViews(Cells):
     methods`; the chart shows PSNR over the number of photographs.
     """
 
-    views: Annotated[tuple[int | Literal["all"], ...], option("N")] = (2, 3, 4, 6, 9, 15, 25, 50, "all")
+    views: Annotated[tuple[Count | Literal["all"], ...], option("N")] = (2, 3, 4, 6, 9, 15, 25, 50, "all")
     """How many photographs to learn from; numbers that a scene does not have are left out."""
-    seconds: Annotated[float | None, option("S", "60")] = None
+    seconds: Annotated[Seconds | None, option("S", "60")] = None
     """Train for so long."""
-    steps: Annotated[int | None, option("N", "as long as --seconds")] = None
+    steps: Annotated[Steps | None, option("N", "as long as --seconds")] = None
     """Train for so many steps instead."""
 
     def run(self) -> int:
-        for views in self.views:
-            if views != "all" and views < 1:
-                raise LumigraphError(f"Nothing can be learnt from {views} photographs; give --views numbers above 0")
         seconds = () if self.seconds is None else (self.seconds,)
         return self.conduct(seconds, () if self.steps is None else (self.steps,), self.possible)
 

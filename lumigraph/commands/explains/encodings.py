@@ -10,6 +10,7 @@ from tyro.conf import Positional
 
 from ...errors import LumigraphError
 from ...progress import counting
+from ...ranges import Downscale, Seed, Steps, between
 from ..common import choose_device, needed, option, scene_name, show
 
 
@@ -25,22 +26,29 @@ class ExplainEncodings:
     """An image file."""
     output: Annotated[Path | None, option("FOLDER", "explained/PICTURE-encodings")] = None
     """Where the page goes."""
-    steps: Annotated[int, option("N")] = 500
+    steps: Annotated[Steps, option("N")] = 500
     """Of training, for each network."""
-    scales: Annotated[tuple[float, ...], option("S S ...")] = (1.0, 2.0, 4.0, 8.0, 16.0, 32.0, 64.0, 128.0)
+    scales: Annotated[tuple[Annotated[float, between(1e-6, 1e6)], ...], option("S S ...")] = (
+        1.0,
+        2.0,
+        4.0,
+        8.0,
+        16.0,
+        32.0,
+        64.0,
+        128.0,
+    )
     """Frequencies in cycles across the picture: the deviation of Gaussian ones, the highest of positional ones."""
-    downscale: Annotated[int | None, option("N", "to about 512 pixels")] = None
+    downscale: Annotated[Downscale | None, option("N", "to about 512 pixels")] = None
     """Shrink the picture by a whole number."""
-    seed: Annotated[int, option("N")] = 0
+    seed: Annotated[Seed, option("N")] = 0
     """Of all random choices."""
     device: Annotated[str, option("NAME")] = "auto"
     """auto, cpu, cuda, cuda:1."""
 
     def run(self) -> int:
-        if self.steps < 1:
-            raise LumigraphError(f"{self.steps} steps teach nothing; give --steps a number above 0")
-        if len(set(self.scales)) < 2 or not all(0 < scale < float("inf") for scale in self.scales):
-            raise LumigraphError("A curve over scales needs two or more, all above 0; for example --scales 1 10 100")
+        if len(set(self.scales)) < 2:
+            raise LumigraphError("A curve over scales needs two or more of them; for example --scales 1 10 100")
         from dataclasses import replace
 
         from ...capture import open_scene, single_image

@@ -10,8 +10,11 @@ from tyro.conf import Positional
 
 from ...errors import LumigraphError
 from ...progress import counting
+from ...ranges import between
 from ..common import choose_device, needed, option, say, show
 from ..controls import Set, tell
+
+Place = Annotated[int, between(0, 1_000_000)]  # along one side of a picture
 
 
 @dataclass(frozen=True)
@@ -24,7 +27,7 @@ class ExplainRay:
 
     run_folder: Annotated[Positional[Path], needed("RUN")]
     """Folder of the run."""
-    pixel: Annotated[tuple[int, int] | None, option("X Y", "the middle of the picture")] = None
+    pixel: Annotated[tuple[Place, Place] | None, option("X Y", "the middle of the picture")] = None
     """Column and row, from 0 0 at the upper left."""
     view: Annotated[str, option("NAME_OR_NUMBER")] = "0"
     """Which photograph of the split: its name, or its number from 0."""

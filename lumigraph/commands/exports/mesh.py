@@ -9,10 +9,10 @@ from typing import Annotated, Literal
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from ...errors import LumigraphError
+from ...ranges import Count, Pixels, Positive, Share, between
 from ..common import needed, option, show
 from ..controls import Set, open_method
 from ..keeping import Keeping
-from .points import check_pictures
 
 FOR_PHONES = 100_000  # triangles that a phone shows with ease
 
@@ -30,28 +30,33 @@ class ExportMesh:
     """Folder of a run, a splat file, or a composition."""
     output: Annotated[Positional[Path], needed("FILE")]
     """The new file."""
-    extent: Annotated[float | None, option("TIMES", "1 for objects, 1.5 for the rest")] = None
+    extent: Annotated[
+        Annotated[float, between(0.001, 1000)] | None, option("TIMES", "1 for objects, 1.5 for the rest")
+    ] = None
     """Size of what is meshed, times the box of interest that `lumigraph info` tells; or give --box or --sphere."""
-    cell_size: Annotated[float | None, option("LENGTH", "1/256 of the box")] = None
+    cell_size: Annotated[Positive | None, option("LENGTH", "1/256 of the box")] = None
     """Side of the cubes marched through, in the units of the photographs' frame: details are twice as large."""
     way: Annotated[
         Literal["auto", "density", "depth"],
         arg(name="from", help_behavior_hint="(default: density where the method has one)"),
     ] = "auto"
     """What the surface is found in."""
-    level: Annotated[float | None, option("DENSITY", "where rays begin to end")] = None
+    level: Annotated[Positive | None, option("DENSITY", "where rays begin to end")] = None
     """Density of the surface, per unit of the scene's own frame."""
-    smooth: Annotated[int, option("N")] = 10
+    smooth: Annotated[int, between(0, 1000), option("N")] = 10
     """Rounds of smoothing; 0 for none."""
-    faces: Annotated[int | None, option("N", f"as many as there are, for phones {FOR_PHONES:,}")] = None
+    faces: Annotated[
+        Annotated[int, between(4, 1_000_000_000)] | None,
+        option("N", f"as many as there are, for phones {FOR_PHONES:,}"),
+    ] = None
     """Triangles to come down to."""
-    keep: Annotated[float, option("SHARE")] = 0.01
+    keep: Annotated[Share, option("SHARE")] = 0.01
     """Pieces smaller than this share of the largest one are dropped."""
     unseen: Annotated[Literal["close", "cut"] | None, option("{close,cut}", "close objects, cut the rest")] = None
     """What becomes of the surface where no camera looks."""
-    size: Annotated[int, option("PIXELS")] = 400
+    size: Annotated[Pixels, option("PIXELS")] = 400
     """Longer side of the pictures that tell colours, and depth where it is fused; at most that of the photographs."""
-    views: Annotated[int, option("N")] = 64
+    views: Annotated[Count, option("N")] = 64
     """Number of these pictures at most."""
     part: OmitArgPrefixes[Keeping] = Keeping()
     told: Set = ()
@@ -93,20 +98,7 @@ class ExportMesh:
         return 0
 
     def _check(self) -> None:
-        """Raises LumigraphError for numbers that make no sense, before anything is opened."""
-        if self.cell_size is not None and not self.cell_size > 0:
-            raise LumigraphError(f"Cells cannot be {self.cell_size:g} large; give --cell-size a length above 0")
-        if self.extent is not None and not self.extent > 0:
-            raise LumigraphError(f"A box cannot be {self.extent:g} times as large; give --extent a number above 0")
+        """Raises LumigraphError for numbers that contradict each other, before anything is opened."""
         if self.extent is not None and self.part.crops:
             raise LumigraphError("--extent and a crop both say how much is meshed; give one of them")
         self.part.check()
-        if self.level is not None and not self.level > 0:
-            raise LumigraphError(f"A density of {self.level:g} is nowhere a surface; give --level a number above 0")
-        if not 0 <= self.smooth <= 1000:
-            raise LumigraphError(f"Nothing can be smoothed {self.smooth} times; give --smooth something from 0 to 1000")
-        if self.faces is not None and self.faces < 4:
-            raise LumigraphError(f"No mesh has {self.faces} triangles; give --faces a number from 4 on")
-        if not 0 <= self.keep <= 1:
-            raise LumigraphError(f"{self.keep:g} is no share; give --keep a number from 0 to 1")
-        check_pictures(self.size, self.views)

@@ -8,12 +8,13 @@ from typing import Annotated
 
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
+from ...ranges import Coordinate, SphereSize
 from ..common import needed, option, show
 from ..controls import Set, open_method
 from ..keeping import Keeping
 
 Place = Annotated[
-    tuple[float, float, float] | None,
+    tuple[Coordinate, Coordinate, Coordinate] | None,
     arg(
         name="from",
         metavar="X Y Z",
@@ -35,7 +36,7 @@ class ExportPanorama:
     """The new picture."""
     place: Place = None
     """Where to stand, in the frame of the photographs."""
-    size: Annotated[int, option("PIXELS")] = 2048
+    size: Annotated[SphereSize, option("PIXELS")] = 2048
     """Width; the height is half of it."""
     part: OmitArgPrefixes[Keeping] = Keeping()
     told: Set = ()

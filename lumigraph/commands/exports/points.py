@@ -9,6 +9,7 @@ from typing import Annotated
 from tyro.conf import OmitArgPrefixes, Positional
 
 from ...errors import LumigraphError
+from ...ranges import CloudSize, Count, Pixels
 from ..common import needed, option, show
 from ..controls import Set, open_method
 from ..keeping import Keeping
@@ -25,11 +26,11 @@ class ExportPoints:
     """Folder of a run, a splat file, or a composition."""
     output: Annotated[Positional[Path], needed("FILE.ply")]
     """The new file."""
-    count: Annotated[int, option("N")] = 200_000
+    count: Annotated[CloudSize, option("N")] = 200_000
     """Points at most."""
-    size: Annotated[int, option("PIXELS")] = 400
+    size: Annotated[Pixels, option("PIXELS")] = 400
     """Longer side of the pictures that the points come from; at most that of the photographs."""
-    views: Annotated[int, option("N")] = 64
+    views: Annotated[Count, option("N")] = 64
     """Number of these pictures at most."""
     part: OmitArgPrefixes[Keeping] = Keeping()
     told: Set = ()
@@ -39,9 +40,6 @@ class ExportPoints:
     def run(self) -> int:
         if self.output.suffix.lower() != ".ply":
             raise LumigraphError(f"{self.output} should end in .ply, the one kind of point cloud there is; rename it")
-        if self.count < 1:
-            raise LumigraphError(f"A cloud cannot have {self.count} points; give --count a number above 0")
-        check_pictures(self.size, self.views)
         self.part.check()
         from ...export.points import extract_points, write_points
 
@@ -58,11 +56,3 @@ class ExportPoints:
             }
         )
         return 0
-
-
-def check_pictures(size: int, views: int) -> None:
-    """Refuse pictures that cannot be, before anything is opened."""
-    if not 16 <= size <= 8192:
-        raise LumigraphError(f"Pictures cannot be {size} pixels large; give --size a number from 16 to 8192")
-    if views < 1:
-        raise LumigraphError(f"{views} views show nothing; give --views a number above 0")

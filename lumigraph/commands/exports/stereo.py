@@ -9,6 +9,7 @@ from typing import Annotated
 from tyro.conf import OmitArgPrefixes, Positional
 
 from ...errors import LumigraphError
+from ...ranges import Positive, SphereSize
 from ..common import needed, option, show
 from ..controls import Set, open_method
 from ..keeping import Keeping
@@ -30,9 +31,9 @@ class ExportStereo:
     """The new picture."""
     place: Place = None
     """Where the middle between the eyes is, in the frame of the photographs."""
-    interpupillary: Annotated[float | None, option("LENGTH", "1/50 of the median distance to what is around")] = None
+    interpupillary: Annotated[Positive | None, option("LENGTH", "1/50 of the median distance to what is around")] = None
     """Distance between the eyes, in the units of the photographs' frame."""
-    size: Annotated[int, option("PIXELS")] = 2048
+    size: Annotated[SphereSize, option("PIXELS")] = 2048
     """Width, and height of both halves together."""
     part: OmitArgPrefixes[Keeping] = Keeping()
     told: Set = ()
@@ -46,10 +47,6 @@ class ExportStereo:
         picture_format(self.output)
         sphere_size(self.size)
         self.part.check()
-        if self.interpupillary is not None and not 0 < self.interpupillary < float("inf"):
-            raise LumigraphError(
-                f"Eyes cannot be {self.interpupillary:g} apart; give --interpupillary a length above 0"
-            )
         opened, method, cameras = open_method(self.source, self.device, self.told)
         method = self.part.of_method(method)
         place, heading, where = standpoint(cameras["train"], opened.frame, self.place)

@@ -10,6 +10,7 @@ from typing import Annotated, Any, Literal
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from ...errors import LumigraphError
+from ...ranges import between
 from ..common import needed, option, show
 from ..controls import Set, open_method
 from ..keeping import Keeping
@@ -40,9 +41,9 @@ class ExportWeb:
         str | None, option("#RRGGBB", "the one it was trained with; outdoors the colours of its sky and ground")
     ] = None
     """Colour behind splats or the mesh."""
-    views: Annotated[int, option("N")] = 72
+    views: Annotated[int, between(2, 1000), option("N")] = 72
     """Pictures in a page of views."""
-    size: Annotated[int, option("PIXELS")] = 640
+    size: Annotated[int, between(16, 4096), option("PIXELS")] = 640
     """Longer side of these pictures."""
     part: OmitArgPrefixes[Keeping] = Keeping()
     told: Set = ()
@@ -55,10 +56,6 @@ class ExportWeb:
 
         if self.output.suffix.lower() not in (".html", ".htm"):
             raise LumigraphError(f"{self.output} should end in .html, as pages do; rename it")
-        if not 2 <= self.views <= 1000:
-            raise LumigraphError(f"A page cannot hold {self.views} views; give --views a number from 2 to 1000")
-        if not 16 <= self.size <= 4096:
-            raise LumigraphError(f"A view cannot be {self.size} pixels large; give --size a number from 16 to 4096")
         self.part.check()
         opened, method, cameras = open_method(self.source, self.device, self.told)
         whole = self._kind(method) != "views" and not self.part.crops

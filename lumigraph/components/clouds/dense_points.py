@@ -7,6 +7,7 @@ neighbours, swept by themselves, find the same place (Merrell 2007).
 from __future__ import annotations
 
 import math
+import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -20,11 +21,8 @@ from ...progress import track
 from ...scene import Scene
 from .flat_view import FlatView, flat_view
 
-VIEWS, LONGEST, COARSE = (
-    48,
-    160,
-    80,
-)  # photographs asked at most; pixels of their longer side, and where none know depth
+VIEWS, FEWEST_VIEWS = 48, 8  # photographs asked at most, and however short the time
+LONGEST, COARSE = 160, 80  # pixels of their longer side, and where no depth is known yet
 NEIGHBOURS, BEST = 4, 2  # of each photograph, and how many of them must see a place
 ANGLE, NARROWER, WIDER = (math.radians(x) for x in (8.0, 4.0, 8.0))  # at which rays should meet; deviations around it
 ANCHORS = 200  # places by which two views are asked whether they see the same
@@ -45,9 +43,10 @@ class Points:
 
 
 @torch.no_grad()
-def dense_points(scene: Scene) -> Points:
+def dense_points(scene: Scene, seconds: float = math.inf) -> Points:
     """Points on what at least two or three of the training photographs see, a pixel or so apart; maybe none.
 
+    seconds: that sweeping may take, about; fewer photographs are asked where all would take longer
     Depths are searched around the scene's sparse points; where there are none, around what smaller pictures tell.
     """
     chosen = evenly(scene.splits["train"].tolist(), VIEWS)
@@ -55,9 +54,10 @@ def dense_points(scene: Scene) -> Points:
     known = scene.points
     if known is None or len(known) < ANCHORS:
         small = [flat_view(scene.photograph(i), COARSE) for i in chosen]
-        known = swept(small, [everywhere(view, scene) for view in small], "Looking for depth").positions
+        seconds = seconds / 2
+        known = swept(small, [everywhere(view, scene) for view in small], "Looking for depth", seconds).positions
     ranges = [around(view, known) or everywhere(view, scene) for view in views]
-    return thinned(swept(views, ranges, "Sweeping for points"))
+    return thinned(swept(views, ranges, "Sweeping for points", seconds))
 
 
 def compile_sweep() -> None:
@@ -67,8 +67,9 @@ def compile_sweep() -> None:
 
 
 def everywhere(view: FlatView, scene: Scene) -> tuple[float, float]:
-    """From the scene's near distance to where it ends."""
-    return scene.frame.near, float(view.pose[:, 3].norm()) + math.sqrt(3) * scene.frame.reach
+    """From where the scene begins before a view to where it ends."""
+    away, radius = float(view.pose[:, 3].norm()), math.sqrt(3) * scene.frame.reach
+    return max(scene.frame.near, away - radius), away + radius
 
 
 def around(view: FlatView, known: Float[Tensor, "point 3"]) -> tuple[float, float] | None:
@@ -80,8 +81,11 @@ def around(view: FlatView, known: Float[Tensor, "point 3"]) -> tuple[float, floa
     return NEARER * near, FARTHER * far
 
 
-def swept(views: Sequence[FlatView], ranges: Sequence[tuple[float, float]], what: str) -> Points:
-    """What all views find, where their neighbours agree."""
+def swept(views: Sequence[FlatView], ranges: Sequence[tuple[float, float]], what: str, seconds: float) -> Points:
+    """What the views find, where their neighbours agree: all views, or as many as can be swept in so many seconds."""
+    if seconds < math.inf:
+        kept = evenly(list(range(len(views))), affordable(views, ranges, seconds))
+        views, ranges = [views[i] for i in kept], [ranges[i] for i in kept]
     neighbours = choose_neighbours(views, ranges)
     depths = []
     for i in track(range(len(views)), what, len(views)):
@@ -99,6 +103,14 @@ def swept(views: Sequence[FlatView], ranges: Sequence[tuple[float, float]], what
         colours.append(view.rgb[found][kept])
         sizes.append(depths[i][found][kept] / view.intrinsics[0, 0])
     return Points(torch.cat(positions), torch.cat(colours), torch.cat(sizes))
+
+
+def affordable(views: Sequence[FlatView], ranges: Sequence[tuple[float, float]], seconds: float) -> int:
+    """How many views can be swept in so many seconds, as one of them tells."""
+    begin, middle = time.perf_counter(), len(views) // 2
+    positions = torch.stack([view.pose[:, 3] for view in views])
+    sweep(views[middle], [views[j] for j in best_neighbours(middle, views, positions, ranges[middle])], ranges[middle])
+    return max(int(seconds / (time.perf_counter() - begin)), FEWEST_VIEWS)
 
 
 def sweep(view: FlatView, neighbours: Sequence[FlatView], span: tuple[float, float]) -> Float[Tensor, "height width"]:
@@ -155,7 +167,7 @@ def best_neighbours(
     view = views[i]
     height, width = view.trust.shape
     grid = view.rays[height // 10 :: height // 5 + 1, width // 10 :: width // 5 + 1].reshape(-1, 3)
-    depths = 1 / torch.linspace(1 / span[0], 1 / span[1], 6)[1:-1]
+    depths = torch.logspace(math.log10(span[0]), math.log10(span[1]), 6)[1:-1]
     places = view.pose[:, 3] + (grid * depths[:, None, None]).reshape(-1, 3)
     here = torch.nn.functional.normalize(places - view.pose[:, 3], dim=-1)
     scores = torch.zeros(len(views))

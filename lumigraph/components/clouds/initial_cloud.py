@@ -26,19 +26,26 @@ BACKDROP = 0.2  # of the random Gaussians: how many lie far out behind dense poi
 
 
 def initial_cloud(
-    scene: Scene, initialization: Initialization, count: int, most: int, degree: int, generator: torch.Generator
+    scene: Scene,
+    initialization: Initialization,
+    count: int,
+    most: int,
+    degree: int,
+    generator: torch.Generator,
+    seconds: float = math.inf,
 ) -> Gaussians:
     """A cloud of at most `most` Gaussians at the points that are known, or where there are none, `count` random ones.
 
     initialization: "dense" adds to the scene's sparse points those that plane sweeps find, "sparse" takes the sparse
                     points as they are, "random" takes neither
+    seconds:        that plane sweeps may take
     Random ones lie inside the silhouettes of photographs with alpha, otherwise inside the box of interest.
     """
     means, colours = torch.zeros(0, 3), torch.zeros(0, 3)
     if initialization != "random":
         means, colours = sparse_points(scene, most, generator)
     if initialization == "dense" and len(means) < (crowd := math.ceil(CROWD * most)):
-        means, colours = with_dense_points(scene, means, colours, count, crowd, generator)
+        means, colours = with_dense_points(scene, means, colours, count, crowd, generator, seconds)
     if len(means) < 2:
         means = random_points(scene, min(count, most), generator)
         colours = torch.rand(len(means), 3, generator=generator)
@@ -59,10 +66,16 @@ def sparse_points(scene: Scene, most: int, generator: torch.Generator) -> tuple[
 
 
 def with_dense_points(
-    scene: Scene, means: Tensor, colours: Tensor, count: int, most: int, generator: torch.Generator
+    scene: Scene,
+    means: Tensor,
+    colours: Tensor,
+    count: int,
+    most: int,
+    generator: torch.Generator,
+    seconds: float,
 ) -> tuple[Tensor, Tensor]:
     """Sparse points and dense ones; without sparse ones also some far out, where sweeps find nothing that agrees."""
-    found = dense_points(scene)
+    found = dense_points(scene, seconds)
     inside = (found.positions.abs().amax(-1) <= scene.frame.reach).nonzero()[:, 0]
     if len(inside) < FEW:
         return means, colours

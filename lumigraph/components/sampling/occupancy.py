@@ -30,12 +30,22 @@ class OccupancyGrid(nn.Module):
 
     def __init__(self, reach: float, resolution: int):
         super().__init__()
-        cascades = 1 + max(0, math.ceil(math.log2(reach)))
+        cascades = self.cascades_of(reach)
         self.register_buffer("density", torch.zeros(cascades, resolution, resolution, resolution))
         self.register_buffer("occupied", torch.ones(cascades, resolution, resolution, resolution, dtype=torch.bool))
         self.register_buffer("possible", torch.ones_like(self.occupied))
         # The box around all occupied cells: rays begin and end there.
         self.register_buffer("box", torch.tensor([[-1.0] * 3, [1.0] * 3]) * 2.0 ** (cascades - 1))
+
+    @staticmethod
+    def cascades_of(reach: float) -> int:
+        """Grids for a scene of a reach."""
+        return 1 + max(0, math.ceil(math.log2(reach)))
+
+    @classmethod
+    def bytes_of(cls, reach: float, resolution: int) -> int:
+        """What a grid takes once it is refined to a resolution: a density and two marks for each cell."""
+        return cls.cascades_of(reach) * resolution**3 * (4 + 1 + 1)
 
     @property
     def resolution(self) -> int:

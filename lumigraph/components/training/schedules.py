@@ -10,5 +10,5 @@ def falling(first: float, last: float, progress: float, warmup: float = 0.0) -> 
 
     progress: share of the budget that is spent, in [0, 1]
     """
-    rate = first * (last / first) ** progress
+    rate = first * (last / first) ** progress if first else 0.0
     return rate * (FIRST_SHARE + (1 - FIRST_SHARE) * min(1.0, progress / warmup) if warmup else 1.0)

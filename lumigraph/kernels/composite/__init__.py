@@ -7,11 +7,13 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from .._dispatch import implementation
+from .._doors import door, require_starts
 from .._facts import Facts
 
 FACTS = Facts(unit="samples", outputs=3, differentiable=(0, 1), typical=13, compiled=15, smooth=(15,))
 
 
+@door
 def composite(
     tau: Float[Tensor, " sample"],
     values: Float[Tensor, "sample channel"],
@@ -31,6 +33,7 @@ def composite(
     Returns the accumulated values sum_i w_i v_i (R, C), opacity sum_i w_i (R,), and the weights (S,).
     All three are differentiable in tau and values.
     """
+    require_starts("ray_starts", ray_starts, len(tau))
     return implementation("composite", tau)(tau, values, ray_starts, stop)
 
 

@@ -3,17 +3,28 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from .._dispatch import implementation
+from .._doors import door, require
 from .._facts import Facts
 
 FACTS = Facts(unit="samples", outputs=1, differentiable=(0, 1), typical=2, compiled=3, smooth=(8,))
 
 PRIMES = (1, 2_654_435_761, 805_459_861)  # section 3; the first is 1 so that neighbours in x stay neighbours
+
+# Of HashLevels, least and most: corners along an axis, and entries, are numbered in 32 bits.
+LIMITS = (
+    ("levels", 1, 64),
+    ("features", 1, 64),
+    ("log2_entries", 1, 30),
+    ("coarsest", 1, 1 << 30),
+    ("finest", 1, 1 << 30),
+)
 
 
 @dataclass(frozen=True)
@@ -28,6 +39,11 @@ class HashLevels:
     log2_entries: int = 19
     coarsest: int = 16
     finest: int = 2048
+
+    def __post_init__(self) -> None:
+        for name, least, most in LIMITS:
+            require(least <= getattr(self, name) <= most, f"{self} cannot be: {name} is from {least} to {most:,}")
+        require(self.entries < 1 << 32, f"{self} has {self.entries:,} entries, which 32 bits do not count")
 
     @property
     def resolutions(self) -> list[int]:
@@ -47,7 +63,13 @@ class HashLevels:
             offsets.append(offsets[-1] + size)
         return offsets
 
+    @cached_property
+    def entries(self) -> int:
+        """Entries of all levels."""
+        return sum(self.sizes)
 
+
+@door
 def hash_encode(
     points: Float[Tensor, "sample 3"], table: Float[Tensor, "entry feature"], levels: HashLevels
 ) -> Float[Tensor, "sample width"]:
@@ -62,6 +84,8 @@ def hash_encode(
     Returns (S, levels * features), level by level; differentiable in the table and in the points (a clamped
     coordinate gets no gradient).
     """
+    wanted = levels.entries, levels.features
+    require(table.shape == wanted, f"a table of shape {tuple(table.shape)} should be {wanted}")
     return implementation("hash_encode", points)(points, table, levels)
 
 

@@ -23,6 +23,7 @@ def _cell(x, resolution):
     """Cell and place within it along one axis; what lies outside is clamped onto the border."""
     s = min(max(x, ZERO), ONE) * np.float32(resolution)
     cell = min(np.int32(s), np.int32(resolution - 1))
+    cell = max(cell, np.int32(0))  # also where x is no number
     return cell, s - np.float32(cell)
 
 

@@ -10,11 +10,13 @@ from torch import Tensor
 
 from ...rays import Samples
 from .._dispatch import implementation
+from .._doors import door, require
 from .._facts import Facts
 
 FACTS = Facts(unit="rays", outputs=3, differentiable=(), typical=2, compiled=7)
 
 
+@door
 def march(
     origins: Float[Tensor, "ray 3"],
     directions: Float[Tensor, "ray 3"],
@@ -42,6 +44,11 @@ def march(
     t_near:   >= 0; a ray whose t_far <= t_near has no samples
     Not differentiable.
     """
+    cascades, n = occupied.shape[:2]
+    require(occupied.numel() > 0 and occupied.shape[2:] == (n, n), f"{tuple(occupied.shape)} are no cubes of cells")
+    least = 2.0 ** (cascades - 25)  # a ray's samples are counted in 32 bits
+    require(least <= step < math.inf, f"a step of {step} cannot be, where cubes ask for {least:g} at least")
+    require(0 <= growth <= 1 and 0 <= stop <= 1, f"growth {growth} and stop {stop} must be from 0 to 1")
     run = implementation("march", origins)
     return Samples(*run(origins, directions, t_near, t_far, occupied, density, step, growth, stop))
 

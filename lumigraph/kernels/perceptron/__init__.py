@@ -9,11 +9,13 @@ from jaxtyping import Float
 from torch import Tensor
 
 from .._dispatch import implementation
+from .._doors import door, require
 from .._facts import Facts
 
 FACTS = Facts(unit="samples", outputs=1, differentiable=(0, 1, 2, 3), typical=4, compiled=4, smooth=(2, 4))
 
 
+@door
 def perceptron(x: Float[Tensor, "sample input"], *weights: Float[Tensor, "_ _"]) -> Float[Tensor, "sample last"]:
     """Linear layers without biases, ReLU between them (Müller 2021, the fully fused network).
 
@@ -24,6 +26,9 @@ def perceptron(x: Float[Tensor, "sample input"], *weights: Float[Tensor, "_ _"])
     contiguous one, as `hash_encode` returns it, is not copied, and the result is such a tensor.
     On a GPU products are taken in bfloat16 and sums in float32. Differentiable in x and the weights.
     """
+    widths = [x.shape[1], *(weight.shape[0] for weight in weights)]
+    chained = all(weight.shape[1] == width for weight, width in zip(weights, widths, strict=False))
+    require(len(weights) > 0 and chained, f"layers do not fit: {widths[0]} inputs, {[tuple(w.shape) for w in weights]}")
     return implementation("perceptron", x)(x, weights)
 
 

@@ -7,6 +7,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from .._dispatch import implementation
+from .._doors import door, require
 from .._facts import Facts
 
 FACTS = Facts(unit="pixels", unit_axes=2, outputs=1, differentiable=(), typical=2, compiled=2)
@@ -15,6 +16,7 @@ VARIANCE = 1e-4  # of values in [0, 1]: a hundredth, squared; windows with less 
 BEHIND = 1e-6  # third coordinate up to which a place is behind the neighbour
 
 
+@door
 def plane_sweep(
     reference: Float[Tensor, "height width"],
     trust: Float[Tensor, "height width"],
@@ -44,8 +46,8 @@ def plane_sweep(
     window: pixels along a side, an odd number; best: from 1 to the number of neighbours
     Not differentiable.
     """
-    if window % 2 == 0 or not 1 <= best <= len(neighbours):
-        raise ValueError(f"a window of {window} and the best {best} of {len(neighbours)} neighbours cannot be")
+    possible = window > 0 and window % 2 == 1 and 1 <= best <= len(neighbours)
+    require(possible, f"a window of {window} and the best {best} of {len(neighbours)} neighbours cannot be")
     run = implementation("plane_sweep", reference)
     with torch.no_grad():  # the same without their means, so that sums of squares stay small
         reference = centred(reference[None], trust[None])[0]

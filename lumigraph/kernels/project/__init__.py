@@ -10,6 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from .._dispatch import implementation
+from .._doors import door, require
 from .._facts import Facts
 
 FACTS = Facts(unit="gaussians", outputs=5, differentiable=(0, 1, 2, 3, 4), typical=5, compiled=5, smooth=(5, 6))
@@ -50,6 +51,7 @@ class View:
         return torch.cat([*parts, self.eye.new_tensor([*self.size, self.near])])
 
 
+@door
 def project(
     means: Float[Tensor, "gaussian 3"],
     quaternions: Float[Tensor, "gaussian 4"],
@@ -86,6 +88,8 @@ def project(
     opacities (N,). All are zero for a Gaussian that adds less than 1/255 to every pixel, or whose centre is within
     `near`. Differentiable in all five tensors.
     """
+    require(1 <= bands <= 4 and bands**2 <= harmonics.shape[1], f"{bands} bands are not there, or more than 4")
+    require(min(view.size) > 0, f"a picture cannot have {view.size[0]} x {view.size[1]} pixels")
     return implementation("project", means)(
         means, quaternions, scales, opacities, harmonics, view, bands, blur, compensate
     )

@@ -7,6 +7,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from .._dispatch import implementation
+from .._doors import door, require, require_indices, require_starts
 from .._facts import Facts
 from ..project import FAINTEST, OPAQUEST
 from ..tile import Tiles, footprints, tile
@@ -14,6 +15,7 @@ from ..tile import Tiles, footprints, tile
 FACTS = Facts(unit="gaussians", outputs=3, differentiable=(0, 1, 2, 3, 4), typical=3, compiled=3, smooth=(3,))
 
 
+@door
 def rasterize(
     centres: Float[Tensor, "gaussian 2"],
     conics: Float[Tensor, "gaussian 3"],
@@ -32,6 +34,9 @@ def rasterize(
     Returns sum_i w_i colour_i (H, W, 3), sum_i w_i depth_i (H, W) and sum_i w_i (H, W). All are differentiable in the
     five tensors; where 0.99 cuts a_i off, nothing flows back through it.
     """
+    require(len(tiles.starts) == tiles.across * tiles.down + 1, "the tiles do not cover their picture")
+    require_starts("tiles.starts", tiles.starts, len(tiles.order))
+    require_indices("tiles.order", tiles.order, len(centres))
     return implementation("rasterize", centres)(centres, conics, opacities, colours, depths, tiles, stop)
 
 

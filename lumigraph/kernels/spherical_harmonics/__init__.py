@@ -9,6 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from .._dispatch import implementation
+from .._doors import door, require
 from .._facts import Facts
 
 FACTS = Facts(unit="directions", outputs=1, differentiable=(0,), typical=4, compiled=0, smooth=(4,))
@@ -19,6 +20,7 @@ K20, K21, K22 = sqrt(5 / (16 * pi)), sqrt(15 / (4 * pi)), sqrt(15 / (16 * pi))
 K30, K31, K32, K33 = sqrt(7 / (16 * pi)), sqrt(21 / (32 * pi)), sqrt(105 / (16 * pi)), sqrt(35 / (32 * pi))
 
 
+@door
 def spherical_harmonics(directions: Float[Tensor, "ray 3"], bands: int) -> Float[Tensor, "ray coefficient"]:
     """The bands^2 real, orthonormal spherical harmonics Y_lm with l < bands, in the order l (l + 1) + m.
 
@@ -28,6 +30,7 @@ def spherical_harmonics(directions: Float[Tensor, "ray 3"], bands: int) -> Float
     directions: unit length
     bands:      1 to 4 (degree 0 to 3)
     """
+    require(1 <= bands <= 4, f"there are 1 to 4 bands, not {bands}")
     return implementation("spherical_harmonics", directions)(directions, bands)
 
 

@@ -7,6 +7,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from .._dispatch import implementation
+from .._doors import door, require
 from .._facts import Facts
 
 FACTS = Facts(unit="pixels", unit_axes=2, outputs=1, differentiable=(0, 1), typical=1, compiled=4, smooth=(1,))
@@ -22,6 +23,7 @@ def weights() -> list[float]:
     return (gaussian / gaussian.sum()).tolist()
 
 
+@door
 def ssim(a: Float[Tensor, "height width channel"], b: Float[Tensor, "height width channel"]) -> Float[Tensor, ""]:
     """Mean structural similarity (Wang 2004, eqs. 13 and 14) of two images with values in [0, 1].
 
@@ -34,6 +36,7 @@ def ssim(a: Float[Tensor, "height width channel"], b: Float[Tensor, "height widt
 
     Returns the mean of S over pixels and channels, which is symmetric, and differentiable in a and b.
     """
+    require(a.numel() > 0, "pictures without pixels are not alike")
     return implementation("ssim", a)(a, b)
 
 

@@ -9,6 +9,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from .._dispatch import implementation
+from .._doors import door, require
 from .._facts import Facts
 from ..project import FAINTEST
 
@@ -43,6 +44,7 @@ class Tiles:
         return -(-self.size[1] // self.side)
 
 
+@door
 def tile(
     centres: Float[Tensor, "gaussian 2"],
     conics: Float[Tensor, "gaussian 3"],
@@ -60,8 +62,8 @@ def tile(
     side: of a tile, in pixels: 4, 8, 16 or 32
     Not differentiable. order is int32, starts int64.
     """
-    if side not in (4, 8, 16, 32):
-        raise ValueError(f"a tile of side {side} cannot be; it is 4, 8, 16 or 32 pixels")
+    require(side in (4, 8, 16, 32), f"a tile of side {side} cannot be; it is 4, 8, 16 or 32 pixels")
+    require(min(size) > 0, f"a picture cannot have {size[0]} x {size[1]} pixels")
     run = implementation("tile", centres)
     order, starts = run(centres.detach(), conics.detach(), opacities.detach(), depths.detach(), size, side)
     return Tiles(order, starts, size, side)

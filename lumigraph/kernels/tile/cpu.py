@@ -54,6 +54,8 @@ def _measure(order, centres, conics, opacities, size, side, ellipses, rows):
         rows[k, 0], rows[k, 1] = max(first, 0), min(last, down - 1)
         wide = math.sqrt(limit * c / (a * upright))
         rows[k, 2] = min(across, np.int64(min(2 * wide / side, 1e6)) + 2)
+        if math.isnan(centres[i, 0] + centres[i, 1] + high + wide):  # nowhere
+            rows[k, 0], rows[k, 1], rows[k, 2] = 0, -1, 0
 
 
 @njit(inline="always")

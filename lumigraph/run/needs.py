@@ -1,0 +1,59 @@
+"""How much memory a method will need: told by its Config before anything is made."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import torch
+
+from .. import methods
+from ..errors import LumigraphError
+from ..memory import ask_for
+from ..method import Method
+from ..ranges import annotations, numbers
+from ..scene import Frame
+
+LEARNING = 4  # times a parameter: itself, its gradient, and the two moments that optimizers like Adam keep
+
+
+def check_memory(kind: type[Method], frame: Frame, config: Any, device: torch.device, learning: bool = False) -> None:
+    """Raise LumigraphError where a method would not fit into the memory that is free, naming what to make smaller."""
+
+    def needed(config: Any) -> int:
+        return bytes_of(kind, frame, config, learning)
+
+    def remedy() -> str:
+        smaller = {name: needed(less) for name, less in halved(config)}
+        name = min(smaller, key=smaller.__getitem__)
+        return f"give a smaller --{name.replace('_', '-')} than {getattr(config, name):,}"
+
+    ask_for(needed(config), device, f"{methods.name_of(kind)} with these numbers", remedy)
+
+
+def bytes_of(kind: type[Method], frame: Frame, config: Any, learning: bool) -> int:
+    """Bytes of a method's parameters, with all that learning keeps of each, of its buffers, and `further_bytes`.
+
+    The method is built of tensors without memory. 0 where it looks at their values, and so cannot be built that way.
+    """
+    further = kind.further_bytes(frame, config, learning)
+    try:
+        with torch.random.fork_rng(devices=[]), torch.device("meta"):
+            method = kind(frame, config)
+    except LumigraphError:
+        raise
+    except (RuntimeError, TypeError, ValueError):
+        return further
+    parameters = sum(x.numel() * x.element_size() for x in method.parameters())
+    buffers = sum(x.numel() * x.element_size() for x in method.buffers())
+    return (LEARNING if learning else 1) * parameters + buffers + further
+
+
+def halved(config: Any) -> list[tuple[str, Any]]:
+    """A Config with each of its whole numbers at half its value, or at the least that its range allows, by name."""
+    found = []
+    for name, kind in annotations(type(config)).items():
+        ranges = [range for number, range in numbers(kind) if number is int and range is not None]
+        if ranges and isinstance(value := getattr(config, name), int):
+            found.append((name, replace(config, **{name: max(value // 2, ranges[0].ge)})))
+    return found
