@@ -34,6 +34,7 @@ from fuzzing.watched import Ended, Limits, begun, still_there, watch
 
 CLOUD, SCENE = "given/run", "given/scene"
 TRAIN = ["train", "gaussian-splatting", SCENE, "--steps", "30", "--device", "cpu", *SMALL["gaussian-splatting"]]
+RECORD = "*.lumigraph"  # of what Lumigraph wrote in a folder
 
 
 @dataclass(frozen=True)
@@ -227,7 +228,7 @@ def after_a_kill(
         return f"it printed more than a sentence: {said[-300:]}"
     if which == signal.SIGTERM and os.waitstatus_to_exitcode(status) not in (0, 143):
         return f"SIGTERM ended it with {os.waitstatus_to_exitcode(status)}: {said[-200:]}"
-    if foreign := touched(before, after, [*allowed(work.words), *work.results]):
+    if foreign := touched(before, after, [*allowed(work.words), *work.results, RECORD]):
         return f"{foreign[0]} is not as it was"
     gone = [path for path in before if path not in after and "checkpoints" not in path and not is_left_over(path)]
     if gone:
@@ -248,7 +249,7 @@ def onward(work: Work, done: bool, folder: Path, notes: Path, before: dict[str, 
     if ended.code:
         return f"{' '.join(words[:2])} does not go on: {ended.said.strip()[-300:]}"
     after = snapshot(folder)
-    if foreign := touched(before, after, [*allowed(words), *work.results]):
+    if foreign := touched(before, after, [*allowed(words), *work.results, RECORD]):
         return f"{foreign[0]} is not as it was, once it has gone on"
     half = [path for path in halfway(folder, before, after) if not is_left_over(path)]
     return f"{half[0]} is half written, once it has gone on" if half else ""

@@ -26,7 +26,17 @@ LONG = {
     "--quality",
     "--port",
 }
-LONG |= {"--seeds", "--eval-views", "--size", "--max-size", "--cell-size", "--faces", "--downscale", "--pause-at", "--view"}
+LONG |= {
+    "--seeds",
+    "--eval-views",
+    "--size",
+    "--max-size",
+    "--cell-size",
+    "--faces",
+    "--downscale",
+    "--pause-at",
+    "--view",
+}
 CLOUD, GRID = "given/gaussian-splatting", "given/instant-ngp"
 # A command that goes well and quickly, by its name.
 COMMANDS: dict[str, list[str]] = {

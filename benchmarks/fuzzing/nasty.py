@@ -58,9 +58,31 @@ OTHERS: list[Any] = [
 # For options and arguments. None leads out of the folders that an input is made in, for some are written to.
 FLAGS = ["0", "-1", "1", "2", "-0.0", "0.5", "1e-300", "1e30", "1e300", "-1e300", "nan", "inf", "-inf", "1_0", "1e3"]
 FLAGS += ["2147483648", "9223372036854775807", "9223372036854775808", "1000000", "1000000000000", "9" * 5000, "-7"]
-FLAGS += ["", " ", "text", "None", "true", "[red]x[/red]", "x" * 5000, "é😀", "--help", "a\nb", "a=b", "a=1:2", "\udcff"]
+FLAGS += [
+    "",
+    " ",
+    "text",
+    "None",
+    "true",
+    "[red]x[/red]",
+    "x" * 5000,
+    "é😀",
+    "--help",
+    "a\nb",
+    "a=b",
+    "a=1:2",
+    "\udcff",
+]
 FLAGS += ["../outside/theirs.json", ".", "..", "../outside", "nowhere/x.json", "given", "out", "out/new"]
-FLAGS += ["theirs/holiday.jpg", "procedural:nothing", "procedural:still-life,size=-1", "cpu", "cpu:7", "cuda:99", "meta"]
+FLAGS += [
+    "theirs/holiday.jpg",
+    "procedural:nothing",
+    "procedural:still-life,size=-1",
+    "cpu",
+    "cpu:7",
+    "cuda:99",
+    "meta",
+]
 
 
 def value(chance: random.Random, like: Any = None) -> Any:
