@@ -22,6 +22,7 @@ import tempfile
 import time
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator
+from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -74,8 +75,9 @@ def verdicts(options: Options, work: Path) -> Iterator[Verdict]:
     if options.processes == 1:
         yield from map(one, tasks)
         return
-    with multiprocessing.get_context("fork").Pool(options.processes) as pool:
-        for count, verdict in enumerate(pool.imap_unordered(one, tasks), 1):
+    with ProcessPoolExecutor(options.processes, multiprocessing.get_context("fork")) as pool:
+        for count, done in enumerate(as_completed([pool.submit(one, task) for task in tasks]), 1):
+            verdict = done.result()
             if verdict.is_bad or count % 250 == 0:
                 told = f"{verdict.kind} {verdict.number}: {verdict.outcome} {verdict.where}" if verdict.is_bad else ""
                 print(f"{count} of {len(tasks)} {told}"[:200], file=sys.stderr, flush=True)

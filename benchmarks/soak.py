@@ -13,6 +13,7 @@ from __future__ import annotations
 import lumigraph  # ahead of PyTorch, as the command line does; isort: skip
 import contextlib
 import json
+import os
 import shutil
 import statistics
 import sys
@@ -31,7 +32,7 @@ WARM, LAST = 0.2, 0.1  # shares of the time: what is left out, and what is compa
 GROWTH = 0.05
 MINUTE = 60.0
 OF_METHOD = {
-    "gaussian-splatting": ["--initial-gaussians", "2000", "--refine-from", "1000000"],
+    "gaussian-splatting": ["--initial-gaussians", "2000", "--refine-until", "0"],
     "instant-ngp": ["--levels", "8", "--log2-hashmap-size", "14", "--max-resolution", "256"],
 }
 EXPORTS = {"gaussian-splatting": ("splats cloud.spz", "web page.html"), "instant-ngp": ("web page.html",)}
@@ -80,7 +81,7 @@ def main(options: Options) -> int:
 def one_round(method: str, scene: Path, run: Path, options: Options) -> None:
     """Everything once, in a folder that is gone afterwards."""
     steps = options.steps
-    with contextlib.redirect_stdout(None), contextlib.redirect_stderr(None):
+    with open(os.devnull, "w") as nowhere, contextlib.redirect_stdout(nowhere), contextlib.redirect_stderr(nowhere):
         must("train", method, scene, "--steps", steps, "--output", run, "--device", "cpu", *OF_METHOD[method])
         must("resume", run, "--steps", 2 * steps)
         look(run, options.pictures)

@@ -218,7 +218,7 @@ def zipped(data: bytes, chance: random.Random) -> bytes:
 
 def bomb(data: bytes, chance: random.Random) -> bytes:
     """A small stream that unpacks to gigabytes, behind a header that says so or does not."""
-    header = bytearray(gzip.decompress(data)[:16]) if data[:2] == b"\x1f\x8b" else bytearray(16)
+    header = bytearray(zlib.decompressobj(31).decompress(data, 16) if data[:2] == b"\x1f\x8b" else 16)
     if chance.random() < 0.7:
         header[8:12] = struct.pack("<I", chance.choice((10**8, 10**7, 2**31, 2**32 - 1)))
     return gzip.compress(bytes(header), 1) + zeros() * 100
