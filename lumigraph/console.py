@@ -8,12 +8,13 @@ from __future__ import annotations
 import sys
 from typing import Any
 
-from rich.console import Console
-from rich.text import Text
+# Rich is imported where it is needed: help, which prints through tyro, comes sooner without it.
 
 
-def console(errors: bool = False, **options: Any) -> Console:
+def console(errors: bool = False, **options: Any) -> Any:
     """A rich Console on standard output, or on standard error, that reads no markup in what it prints."""
+    from rich.console import Console
+
     return Console(stderr=errors, markup=False, highlight=False, emoji=False, **options)
 
 
@@ -23,9 +24,16 @@ def is_live(errors: bool = True) -> bool:
     return stream.isatty() and not console(errors).is_dumb_terminal
 
 
-def bold(text: object) -> Text:
-    return Text(str(text), style="bold")
+def bold(text: object) -> Any:
+    return styled(text, "bold")
 
 
-def dim(text: object) -> Text:
-    return Text(str(text), style="dim")
+def dim(text: object) -> Any:
+    return styled(text, "dim")
+
+
+def styled(text: object, style: str) -> Any:
+    """A rich Text, which stands as it is in one style."""
+    from rich.text import Text
+
+    return Text(str(text), style=style)

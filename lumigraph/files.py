@@ -1,55 +1,197 @@
-"""Files that are written whole or not at all."""
+"""Files that are written whole or not at all, and nowhere where somebody else's lie.
+
+What is there already is replaced only if Lumigraph wrote it, as a thing of the same kind, and nobody has changed it
+since (`marks`), or if the user said --overwrite to this very file. A folder goes only if Lumigraph wrote it as one and
+all that is in it. Commands ask by `claim` before any work; whoever writes asks again.
+"""
 
 from __future__ import annotations
 
 import contextlib
 import errno
+import itertools
 import json
 import os
 import re
-import shutil
-from collections.abc import Iterator
+import stat
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
+from . import marks
 from .errors import LumigraphError
+from .marks import Kind as Kind
+from .partials import partial
+from .partials import remove as remove
 
 NUMBERS = re.compile(r"\[[-+.eE\d,\s]*\]")
-PARTIAL = ".partial"  # what is still being written, or being deleted; whoever reads a folder passes over it
+
+Seen = tuple[int, ...]  # by which a file is known to be the same, unchanged
+
+_granted: dict[Path, Seen | None] = {}  # what lay there when this process was allowed to write there
+
+
+def claim(path: Path, kind: Kind, overwrite: bool | None = None, reads: Iterable[Path] = ()) -> None:
+    """Raise LumigraphError unless a file may be written there. For whoever has work to do first: before it.
+
+    kind:      what it will be; in the place of anything else it does not go
+    overwrite: whether the user wants whatever file lies there replaced; None where there is no option to say so
+    reads:     what the work begins with, which stays in any case
+    """
+    place = Path(os.path.abspath(path))
+    with explained(path):
+        if any(one.exists() and path.exists() and one.samefile(path) for one in reads):
+            raise LumigraphError(f"{path} would be replaced, and is what the command reads; choose another name")
+        there = seen(path)
+        if place in _granted and _granted[place] == there:
+            return
+        check_room(place)
+        if there is not None:
+            refuse_all_but_files(path)
+            if not (overwrite or marks.is_ours(path, kind)):
+                option = "" if overwrite is None else ", or give --overwrite"
+                raise LumigraphError(
+                    f"{path} is there already, and not as Lumigraph has written it; move it away, choose another "
+                    f"name{option}"
+                )
+        _granted[place] = there
+
+
+def claim_folder(path: Path, kind: Kind | None = None) -> None:
+    """Raise LumigraphError unless a folder may be written there, as a whole: in the place of nothing, of an empty
+    folder, or of one of the same kind."""
+    with explained(path):
+        check_room(Path(os.path.abspath(path)))
+        if seen(path) is None:
+            return
+        if path.is_symlink() or not path.is_dir():
+            raise LumigraphError(
+                f"{path} is to be a folder and is something else; move it away, or choose another name"
+            )
+        if not any(path.iterdir()):
+            return
+        if kind is None or not marks.is_whole(path, kind):
+            raise LumigraphError(f"{path} is a folder with something else in it; move it away, or choose another name")
+        if foreign := marks.foreign_in(path, kind):
+            raise LumigraphError(
+                f"{path} would be replaced, and {foreign.relative_to(path)} in it is not as Lumigraph has written it; "
+                "move that away, or choose another name"
+            )
 
 
 @contextlib.contextmanager
-def replacing(path: Path) -> Iterator[Path]:
-    """A path to write a file or a folder to, in the folder of `path`; it takes that place once the block ends well.
+def replacing(path: Path, kind: Kind = "file", ours: bool = False) -> Iterator[Path]:
+    """An empty file to fill, in the folder of `path`; it takes that place once the block ends well.
 
-    After a fault or a kill the place holds what it held before. Raises LumigraphError if the disk refuses.
+    ours: this is a part of a folder that was recognised by its own mark, such as a run's config.json: what may lie
+          there is ours, nobody needs to ask
+    After a fault or a kill the place holds what it held before. Raises LumigraphError as `claim` does, or if the disk
+    refuses.
     """
-    partial = path.with_name(f"{path.stem}{PARTIAL}{path.suffix}")
+    if not ours:
+        claim(path, kind)
     with explained(path):
-        remove(partial)
         path.parent.mkdir(parents=True, exist_ok=True)
-        try:
-            yield partial
-            sync(partial)
-            if path.is_dir():
-                remove(path)  # a folder cannot be replaced in one step; Run never needs it
-            os.replace(partial, path)
+        with partial(path.parent) as new:
+            yield new
+            sync(new)
+            target = path
+            if not ours:
+                target = place_now(path, lambda: claim(path, kind))
+                marks.note(target, kind, new)
+            os.replace(new, target)
+            if not ours:
+                _granted[Path(os.path.abspath(target))] = seen(target)
             sync_folder(path.parent)
+        tell_if_moved(path, target)
+
+
+@contextlib.contextmanager
+def replacing_folder(path: Path, kind: Kind | None = None, ours: bool = False) -> Iterator[Path]:
+    """An empty folder to fill; otherwise as `replacing`. Without a kind it replaces nothing, now or later."""
+    if not ours:
+        claim_folder(path, kind)
+    with explained(path):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with partial(path.parent, is_folder=True) as new:
+            yield new
+            sync(new)
+            target = path
+            if kind is not None:
+                marks.note_folder(new, kind)
+            if not ours:
+                target = place_now(path, lambda: claim_folder(path, kind))
+            exchange(new, target)
+            sync_folder(path.parent)
+        tell_if_moved(path, target)
+
+
+def exchange(new: Path, place: Path) -> None:
+    """Put a folder into a place, and delete what was there."""
+    with partial(place.parent, is_folder=True) as aside:
+        old = aside / place.name
+        if seen(place) is not None:
+            os.replace(place, old)
+        try:
+            os.replace(new, place)
         except BaseException:
-            remove(partial)
+            if seen(old) is not None:
+                os.replace(old, place)
             raise
 
 
-def write_bytes(path: Path, data: bytes) -> None:
-    with replacing(path) as partial:
-        partial.write_bytes(data)
+def place_now(path: Path, ask: Callable[[], None]) -> Path:
+    """Where to put what has been made: where it was to go, or beside it if somebody else has been there meanwhile."""
+    try:
+        ask()
+        return path
+    except LumigraphError:
+        beside = (path.with_stem(f"{path.stem}-{number}") for number in itertools.count(2))
+        return next(other for other in beside if seen(other) is None)
 
 
-def write_json(path: Path, value: Any) -> None:
+def tell_if_moved(wanted: Path, place: Path) -> None:
+    if place != wanted:
+        raise LumigraphError(f"{wanted} has been changed by somebody else meanwhile; what was made is {place}")
+
+
+def seen(path: Path) -> Seen | None:
+    """What lies at a path, links as such; None if nothing does."""
+    try:
+        about = os.lstat(path)
+    except (FileNotFoundError, NotADirectoryError):
+        return None
+    return about.st_dev, about.st_ino, about.st_mode, about.st_size, about.st_mtime_ns
+
+
+def check_room(place: Path) -> None:
+    """Raise OSError unless something may be written there, as far as that can be told beforehand."""
+    above = next(folder for folder in [*place.parents, Path(place.anchor)] if os.path.lexists(folder))
+    if not above.is_dir():
+        raise NotADirectoryError(errno.ENOTDIR, os.strerror(errno.ENOTDIR), str(above))
+    if not os.access(above, os.W_OK | os.X_OK):
+        raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(above))
+
+
+def refuse_all_but_files(path: Path) -> None:
+    mode = os.lstat(path).st_mode
+    if stat.S_ISLNK(mode):
+        raise LumigraphError(f"{path} is a link, which stays as it is; name the file that it leads to, or another one")
+    if not stat.S_ISREG(mode):
+        what = "a folder" if stat.S_ISDIR(mode) else "no ordinary file"
+        raise LumigraphError(f"{path} is {what}; choose another name for the file")
+
+
+def write_bytes(path: Path, data: bytes, kind: Kind = "file", ours: bool = False) -> None:
+    with replacing(path, kind, ours) as new:
+        new.write_bytes(data)
+
+
+def write_json(path: Path, value: Any, kind: Kind = "file", ours: bool = False) -> None:
     """JSON for programs and people: indented, but rows of numbers stay rows."""
     text = json.dumps(value, indent=2, ensure_ascii=False, allow_nan=False)
     text = NUMBERS.sub(lambda match: " ".join(match[0].split()).replace("[ ", "[").replace(" ]", "]"), text)
-    write_bytes(path, text.encode() + b"\n")
+    write_bytes(path, text.encode() + b"\n", kind, ours)
 
 
 def read_json(path: Path) -> Any:
@@ -59,14 +201,6 @@ def read_json(path: Path) -> Any:
             return json.loads(path.read_text("utf-8"))
         except (UnicodeDecodeError, json.JSONDecodeError) as error:
             raise LumigraphError(f"{path} cannot be read as JSON ({error}); restore it from a copy") from error
-
-
-def remove(path: Path) -> None:
-    """Delete a file or a folder, if it is there."""
-    if path.is_dir() and not path.is_symlink():
-        shutil.rmtree(path)
-    else:
-        path.unlink(missing_ok=True)
 
 
 def sync(path: Path) -> None:

@@ -20,6 +20,7 @@ from .errors import LumigraphError
 from .files import explained
 
 NAME = "lock.json"  # in the folder: who holds it, for people; what counts is the system's lock on this file
+BEGINS = b'{"process": '
 FAR = 1 << 30  # byte that Windows locks, for it lets nobody read what is locked
 
 _ours: set[Path] = set()  # held by this process
@@ -36,6 +37,7 @@ def held(folder: Path, doing: str) -> Iterator[None]:
     if place in _ours:
         yield
         return
+    check_place(folder)
     with explained(place):
         file = taken(place)
     if file is None:
@@ -48,6 +50,25 @@ def held(folder: Path, doing: str) -> Iterator[None]:
         with contextlib.suppress(OSError):  # Windows deletes no open file; then it stays, and means nothing
             place.unlink()
         file.close()
+
+
+def check_place(folder: Path) -> None:
+    """Raise LumigraphError if somebody's file lies where a folder's lock would: it would be replaced, and deleted."""
+    with explained(folder / NAME):
+        if not is_lock(folder / NAME):
+            raise LumigraphError(f"{folder / NAME} is no lock of Lumigraph's; rename it, or choose another folder")
+
+
+def is_lock(place: Path) -> bool:
+    """Whether a lock's file may be put there: nothing is, or one that somebody holds or has left behind."""
+    if not os.path.lexists(place):
+        return True
+    if place.is_symlink() or not place.is_file():
+        return False
+    try:
+        return place.read_bytes()[: len(BEGINS)] in (BEGINS, b"")
+    except FileNotFoundError:
+        return True  # it went just now
 
 
 def taken(place: Path) -> TextIO | None:

@@ -18,6 +18,7 @@ from .errors import LumigraphError
 STATUS = Path("/proc/self/status")
 SPARED = 0.3  # of what is free now, for everybody else
 IMAGES = 0.4  # share of the machine's memory that images may take; the rest is for training and all else that runs
+PIXEL = 128  # bytes that one needs on its way to a picture: its ray, its colour, depth and opacity, in parts and whole
 SIGNS = ("can't allocate memory", "bad_alloc", "Storage size calculation overflowed", "Cannot allocate memory")
 UNITS = {unit: 1024**power for power, unit in enumerate("bKMGTPE")}
 LIMITS = (  # of a container, and what it uses of it
@@ -60,6 +61,11 @@ def ask_for(size: int, device: torch.device, what: str, remedy: Callable[[], str
     if size > (free := free_on(device)):
         less = remedy if isinstance(remedy, str) else remedy()
         raise LumigraphError(f"{what} would need {gigabytes(size)} of memory, and {gigabytes(free)} are free; {less}")
+
+
+def ask_for_picture(width: int, height: int, device: torch.device) -> None:
+    """Raise LumigraphError unless a rendering of so many pixels may be had on a device."""
+    ask_for(PIXEL * width * height, device, f"A picture of {width} x {height} pixels", "give a smaller --size")
 
 
 def gigabytes(size: float) -> str:

@@ -3,7 +3,8 @@
     levels: Annotated[int, between(1, 32)] = 16         of a Config, or of a command
     frames: Annotated[Count | None, option("N")] = None
 
-`check` asks a dataclass whether it keeps to its ranges, `typed` makes one of plain JSON, `domain` says a range.
+`check` asks a dataclass whether it keeps to its ranges, `typed` makes one of plain JSON, `domain` says a range. What
+must agree beyond that, such as the coarsest level and the finest, a dataclass says in a method `check`.
 """
 
 from __future__ import annotations
@@ -42,7 +43,8 @@ NonNegative = Annotated[float, between(0, 1e6)]  # weights of losses, thresholds
 LearningRate = Annotated[float, between(0, 10)]
 Width = Annotated[int, between(2, 8192)]  # of a layer
 Layers = Annotated[int, between(1, 64)]
-RaySamples = Annotated[int, between(1, 4096)]  # of one ray
+Depth = Annotated[int, between(2, 64)]  # of a network that needs a layer before the last
+RaySamples = Annotated[int, between(4, 4096)]  # of one ray
 BatchSize = Annotated[int, between(1, 1 << 22)]  # rays or pixels of one step
 Octaves = Annotated[int, between(1, 32)]
 CloudSize = Annotated[int, between(1, 100_000_000)]  # Gaussians, points
@@ -80,16 +82,16 @@ def said(number: Any) -> str:
 
 
 @cache
-def annotations(kind: type) -> dict[str, Any]:
+def hints(kind: Any) -> dict[str, Any]:
     """The fields of a dataclass with what their annotations say."""
-    hints = typing.get_type_hints(kind, include_extras=True)
-    return {field.name: hints[field.name] for field in fields(kind)}
+    said = typing.get_type_hints(kind, include_extras=True)
+    return {field.name: said[field.name] for field in fields(kind)}
 
 
 def outside(value: Any) -> Iterator[tuple[str, Any, Any]]:
     """The fields of a dataclass, and of dataclasses in it, whose numbers are none or beyond their ranges, as
     (name, annotation, value)."""
-    for name, kind in annotations(type(value)).items():
+    for name, kind in hints(type(value)).items():
         found = getattr(value, name)
         if is_dataclass(found):
             yield from outside(found)
@@ -100,10 +102,21 @@ def outside(value: Any) -> Iterator[tuple[str, Any, Any]]:
                 yield name, kind, found
 
 
+def coherent(value: Any) -> None:
+    """Ask a dataclass, and dataclasses in it, whether their numbers agree: the `check` of those that have one raises
+    LumigraphError."""
+    for name in hints(type(value)):
+        if is_dataclass(inner := getattr(value, name)):
+            coherent(inner)
+    if hasattr(value, "check"):
+        value.check()
+
+
 def check(value: Any, where: Path | str) -> None:
-    """Raise LumigraphError for the first number of a dataclass beyond its range. where: what to name before it."""
+    """Raise LumigraphError for numbers of a dataclass beyond their ranges, or that disagree. where: what to name."""
     for name, kind, found in outside(value):
         raise LumigraphError(f"{where}: {name} cannot be {shown(found)}; it is from {domain(kind)}")
+    coherent(value)
 
 
 def typed(kind: type[Kind], value: Any, where: Path | str) -> Kind:
@@ -112,7 +125,7 @@ def typed(kind: type[Kind], value: Any, where: Path | str) -> Kind:
     where: the file or option to name. Raises LumigraphError that says which value is wrong, and what it should be.
     """
     try:
-        return msgspec.convert(value, kind)
+        made = msgspec.convert(value, kind)
     except (msgspec.ValidationError, ValueError, TypeError) as error:
         fault, _, path = str(error).partition(" - at `$")
         name = path.rstrip("`").lstrip(".")
@@ -120,6 +133,9 @@ def typed(kind: type[Kind], value: Any, where: Path | str) -> Kind:
         what = f"{name} is {shown(found)}" if name else f"it holds {shown(found)}"
         should = f"should be from {domain(wanted)}" if re.match(r"Expected `\w+` [<>]", fault) else fault
         raise LumigraphError(f"{where} does not hold what it should: {what}, {should}") from error
+    if is_dataclass(made):
+        coherent(made)
+    return made
 
 
 def found_at(kind: Any, value: Any, path: str) -> tuple[Any, Any]:
@@ -132,7 +148,7 @@ def found_at(kind: Any, value: Any, path: str) -> tuple[Any, Any]:
         except (KeyError, IndexError, TypeError):
             return value, None
         if is_dataclass(kind):
-            kind = annotations(typing.cast(type, kind)).get(name)
+            kind = hints(typing.cast(type, kind)).get(name)
         elif index:
             inner = [x for x in get_args(kind) if x is not Ellipsis]
             kind = inner[min(int(index), len(inner) - 1)] if inner else None

@@ -17,7 +17,7 @@ from . import __version__, methods
 from .budget import Budget
 from .figures.charts import STYLE as CHARTS
 from .figures.charts import Series, bar_chart, line_chart
-from .files import write_bytes
+from .files import claim, write_bytes
 from .metrics import scores_of
 from .progress import clock, short
 from .run import Run
@@ -28,6 +28,7 @@ STYLE = CHARTS + (Path(__file__).parent / "report.css").read_text("utf-8")
 
 def write_report(run: Run) -> Path:
     """Write RUN/report.html from what the run's folder holds: the more commands have run, the more it shows."""
+    path = claim_report(run)
     evaluation = run.evaluation()
     title = f"{run.title} · {run.method_name}"
     sections = [
@@ -39,8 +40,14 @@ def write_report(run: Run) -> Path:
         contact_sheet(run),
         settings(run, evaluation),
     ]
+    write_bytes(path, page(title, "".join(sections), str(run.folder)), "report")
+    return path
+
+
+def claim_report(run: Run, overwrite: bool | None = None) -> Path:
+    """RUN/report.html. Raises LumigraphError unless a report may be written there; see `files.claim`."""
     path = run.folder / "report.html"
-    write_bytes(path, page(title, "".join(sections), str(run.folder)))
+    claim(path, "report", overwrite)
     return path
 
 

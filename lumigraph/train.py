@@ -265,7 +265,7 @@ class Previews:
             return
         self.next = [share for share in self.next if share > progress]
         self.method.eval()
-        save_picture(self.run.folder / "previews" / f"{step:06d}.png", self.method.render(self.camera).rgb)
+        save_picture(self.run.folder / "previews" / f"{step:06d}.png", self.method.render(self.camera).rgb, ours=True)
         self.method.train()
 
 

@@ -46,12 +46,16 @@ SHARES: dict[str, tuple[str, float]] = {
     "test_web": ("exports, viewer, web", 15),
     "test_viewer_page": ("exports, viewer, web", 20),
     "test_viewer": ("exports, viewer, web", 10),
+    "test_viewer_guard": ("exports, viewer, web", 5),
+    "test_foreign_files": ("runs, commands, benchmark", 15),
     "test_panorama": ("exports, viewer, web", 8),
     "test_benchmark": ("runs, commands, benchmark", 20),
     "test_cli": ("runs, commands, benchmark", 18),
     "test_run": ("runs, commands, benchmark", 8),
     "test_train": ("runs, commands, benchmark", 8),
     "test_signals": ("runs, commands, benchmark", 15),
+    "test_ranges": ("methods", 20),
+    "test_memory": ("runs, commands, benchmark", 12),
     "test_nerf": ("methods", 16),
     "test_instant_ngp": ("methods", 10),
     "test_gaussian_splatting": ("methods", 10),
@@ -59,7 +63,7 @@ SHARES: dict[str, tuple[str, float]] = {
 }
 A_METHOD = 6.0  # by contract, of each method, beside what its own file takes
 GROUPS: dict[str, str] = {
-    **dict.fromkeys("test_bench_kernels test_lanes".split(), "kernels"),
+    **dict.fromkeys("test_bench_kernels test_lanes test_doors".split(), "kernels"),
     **dict.fromkeys(
         "test_export test_viewer_controls test_viewer_crop test_exchange test_explain_ray test_keyframes".split(),
         "exports, viewer, web",

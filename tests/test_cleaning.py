@@ -177,7 +177,7 @@ REFUSED = {
     "no Gaussians": (["RAYS", "--output", "OUT"], "holds no Gaussians"),
     "a file to a run": (["FILE", "--output", "OUT"], "is no run"),
     "nothing left": (["FILE", "--sphere", "90", "0", "0", "1", "--output", "OUT.ply"], "No Gaussian is left"),
-    "its own source": (["FILE", "--output", "FILE"], "is there already"),
+    "its own source": (["FILE", "--output", "FILE"], "is what the command reads"),
     "two crops": (["FILE", "--sphere", *"0 0 0 1".split(), "--box", *"0 0 0 1 1 1".split(), "--output", "OUT.ply"],
                   "two ways to crop"),
     "an empty box": (["FILE", "--box", *"0 0 0 1 1 -1".split(), "--output", "OUT.ply"], "holds nothing"),

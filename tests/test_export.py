@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 import tiny
 import torch
+from listing import names
 from PIL import Image, ImageSequence
 
 from lumigraph.camera import Camera
@@ -222,7 +223,7 @@ def test_moving_pictures_hold_their_frames_and_last_as_long(ending, error, tmp_p
     for a, b in zip(pictures_of(tmp_path / f"a.{ending}"), given, strict=True):
         blurred = (a - b.numpy()).reshape(10, 8, 15, 6, 3).mean((1, 3))  # what dithering keeps
         assert np.abs(a - b.numpy()).mean() < error and np.abs(blurred).mean() < 3
-    assert [x.name for x in tmp_path.iterdir()] == [f"a.{ending}"]
+    assert names(tmp_path) == [f"a.{ending}"]
 
 
 def test_a_gifs_dithering_stands_still_and_spends_one_palette(tmp_path):
@@ -288,7 +289,7 @@ def test_a_film_of_a_method(ball_run, tmp_path):
     path = camera_path("orbit", ball_run.cameras()["train"], ball_run.frame, 7, (26, 24))
     about = film(method, path, tmp_path / "out" / "orbit.mp4", fps=10)
     out = tmp_path / "out"
-    assert sorted(x.name for x in out.iterdir()) == ["orbit", "orbit-depth.mp4", "orbit.json", "orbit.mp4"]
+    assert names(out) == ["orbit", "orbit-depth.mp4", "orbit.json", "orbit.mp4"]
     assert len(frames_of(out / "orbit.mp4")) == len(frames_of(out / "orbit-depth.mp4")) == 7
     assert len(list((out / "orbit").glob("????.png"))) == len(list((out / "orbit").glob("????-depth.png"))) == 7
     seen = method.render(path[3]).rgb.clamp(0, 1)
@@ -296,13 +297,13 @@ def test_a_film_of_a_method(ball_run, tmp_path):
     assert kept.shape == (24, 26, 3) and (kept - seen).abs().max() < 0.01
     assert json.loads((out / "orbit.json").read_text())["frames"] == 7 == about["frames"]
     film(method, path[:2], out / "orbit.mp4")  # again: replaced, not mixed
-    assert len(frames_of(out / "orbit.mp4")) == 2 and len(list((out / "orbit").iterdir())) == 4
+    assert len(frames_of(out / "orbit.mp4")) == 2 and len(names(out / "orbit")) == 4
 
 
 def test_a_film_as_a_moving_picture_has_a_twin_of_depth(ball_run, tmp_path):
     path = camera_path("orbit", ball_run.cameras()["train"], ball_run.frame, 3, (26, 24))
     film(ball_run.method(), path, tmp_path / "orbit.webp", fps=10)
-    assert sorted(x.name for x in tmp_path.iterdir()) == ["orbit", "orbit-depth.webp", "orbit.json", "orbit.webp"]
+    assert names(tmp_path) == ["orbit", "orbit-depth.webp", "orbit.json", "orbit.webp"]
     assert len(pictures_of(tmp_path / "orbit.webp")) == len(pictures_of(tmp_path / "orbit-depth.webp")) == 3
 
 

@@ -7,6 +7,7 @@ import math
 from dataclasses import replace
 from pathlib import Path
 
+import listing
 import numpy as np
 import pytest
 import torch
@@ -160,7 +161,7 @@ def test_a_seed_gives_the_same_figures(photograph):
 def test_the_page_holds_everything(comparison, tmp_path):
     write_page(tmp_path, comparison)
     names = ("index.html", "scales.svg", "spectrum.svg", "comparison.png", "figures.json")
-    assert sorted(path.name for path in tmp_path.iterdir()) == sorted(names)
+    assert listing.names(tmp_path) == sorted(names)
     page = (tmp_path / "index.html").read_text("utf-8")
     assert page.count("<svg") == 2 and "data:image/jpeg" in page and "waves.png" in page
     assert f"{comparison.gain:.2f} dB over no encoding" in page and "src='http" not in page

@@ -17,8 +17,8 @@ import lumigraph
 FLOORS: list[set[str]] = [
     {"console", "errors", "processes", "quality", "signals"},
     {
-        *("blending", "budget", "choice", "controls", "geometry", "loops"),
-        *("memory", "names", "progress", "ranges", "readers", "srgb", "threads"),
+        *("blending", "budget", "choice", "controls", "geometry", "loops", "marks"),
+        *("memory", "names", "partials", "progress", "ranges", "readers", "srgb", "threads"),
     },
     {"files", "plain", "lens", "rays"},
     {"camera", "crop", "images", "kernels", "figures", "locks", "metrics"},

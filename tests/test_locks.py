@@ -78,7 +78,7 @@ def test_a_run_is_trained_by_one_process_at_a_time(tmp_path, capsys):
 
 
 def test_a_run_begins_where_only_a_dead_lock_lies(tmp_path):
-    (tmp_path / locks.NAME).write_text("half wri")
+    (tmp_path / locks.NAME).write_text('{"process": 4')
     assert tiny.new_run(tmp_path).folder == tmp_path
 
 

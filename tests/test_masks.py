@@ -10,6 +10,7 @@ import pytest
 import tiny
 import torch
 from captures import HEIGHT, WIDTH, WRITERS, Tiny, write_ngp
+from listing import names
 from PIL import Image
 
 from lumigraph.capture import open_scene
@@ -75,7 +76,7 @@ def test_capture_takes_masks_and_not_for_photographs(place, tmp_path):
     intake = gather([tmp_path / "all" / "images"], tmp_path / "work")
     assert [photo.mask is not None for photo in intake.photos] == [False, True, True, False]
     masks = copy_masks(intake.photos, tmp_path / "masks", untracked)
-    assert sorted(path.name for path in masks.iterdir()) == ["view_01.png.png", "view_02.png.png"]
+    assert names(masks) == ["view_01.png.png", "view_02.png.png"]
     copied = np.asarray(Image.open(masks / "view_01.png.png"))
     assert copied.shape == (HEIGHT, WIDTH) and (copied[:, WIDTH // 2 :] > 0).all() and not copied[:, : WIDTH // 2].any()
     assert copy_masks(intake.photos[:1], tmp_path / "none", untracked) is None

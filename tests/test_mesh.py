@@ -13,6 +13,7 @@ import pytest
 import tiny
 import torch
 import trimesh
+from listing import names
 from scipy.spatial import cKDTree
 from solids import SOLID, Seen, Solid, around, ball, painted, shell, together, torus
 
@@ -234,7 +235,7 @@ def test_files_open_elsewhere_with_their_colours(solid_ball, tmp_path, ending):
         linear = np.asarray(found.visual.vertex_attributes["color"], np.float64)
         encoded = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
         np.testing.assert_allclose(255 * encoded, solid_ball.colours, atol=0.01)
-    assert [x.name for x in tmp_path.iterdir()] == [path.name]
+    assert names(tmp_path) == [path.name]
 
 
 def test_a_glb_is_unlit_and_well_formed(solid_ball, tmp_path):

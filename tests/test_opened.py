@@ -100,7 +100,7 @@ def rewrite(run: Run, change) -> dict:
     """Change a run's config.json as another version would have written it."""
     said = json.loads((run.folder / "config.json").read_text())
     change(said)
-    write_json(run.folder / "config.json", said)
+    write_json(run.folder / "config.json", said, ours=True)
     return said
 
 

@@ -13,6 +13,7 @@ from pathlib import Path
 import pytest
 import tiny
 import torch
+from listing import names
 
 from lumigraph import methods
 from lumigraph.errors import LumigraphError
@@ -122,7 +123,7 @@ OLDER = {  # what `lumigraph train` wrote before fields had the names they have 
 def test_runs_with_former_names_open(name, run):
     """Each number arrives under its name of today, and the rest are defaults."""
     kind, old = methods.find(name), OLDER[name]
-    write_json(run.folder / "config.json", run.settings.to_json() | {"method": name, "config": old})
+    write_json(run.folder / "config.json", run.settings.to_json() | {"method": name, "config": old}, ours=True)
     config = Run(run.folder).new_method().config
     assert config == kind.Config(**{kind.formerly.get(key, key): value for key, value in old.items()})
     assert list(old.values()) == [getattr(config, kind.formerly.get(key, key)) for key in old]
@@ -130,7 +131,7 @@ def test_runs_with_former_names_open(name, run):
 
 def test_a_number_under_both_its_names_is_refused(run):
     config = {"method": "nerf", "config": {"width": 32, "hidden_width": 64}}
-    write_json(run.folder / "config.json", run.settings.to_json() | config)
+    write_json(run.folder / "config.json", run.settings.to_json() | config, ours=True)
     with pytest.raises(LumigraphError, match="width is the former name of hidden_width, and both are given"):
         Run(run.folder).new_method()
 
@@ -261,7 +262,7 @@ def test_files_are_replaced_whole_or_not_at_all(tmp_path):
     with pytest.raises(RuntimeError), replacing(path) as partial:
         partial.write_text("half")
         raise RuntimeError
-    assert json.loads(path.read_text())["x"] == [1.5, 2.0] and os.listdir(tmp_path) == ["value.json"]
+    assert json.loads(path.read_text())["x"] == [1.5, 2.0] and names(tmp_path) == ["value.json"]
     with pytest.raises(ValueError):
         write_json(path, {"x": float("nan")})
     assert json.loads(path.read_text())["x"] == [1.5, 2.0]

@@ -260,5 +260,5 @@ def test_a_frame_comes_back_from_json_and_older_ones_still_open(tmp_path: Path):
     run = Run.create(tmp_path / "run", tiny.method(scene.frame), scene)
     config = run.settings.to_json()
     del config["frame"]["forward"]
-    files.write_json(run.folder / "config.json", config)
+    files.write_json(run.folder / "config.json", config, ours=True)
     assert len(Run(run.folder).scene()) == len(scene)

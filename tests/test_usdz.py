@@ -9,6 +9,7 @@ import zipfile
 import numpy as np
 import pytest
 import trimesh
+from listing import names
 from PIL import Image
 
 from lumigraph.export.mesh_file import write_mesh
@@ -40,7 +41,7 @@ def test_files_lie_as_they_are_at_multiples_of_64_bytes(cone, tmp_path):
             assert (entry.header_offset + 30 + name + extra) % ALIGNED == 0
         text = packed.read(layer).decode()
         assert text.startswith("#usda 1.0") and 'upAxis = "Y"' in text and f"@{picture.filename}@" in text
-    assert [x.name for x in tmp_path.iterdir()] == ["cone.usdz"]
+    assert names(tmp_path) == ["cone.usdz"]
 
 
 def test_the_picture_is_linear_between_the_corners(cone):

@@ -12,6 +12,8 @@ from ..budget import Budget
 from ..errors import LumigraphError
 from ..run import Run
 
+SHEET = "views.png"
+
 
 @dataclass(frozen=True)
 class Settings:
@@ -124,10 +126,13 @@ def evaluated(folder: Path, settings: Settings) -> bool:
 
 
 def claim(output: Path, cells: Sequence[Cell], settings: Settings) -> None:
-    """Note in the output's folder what its cells share. Raises LumigraphError if they shared something else so far."""
+    """Note in the output's folder what its cells share. Raises LumigraphError if they shared something else so far, or
+    if somebody else's files lie where the results go."""
     path = output / "settings.json"
     shared = {name: getattr(settings, name) for name in ("downscale", "reader", "scales", "preset", "device")}
     known = files.read_json(path) if path.exists() else {"settings": shared, "scenes": {}}
+    if not (isinstance(known, dict) and all(isinstance(known.get(part), dict) for part in ("settings", "scenes"))):
+        raise LumigraphError(f"{path} is not of a benchmark, and would be replaced; choose another --output")
     for name, value in shared.items():
         begun = known["settings"].get(name, getattr(Settings, name))  # older folders know fewer options
         if begun != value:
@@ -140,4 +145,6 @@ def claim(output: Path, cells: Sequence[Cell], settings: Settings) -> None:
                 f"Two scenes are called {cell.scene}: {known['scenes'][cell.scene]} and {cell.source}; "
                 "rename a folder, or choose another --output"
             )
-    files.write_json(path, known)
+    for name in ("results.json", "results.md", SHEET, *(chart.name for chart in output.glob("*-over-*.svg"))):
+        files.claim(output / name, "benchmark")
+    files.write_json(path, known, ours=True)

@@ -8,10 +8,10 @@ from pathlib import Path
 
 from .. import files
 from ..errors import LumigraphError
-from ..locks import held
+from ..locks import check_place, held
 from ..progress import clock, counting
 from .cell import Cell, Settings, claim, evaluation, training
-from .launch import STOPPED, Launch, launch, reason
+from .launch import STOPPED, Launch, claim_log, launch, reason
 from .pictures import draw_charts, draw_views
 from .results import read_rows, row_of
 from .table import markdown
@@ -29,6 +29,9 @@ def conduct(
     Cells that are done are kept, half-trained ones go on, failed ones are tried again. A cell that fails is a row that
     says why. tell: hears which cell is next. Returns the signal's exit code if one stopped it, otherwise 0.
     """
+    check_place(output)
+    for cell in cells:
+        claim_log(log_of(cell, output))
     claim(output, cells, settings)
     with held(output, "worked in"):
         return carry_on(cells, settings, output, tell, launch)
@@ -54,17 +57,17 @@ def carry_on(
             tell(f"{cell.title} failed: {failure}")
         rows[f"runs/{cell.name}"] = row_of(cell, output, settings, failure)
         found = list(rows.values())
-        files.write_json(output / "results.json", {"settings": settings.to_json(), "cells": found})
-        files.write_bytes(output / "results.md", markdown(found, draw_charts(found, output)).encode())
+        files.write_json(output / "results.json", {"settings": settings.to_json(), "cells": found}, "benchmark")
+        files.write_bytes(output / "results.md", markdown(found, draw_charts(found, output)).encode(), "benchmark")
     found = list(rows.values())
     pictures = draw_charts(found, output) + draw_views(found, output)
-    files.write_bytes(output / "results.md", markdown(found, pictures).encode())
+    files.write_bytes(output / "results.md", markdown(found, pictures).encode(), "benchmark")
     return 0
 
 
 def carry_out(cell: Cell, output: Path, settings: Settings, launch: Launch) -> tuple[int, str | None]:
     """Train and evaluate a cell as far as that is not done. Returns the last exit code, and why it failed if it did."""
-    folder, log = output / "runs" / cell.name, output / "runs" / f"{cell.name}.log"
+    folder, log = output / "runs" / cell.name, log_of(cell, output)
     for task in (training, evaluation):
         try:
             command = task(cell, folder, settings)
@@ -74,6 +77,10 @@ def carry_out(cell: Cell, output: Path, settings: Settings, launch: Launch) -> t
         if code:
             return code, reason(log, code)
     return 0, None
+
+
+def log_of(cell: Cell, output: Path) -> Path:
+    return output / "runs" / f"{cell.name}.log"
 
 
 def unfinished(cell: Cell, output: Path, settings: Settings) -> bool:

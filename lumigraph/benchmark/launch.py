@@ -9,11 +9,13 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from .. import files
+from ..errors import LumigraphError
 from ..processes import start
 from ..signals import Interrupt
 
 Launch = Callable[[Sequence[str], Path], int]
 STOPPED = (130, 143)  # after Ctrl-C and SIGTERM
+PROMPT = b"$ lumigraph "  # each command in a log begins so
 LOOKS = 0.2  # seconds between looks at whether to stop
 
 
@@ -27,7 +29,7 @@ def launch(arguments: Sequence[str], log: Path) -> int:
         log.parent.mkdir(parents=True, exist_ok=True)
         out = open(log, "ab")
     with out, Interrupt() as interrupt:
-        out.write(f"$ lumigraph {' '.join(arguments)}\n".encode())
+        out.write(PROMPT + f"{' '.join(arguments)}\n".encode())
         out.flush()
         command = [sys.executable, "-m", "lumigraph", *arguments]
         process = start(command, stdin=subprocess.DEVNULL, stdout=out, stderr=out, start_new_session=True)
@@ -44,6 +46,13 @@ def launch(arguments: Sequence[str], log: Path) -> int:
     if interrupt.signal:
         return 128 + interrupt.signal  # even if the command was done just then: whoever asked wants to stop
     return code if code >= 0 else 128 - code
+
+
+def claim_log(log: Path) -> None:
+    """Raise LumigraphError unless lines may be added to a log: it is a benchmark's, or not there."""
+    with files.explained(log):
+        if os.path.lexists(log) and (log.is_symlink() or log.read_bytes()[: len(PROMPT)] != PROMPT):
+            raise LumigraphError(f"{log} is no log of a benchmark; move it away, or choose another --output")
 
 
 def ended(process: subprocess.Popen[bytes]) -> int | None:

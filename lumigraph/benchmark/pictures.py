@@ -20,10 +20,9 @@ from ..figures import contact_sheet, save_picture
 from ..figures.charts import Series, line_chart, standalone
 from ..metrics import scores_of
 from ..run import Run
+from .cell import SHEET
 from .results import Row
 from .table import resolution, trained_for
-
-SHEET = "views.png"
 
 
 def draw_charts(rows: Sequence[Row], output: Path) -> list[str]:
@@ -53,7 +52,7 @@ def draw_charts(rows: Sequence[Row], output: Path) -> list[str]:
                 x_ticks=ticks,
             )
             drawn.append(f"{scene}-{headline.name.lower().replace(' ', '-')}-over-{name}.svg")
-            files.write_bytes(output / drawn[-1], standalone(chart))
+            files.write_bytes(output / drawn[-1], standalone(chart), "benchmark")
     return drawn
 
 
@@ -102,7 +101,7 @@ def draw_views(rows: Sequence[Row], output: Path) -> list[str]:
         lines.append(Line([f"{scene}, {views} views", *scores], [truth, *seen]))
     if not lines:
         return []
-    save_picture(output / SHEET, contact_sheet("Held-out views", ["photograph", *methods], lines))
+    save_picture(output / SHEET, contact_sheet("Held-out views", ["photograph", *methods], lines), "benchmark")
     return [SHEET]
 
 

@@ -8,7 +8,8 @@ from typing import Annotated, Any
 
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
-from .common import choose_device, needed, option, show
+from ..files import claim
+from .common import Overwrite, choose_device, needed, option, show
 from .keeping import Keeping
 
 SIZE = 400  # pixels of the longer side of the pictures that compare
@@ -27,12 +28,14 @@ class Clean:
     """Folder of a run, a splat file, or a composition."""
     output: Annotated[Path, arg(metavar="NEW", help_behavior_hint="")]
     """New folder for a run, or new file: .ply, .compressed.ply, .spz, .splat."""
+    overwrite: Overwrite = False
     part: OmitArgPrefixes[Keeping] = Keeping(clean=True)
     device: Annotated[str, option("NAME")] = "auto"
     """Where the pictures are rendered: auto, cpu, cuda, cuda:1."""
 
     def run(self) -> int:
         from ..capabilities import HasGaussians, needs
+        from ..exchange import is_splat_file
         from ..figures import save_picture
         from ..gaussians.cleaning import gone
         from ..run import open_any
@@ -40,16 +43,16 @@ class Clean:
 
         self.part.check()
         opened, device = open_any(self.source), choose_device(self.device)
-        check_output(opened, self.output)
+        check_output(opened, self.output, self.overwrite, [self.source])
+        beside = self.output.with_name(f"{self.output.name}.png")
+        picture = beside if is_splat_file(self.output) else self.output / "clean.png"
+        claim(picture, "comparison", self.overwrite, [self.source])
         gaussians = needs(opened.method(device), HasGaussians).gaussians()
         reasons = self.part.unwanted(gaussians, self.part.crop(opened.frame))
         which = gone(reasons)
         counts = {reason: count for reason, some in reasons.items() if (count := int(some.sum()))}
         save_picked(opened, ~which.cpu(), self.output, {"removed": counts})
-        picture = (
-            self.output / "clean.png" if self.output.is_dir() else self.output.with_name(f"{self.output.name}.png")
-        )
-        save_picture(picture, before_and_after(opened, gaussians, which))
+        save_picture(picture, before_and_after(opened, gaussians, which), "comparison")
         show(
             {"Gaussians": f"{int((~which).sum()):,} of {len(gaussians):,} stay"}
             | {reason: f"{count:,} went" for reason, count in counts.items()}

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
-from rich.text import Text
 
 from ..budget import Budget
 from ..console import console, dim
@@ -40,6 +39,15 @@ ReaderOption = Annotated[
     Reader | None,
     tyro.conf.arg(
         metavar="NAME", help_behavior_hint="(default: found by looking)", help=f"Layout of the folder: {LISTED}."
+    ),
+]
+
+
+Overwrite = Annotated[
+    bool,
+    tyro.conf.arg(
+        help="Replace files that are there, whoever wrote them. What Lumigraph wrote and nobody changed is replaced "
+        "anyway; folders with anything else in them never are."
     ),
 ]
 
@@ -93,8 +101,8 @@ def say(text: str) -> None:
     print(text, file=sys.stderr, flush=True)
 
 
-def show(rows: Mapping[str, str | Text]) -> None:
-    """Results, one to a line, names aligned."""
+def show(rows: Mapping[str, Any]) -> None:
+    """Results, text or rich Text, one to a line, names aligned."""
     out, width = console(soft_wrap=True), max(map(len, rows))
     for name, value in rows.items():
         out.print(dim(f"{name:<{width}}") + "  " + value)

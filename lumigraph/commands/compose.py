@@ -9,8 +9,9 @@ from typing import Annotated
 from tyro.conf import Positional, arg
 
 from ..errors import LumigraphError
+from ..files import claim
 from ..ranges import Coordinate, Positive, between
-from .common import needed, option, show, typed
+from .common import Overwrite, needed, option, show, typed
 
 Triple = tuple[Coordinate, Coordinate, Coordinate]
 
@@ -40,8 +41,7 @@ class Compose:
         tuple[Triple, Triple] | None, arg(metavar="X Y Z X Y Z", help_behavior_hint="(default: all of it)")
     ] = None
     """Show only what lies between two corners of the part, in its scene's frame: `lumigraph info` tells its bounds."""
-    overwrite: bool = False
-    """Replace the file if it is there."""
+    overwrite: Overwrite = False
 
     def run(self) -> int:
         import torch
@@ -54,8 +54,7 @@ class Compose:
 
         if self.output.suffix.lower() != ".json":
             raise LumigraphError(f"{self.output} should end in .json, as compositions do; rename it")
-        if self.output.exists() and not self.overwrite:
-            raise LumigraphError(f"{self.output} is there already; give --overwrite to replace it, or another --output")
+        claim(self.output, "composition", self.overwrite, [self.lead, self.part])
         if self.box is not None and not all(a < b for a, b in zip(*self.box, strict=True)):
             raise LumigraphError("The box holds nothing; give --box its lower corner first, then its upper one")
         lead, part = open_any(self.lead), open_any(self.part)

@@ -52,7 +52,7 @@ class Demo:
 
         say(f"Photographing {self.scene}")
         data = open_dataset(self.scene, kind.learns_from)
-        method = build(kind, data.frame, kind.preset(device), device, seed=0)
+        method = build(kind, data.frame, kind.preset(device), device, seed=0, learning=True)
         run = Run.create(output, method, data, budget=budget.to_json())
         outcome = fit(method, data, run, budget=budget)
         if outcome.signal is not None:

@@ -11,7 +11,7 @@ from tyro.conf import Positional
 
 from ..console import bold
 from ..ranges import Count
-from .common import choose_device, needed, option, show
+from .common import Overwrite, choose_device, needed, option, show
 from .controls import Set, tell
 
 MEMORISED = 4.0  # dB by which photographs learnt from are better than held-out ones, from which on they are remembered
@@ -37,6 +37,7 @@ class Eval:
     """Files with the weights of LPIPS, .pth or .safetensors."""
     save_images: bool = False
     """Keep every rendering, as RUN/eval/NAME.png."""
+    overwrite: Overwrite = False
     scene: Annotated[str | None, option("SCENE", "where they were")] = None
     """Where what it learnt from is now, if it has moved."""
     told: Set = ()
@@ -44,13 +45,15 @@ class Eval:
     """auto, cpu, cuda, cuda:1."""
 
     def run(self) -> int:
-        from ..evaluate import evaluate_run, stem
+        from ..evaluate import claim_evaluation, evaluate_run, stem
         from ..metrics import scores_of
         from ..run import Run
         from ..verdict import last_psnr
         from .outcome import next_commands
 
-        run, lpips = Run(self.run_folder), chosen_lpips(self.lpips)
+        run = Run(self.run_folder)
+        claim_evaluation(run, self.split, self.save_images, self.overwrite)
+        lpips = chosen_lpips(self.lpips)
         method = tell(run, run.method(choose_device(self.device)), self.told)
         data = run.dataset(self.scene)
         result = evaluate_run(run, method, data, self.split, self.save_images, self.views, lpips)

@@ -43,9 +43,9 @@ def run_tree(run: Run) -> Tree:
         figures["seconds per view"] = evaluation.get("seconds_per_view")
         protocol = ("split", "views", "shapes", "members", "resolution")
         branch(tree, "evaluated", figures | {name: evaluation["protocol"].get(name) for name in protocol})
-    found = [path for path in run.folder.rglob("*") if path.is_file() and path.suffix in (".mp4", ".html", ".png")]
-    found.sort(key=lambda path: natural(path.as_posix()))
-    pages = [path for path in found if path.parent in (run.folder, run.folder / "renders")]
+    places = [path for folder in (run.folder, run.folder / "renders") if folder.is_dir() for path in folder.iterdir()]
+    pages = [path for path in places if path.is_file() and path.suffix in (".mp4", ".html", ".png")]
+    pages.sort(key=lambda path: natural(path.as_posix()))
     if pages:
         branch(tree, "files", {str(path.relative_to(run.folder)): size(path) for path in pages})
     return tree

@@ -14,7 +14,7 @@ from tyro.conf import arg
 from tyro.constructors import ConstructorRegistry, StructConstructorSpec, StructTypeInfo
 
 from ..errors import LumigraphError
-from ..ranges import domain, outside, shown
+from ..ranges import coherent, domain, outside, shown
 
 RULES = ConstructorRegistry()
 beneath = False  # whether tyro is asked for what it would do without our rule
@@ -54,10 +54,11 @@ def with_range(kind: Any) -> Any:
 
 
 def held(command: Any) -> Any:
-    """A command as it was typed. Raises LumigraphError for the first number that is beyond its range."""
+    """A command as it was typed. Raises LumigraphError for a number beyond its range, and for those that disagree."""
     for name, kind, value in outside(command):
         called = next((x.name for x in get_args(kind)[1:] if getattr(x, "name", None)), name).replace("_", "-")
         typed = " ".join(map(shown, value)) if isinstance(value, tuple) else shown(value)
         numbers = "numbers" if isinstance(value, tuple) else "a number"
         raise LumigraphError(f"--{called} cannot be {typed}; give it {numbers} from {domain(kind)}")
+    coherent(command)
     return command

@@ -10,7 +10,7 @@ from tyro.conf import Positional
 
 from ..errors import LumigraphError
 from ..ranges import Count, FramesPerSecond, Pixels
-from .common import needed, option, show
+from .common import Overwrite, needed, option, show
 from .controls import Animate, Set, animate, open_method
 
 # As `paths.film` has them, which help does not wait for.
@@ -39,24 +39,27 @@ class Render:
     """Longer side of the picture."""
     output: Annotated[Path | None, option("FILE", "RUN/renders/PATH.mp4, or renders/FILE/PATH.mp4")] = None
     """The film: .mp4, .gif or .webp. Depth (FILE-depth), FILE.json and the folder FILE of pictures go beside it."""
+    overwrite: Overwrite = False
     told: Set = ()
     animated: Animate = ()
     device: Annotated[str, option("NAME")] = "auto"
     """auto, cpu, cuda, cuda:1."""
 
     def run(self) -> int:
-        from ..export.film import film
+        from ..export.film import claim_film, film
         from ..export.video import kind_of
         from ..paths import film_cameras
 
         flight = None if self.path in PATHS else read_path(self.path, self.fps)
         fps = self.fps or (flight.fps if flight else 30.0)
+        reads = [self.source, *([Path(self.path)] if flight else [])]
+        if self.output is not None:
+            kind_of(self.output, fps)
+            claim_film(self.output, self.overwrite, reads)
         opened, method, views = open_method(self.source, self.device, self.told)
         output = self.output or opened.renders / f"{Path(self.path).stem}.mp4"
         kind_of(output, fps)
-        for read in [self.source, *([Path(self.path)] if flight else [])]:
-            if output.with_suffix(".json").resolve() == read.resolve():
-                raise LumigraphError(f"{read} would be replaced by what goes beside the film; give another --output")
+        claim_film(output, self.overwrite, reads)
         cameras = film_cameras(views, opened.frame, flight or self.path, self.frames, self.size)
         about = film(animate(opened, method, self.animated, len(cameras)), cameras, output, fps)
         width, height = about["size"]

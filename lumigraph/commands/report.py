@@ -8,8 +8,7 @@ from typing import Annotated
 
 from tyro.conf import Positional
 
-from ..progress import counting
-from .common import needed, show
+from .common import Overwrite, needed, show
 
 
 @dataclass(frozen=True)
@@ -21,12 +20,16 @@ class Report:
 
     run_folder: Annotated[Positional[Path], needed("RUN")]
     """Folder of the run."""
+    overwrite: Overwrite = False
 
     def run(self) -> int:
-        from ..report import write_report
+        from ..progress import counting
+        from ..report import claim_report, write_report
         from ..run import Run
 
+        run = Run(self.run_folder)
+        claim_report(run, self.overwrite)
         with counting("Putting the page together"):
-            path = write_report(Run(self.run_folder))
+            path = write_report(run)
         show({"report": str(path)})
         return 0

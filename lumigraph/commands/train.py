@@ -98,7 +98,7 @@ class Train:
         data = open_dataset(source, kind.learns_from, **options)
         config = self.method_config(kind)
         seed = getattr(config, "seed", self.seed)
-        method = build(kind, data.frame, config, device, seed)
+        method = build(kind, data.frame, config, device, seed, learning=True)
         if budget is None:
             asked = self.quality
             budget = quality_budget(asked, method, data) if asked else Budget(seconds=DEFAULT_SECONDS)

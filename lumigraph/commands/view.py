@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import os
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -75,11 +76,13 @@ def saver(opened: Any) -> Any:
         from ..gaussians.cleaning import gone, unwanted
         from ..run.picking import save_picked
 
+        output = opened.path.parent / name
+        if os.path.lexists(output):
+            raise LumigraphError(f"{output} is there already; choose another name")
         reasons = unwanted(needs(opened.method(), HasGaussians).gaussians(), crop, **floaters)
         keep = ~gone(reasons)
         if not keep.any():
             raise LumigraphError("No Gaussian is left; crop or clean less")
-        output = opened.path.parent / name
         save_picked(opened, keep, output, {"removed": {reason: int(some.sum()) for reason, some in reasons.items()}})
         return str(output)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
 from PIL import Image
@@ -10,7 +11,7 @@ from PIL import Image
 from ..collection import Collection
 from ..dataset import Dataset
 from ..figures import save_picture
-from ..files import scene_name, write_json
+from ..files import claim, scene_name, write_json
 from ..method import Method
 from ..metrics import Score
 from ..metrics.lpips import Lpips
@@ -74,10 +75,11 @@ def evaluate_run(
     lpips: Lpips | None = None,
 ) -> dict[str, Any]:
     """Evaluate a Run's Method on its dataset and write the files. Returns what eval.json says."""
+    claim_evaluation(run, split, save_images)
 
     def keep(name: str, rendering: Rendering) -> None:
         if save_images:
-            save_picture(run.folder / "eval" / f"{file_name(name)}.png", rendering.rgb)
+            save_picture(image_of(run, name), rendering.rgb, "rendering")
 
     found, state = evaluate_on(method, data, split, keep, most, lpips), run.state
     result = found.to_json() | {
@@ -94,9 +96,22 @@ def evaluate_run(
     figures = [f"{score.name} {score}" for score in found.scores]
     title = " · ".join([run.method_name, scene_name(run.settings.scene.source), found.compared, *figures])
     with counting("Drawing the contact sheet"):
-        save_picture(run.folder / f"{stem(split)}.png", found.contact_sheet(title))
-    write_json(run.folder / f"{stem(split)}.json", result)
+        save_picture(run.folder / f"{stem(split)}.png", found.contact_sheet(title), "evaluation")
+    write_json(run.folder / f"{stem(split)}.json", result, "evaluation")
     return result
+
+
+def claim_evaluation(run: Run, split: str, save_images: bool, overwrite: bool | None = None) -> None:
+    """Raise LumigraphError unless what an evaluation writes may be written into its run; see `files.claim`."""
+    for ending in (".json", ".png"):
+        claim(run.folder / f"{stem(split)}{ending}", "evaluation", overwrite)
+    for name in run.view_names().get(split, []) if save_images else []:
+        claim(image_of(run, name), "rendering", overwrite)
+
+
+def image_of(run: Run, name: str) -> Path:
+    """Where the rendering of a view is kept."""
+    return run.folder / "eval" / f"{file_name(name)}.png"
 
 
 def stem(split: str) -> str:

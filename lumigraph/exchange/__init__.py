@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from ..errors import LumigraphError
-from ..files import explained
+from ..files import claim, explained
 from ..gaussians import Gaussians
 from ..progress import counting
 from . import compressed_ply, ply, splat, spz
@@ -23,7 +23,7 @@ def read_gaussians(path: Path | str) -> Gaussians:
     length zero none at all. Raises LumigraphError for anything else that keeps the file from being a sound cloud.
     """
     path = Path(path).expanduser()
-    suffix = _suffix(path)
+    suffix = check_ending(path)
     with explained(path):
         _refuse_folder(path)
         if path.stat().st_size == 0:
@@ -41,9 +41,8 @@ def write_gaussians(path: Path | str, gaussians: Gaussians) -> None:
     LumigraphError where the suffix is none of SUFFIXES, the cloud is not sound or the disk refuses.
     """
     path = Path(path).expanduser()
-    write = WRITERS[_suffix(path)]
-    with explained(path):
-        _refuse_folder(path)
+    write = WRITERS[check_ending(path)]
+    claim(path, "splats")
     with counting(f"Writing {path.name}"):
         write(path, checked(gaussians, f"what is to be written to {path}", "remove them first"))
 
@@ -63,7 +62,8 @@ def _read(path: Path, suffix: str) -> Gaussians:
     return (compressed_ply if compressed_ply.recognises(header) else ply).read(path, header)
 
 
-def _suffix(path: Path) -> str:
+def check_ending(path: Path) -> str:
+    """The one of SUFFIXES that a name has. Raises LumigraphError if it has none."""
     for suffix in SUFFIXES:
         if path.name.lower().endswith(suffix):
             return suffix

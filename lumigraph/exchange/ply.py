@@ -69,7 +69,7 @@ def write(path: Path, gaussians: Gaussians) -> None:
 
 def save(path: Path, elements: list[plyfile.PlyElement], antialiased: bool) -> None:
     comments = ["written by Lumigraph", *(ANTIALIASED if antialiased else [])]
-    with replacing(path) as partial, open(partial, "wb") as file:
+    with replacing(path, "splats") as partial, open(partial, "wb") as file:
         plyfile.PlyData(elements, byte_order="<", comments=comments).write(file)
 
 

@@ -60,4 +60,4 @@ def write(path: Path, gaussians: Gaussians) -> None:
     records["colour"] = to_byte(255 * (K00 * array(gaussians.harmonics[:, 0]) + 0.5))
     records["alpha"] = alpha_to_byte(array(gaussians.opacities))
     records["rotation"] = to_byte(128 * unit(array(gaussians.quaternions)) + 128)
-    write_bytes(path, records.tobytes())
+    write_bytes(path, records.tobytes(), "splats")

@@ -82,7 +82,7 @@ def _told(path: Path) -> Iterator[None]:
 
 def write(path: Path, gaussians: Gaussians) -> None:
     """Version 3. Raises LumigraphError if the cloud is wider than 24 bits can say."""
-    write_bytes(path, encode(gaussians, str(path)))
+    write_bytes(path, encode(gaussians, str(path)), "splats")
 
 
 def encode(gaussians: Gaussians, name: str = "a .spz file", steps: tuple[int, int] = STEPS) -> bytes:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from pathlib import Path
 
 import torch
@@ -10,7 +11,7 @@ from torch import Tensor
 
 from ..figures import Row, contact_sheet, save_picture
 from ..figures.charts import Series, line_chart, standalone
-from ..files import write_bytes, write_json
+from ..files import claim, write_bytes, write_json
 from ..report import heading, jpeg, page, section
 from .encodings import SCALED, Comparison, Fit
 
@@ -23,17 +24,23 @@ def write_page(folder: Path, comparison: Comparison) -> None:
     """Write index.html, which holds everything; and by themselves scales.svg, spectrum.svg, comparison.png and
     figures.json."""
     scales, spectrum, sheet = scale_chart(comparison), spectrum_chart(comparison), folder / "comparison.png"
-    save_picture(sheet, comparison_sheet(comparison))
-    write_bytes(folder / "scales.svg", standalone(scales))
-    write_bytes(folder / "spectrum.svg", standalone(spectrum))
-    write_json(folder / "figures.json", comparison.to_json())
+    save_picture(sheet, comparison_sheet(comparison), "figure")
+    write_bytes(folder / "scales.svg", standalone(scales), "figure")
+    write_bytes(folder / "spectrum.svg", standalone(spectrum), "figure")
+    write_json(folder / "figures.json", comparison.to_json(), "figure")
     name = Path(comparison.source).name
     sections = [
         header(name, comparison),
         section("What the scale does", side_by_side((scales, about_scales(comparison)), (spectrum, ABOUT_SPECTRUM))),
         section("What they draw", f"<img class='sheet' src='{jpeg(sheet)}' alt=''>", ABOUT_PICTURES),
     ]
-    write_bytes(folder / "index.html", page(f"{name} · encodings", "".join(sections), comparison.source))
+    write_bytes(folder / "index.html", page(f"{name} · encodings", "".join(sections), comparison.source), "figure")
+
+
+def claim_page(folder: Path, overwrite: bool | None = None, reads: Iterable[Path] = ()) -> None:
+    """Raise LumigraphError unless all that `write_page` writes may be written; see `files.claim`."""
+    for name in ("index.html", "scales.svg", "spectrum.svg", "comparison.png", "figures.json"):
+        claim(folder / name, "figure", overwrite, reads)
 
 
 def header(name: str, comparison: Comparison) -> str:

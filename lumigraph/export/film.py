@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +15,8 @@ from ..camera import Camera
 from ..choice import evenly
 from ..controls import Value
 from ..figures import Range, colour_depth, depth_range, to_bytes
-from ..files import replacing, write_json
+from ..files import claim, claim_folder, replacing_folder, write_json
+from ..memory import ask_for_picture
 from ..method import Method
 from ..progress import track
 from .video import open_video
@@ -29,17 +30,21 @@ def film(method: Method | Sequence[Method], cameras: Camera, path: Path, fps: fl
     method: one for all frames, or one for each, such as what `animated` makes
     For path/orbit.mp4 also writes path/orbit-depth.mp4, the pictures path/orbit/0000.png and 0000-depth.png, and
     path/orbit.json with the cameras (poses in the scene's frame; source_from_scene leads back to the capture's) and
-    what the method was told.
+    what the method was told. Raises LumigraphError, before anything is rendered, if something else lies there.
     """
+    claim_film(path)
     shown = [method] * len(cameras) if isinstance(method, Method) else list(method)
     assert len(shown) == len(cameras), f"{len(shown)} methods for {len(cameras)} frames"
     for one in shown:
         one.eval()
+    ask_for_picture(*cameras.size[0].tolist(), shown[0].device)
     within = film_depth_range(shown, cameras)
     with contextlib.ExitStack() as stack:
-        targets = [stack.enter_context(open_video(x, fps)) for x in (path, path.with_stem(f"{path.stem}-depth"))]
-        folder = stack.enter_context(replacing(path.with_suffix("")))
-        folder.mkdir()
+        targets = [
+            stack.enter_context(open_video(path, fps, "film")),
+            stack.enter_context(open_video(depth_beside(path), fps, "film of depth")),
+        ]
+        folder = stack.enter_context(replacing_folder(path.with_suffix(""), "pictures of a film"))
         begin = time.perf_counter()
         for i in track(range(len(cameras)), f"Filming {path.name}", len(cameras)):
             seen = shown[i].render(cameras[i]).cpu()
@@ -60,8 +65,21 @@ def film(method: Method | Sequence[Method], cameras: Camera, path: Path, fps: fl
         **({} if cameras.time is None else {"times": cameras.time.tolist()}),
         **({"controls": told} if (told := what_was_told(shown)) else {}),
     }
-    write_json(path.with_suffix(".json"), about)
+    write_json(path.with_suffix(".json"), about, "cameras of a film")
     return about
+
+
+def claim_film(path: Path, overwrite: bool | None = None, reads: Collection[Path] = ()) -> None:
+    """Raise LumigraphError unless a film, and all that goes beside it, may be written there; see `files.claim`."""
+    claim(path, "film", overwrite, reads)
+    claim(depth_beside(path), "film of depth", overwrite, reads)
+    claim(path.with_suffix(".json"), "cameras of a film", overwrite, reads)
+    claim_folder(path.with_suffix(""), "pictures of a film")
+
+
+def depth_beside(path: Path) -> Path:
+    """Where the film of depth goes."""
+    return path.with_stem(f"{path.stem}-depth")
 
 
 def animated(method: Method, stations: Mapping[str, Sequence[Value]], frames: int) -> list[Method]:

@@ -41,7 +41,7 @@ def write_mesh(path: Path, mesh: Mesh, up: Float[np.ndarray, " 3"] = Z) -> None:
     encode = ENCODERS[ending(path)]
     upright = turning(torch.from_numpy(np.asarray(up)), torch.tensor([0.0, 1.0, 0.0])).numpy()
     with counting(f"Writing {path.name}"):
-        write_bytes(path, encode(mesh, upright))
+        write_bytes(path, encode(mesh, upright), "mesh")
 
 
 def ending(path: Path) -> str:

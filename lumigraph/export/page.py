@@ -205,4 +205,4 @@ def write_page(path: Path, program: str, settings: dict[str, Any], data: bytes) 
     page = (WEB / "page.html").read_text("utf-8")
     pieces = page.split("@@")  # text, name, text, name, ..., text
     pieces[1::2] = [parts[name] for name in pieces[1::2]]
-    write_bytes(path, "".join(pieces).encode())
+    write_bytes(path, "".join(pieces).encode(), "page")

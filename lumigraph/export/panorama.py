@@ -23,6 +23,7 @@ from ..figures import to_image
 from ..files import replacing
 from ..geometry import look_at
 from ..lens import Equirectangular, Pinhole
+from ..memory import ask_for_picture
 from ..method import Method
 from ..paths import Surroundings
 from ..progress import track
@@ -56,6 +57,7 @@ def sphere(method: Method, camera: Camera, name: str, columns: int | None = None
     """
     method.eval()
     width, height = camera.size[0].tolist()
+    ask_for_picture(width, height, method.device)
     if method.any_lens:
         step = max(1, AT_ONCE // width)
         tops = range(0, height, step)
@@ -195,7 +197,7 @@ def save_sphere(path: Path, rgb: Float[Tensor, "height width 3"], whole: bool) -
         about["xmp"] = gpano(width, height).encode()
     if path.suffix.lower() != ".png":
         about |= {"quality": JPEG_QUALITY, "subsampling": 0}
-    with replacing(path) as partial:
+    with replacing(path, "panorama") as partial:
         image.save(partial, picture_format(path), **about)
 
 

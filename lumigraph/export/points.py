@@ -136,6 +136,6 @@ def write_points(path: Path, points: PointCloud) -> None:
     values = np.concatenate([points.positions, points.normals, points.colours], -1)
     for name, column in zip((*floats, *bytes_), values.T, strict=True):
         rows[name] = column
-    with replacing(path) as partial, open(partial, "wb") as file:
+    with replacing(path, "points") as partial, open(partial, "wb") as file:
         elements = [plyfile.PlyElement.describe(rows, "vertex")]
         plyfile.PlyData(elements, byte_order="<", comments=["written by Lumigraph"]).write(file)

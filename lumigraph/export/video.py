@@ -20,7 +20,7 @@ from PIL import Image
 from torch import Tensor
 
 from ..errors import LumigraphError
-from ..files import replacing
+from ..files import Kind, replacing
 from ..progress import counting, track
 
 CRF = 17  # x264's constant rate factor: 0 is lossless, 18 looks it, 28 is small
@@ -31,15 +31,16 @@ MOST_FRAMES = 50  # per second, of a GIF: browsers slow quicker ones down to 10
 
 
 @contextlib.contextmanager
-def open_video(path: Path, fps: float = 30.0) -> Iterator[Video]:
+def open_video(path: Path, fps: float = 30.0, what: Kind = "film") -> Iterator[Video]:
     """A film to add frames to, in order; the file appears once the block ends well.
 
-    fps: frames per second
+    fps:  frames per second
+    what: it will be known as, see `files.replacing`
     Raises LumigraphError for an ending that is no film's, where frames differ in size, or if the disk refuses.
     """
     kind = kind_of(path, fps)
     with (
-        replacing(path) as partial,
+        replacing(path, what) as partial,
         av.open(str(partial), "w", format=kind.format, options=kind.options) as container,
         contextlib.ExitStack() as stack,
     ):

@@ -10,7 +10,7 @@ from PIL import Image
 from torch import Tensor
 
 from ..blending import before
-from ..files import replacing
+from ..files import Kind, replacing
 
 # Bright and warm to dark and cool, evenly falling in lightness.
 RAMP = ("fff6dc", "fbcf7f", "f39a5b", "db5f60", "a93b77", "6c2e80", "352a6e", "131a3e")
@@ -29,10 +29,12 @@ def to_image(rgb: Float[Tensor, "height width 3"]) -> Image.Image:
     return Image.fromarray(to_bytes(rgb).numpy())
 
 
-def save_picture(path: Path, rgb: Float[Tensor, "height width 3"] | Image.Image) -> None:
-    """Write a PNG, whole or not at all."""
+def save_picture(
+    path: Path, rgb: Float[Tensor, "height width 3"] | Image.Image, kind: Kind = "file", ours: bool = False
+) -> None:
+    """Write a PNG, whole or not at all. kind, ours: as for `files.replacing`."""
     image = rgb if isinstance(rgb, Image.Image) else to_image(rgb)
-    with replacing(path) as partial:
+    with replacing(path, kind, ours) as partial:
         image.save(partial, "PNG")
 
 

@@ -18,7 +18,7 @@ from rich.table import Table
 from torch import Tensor
 
 from ..console import console as plain_console
-from ..files import write_json
+from ..files import claim, write_json
 from ..progress import track
 from ._dispatch import Engine, using
 from ._facts import operations as all_operations
@@ -46,6 +46,8 @@ def bench_kernels(
     Backward is the gradient in what training differentiates (for hash encoding the table alone), given a gradient
     of the outputs. Rates are in operations["unit"] per second. Raises LumigraphError if `output` cannot be written.
     """
+    if output is not None:
+        claim(output, "benchmark")
     device = torch.device(device or ("cuda" if torch.cuda.is_available() else "cpu"))
     fast: Engine = "gpu" if device.type == "cuda" else "cpu"
     result: dict[str, Any] = {"protocol": _protocol(device, size, repeats), "operations": {}}
@@ -61,7 +63,7 @@ def bench_kernels(
         result["operations"][name] = {"unit": folder.FACTS.unit, "count": count, "engines": engines}
     _print(result, console or plain_console())
     if output is not None:
-        write_json(output, result)
+        write_json(output, result, "benchmark")
     return result
 
 

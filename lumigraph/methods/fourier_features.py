@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from ..components.fields.dense import Dense
 from ..components.fields.encodings import FourierFeatures as Waves
 from ..method import RayMethod
-from ..ranges import BatchSize, LearningRate, NonNegative, Seed, Width, between
+from ..ranges import BatchSize, Depth, LearningRate, NonNegative, Seed, Width, between
 from ..rays import Rays, Rendering
 from ..scene import Batch, Frame, Scene
 
@@ -29,7 +29,7 @@ class Config:
     encoding: Encoding = "gaussian"
     scale: NonNegative = 10.0  # sigma, cycles across the picture: of gaussian the deviation, of positional the highest
     frequencies: Annotated[int, between(2, 65_536)] = 256  # rows of B, for positional and gaussian
-    layers: Annotated[int, between(2, 64)] = 4  # the last of them gives colours
+    layers: Depth = 4  # the last of them gives colours
     hidden_width: Width = 256  # of the others
     learning_rate: LearningRate = 1e-3  # Adam's
     pixels_per_step: BatchSize = 1 << 13  # the paper takes all of them

@@ -59,16 +59,17 @@ class Config:
     refine_cameras: bool = False  # learn a correction of each photograph's pose
     seed: Seed = 0
 
-    def __post_init__(self) -> None:
+    def check(self) -> None:
+        """Raises LumigraphError for numbers that contradict each other."""
         if self.base_resolution > self.max_resolution:
             raise LumigraphError(
                 f"The coarsest level cannot be finer than the finest: --base-resolution {self.base_resolution:,} is "
                 f"above --max-resolution {self.max_resolution:,}"
             )
-        if self.levels << min(self.log2_hashmap_size, 64) >= 1 << 32:
+        if self.levels << self.log2_hashmap_size >= 1 << 32:
             raise LumigraphError(
-                f"Tables of {self.levels} levels with up to 2^{self.log2_hashmap_size} entries are beyond what 32 bits "
-                f"count; give a smaller --log2-hashmap-size"
+                f"--levels {self.levels} with --log2-hashmap-size {self.log2_hashmap_size} make more entries than "
+                f"32 bits count; give a smaller one"
             )
 
 

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Annotated, Any, ClassVar
+from typing import Any, ClassVar
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import max_pool1d, pad, softplus
 
-from ..components.fields.coordinate_network import CoordinateNetwork
+from ..components.fields.coordinate_network import CoordinateNetwork, bytes_kept
 from ..components.fields.dense import in_chunks
 from ..components.fields.encodings import FrequencyEncoding, IntegratedEncoding
 from ..components.sampling.frustums import frustum_moments
@@ -20,19 +20,7 @@ from ..components.sampling.sampling import inverse_transform, stratified
 from ..components.sampling.spaces import space_of
 from ..components.training.schedules import falling
 from ..method import RayMethod
-from ..ranges import (
-    BatchSize,
-    Cells,
-    Layers,
-    LearningRate,
-    NonNegative,
-    Octaves,
-    RaySamples,
-    Seed,
-    Share,
-    Width,
-    between,
-)
+from ..ranges import BatchSize, Cells, Depth, Layers, LearningRate, NonNegative, Octaves, RaySamples, Seed, Share, Width
 from ..rays import Look, Rays, Rendering, Samples
 from ..scene import Frame, Scene
 from ..volume import composite, weights_of
@@ -42,7 +30,7 @@ from ..volume import composite, weights_of
 class Config:
     """The paper's numbers, with where it gives them; below them what saves time and keeps the mathematics."""
 
-    depth: Annotated[int, between(2, 64)] = 8  # hidden layers before density, as NeRF's
+    depth: Depth = 8  # hidden layers before density, as NeRF's
     hidden_width: Width = 256  # channels of a layer, as NeRF's
     skip_layer: Layers = 5  # the layer whose activation the input joins again, as NeRF's
     position_frequencies: Octaves = 16  # L for frustums, section 4: with cones, more do no harm
@@ -130,10 +118,7 @@ class MipNeRF(RayMethod):
 
     @classmethod
     def further_bytes(cls, frame: Frame, config: Any, learning: bool) -> int:
-        asked = (
-            0 if config.occupancy_resolution else config.rays_per_step * (config.coarse_samples + config.fine_samples)
-        )
-        return 2 * asked * config.depth * config.hidden_width * learning
+        return bytes_kept(config) if learning else 0
 
     def begin(self, scene: Scene, seconds: float = math.inf) -> None:
         self.empty.begin(scene)

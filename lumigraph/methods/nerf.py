@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from ..components.fields.coordinate_network import CoordinateNetwork
+from ..components.fields.coordinate_network import CoordinateNetwork, bytes_kept
 from ..components.fields.dense import in_chunks
 from ..components.fields.encodings import FrequencyEncoding
 from ..components.sampling.occupancy_mask import OccupancyMask
@@ -22,6 +22,7 @@ from ..method import RayMethod
 from ..ranges import (
     BatchSize,
     Cells,
+    Depth,
     Layers,
     LearningRate,
     NonNegative,
@@ -41,7 +42,7 @@ from ..volume import composite, weights_of
 class Config:
     """The paper's numbers, with where it gives them; below them what saves time and keeps the mathematics."""
 
-    depth: Annotated[int, between(2, 64)] = 8  # hidden layers before density, appendix A
+    depth: Depth = 8  # hidden layers before density, appendix A
     hidden_width: Width = 256  # channels of a layer, appendix A
     skip_layer: Layers = 5  # the layer whose activation the input joins again, figure 7
     position_frequencies: Octaves = 10  # L for points, section 5.1
@@ -61,7 +62,8 @@ class Config:
     bfloat16: bool = True  # multiply in bfloat16 where the machine is fast at it
     seed: Seed = 0
 
-    def __post_init__(self) -> None:
+    def check(self) -> None:
+        """Raises LumigraphError for numbers that contradict each other."""
         if self.networks == 2 and not self.coarse_loss_weight:
             raise LumigraphError(
                 "The first of two networks learns from --coarse-loss-weight alone, so --networks 2 with "
@@ -139,10 +141,7 @@ class NeRF(RayMethod):
 
     @classmethod
     def further_bytes(cls, frame: Frame, config: Any, learning: bool) -> int:
-        asked = (
-            0 if config.occupancy_resolution else config.rays_per_step * (config.coarse_samples + config.fine_samples)
-        )
-        return 2 * asked * config.depth * config.hidden_width * learning
+        return bytes_kept(config) if learning else 0
 
     def begin(self, scene: Scene, seconds: float = math.inf) -> None:
         self.empty.begin(scene)

@@ -95,7 +95,7 @@ class CameraPath:
         for key in data["keyframes"]:
             if key["time"] is None:
                 del key["time"]
-        write_json(path, {"format": FORMAT, **data})
+        write_json(path, {"format": FORMAT, **data}, "camera path")
 
     @classmethod
     def load(cls, path: Path) -> CameraPath:

@@ -9,6 +9,7 @@ that whoever reads passes over. So there is a complete state whenever there was 
 from __future__ import annotations
 
 import json
+import os
 import re
 import zlib
 from collections.abc import Iterable
@@ -23,10 +24,13 @@ from torch import Tensor, nn
 from .. import files
 from ..errors import LumigraphError
 from ..method import Method
+from ..partials import partial
 from ..plain import flatten, understood, unflatten
 
 FORMAT = "lumigraph checkpoint 1"
-WEIGHTS, OPTIMIZER = "weights.safetensors", "optimizer.safetensors"
+WEIGHTS, OPTIMIZER, STATE = "weights.safetensors", "optimizer.safetensors", "state.json"
+NAME = re.compile(r"\d+")
+OLD_PARTIAL = re.compile(r"\d+(\.partial)+")  # what older versions had begun to write or to delete
 
 
 @dataclass(frozen=True)
@@ -84,16 +88,15 @@ class Checkpoints:
             return
         tensors: dict[str, Tensor] = {"generator": generator.get_state()}
         structure = flatten([optimizer.state_dict() for optimizer in optimizers], tensors)
-        with files.replacing(folder) as partial:
-            partial.mkdir()
+        with files.replacing_folder(folder) as new:
             sums = {
-                name: write_tensors(partial / name, content)
+                name: write_tensors(new / name, content)
                 for name, content in ((WEIGHTS, method.state_dict()), (OPTIMIZER, tensors))
             }
             about = {"format": FORMAT, "method": self.method, **asdict(state), "files": sums}
-            (partial / "state.json").write_text(json.dumps({**about, "optimizers": structure}), "utf-8")
+            (new / STATE).write_text(json.dumps({**about, "optimizers": structure}), "utf-8")
         for path in self.folder.iterdir():
-            if path != folder:
+            if path != folder and is_state(path):
                 retire(path)
 
     def load_weights(self, method: Method) -> None:
@@ -122,11 +125,11 @@ class Checkpoints:
                     group |= own | group  # older runs know fewer entries of a group
 
     def _all(self) -> list[Path]:
-        found = [x for x in self.folder.iterdir() if re.fullmatch(r"\d+", x.name)] if self.folder.is_dir() else []
+        found = [x for x in self.folder.iterdir() if NAME.fullmatch(x.name)] if self.folder.is_dir() else []
         return sorted(found, key=lambda x: int(x.name))
 
     def _about(self, checkpoint: Path) -> dict[str, Any]:
-        about = files.read_json(checkpoint / "state.json")
+        about = files.read_json(checkpoint / STATE)
         if not isinstance(about, dict) or about.get("format") != FORMAT:
             raise LumigraphError(f"{checkpoint} is not a checkpoint that Lumigraph wrote; restore it from a copy")
         if about["method"] != self.method:
@@ -175,9 +178,15 @@ def checksum(data: bytes) -> dict[str, int]:
     return {"bytes": len(data), "crc32": zlib.crc32(data)}
 
 
+def is_state(path: Path) -> bool:
+    """Whether a folder is a state or a part of one, and holds nothing that somebody else has put there."""
+    named = NAME.fullmatch(path.name) or OLD_PARTIAL.fullmatch(path.name)
+    if not named or path.is_symlink() or not path.is_dir():
+        return False
+    return all(file.name in (WEIGHTS, OPTIMIZER, STATE) and not file.is_dir() for file in path.iterdir())
+
+
 def retire(path: Path) -> None:
     """Delete a checkpoint so that a half-deleted one cannot be taken for a whole one."""
-    with files.explained(path):
-        if not path.name.endswith(files.PARTIAL):
-            path = path.rename(path.with_name(path.name + files.PARTIAL))
-        files.remove(path)
+    with files.explained(path), partial(path.parent, is_folder=True) as aside:
+        os.replace(path, aside / path.name)

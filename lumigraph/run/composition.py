@@ -125,7 +125,8 @@ def read_composition(path: Path) -> tuple[list[Part], int]:
 
 def write_composition(path: Path, parts: Sequence[Part], lead: int = 0) -> None:
     """Write a composition's file."""
-    files.write_json(path, {"format": FORMAT, "lead": lead, "parts": [part_to_json(part) for part in parts]})
+    said = {"format": FORMAT, "lead": lead, "parts": [part_to_json(part) for part in parts]}
+    files.write_json(path, said, "composition")
 
 
 def relative(source: Path, file: Path) -> str:

@@ -30,9 +30,11 @@ from ..dataset import Dataset
 from ..errors import LumigraphError
 from ..lens import Lens
 from ..locks import NAME as LOCK
-from ..locks import held
+from ..locks import check_place, held
+from ..marks import NAME as RECORD
 from ..method import Method
 from ..plain import understood
+from ..ranges import check
 from ..scene import Frame, Scene
 from .checkpoint import WEIGHTS, Checkpoints, State
 from .needs import check_memory
@@ -89,7 +91,7 @@ class Run(Opened):
         with held(folder, "made a run"):
             check_new(folder)  # again, for somebody else may have been quicker
             if isinstance(data, Scene):
-                files.write_json(folder / "cameras.json", cameras_to_json(data))
+                files.write_json(folder / "cameras.json", cameras_to_json(data), ours=True)
             settings.write(folder / "config.json")  # last: a folder with it is a run
         return cls(folder)
 
@@ -259,14 +261,15 @@ class Run(Opened):
     def forget_after(self, step: int) -> None:
         """Drop lines and previews of steps after the saved state: they will be taken again."""
         rows = [json.dumps(row) for row in self.metrics() if row["step"] <= step]
-        files.write_bytes(self.folder / "metrics.jsonl", "".join(row + "\n" for row in rows).encode())
+        files.write_bytes(self.folder / "metrics.jsonl", "".join(row + "\n" for row in rows).encode(), ours=True)
         for preview, path in self.previews().items():
             if preview > step:
                 files.remove(path)
 
     def previews(self) -> dict[int, Path]:
         """One view at the steps at which it was taken."""
-        return {int(path.stem): path for path in sorted((self.folder / "previews").glob("[0-9]*.png"))}
+        found = sorted((self.folder / "previews").glob("*.png"))
+        return {int(path.stem): path for path in found if re.fullmatch("[0-9]{6,12}", path.stem)}
 
     def evaluation(self) -> dict[str, Any] | None:
         """What eval.json says, if the run has been evaluated."""
@@ -274,12 +277,16 @@ class Run(Opened):
         return files.read_json(path) if path.exists() else None
 
 
-def build(kind: type[Method], frame: Frame, config: Any, device: torch.device, seed: int) -> Method:
+def build(
+    kind: type[Method], frame: Frame, config: Any, device: torch.device, seed: int, learning: bool = False
+) -> Method:
     """A fresh method whose initial weights depend on the seed alone.
 
-    Raises LumigraphError where memory does not hold it.
+    learning: whether it is to learn, which takes more memory than looking
+    Raises LumigraphError for numbers beyond their ranges, and where memory does not hold it.
     """
-    check_memory(kind, frame, config, device)
+    check(config, methods.name_of(kind))
+    check_memory(kind, frame, config, device, learning)
     with torch.random.fork_rng():
         torch.manual_seed(seed)
         method = kind(frame, config)
@@ -293,8 +300,9 @@ def check_new(folder: Path) -> None:
             f"{folder} already holds a run; go on with it by `lumigraph resume {folder}`, or choose another --output"
         )
     with files.explained(folder):
-        if folder.exists() and (not folder.is_dir() or any(path.name != LOCK for path in folder.iterdir())):
+        if folder.exists() and (not folder.is_dir() or {path.name for path in folder.iterdir()} - {LOCK, RECORD}):
             raise LumigraphError(f"{folder} is not an empty folder; choose another --output")
+    check_place(folder)
 
 
 def cameras_to_json(scene: Scene) -> dict[str, Any]:

@@ -11,7 +11,7 @@ from .. import methods
 from ..errors import LumigraphError
 from ..memory import ask_for
 from ..method import Method
-from ..ranges import annotations, numbers
+from ..ranges import hints, numbers
 from ..scene import Frame
 
 LEARNING = 4  # times a parameter: itself, its gradient, and the two moments that optimizers like Adam keep
@@ -52,8 +52,8 @@ def bytes_of(kind: type[Method], frame: Frame, config: Any, learning: bool) -> i
 def halved(config: Any) -> list[tuple[str, Any]]:
     """A Config with each of its whole numbers at half its value, or at the least that its range allows, by name."""
     found = []
-    for name, kind in annotations(type(config)).items():
+    for name, kind in hints(type(config)).items():
         ranges = [range for number, range in numbers(kind) if number is int and range is not None]
         if ranges and isinstance(value := getattr(config, name), int):
-            found.append((name, replace(config, **{name: max(value // 2, ranges[0].ge)})))
+            found.append((name, replace(config, **{name: max(value // 2, int(ranges[0].ge or 0))})))
     return found

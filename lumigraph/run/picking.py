@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -22,8 +23,9 @@ from .opened import Opened
 from .splat_file import SplatFile
 
 
-def check_output(opened: Opened, output: Path) -> None:
-    """Raises LumigraphError unless what is picked may go there: to a new file, or of a run to a new folder."""
+def check_output(opened: Opened, output: Path, overwrite: bool | None = None, reads: Iterable[Path] = ()) -> None:
+    """Raises LumigraphError unless what is picked may go there: to a file, see `files.claim`, or of a run to a new
+    folder."""
     if not is_splat_file(output):
         if not isinstance(opened, Run):
             raise LumigraphError(
@@ -31,8 +33,8 @@ def check_output(opened: Opened, output: Path) -> None:
                 f"{', '.join(SUFFIXES)}"
             )
         check_new(output)
-    elif output.exists():
-        raise LumigraphError(f"{output} is there already; choose another --output")
+    else:
+        files.claim(output, "splats", overwrite, reads)
 
 
 def save_picked(opened: Opened, keep: Bool[Tensor, " gaussian"], output: Path, why: dict[str, Any]) -> None:
@@ -59,8 +61,7 @@ def write_run(run: Run, keep: Bool[Tensor, " gaussian"], folder: Path, why: dict
     run.restore_training(optimizers, generator)
     method.prune(keep)
     settings = replace(run.settings, said=run.settings.said | {"cleaned": {"source": str(run.folder.resolve())} | why})
-    with files.replacing(folder) as partial:
-        partial.mkdir()
+    with files.replacing_folder(folder) as partial:
         for name in ("cameras.json", "metrics.jsonl"):
             if (run.folder / name).exists():
                 shutil.copy2(run.folder / name, partial / name)

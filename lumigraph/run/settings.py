@@ -11,7 +11,7 @@ from .. import files
 from ..errors import LumigraphError
 from ..method import Method
 from ..plain import alike, from_plain, renamed, understood
-from ..ranges import annotations, typed
+from ..ranges import hints, typed
 from ..scene import Frame, Scene
 
 FORMAT = "lumigraph run 1"
@@ -68,7 +68,7 @@ class Settings:
             return Settings(**plain | made)
 
     def write(self, file: Path) -> None:
-        files.write_json(file, self.to_json())
+        files.write_json(file, self.to_json(), ours=True)
 
     def to_json(self) -> dict[str, Any]:
         """What config.json says: under the same names, and a frame as it was read if it is still that one."""
@@ -87,7 +87,7 @@ class Settings:
         file: to name where a number is unknown, of another type, or beyond its range
         """
         given = renamed(self.config, kind.formerly)
-        if unknown := sorted(given.keys() - annotations(kind.Config).keys()):
+        if unknown := sorted(given.keys() - hints(kind.Config).keys()):
             raise ValueError(f"{self.method} has no {unknown[0]}")
         return typed(kind.Config, given, file)
 

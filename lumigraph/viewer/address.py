@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ipaddress
+import secrets
 import socket
 import warnings
 from dataclasses import dataclass
@@ -15,10 +16,14 @@ TRIED = 100  # ports after the usual one
 
 @dataclass(frozen=True)
 class Address:
-    """A host as the user named it, and a port that was free a moment ago."""
+    """A host as the user named it, and a port that was free a moment ago.
+
+    token: what a browser must know besides; empty where only this machine can reach the viewer
+    """
 
     host: str
     port: int
+    token: str = ""
 
     @property
     def url(self) -> str:
@@ -29,7 +34,8 @@ class Address:
     def urls(self) -> list[str]:
         """All addresses that the viewer answers to, as far as this machine knows its own."""
         hosts = own_addresses() if is_wildcard(self.host) else [self.host]
-        return [f"http://{f'[{host}]' if ':' in host else host}:{self.port}" for host in hosts]
+        secret = f"/?token={self.token}" if self.token else ""
+        return [f"http://{f'[{host}]' if ':' in host else host}:{self.port}{secret}" for host in hosts]
 
 
 def choose_address(host: str = HOST, port: int | None = None) -> Address:
@@ -46,10 +52,11 @@ def choose_address(host: str = HOST, port: int | None = None) -> Address:
         raise LumigraphError(f"Ports {PORT} to {PORT + TRIED - 1} are all in use; choose another by --port")
     if found is None:
         raise LumigraphError(f"Port {port} is in use; choose another by --port, or leave it out to get a free one")
-    address = Address(host, found)
-    if not is_local(host):
+    address = Address(host, found, "" if is_local(host) else secrets.token_urlsafe(16))
+    if address.token:
         warnings.warn(
-            f"Whoever can reach this machine can look at the scene and use the viewer: {', '.join(address.urls)}",
+            "Whoever can reach this machine and knows the token in the address can look at the scene and use the "
+            f"viewer: {', '.join(address.urls)}",
             LumigraphWarning,
             stacklevel=2,
         )

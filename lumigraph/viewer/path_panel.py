@@ -255,8 +255,8 @@ class PathPanel:
 
     def _open(self) -> None:
         self._saved.options, name = self._names(), self._saved.value
-        if name == NONE:
-            self._tell("Nothing to open", f"No path lies in {self._subject.paths}")
+        if name == NONE or name not in self._saved.options:  # a browser may say anything
+            self._tell("Nothing to open", f"No such path lies in {self._subject.paths}")
             return
         try:
             path = CameraPath.load(self._subject.paths / f"{name}.json")

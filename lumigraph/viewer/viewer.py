@@ -7,17 +7,14 @@ import time
 from collections.abc import Callable
 from typing import Any
 
-import rich
-import viser
-
 from ..camera import Camera
 from ..capabilities import HasGaussians, can
-from ..errors import LumigraphError
 from ..method import Method
 from . import window
 from .address import Address
 from .cameras import angles
 from .scenery import Scenery
+from .serving import quiet, start_server
 from .shared import Shared
 from .subject import Subject
 from .training_panel import TrainingPanel
@@ -146,25 +143,3 @@ class Viewer:
                 visitor.tell("Without photographs", fault)
             elif self._scenery.has_points:
                 visitor.controls.offer_points()
-
-
-def start_server(address: Address, title: str) -> Any:
-    """viser's server, at this address and nowhere else. Raises LumigraphError if the port has just been taken."""
-    with quiet():
-        server = viser.ViserServer(address.host, address.port, label=title, verbose=False)
-    if server.get_port() != address.port:
-        with quiet():
-            server.stop()
-        raise LumigraphError(f"Port {address.port} has just been taken; start the viewer again")
-    server.request_share_url = lambda *_, **__: None  # viser would connect to the outside if a client asked it to
-    return server
-
-
-class quiet:  # noqa: N801
-    """viser greets on stdout, where our results go; inside this block it does not."""
-
-    def __enter__(self) -> None:
-        self._before, rich.get_console().quiet = rich.get_console().quiet, True
-
-    def __exit__(self, *fault: object) -> None:
-        rich.get_console().quiet = self._before

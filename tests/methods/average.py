@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import torch
 
 from lumigraph.method import RayMethod
+from lumigraph.ranges import Cells, NonNegative, RaySamples, Share
 from lumigraph.rays import Look, Samples
 
 NEAR, FAR = 1.0, 5.0  # scene units from a camera, between which the cube lies
@@ -14,10 +15,10 @@ NEAR, FAR = 1.0, 5.0  # scene units from a camera, between which the cube lies
 
 @dataclass(frozen=True)
 class Config:
-    cells: int = 32  # along each axis
-    samples: int = 64  # per ray
-    solid: float = 0.9  # mean opacity from which on a cell is solid
-    density: float = 50.0  # of a solid cell, per scene unit
+    cells: Cells = 32  # along each axis
+    samples: RaySamples = 64  # per ray
+    solid: Share = 0.9  # mean opacity from which on a cell is solid
+    density: NonNegative = 50.0  # of a solid cell, per scene unit
 
 
 class Average(RayMethod):

@@ -8,17 +8,18 @@ import torch
 from torch import nn
 
 from lumigraph.method import RayMethod
+from lumigraph.ranges import BatchSize, Cells, LearningRate, NonNegative, RaySamples
 from lumigraph.rays import Look, Samples
 from lumigraph.shapes import Shapes
 
 
 @dataclass(frozen=True)
 class Config:
-    cells: int = 24
-    points: int = 1024  # per step
-    samples: int = 24  # per ray
-    sharpness: float = 40.0  # of the density, per scene unit (beta of Yariv 2021, VolSDF, is its inverse)
-    learning_rate: float = 0.05
+    cells: Cells = 24
+    points: BatchSize = 1024  # per step
+    samples: RaySamples = 24  # per ray
+    sharpness: NonNegative = 40.0  # of the density, per scene unit (beta of Yariv 2021, VolSDF, is its inverse)
+    learning_rate: LearningRate = 0.05
 
 
 class DistanceGrid(RayMethod):

@@ -9,6 +9,7 @@ from torch import nn
 
 from lumigraph.collection import Collection
 from lumigraph.method import RayMethod
+from lumigraph.ranges import BatchSize, Cells, LearningRate, RaySamples
 from lumigraph.rays import Look, Samples
 from lumigraph.scene import Scene
 from lumigraph.volume import composite
@@ -16,11 +17,11 @@ from lumigraph.volume import composite
 
 @dataclass(frozen=True)
 class Config:
-    cells: int = 12
-    rays: int = 256  # per step
-    samples: int = 24  # per ray
-    seen: int = 1024  # pixels that tell a member's colour
-    learning_rate: float = 0.1
+    cells: Cells = 12
+    rays: BatchSize = 256  # per step
+    samples: RaySamples = 24  # per ray
+    seen: BatchSize = 1024  # pixels that tell a member's colour
+    learning_rate: LearningRate = 0.1
 
 
 class TintedGrid(RayMethod):

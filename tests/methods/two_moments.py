@@ -9,16 +9,17 @@ from torch import nn
 
 from lumigraph.controls import Control, moment
 from lumigraph.method import RayMethod
+from lumigraph.ranges import BatchSize, Cells, LearningRate, RaySamples
 from lumigraph.rays import Look, Samples
 from lumigraph.volume import composite
 
 
 @dataclass(frozen=True)
 class Config:
-    cells: int = 12
-    rays_per_step: int = 256
-    samples: int = 24  # per ray
-    learning_rate: float = 0.1
+    cells: Cells = 12
+    rays_per_step: BatchSize = 256
+    samples: RaySamples = 24  # per ray
+    learning_rate: LearningRate = 0.1
 
 
 class TwoMoments(RayMethod):

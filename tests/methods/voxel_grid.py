@@ -8,6 +8,7 @@ import torch
 from torch import nn
 
 from lumigraph.method import RayMethod
+from lumigraph.ranges import BatchSize, LearningRate, RaySamples
 from lumigraph.rays import Look, Rendering, Samples
 from lumigraph.volume import composite
 
@@ -20,9 +21,9 @@ class Grids:
 
 @dataclass(frozen=True)
 class Config:
-    rays: int = 256  # per step
-    samples: int = 24  # per ray
-    learning_rate: float = 0.1  # decays to a tenth
+    rays: BatchSize = 256  # per step
+    samples: RaySamples = 24  # per ray
+    learning_rate: LearningRate = 0.1  # decays to a tenth
     momentum: bool = False  # a second kind of optimizer for the colours
     grids: Grids = Grids()
 

@@ -57,7 +57,7 @@ def draw_capture(path: Path, model: pycolmap.Reconstruction, diagnosis: Diagnosi
         sheet.paste(draw_view(sketch, axis, low, high, (PANEL, height[i])), corner)
     foot = "cameras from first (dark) to last (bright); points in their own colours"
     draw.text((MARGIN, sheet.height - MARGIN), foot, FAINT, ImageFont.load_default(14))
-    save_picture(path, sheet)
+    save_picture(path, sheet, "capture")
 
 
 def heading(diagnosis: Diagnosis) -> str:
@@ -195,7 +195,7 @@ def draw_photographs(path: Path, intake: Intake, diagnosis: Diagnosis) -> None:
             draw.text((x, y + height + 3), shortened(name, letters), INK, small)
             for k, line in enumerate(notes.get(name, ())):
                 draw.text((x, y + height + 3 + text * (k + 1)), line, mark, small)
-    save_picture(path, sheet)
+    save_picture(path, sheet, "capture")
 
 
 def remark(name: str, diagnosis: Diagnosis) -> tuple[str, str | None]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Sequence
+from collections.abc import Container, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +13,9 @@ import plyfile
 from PIL import Image
 
 from ...errors import LumigraphError
-from ...files import PARTIAL, read_json, remove, replacing, write_json
+from ...files import claim as claim_file
+from ...files import claim_folder, read_json, remove, replacing, replacing_folder, write_json
+from ...marks import is_ours
 from ..library import pycolmap
 from ..masks import MASKS as MASKS
 from ..photos import Photo
@@ -25,6 +27,8 @@ WORK = "work"
 RESULT = "capture.json"
 OWNER = "sources.json"  # inside WORK: what the folder was made of
 POINTS = "points.ply"
+DRAWN = "capture.png", "photographs.png"
+WRITTEN = (RESULT, "transforms.json", POINTS, *DRAWN)
 
 # COLMAP's parameters by the names that transforms.json has for them.
 NAMES = {
@@ -62,21 +66,32 @@ def claim(folder: Path, sources: Sequence[Path]) -> Path:
             )
     # Beside a folder called sparse lie no bare photographs: so those of a scene that lies among them are passed over.
     (folder / "sparse").mkdir(parents=True, exist_ok=True)
-    write_json(work / OWNER, wanted)
+    write_json(work / OWNER, wanted, ours=True)
     return work
 
 
+def claim_results(folder: Path) -> None:
+    """Raise LumigraphError unless everything that a capture results in may be written into its folder."""
+    for name in WRITTEN:
+        claim_file(folder / name, "capture")
+    claim_folder(folder / "sparse", "capture")
+
+
 def copy_photographs(photos: Sequence[Photo], images: Path, track: Track) -> None:
-    """Copies with their sources' dates; those that are there already stay, what else lies there goes."""
-    kept = {photo.name for photo in photos}
-    for name in list_images(images):
-        if name not in kept or PARTIAL in name:
-            remove(images / name)
+    """Copies with their sources' dates; those that are there already stay, and other copies that were made go."""
+    remove_copies(images, {photo.name for photo in photos})
     for photo in track(photos, "Copying photographs", len(photos)):
         target = images / photo.name
         if not target.is_file() or stamp(target) != stamp(photo.path):
-            with replacing(target) as partial:
+            with replacing(target, "capture") as partial:
                 shutil.copy2(photo.path, partial)
+
+
+def remove_copies(folder: Path, kept: Container[str]) -> None:
+    """Delete what an earlier capture has put into a folder, but not names to keep, nor what others have put there."""
+    for name in list_images(folder):
+        if name not in kept and is_ours(folder / name, "capture"):
+            remove(folder / name)
 
 
 def copy_masks(photos: Sequence[Photo], masks: Path, track: Track) -> Path | None:
@@ -87,18 +102,15 @@ def copy_masks(photos: Sequence[Photo], masks: Path, track: Track) -> Path | Non
     having = [photo for photo in photos if photo.mask is not None]
     if not having:
         return None
-    kept = {f"{photo.name}.png" for photo in having}
-    for name in list_images(masks):
-        if name not in kept:
-            remove(masks / name)
+    remove_copies(masks, {f"{photo.name}.png" for photo in having})
     for photo in track(having, "Copying masks", len(having)):
         assert photo.mask is not None
         target = masks / f"{photo.name}.png"
         if target.is_file() and target.stat().st_mtime_ns == photo.mask.stat().st_mtime_ns:
             continue
         trusted = np.asarray(Image.fromarray(read_grey(photo.mask, photo.size, True)).resize(photo.size)) > 127
-        with replacing(target) as partial:
-            Image.fromarray(trusted).save(partial)
+        with replacing(target, "capture") as partial:
+            Image.fromarray(trusted).save(partial, "PNG")
             about = photo.mask.stat()
             os.utime(partial, ns=(about.st_atime_ns, about.st_mtime_ns))
     return masks
@@ -115,14 +127,14 @@ def write_model(folder: Path, model: pycolmap.Reconstruction, photos: Sequence[P
 
     z_up: whether +z is known to be up, by more than how cameras were held
     """
-    with replacing(folder / "sparse") as partial:
+    with replacing_folder(folder / "sparse", "capture") as partial:
         (partial / "0").mkdir(parents=True)
         model.write(partial / "0")
     write_points(folder / POINTS, model)
     by_name = {image.name: image for image in model.images.values() if image.has_pose}
     up = {"up": [0.0, 0.0, 1.0]} if z_up else {}
     images = [by_name[p.name] for p in photos if p.name in by_name]
-    write_json(folder / "transforms.json", up | transforms(model, images))
+    write_json(folder / "transforms.json", up | transforms(model, images), "capture")
 
 
 def transforms(model: pycolmap.Reconstruction, images: Sequence[pycolmap.Image]) -> dict[str, Any]:
@@ -150,5 +162,5 @@ def write_points(path: Path, model: pycolmap.Reconstruction) -> None:
     points = list(model.points3D.values())
     kinds = [(k, "f4") for k in "xyz"] + [(k, "u1") for k in ("red", "green", "blue")] + [("sightings", "i4")]
     rows = np.array([(*p.xyz, *p.color, p.track.length()) for p in points], kinds)
-    with replacing(path) as partial:
+    with replacing(path, "capture") as partial:
         plyfile.PlyData([plyfile.PlyElement.describe(rows, "vertex")]).write(partial)

@@ -13,7 +13,8 @@ from typing import Any, Literal
 import numpy as np
 
 from ...errors import LumigraphError
-from ...files import read_json, remove, replacing, write_bytes, write_json
+from ...files import claim as claim_file
+from ...files import read_json, remove, replacing, replacing_folder, write_bytes, write_json
 from ...locks import held
 from ...names import natural
 from ...progress import counting
@@ -22,7 +23,7 @@ from ..photos import Intake, Photo, gather
 from ..photos.track import Track, untracked
 from .diagnosis import FEW_FEATURES, Diagnosis, Matches, counted, diagnose, folds, read_matches
 from .drawings import draw_capture, draw_photographs
-from .folder import MASKS, RESULT, claim, copy_masks, copy_photographs, stamp, write_model
+from .folder import DRAWN, MASKS, RESULT, claim, claim_results, copy_masks, copy_photographs, stamp, write_model
 from .georeference import Georeference, georeference, gps_positions, upright
 from .lenses import Sharing, group_by_lens, model_for, prior, write_database
 from .pairs import NEIGHBOURS, Matching, choose_matching, choose_pairs
@@ -167,6 +168,7 @@ class Reconstruction:
         return {"features": features, "matching": matching, "mapping": mapping, "result": result}
 
     def run(self) -> dict[str, Any]:
+        claim_results(self.folder)
         copy_photographs(self.photos, self.images, self.track)
         self.masks = copy_masks(self.photos, self.folder / MASKS, self.track)
         self.find_features(self.keys["features"])
@@ -183,9 +185,8 @@ class Reconstruction:
         if self.stages.is_done("features", key) and self.database.is_file():
             return
         if not self.stages.was_begun("features", key) or not self.database.is_file():
-            for file in self.work.glob(f"{self.database.name}*"):
-                remove(file)
-            with replacing(self.database) as partial:
+            remove_database(self.database)
+            with replacing(self.database, ours=True) as partial:
                 write_database(partial, self.groups)
         with self.stages.working("features", key):
             self.colmap(
@@ -212,14 +213,13 @@ class Reconstruction:
             with counting("Choosing pairs"):
                 pairs = choose_pairs(self.matching, self.names, self.database, gps_positions(self.photos))
             listed = self.work / "pairs.txt"
-            write_bytes(listed, "".join(f"{self.names[i]} {self.names[j]}\n" for i, j in pairs).encode())
+            write_bytes(listed, "".join(f"{self.names[i]} {self.names[j]}\n" for i, j in pairs).encode(), ours=True)
             self.colmap("Comparing pairs", len(pairs), self.database, stage="matching", pairs=str(listed))
 
     def place(self, key: str) -> None:
         if self.stages.is_done("mapping", key) and self.models.is_dir():
             return
-        with self.stages.working("mapping", key), replacing(self.models) as partial:
-            partial.mkdir()
+        with self.stages.working("mapping", key), replacing_folder(self.models, ours=True) as partial:
             self.map(self.database, partial, self.options.mapper)
             if self.options.mapper == "global" and not any(partial.iterdir()):
                 self.map(self.database, partial, "incremental")
@@ -241,8 +241,7 @@ class Reconstruction:
                 near = self.work / "near.db"
                 copy_database(self.database, near)
                 keep_near(near, self.names, NEIGHBOURS)
-                with replacing(self.unfolded) as partial:
-                    partial.mkdir()
+                with replacing_folder(self.unfolded, ours=True) as partial:
                     self.map(near, partial, "incremental")
 
     def leaps(self, model: pycolmap.Reconstruction, matches: Matches) -> int:
@@ -288,6 +287,7 @@ class Reconstruction:
         if not found or found[0].num_reg_images() < FEWEST:
             raise LumigraphError(nothing_fits(self.intake.source, self.photos, matches))
         for name in (RESULT, "transforms.json"):
+            claim_file(self.folder / name, "capture")
             remove(self.folder / name)
         model = found[0]
         place = self.turn_upright(model)
@@ -303,12 +303,11 @@ class Reconstruction:
         diagnosis = replace(diagnosis, warnings=[*diagnosis.warnings, *told])
         known = place is not None and place.new_from_old is not None
         write_model(self.folder, model, self.photos, z_up=known)
-        draw_capture(
-            self.folder / "capture.png", model, diagnosis, place is not None and place.new_from_old is not None
-        )
-        draw_photographs(self.folder / "photographs.png", self.intake, diagnosis)
+        capture_sheet, photograph_sheet = (self.folder / name for name in DRAWN)
+        draw_capture(capture_sheet, model, diagnosis, known)
+        draw_photographs(photograph_sheet, self.intake, diagnosis)
         result = self.summary(key, model, place, diagnosis)
-        write_json(self.folder / RESULT, result)
+        write_json(self.folder / RESULT, result, "capture")
         return result
 
     def turn_upright(self, model: pycolmap.Reconstruction) -> Georeference | None:
@@ -363,9 +362,14 @@ def read_models(folder: Path) -> list[pycolmap.Reconstruction]:
     return sorted(found, key=lambda model: (model.num_reg_images(), model.num_points3D()), reverse=True)
 
 
+def remove_database(path: Path) -> None:
+    """Delete a database and what SQLite keeps beside it."""
+    for ending in ("", "-journal", "-wal", "-shm"):
+        remove(path.with_name(path.name + ending))
+
+
 def copy_database(source: Path, target: Path) -> None:
-    for file in target.parent.glob(f"{target.name}*"):
-        remove(file)
+    remove_database(target)
     with closing(sqlite3.connect(source)) as old, closing(sqlite3.connect(target)) as new:
         old.backup(new)
 

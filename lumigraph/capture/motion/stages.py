@@ -60,7 +60,7 @@ class Stages:
 
     def mark(self, stage: str, key: str, done: bool, seconds: float) -> None:
         self.marks[stage] = {"key": key, "done": done, "seconds": round(seconds, 2)}
-        write_json(self.path, self.marks)
+        write_json(self.path, self.marks, ours=True)
 
     def colmap(self, total: int, **job: Any) -> Generator[int, None, None]:
         """Do a job of `worker.py`; gives a number for each of `total` things that becomes ready, as it does.

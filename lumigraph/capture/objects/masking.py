@@ -15,7 +15,7 @@ from PIL import Image
 from ...choice import evenly
 from ...errors import LumigraphError
 from ...figures import Row, contact_sheet, fit_into, save_picture
-from ...files import replacing
+from ...files import claim, replacing_folder
 from ...scene import Scene
 from ..assemble import assemble
 from ..capture import Capture
@@ -53,12 +53,13 @@ def mask_object(folder: Path, capture: Capture, track: Track) -> Masked:
     """
     if (folder / OBJECT_MASKS).exists():
         raise LumigraphError(f"{folder / OBJECT_MASKS} is there already; delete it, and masks will be made anew")
+    claim(folder / SHEET, "masks")
     scene = assemble(replace(capture, shots=[replace(shot, mask=None, alpha=None) for shot in capture.shots]))
     views = [view_of(scene, i) for i in track(range(len(scene)), "Dividing photographs", len(scene))]
     found = segment(views, scene.points, track)
     tiles: dict[int, Image.Image] = {}
     shown = evenly(range(len(scene)), SHOWN)
-    with replacing(folder / OBJECT_MASKS) as partial:
+    with replacing_folder(folder / OBJECT_MASKS) as partial:
         for i in track(range(len(scene)), "Writing masks", len(scene)):
             rgb = scene.photograph(i).rgb.numpy()
             alpha = refined(found, i, rgb)
@@ -68,7 +69,7 @@ def mask_object(folder: Path, capture: Capture, track: Track) -> Masked:
             if i in shown:
                 lit = rgb * (DIM + (1 - DIM) * alpha[..., None])
                 tiles[i] = fit_into(Image.fromarray((lit * 255).astype(np.uint8)), 320, 320)
-    save_picture(folder / SHEET, sheet_of(scene, tiles))
+    save_picture(folder / SHEET, sheet_of(scene, tiles), "masks")
     return Masked(len(scene), folder / SHEET, doubts(found))
 
 

@@ -50,18 +50,18 @@ def copy(image: Image.Image, source: Path, path: Path) -> None:
     Raises LumigraphError where the disk refuses, and whatever Pillow raises for a damaged image.
     """
     upright = eight_bits(ImageOps.exif_transpose(image))
-    with replacing(path) as partial:
-        save(upright, partial, image.info.get("icc_profile"))
+    with replacing(path, ours=True) as partial:
+        save(upright, partial, path.suffix, image.info.get("icc_profile"))
         stat = source.stat()
         os.utime(partial, ns=(stat.st_atime_ns, stat.st_mtime_ns))
 
 
-def save(image: Image.Image, path: Path, profile: bytes | None = None) -> None:
-    """Write an image as JPEG or PNG, by the suffix. profile: of the image's colours (ICC)."""
-    if path.suffix.lower() in JPEG:
-        image.save(path, icc_profile=profile, quality=QUALITY, subsampling=0)
+def save(image: Image.Image, path: Path, suffix: str, profile: bytes | None = None) -> None:
+    """Write an image as JPEG or PNG, as a suffix says. profile: of the image's colours (ICC)."""
+    if suffix.lower() in JPEG:
+        image.save(path, "JPEG", icc_profile=profile, quality=QUALITY, subsampling=0)
     else:
-        image.save(path, icc_profile=profile)
+        image.save(path, "PNG", icc_profile=profile)
 
 
 def is_current(path: Path, source: Path) -> bool:

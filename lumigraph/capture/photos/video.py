@@ -23,7 +23,7 @@ from jaxtyping import Float
 from PIL import Image
 
 from ...errors import LumigraphError, LumigraphWarning
-from ...files import read_json, replacing, write_json
+from ...files import read_json, replacing_folder, write_json
 from .judge import SAME, WORKING, sharpness, signature
 from .movement import Odometer
 from .track import Track, untracked
@@ -63,10 +63,9 @@ def extract(path: Path, folder: Path, frames: int | None = None, track: Track = 
     complete = all((folder / name).is_file() for name in known.get("frames", ()))
     if not complete or {key: known.get(key) for key in identity} != identity:
         chosen = choose(*judge(path, frames, track), frames)
-        with replacing(folder) as partial:
-            partial.mkdir()
+        with replacing_folder(folder, ours=True) as partial:
             written = write(path, partial, chosen, track)
-            write_json(partial / "frames.json", {**identity, "frames": written})
+            write_json(partial / "frames.json", {**identity, "frames": written}, ours=True)
         known = read_json(index)
     return [(folder / name, seconds) for name, seconds in known["frames"].items()]
 
@@ -121,7 +120,7 @@ def write(path: Path, folder: Path, chosen: Sequence[int], track: Track) -> dict
         new = signature(image.convert("L"))
         if not any(new @ old > SAME for old in signatures):
             name = f"{number:06d}.jpg"
-            save(image, folder / name)
+            save(image, folder / name, ".jpg")
             signatures.append(new)
             written[name] = seconds
     return written

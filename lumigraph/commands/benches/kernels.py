@@ -6,7 +6,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
-from ..common import choose_device, option
+from ...files import claim
+from ..common import Overwrite, choose_device, option
 
 
 @dataclass(frozen=True)
@@ -15,11 +16,14 @@ class BenchKernels:
 
     output: Annotated[Path | None, option("FILE.json", "the table alone")] = None
     """Also write the figures there."""
+    overwrite: Overwrite = False
     device: Annotated[str, option("NAME")] = "auto"
     """auto, cpu, cuda, cuda:1."""
 
     def run(self) -> int:
         from ...kernels.bench import bench_kernels
 
+        if self.output is not None:
+            claim(self.output, "benchmark", self.overwrite)
         bench_kernels(device=choose_device(self.device), output=self.output)
         return 0

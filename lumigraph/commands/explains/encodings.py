@@ -9,9 +9,8 @@ from typing import Annotated
 from tyro.conf import Positional
 
 from ...errors import LumigraphError
-from ...progress import counting
 from ...ranges import Downscale, Seed, Steps, between
-from ..common import choose_device, needed, option, scene_name, show
+from ..common import Overwrite, choose_device, needed, option, scene_name, show
 
 
 @dataclass(frozen=True)
@@ -26,6 +25,7 @@ class ExplainEncodings:
     """An image file."""
     output: Annotated[Path | None, option("FOLDER", "explained/PICTURE-encodings")] = None
     """Where the page goes."""
+    overwrite: Overwrite = False
     steps: Annotated[Steps, option("N")] = 500
     """Of training, for each network."""
     scales: Annotated[tuple[Annotated[float, between(1e-6, 1e6)], ...], option("S S ...")] = (
@@ -53,16 +53,18 @@ class ExplainEncodings:
 
         from ...capture import open_scene, single_image
         from ...explain.encodings import compare
-        from ...explain.encodings_page import write_page
+        from ...explain.encodings_page import claim_page, write_page
         from ...methods.fourier_features import FourierFeatures
+        from ...progress import counting
 
         if not single_image.recognises(self.picture.expanduser()):
             raise LumigraphError(f"{self.picture} is no image file; name one picture, as in photograph.png")
+        folder = self.output or Path("explained") / f"{scene_name(str(self.picture))}-encodings"
+        claim_page(folder, self.overwrite, [self.picture.expanduser()])
         device = choose_device(self.device)
         scene = open_scene(self.picture, self.downscale)
         config = replace(FourierFeatures.preset(device), seed=self.seed)
         comparison = compare(scene, tuple(sorted(set(self.scales))), self.steps, device, config)
-        folder = self.output or Path("explained") / f"{scene_name(str(self.picture))}-encodings"
         with counting("Drawing the page"):
             write_page(folder, comparison)
         show({fit.name: f"{fit.held_out:.2f} dB" for fit in comparison.leading} | {"page": str(folder / "index.html")})

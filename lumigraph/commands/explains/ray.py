@@ -9,9 +9,8 @@ from typing import Annotated, Any, Literal
 from tyro.conf import Positional
 
 from ...errors import LumigraphError
-from ...progress import counting
 from ...ranges import between
-from ..common import choose_device, needed, option, say, show
+from ..common import Overwrite, choose_device, needed, option, say, show
 from ..controls import Set, tell
 
 Place = Annotated[int, between(0, 1_000_000)]  # along one side of a picture
@@ -35,6 +34,7 @@ class ExplainRay:
     """Which photographs."""
     output: Annotated[Path | None, option("FILE.svg", "RUN/rays/VIEW-X-Y.svg")] = None
     """The figure."""
+    overwrite: Overwrite = False
     scene: Annotated[str | None, option("SCENE", "where they were")] = None
     """Where the photographs are now, if they have moved."""
     told: Set = ()
@@ -48,23 +48,26 @@ class ExplainRay:
         from ...explain.ray import along_ray
         from ...explain.ray_figure import ray_figure
         from ...figures.charts import standalone
-        from ...files import write_bytes, write_json
+        from ...files import claim, write_bytes, write_json
+        from ...progress import counting
         from ...run import Run
 
         run = Run(self.run_folder)
         name, camera = find_view(run, self.split, self.view)
+        x, y = pixel = self.pixel or tuple((camera.size[0] // 2).tolist())
+        output = self.output or run.folder / "rays" / f"{file_name(name)}-{x}-{y}.svg"
+        for file in (output, output.with_suffix(".json")):
+            claim(file, "figure", self.overwrite)
         method = tell(run, run.method(choose_device(self.device)), self.told)
         camera = method.refined(camera)
-        x, y = pixel = self.pixel or tuple((camera.size[0] // 2).tolist())
         with counting("Looking along the ray"):
             sight = along_ray(method, camera, pixel)
         sight = sight.beside(self._photograph(run, name))
-        output = self.output or run.folder / "rays" / f"{file_name(name)}-{x}-{y}.svg"
         title = f"{run.method_name}: pixel ({x}, {y}) of {name}"
-        write_bytes(output, standalone(ray_figure(sight, title)))
+        write_bytes(output, standalone(ray_figure(sight, title)), "figure")
         about = {"run": str(run.folder), "method": run.method_name, "view": name, "split": self.split}
         about |= {"controls": method.told} if method.told else {}
-        write_json(output.with_suffix(".json"), about | sight.to_json())
+        write_json(output.with_suffix(".json"), about | sight.to_json(), "figure")
         show(sight.rows() | {"files": f"{output}, {output.with_suffix('.json')}"})
         return 0
 

@@ -9,8 +9,9 @@ from typing import Annotated, Literal
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from ...errors import LumigraphError
+from ...files import claim
 from ...ranges import Count, Pixels, Positive, Share, between
-from ..common import needed, option, show
+from ..common import Overwrite, needed, option, show
 from ..controls import Set, open_method
 from ..keeping import Keeping
 
@@ -58,6 +59,7 @@ class ExportMesh:
     """Longer side of the pictures that tell colours, and depth where it is fused; at most that of the photographs."""
     views: Annotated[Count, option("N")] = 64
     """Number of these pictures at most."""
+    overwrite: Overwrite = False
     part: OmitArgPrefixes[Keeping] = Keeping()
     told: Set = ()
     device: Annotated[str, option("NAME")] = "auto"
@@ -69,6 +71,7 @@ class ExportMesh:
         from ...export.mesh_file import ending, write_mesh
 
         for_phones = ending(self.output) == ".usdz"
+        claim(self.output, "mesh", self.overwrite, [self.source])
         opened, method, cameras = open_method(self.source, self.device, self.told)
         mesh = extract_mesh(
             self.part.without_floaters(method),

@@ -8,8 +8,9 @@ from typing import Annotated
 
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
+from ...files import claim
 from ...ranges import Coordinate, SphereSize
-from ..common import needed, option, show
+from ..common import Overwrite, needed, option, show
 from ..controls import Set, open_method
 from ..keeping import Keeping
 
@@ -38,6 +39,7 @@ class ExportPanorama:
     """Where to stand, in the frame of the photographs."""
     size: Annotated[SphereSize, option("PIXELS")] = 2048
     """Width; the height is half of it."""
+    overwrite: Overwrite = False
     part: OmitArgPrefixes[Keeping] = Keeping()
     told: Set = ()
     device: Annotated[str, option("NAME")] = "auto"
@@ -49,6 +51,7 @@ class ExportPanorama:
         picture_format(self.output)
         sphere_size(self.size)
         self.part.check()
+        claim(self.output, "panorama", self.overwrite, [self.source])
         opened, method, cameras = open_method(self.source, self.device, self.told)
         method = self.part.of_method(method)
         place, heading, where = standpoint(cameras["train"], opened.frame, self.place)

@@ -9,8 +9,9 @@ from typing import Annotated
 from tyro.conf import OmitArgPrefixes, Positional
 
 from ...errors import LumigraphError
+from ...files import claim
 from ...ranges import CloudSize, Count, Pixels
-from ..common import needed, option, show
+from ..common import Overwrite, needed, option, show
 from ..controls import Set, open_method
 from ..keeping import Keeping
 
@@ -32,6 +33,7 @@ class ExportPoints:
     """Longer side of the pictures that the points come from; at most that of the photographs."""
     views: Annotated[Count, option("N")] = 64
     """Number of these pictures at most."""
+    overwrite: Overwrite = False
     part: OmitArgPrefixes[Keeping] = Keeping()
     told: Set = ()
     device: Annotated[str, option("NAME")] = "auto"
@@ -41,6 +43,7 @@ class ExportPoints:
         if self.output.suffix.lower() != ".ply":
             raise LumigraphError(f"{self.output} should end in .ply, the one kind of point cloud there is; rename it")
         self.part.check()
+        claim(self.output, "points", self.overwrite, [self.source])
         from ...export.points import extract_points, write_points
 
         opened, method, cameras = open_method(self.source, self.device, self.told)

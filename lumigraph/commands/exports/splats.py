@@ -9,7 +9,8 @@ from typing import Annotated
 from tyro.conf import OmitArgPrefixes, Positional
 
 from ...errors import LumigraphError
-from ..common import needed, show
+from ...files import claim
+from ..common import Overwrite, needed, show
 from ..controls import Set, tell
 from ..keeping import Keeping
 
@@ -26,17 +27,20 @@ class ExportSplats:
     """Folder of a run, a splat file, or a composition."""
     output: Annotated[Positional[Path], needed("FILE")]
     """The new file."""
+    overwrite: Overwrite = False
     part: OmitArgPrefixes[Keeping] = Keeping()
     told: Set = ()
 
     def run(self) -> int:
         from ...capabilities import HasGaussians, needs
-        from ...exchange import is_splat_file, read_gaussians, write_gaussians
+        from ...exchange import check_ending, is_splat_file, read_gaussians, write_gaussians
         from ...export.splats import export_splats
         from ...run import open_any
         from ...run.splat_file import frame_of
 
         self.part.check()
+        check_ending(self.output)
+        claim(self.output, "splats", self.overwrite, [self.source])
         if is_splat_file(self.source):
             if self.told:
                 raise LumigraphError(f"{self.source} is a file of Gaussians, which has no controls; leave out --set")

@@ -9,8 +9,9 @@ from typing import Annotated
 from tyro.conf import OmitArgPrefixes, Positional
 
 from ...errors import LumigraphError
+from ...files import claim
 from ...ranges import Positive, SphereSize
-from ..common import needed, option, show
+from ..common import Overwrite, needed, option, show
 from ..controls import Set, open_method
 from ..keeping import Keeping
 from .panorama import Place
@@ -35,6 +36,7 @@ class ExportStereo:
     """Distance between the eyes, in the units of the photographs' frame."""
     size: Annotated[SphereSize, option("PIXELS")] = 2048
     """Width, and height of both halves together."""
+    overwrite: Overwrite = False
     part: OmitArgPrefixes[Keeping] = Keeping()
     told: Set = ()
     device: Annotated[str, option("NAME")] = "auto"
@@ -47,6 +49,7 @@ class ExportStereo:
         picture_format(self.output)
         sphere_size(self.size)
         self.part.check()
+        claim(self.output, "panorama", self.overwrite, [self.source])
         opened, method, cameras = open_method(self.source, self.device, self.told)
         method = self.part.of_method(method)
         place, heading, where = standpoint(cameras["train"], opened.frame, self.place)

@@ -10,8 +10,9 @@ from typing import Annotated, Any, Literal
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from ...errors import LumigraphError
+from ...files import claim
 from ...ranges import between
-from ..common import needed, option, show
+from ..common import Overwrite, needed, option, show
 from ..controls import Set, open_method
 from ..keeping import Keeping
 
@@ -45,6 +46,7 @@ class ExportWeb:
     """Pictures in a page of views."""
     size: Annotated[int, between(16, 4096), option("PIXELS")] = 640
     """Longer side of these pictures."""
+    overwrite: Overwrite = False
     part: OmitArgPrefixes[Keeping] = Keeping()
     told: Set = ()
     device: Annotated[str, option("NAME")] = "auto"
@@ -57,6 +59,7 @@ class ExportWeb:
         if self.output.suffix.lower() not in (".html", ".htm"):
             raise LumigraphError(f"{self.output} should end in .html, as pages do; rename it")
         self.part.check()
+        claim(self.output, "page", self.overwrite, [self.source])
         opened, method, cameras = open_method(self.source, self.device, self.told)
         whole = self._kind(method) != "views" and not self.part.crops
         behind = backdrop(method, cameras["train"]) if whole else None

@@ -48,7 +48,7 @@ def march(
     require(occupied.numel() > 0 and occupied.shape[2:] == (n, n), f"{tuple(occupied.shape)} are no cubes of cells")
     least = 2.0 ** (cascades - 25)  # a ray's samples are counted in 32 bits
     require(least <= step < math.inf, f"a step of {step} cannot be, where cubes ask for {least:g} at least")
-    require(0 <= growth <= 1 and 0 <= stop <= 1, f"growth {growth} and stop {stop} must be from 0 to 1")
+    require(0 <= growth < math.inf and 0 <= stop <= 1, f"growth {growth} and stop {stop} cannot be")
     run = implementation("march", origins)
     return Samples(*run(origins, directions, t_near, t_far, occupied, density, step, growth, stop))
 

@@ -1,0 +1,120 @@
+"""What Lumigraph wrote into a folder, so that it knows its own again: lines of JSON in a file `.lumigraph` there.
+
+Each line is a file: its name, what kind of thing it is, its bytes and their SHA-256. A file is ours if a line says so
+and nobody has changed it since. Why here, rather than
+
+- inside each file: some formats have no room (.splat), and a mark inside stays when somebody edits the file, or is
+  there because a friend's Lumigraph wrote it;
+- in the user's home: folders are moved, copied, and mounted in containers; this one travels along.
+
+Lines are only ever added, in one write: processes that share a folder lose nothing of each other's, and of a kill
+remains half a line at most, which is passed over. A line comes before its file; one whose file never came fits no
+other. A `.lumigraph` that is somebody else's stays as it is; what is written beside it is not known again.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import stat
+from collections import defaultdict
+from pathlib import Path
+from typing import Literal
+
+NAME = ".lumigraph"
+HEAD = b'{"lumigraph": "what it wrote here, by which it knows its own again"}\n'
+WHOLE = "."  # the name that stands for a folder which was written as one
+
+Sum = tuple[int, str]  # bytes, SHA-256
+Kind = Literal[
+    "film", "film of depth", "pictures of a film", "cameras of a film", "camera path", "composition",
+    "page", "splats", "points", "mesh", "panorama", "comparison",
+    "evaluation", "rendering", "report", "figure", "benchmark", "capture", "masks", "file",
+]  # fmt: skip
+
+
+def note(path: Path, kind: Kind, written: Path) -> None:
+    """Remember that a file, which still has another name, will be ours at `path`. OSError if the disk is full."""
+    add(path.parent, kind, {path.name: sum_of(written)})
+
+
+def note_folder(folder: Path, kind: Kind) -> None:
+    """Remember that a folder and all that is in it are ours, of one kind. OSError if the disk is full."""
+    for place, _, names in os.walk(folder):
+        whole: dict[str, Sum] = {WHOLE: (0, "")} if Path(place) == folder else {}
+        add(Path(place), kind, whole | {name: sum_of(Path(place, name)) for name in names if name != NAME})
+
+
+def is_ours(path: Path, kind: Kind) -> bool:
+    """Whether a file is one of this kind that Lumigraph wrote, and is as it was then. Links never are."""
+    return is_among(known(path.parent, kind), path)
+
+
+def is_whole(folder: Path, kind: Kind) -> bool:
+    """Whether Lumigraph wrote a folder as one thing of this kind; see `foreign_in` for what it holds now."""
+    return WHOLE in known(folder, kind)
+
+
+def foreign_in(folder: Path, kind: Kind) -> Path | None:
+    """Something in a folder, however deep, that Lumigraph did not write or that has been changed since; or None."""
+    for place, folders, names in os.walk(folder):
+        here, sums = Path(place), known(Path(place), kind)
+        own = {NAME} if is_record(here / NAME) else set()
+        for name in {*folders, *names} - own:
+            if (here / name).is_symlink() or (name in names and not is_among(sums, here / name)):
+                return here / name
+    return None
+
+
+def is_among(sums: dict[str, set[Sum]], path: Path) -> bool:
+    about, there = os.lstat(path), sums.get(path.name, set())
+    looks_so = stat.S_ISREG(about.st_mode) and about.st_size in {size for size, _ in there}
+    return looks_so and sum_of(path) in there
+
+
+def sum_of(path: Path) -> Sum:
+    with open(path, "rb") as file:
+        digest = hashlib.file_digest(file, "sha256").hexdigest()
+        return file.tell(), digest
+
+
+def known(folder: Path, kind: Kind) -> dict[str, set[Sum]]:
+    """What a folder's record says of this kind, by name; nothing where there is none, or somebody else's."""
+    sums: dict[str, set[Sum]] = defaultdict(set)
+    for line in (folder / NAME).read_bytes().splitlines() if is_record(folder / NAME) else []:
+        try:
+            row = json.loads(line)
+            if row["kind"] == kind:
+                sums[row["name"]].add((row["bytes"], row["sha256"]))
+        except (ValueError, LookupError, TypeError, RecursionError):
+            continue
+    return sums
+
+
+def is_record(path: Path) -> bool:
+    """Whether a path is a record that Lumigraph began."""
+    try:
+        if not stat.S_ISREG(os.lstat(path).st_mode):
+            return False
+        with open(path, "rb") as file:
+            return file.read(len(HEAD)) == HEAD
+    except OSError:
+        return False
+
+
+def add(folder: Path, kind: Kind, sums: dict[str, Sum]) -> None:
+    """Add lines to a folder's record, and begin it if there is none."""
+    path = folder / NAME
+    is_new = not os.path.lexists(path)
+    if not (sums and (is_new or is_record(path))):
+        return
+    flags = os.O_WRONLY | os.O_APPEND | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_BINARY", 0)
+    try:
+        file = open(os.open(path, flags, 0o666), "wb")
+    except PermissionError:
+        return  # another user's, in a folder that both may write to
+    rows = [{"name": name, "kind": kind, "bytes": size, "sha256": sha256} for name, (size, sha256) in sums.items()]
+    lines = b"".join(b"\n" + json.dumps(row).encode() + b"\n" for row in rows)  # after half a line, a line of its own
+    with file:
+        file.write((HEAD if is_new else b"") + lines)

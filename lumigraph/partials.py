@@ -1,0 +1,75 @@
+"""What is still being written: names that nobody else has, in the folder where it will lie, and what a kill left of it.
+
+A process holds a lock on whatever it is writing, and the system drops the lock when the process ends, even killed. So
+what has such a name and no lock is a leftover of ours, and goes when somebody writes into the folder again. Where the
+file system knows no locks it stays.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import re
+import shutil
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+FORM = re.compile(r"\.lumigraph-[0-9a-f]{16}\.partial")
+
+_swept: set[tuple[int, Path]] = set()  # processes and folders
+
+
+@contextlib.contextmanager
+def partial(folder: Path, is_folder: bool = False) -> Iterator[Path]:
+    """An empty file or folder to fill; what still has this name when the block ends is deleted."""
+    sweep(folder)
+    while True:
+        path, lock = folder / f".lumigraph-{os.urandom(8).hex()}.partial", None
+        try:
+            path.mkdir() if is_folder else path.touch(exist_ok=False)
+            lock = locked(path)
+            if path.exists():  # else somebody took it for a leftover, before it was locked
+                yield path
+                return
+        finally:
+            remove(path)
+            if lock is not None:
+                os.close(lock)
+
+
+def sweep(folder: Path) -> None:
+    """Delete what processes that were killed have left behind, once for each folder."""
+    if (os.getpid(), folder.absolute()) in _swept:
+        return
+    _swept.add((os.getpid(), folder.absolute()))
+    for name in filter(FORM.fullmatch, os.listdir(folder)):
+        lock = locked(folder / name)
+        if lock is not None:
+            remove(folder / name)
+            os.close(lock)
+
+
+def locked(path: Path) -> int | None:
+    """A descriptor that holds a file's or folder's lock; None if another process does, or if there are no locks."""
+    if sys.platform == "win32":
+        return None  # and files that are open could not be renamed
+    import fcntl
+
+    descriptor = None
+    try:
+        descriptor = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK)
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:
+        if descriptor is not None:
+            os.close(descriptor)
+        return None
+    return descriptor
+
+
+def remove(path: Path) -> None:
+    """Delete a file or a folder, if it is there. A link goes, and what it leads to stays."""
+    if path.is_dir() and not path.is_symlink():
+        shutil.rmtree(path)
+    else:
+        path.unlink(missing_ok=True)

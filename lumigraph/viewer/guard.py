@@ -1,0 +1,123 @@
+"""Who may speak to the viewer: its own page, opened at an address of its own, with the token where one is needed.
+
+A browser sends requests to any address that any page names, so that a foreign page could look at the scene and press
+buttons; but it says truly which page asks (Origin) and by which name it found the server (Host). A page of another
+site has another Origin; one whose name was turned to this machine after it was loaded (DNS rebinding) has a Host that
+is none of ours. Where other machines can reach the server, an unguessable token in the address is asked for besides;
+the page keeps it as a cookie, so that its websocket has it too.
+"""
+
+from __future__ import annotations
+
+import hmac
+import ipaddress
+import socket
+from collections.abc import Callable, Iterable
+from http import HTTPStatus
+from http.cookies import CookieError, SimpleCookie
+from typing import Any
+from urllib.parse import parse_qs, urlsplit
+
+from websockets.datastructures import Headers
+from websockets.http11 import Request, Response
+
+from .address import Address, is_wildcard
+
+LOOPBACK = ("localhost", "127.0.0.1", "::1")
+# What pages of ours tell a browser: nobody frames them, reads them from another site, or learns their address.
+ALOOF = {
+    "Content-Security-Policy": "frame-ancestors 'self'",
+    "Cross-Origin-Resource-Policy": "same-origin",
+    "Referrer-Policy": "no-referrer",
+    "X-Content-Type-Options": "nosniff",
+    "X-Frame-Options": "SAMEORIGIN",
+}
+
+
+Answers = Callable[[Any, Request], Response | None]  # of a server: to a connection and its request
+
+
+class Guard:
+    """Whether a request may be answered, by its headers; the websocket's handshake is a request like any other."""
+
+    def __init__(self, address: Address):
+        self.token = address.token
+        self._cookie = f"lumigraph-{address.port}"
+        self._names = own_names(address)
+
+    def refusal(self, request: Request) -> str | None:
+        """Why a request gets no answer; None if it does."""
+        hosts, origins = request.headers.get_all("Host"), request.headers.get_all("Origin")
+        if len(hosts) != 1 or not self.is_ours(hosts[0]):
+            return "This is no address of the viewer; open the one that it printed"
+        if any(origin != f"http://{hosts[0]}" for origin in origins):
+            return "Another page may not use the viewer"
+        if self.token and not self.knows_token(request):
+            return "Open the address that the viewer printed, with its token"
+        return None
+
+    def is_ours(self, host: str) -> bool:
+        """Whether a Host header names this machine. Another port may lead here, through a tunnel.
+
+        With a token any number will do: what rebinds is a name, and knows no token.
+        """
+        try:
+            name = (urlsplit(f"//{host}").hostname or "").rstrip(".")
+            _ = urlsplit(f"//{host}").port
+        except ValueError:
+            return False
+        return name in self._names or (bool(self.token) and is_number(name))
+
+    def knows_token(self, request: Request) -> bool:
+        said = parse_qs(urlsplit(request.path).query).get("token", [])
+        for line in request.headers.get_all("Cookie"):
+            said += cookies(line, self._cookie)
+        return any(hmac.compare_digest(one.encode(), self.token.encode()) for one in said)
+
+    def answering(self, answer: Answers) -> Answers:
+        """Another server's answers, for those who may have them; 403 for the rest."""
+
+        def guarded(connection: Any, request: Request) -> Response | None:
+            if why := self.refusal(request):
+                return refused(why)
+            response = answer(connection, request)
+            if response is not None:
+                response.headers.update(ALOOF)
+                if self.token:
+                    response.headers["Set-Cookie"] = f"{self._cookie}={self.token}; HttpOnly; SameSite=Strict; Path=/"
+            return response
+
+        return guarded
+
+
+def refused(why: str) -> Response:
+    body = f"{why}.\n".encode()
+    about = {"Content-Type": "text/plain; charset=utf-8", "Content-Length": str(len(body)), "Connection": "close"}
+    return Response(HTTPStatus.FORBIDDEN, "Forbidden", Headers(about | ALOOF), body)
+
+
+def own_names(address: Address) -> set[str]:
+    """The hosts by which a browser may have found the viewer, as `urlsplit` has them."""
+    names: Iterable[str] = LOOPBACK
+    if address.token:
+        here = socket.gethostname()
+        names = [*names, here, f"{here}.local"]
+    if not is_wildcard(address.host):
+        names = [*names, address.host]
+    return {name.lower() for name in names}
+
+
+def is_number(name: str) -> bool:
+    """Whether a host is an IP address rather than a name."""
+    try:
+        return bool(ipaddress.ip_address(name))
+    except ValueError:
+        return False
+
+
+def cookies(line: str, name: str) -> list[str]:
+    """The values of a cookie in a header."""
+    try:
+        return [morsel.value for key, morsel in SimpleCookie(line).items() if key == name]
+    except CookieError:
+        return []

@@ -1,0 +1,11 @@
+"""What lies in a folder, for tests: names in order, without the record of what Lumigraph wrote there."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from lumigraph.marks import NAME
+
+
+def names(folder: Path) -> list[str]:
+    return sorted(path.name for path in folder.iterdir() if path.name != NAME)

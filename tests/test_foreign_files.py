@@ -1,0 +1,296 @@
+"""Nobody's files are replaced: whatever lies where a command would write, it stays, and the command says so first."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from hashlib import sha256
+from pathlib import Path
+
+import pytest
+import tiny
+import torch
+from listing import names
+from PIL import Image
+
+from lumigraph import files, marks, methods, partials
+from lumigraph.capture.motion.folder import WRITTEN, claim_results, copy_photographs
+from lumigraph.capture.photos import Photo
+from lumigraph.capture.photos.track import untracked
+from lumigraph.cli import COMMANDS, main
+from lumigraph.errors import LumigraphError
+from lumigraph.paths.keyframes import CameraPath, Keyframe
+from lumigraph.run import Run, State, build
+
+# What each command is told, and all that it would write.
+FILM = ("film.mp4", "film-depth.mp4", "film.json", "film/")
+WRITES: dict[str, tuple[str, tuple[str, ...]]] = {
+    "render": ("render ball --frames 2 --size 16 --output film.mp4", FILM),
+    "render, where films go": ("render ball --frames 2 --size 16", ("ball/renders/orbit.json", "ball/renders/orbit/")),
+    "render, a run's own name": ("render ball --frames 2 --size 16 --output ball.gif", ("ball.gif", "ball.json")),
+    "export web": ("export web gs page.html", ("page.html",)),
+    "export points": ("export points ball p.ply", ("p.ply",)),
+    "export splats": ("export splats gs s.spz", ("s.spz",)),
+    "export mesh": ("export mesh ball m.glb", ("m.glb",)),
+    "export panorama": ("export panorama ball sphere.png", ("sphere.png",)),
+    "export stereo": ("export stereo ball eyes.jpg", ("eyes.jpg",)),
+    "clean": ("clean gs --output some.ply", ("some.ply", "some.ply.png")),
+    "clean, to a run": ("clean gs --output fewer", ("fewer/",)),
+    "compose": ("compose gs gs --output two.json", ("two.json",)),
+    "report": ("report ball", ("ball/report.html",)),
+    "eval": ("eval ball --scene photographs", ("ball/eval.json", "ball/eval.png")),
+    "eval, pictures": ("eval ball --scene photographs --save-images", ("ball/eval/ball_4.png",)),
+    "explain ray": ("explain ray ball --output ray.svg", ("ray.svg", "ray.json")),
+    "explain encodings": ("explain encodings one.png --output told", ("told/index.html", "told/figures.json")),
+    "bench kernels": ("bench kernels --output speed.json", ("speed.json",)),
+    "bench methods": (
+        "bench methods --methods voxel-grid --scenes photographs --output bench --steps 1",
+        ("bench/results.json", "bench/results.md", "bench/settings.json", "bench/views.png", "bench/lock.json")
+        + ("bench/runs/photographs-voxel-grid-1steps-seed0.log",),
+    ),
+    "train": ("train voxel-grid photographs --steps 1 --output learnt", ("learnt/", "learnt", "learnt/lock.json")),
+    "demo": ("demo --seconds 1 --output shown", ("shown/", "shown")),
+    "capture": ("capture photographs --output placed", ("placed/",)),
+}
+WRITE_NOTHING = {"info", "methods"}
+WITHIN_RUNS = {"resume", "view"}  # see the tests of checkpoints and of what is saved in the viewer
+
+
+@pytest.fixture
+def home(ball_run, ball_folder, tmp_path, monkeypatch):
+    """A folder with two runs, photographs, a picture, and things that nobody may touch."""
+    shutil.copytree(ball_run.folder, tmp_path / "ball")
+    shutil.copytree(ball_folder, tmp_path / "photographs")
+    gs_run(tmp_path / "gs")
+    Image.new("RGB", (16, 16)).save(tmp_path / "one.png")
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def gs_run(folder: Path) -> Run:
+    scene, kind = tiny.scene(), methods.find("gaussian-splatting")
+    method = build(kind, scene.frame, kind.smallest(), torch.device("cpu"), 0)
+    run = Run.create(folder, method, scene)
+    run.save(State(), method, method.optimizers(), torch.Generator())
+    return run
+
+
+def everything(home: Path) -> dict[str, str]:
+    """What lies in a folder, however deep: sums of files, and where links lead."""
+    found = {}
+    for path in sorted(home.rglob("*")):
+        content = os.readlink(path).encode() if path.is_symlink() else b"" if path.is_dir() else path.read_bytes()
+        found[str(path.relative_to(home))] = sha256(content).hexdigest()
+    return found
+
+
+def put_there(place: str, how: str) -> None:
+    """Something that somebody else has put to a path."""
+    path = Path(place.rstrip("/"))
+    path.parent.mkdir(parents=True, exist_ok=True)
+    if how == "link":
+        Path("precious").write_text("precious")
+        path.symlink_to(Path("precious").resolve())
+    elif how == "folder":
+        path.mkdir()
+        (path / "photograph.jpg").write_text("precious")
+    else:
+        path.write_text("precious")
+
+
+HOW = "file", "folder", "link"
+CASES = [(name, place, how) for name, (_, places) in WRITES.items() for place in places for how in HOW]
+
+
+@pytest.mark.parametrize(("name", "place", "how"), CASES, ids=[f"{a}: {b} is a {c}" for a, b, c in CASES])
+def test_what_others_have_put_there_stays(home, capsys, name, place, how):
+    put_there(place, how)
+    before = everything(home)
+    assert main(WRITES[name][0].split()) == 2
+    told = capsys.readouterr()
+    assert told.err.startswith("lumigraph: ") and len(told.err.splitlines()) == 1, told.err
+    assert place.rstrip("/").split("/")[-1] in told.err or name == "capture", told.err
+    assert everything(home) == before
+
+
+def test_every_command_that_writes_is_in_the_table():
+    assert {command.split()[0] for command, _ in WRITES.values()} == set(COMMANDS) - WRITE_NOTHING - WITHIN_RUNS
+
+
+@pytest.mark.parametrize("name", ["render", "export web", "export splats", "compose", "report", "clean"])
+def test_what_it_wrote_itself_is_replaced_until_somebody_changes_it(home, capsys, name):
+    command, places = WRITES[name]
+    (home / "film.partial").mkdir()
+    (home / "film.partial" / "precious").touch()
+    assert main(command.split()) == 0
+    files._granted.clear()  # as in another process
+    assert main(command.split()) == 0
+    assert (home / "film.partial" / "precious").exists()
+    if places[-1].endswith("/"):
+        (home / places[-1] / "notes.txt").write_text("precious")
+        files._granted.clear()
+        before = everything(home)
+        assert main([*command.split(), "--overwrite"]) == 2 and "notes.txt" in capsys.readouterr().err
+        assert everything(home) == before
+        (home / places[-1] / "notes.txt").unlink()
+    with open(home / places[0], "ab") as file:
+        file.write(b"\n")
+    files._granted.clear()
+    before = everything(home)
+    assert main(command.split()) == 2 and "--overwrite" in capsys.readouterr().err
+    assert everything(home) == before
+    assert main([*command.split(), "--overwrite"]) == 0
+
+
+def test_a_run_is_no_folder_of_pictures(home):
+    """Not even one that `clean` has made, every file of which is Lumigraph's."""
+    assert main("clean gs --output fewer".split()) == 0
+    for run in ("gs", "fewer"):
+        before = everything(home)
+        assert main(f"render {run} --frames 2 --size 16 --output {run}.mp4 --overwrite".split()) == 2
+        assert everything(home) == before
+
+
+def test_a_file_of_another_kind_stays(home):
+    """A path that somebody has made in the viewer lies where a film's cameras would go."""
+    row = (1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0)
+    CameraPath((Keyframe(row, 40.0, 0.0),)).save(home / "film.json")
+    files._granted.clear()
+    before = everything(home)
+    assert main(WRITES["render"][0].split()) == 2
+    assert everything(home) == before
+
+
+def test_what_a_command_reads_stays_even_where_it_may_overwrite(home, capsys):
+    assert main("export splats gs own.ply".split()) == 0
+    assert main("compose own.ply gs --output own.json".split()) == 0
+    before = everything(home)
+    for command in (
+        "clean own.ply --output own.ply",
+        "export splats own.ply own.ply",
+        "export points own.ply own.ply",
+        "compose own.json gs --output own.json",
+        "render own.json --frames 2 --size 16 --output own.gif",
+    ):
+        capsys.readouterr()
+        assert main([*command.split(), "--overwrite"]) == 2 and "is what the command reads" in capsys.readouterr().err
+    assert everything(home) == before
+
+
+def test_saving_in_the_viewer_replaces_nothing(home):
+    from lumigraph.commands.view import saver
+    from lumigraph.run import open_any
+
+    save = saver(open_any(home / "gs"))
+    (home / "mine.ply").write_text("precious")
+    with pytest.raises(LumigraphError, match=r"mine\.ply is there already"):
+        save("mine.ply", None, {})
+    with pytest.raises(LumigraphError, match="photographs is there already"):
+        save("photographs", None, {})
+    assert (home / "mine.ply").read_text() == "precious" and save("ours.ply", None, {}).endswith("ours.ply")
+    with pytest.raises(LumigraphError, match="is there already"):
+        save("ours.ply", None, {})
+
+
+def test_what_lies_among_checkpoints_stays(ball_run, tmp_path):
+    shutil.copytree(ball_run.folder, tmp_path / "ball")
+    run = Run(tmp_path / "ball")
+    folder = run.folder / "checkpoints"
+    for copy in ("backup", "000001", "000002.partial", "1 (copy)"):
+        shutil.copytree(folder / "000060", folder / copy)
+    for noted in ("000001", "000002.partial"):
+        (folder / noted / "notes.txt").write_text("precious")
+    (folder / "000003").symlink_to(tmp_path)
+    before = everything(folder)
+    method = run.method()
+    run.save(State(61, 1.0), method, method.optimizers(), torch.Generator())
+    after = everything(folder)
+    assert {name: after.get(name) for name in before if not name.startswith("000060")} == {
+        name: what for name, what in before.items() if not name.startswith("000060")
+    }
+    assert run.state.step == 61 and not (folder / "000060").exists()
+
+
+def test_a_capture_clears_away_its_own_alone(tmp_path):
+    photos, scene = tmp_path / "photos", tmp_path / "scene"
+    photos.mkdir()
+    for name in "ab":
+        Image.new("RGB", (8, 8)).save(photos / f"{name}.jpg")
+    given = [Photo(f"{name}.jpg", photos / f"{name}.jpg", (8, 8)) for name in "ab"]
+    copy_photographs(given, scene / "images", untracked)
+    Image.new("RGB", (8, 8)).save(scene / "images" / "mine.jpg")
+    copy_photographs(given[:1], scene / "images", untracked)
+    assert names(scene / "images") == ["a.jpg", "mine.jpg"]
+    claim_results(scene)
+    for name in WRITTEN:
+        (scene / name).write_text("precious")
+        with pytest.raises(LumigraphError, match="is there already"):
+            claim_results(scene)
+        (scene / name).unlink()
+    (scene / "sparse" / "1").mkdir(parents=True)
+    with pytest.raises(LumigraphError, match="something else in it"):
+        claim_results(scene)
+
+
+def test_somebody_elses_record_stays(tmp_path):
+    (tmp_path / marks.NAME).write_text("precious")
+    files.write_bytes(tmp_path / "a", b"1")
+    files.write_bytes(tmp_path / "a", b"2")  # by the same process
+    files._granted.clear()
+    with pytest.raises(LumigraphError, match="is there already"):
+        files.write_bytes(tmp_path / "a", b"3")
+    assert (tmp_path / marks.NAME).read_text() == "precious" and (tmp_path / "a").read_bytes() == b"2"
+
+
+def test_half_a_line_of_the_record_is_passed_over(tmp_path):
+    files.write_bytes(tmp_path / "a", b"1")
+    with open(tmp_path / marks.NAME, "ab") as record:
+        record.write(b'\n{"name": "b", "ki')
+    files.write_bytes(tmp_path / "c", b"1")
+    assert marks.is_ours(tmp_path / "a", "file") and marks.is_ours(tmp_path / "c", "file")
+    (tmp_path / "a").write_bytes(b"2")
+    assert not marks.is_ours(tmp_path / "a", "file")
+
+
+def test_what_came_meanwhile_stays_and_nothing_is_lost(tmp_path):
+    path, folder = tmp_path / "film.mp4", tmp_path / "film"
+    with pytest.raises(LumigraphError, match=r"film\.mp4 has been changed .* made is .*film-2\.mp4"):
+        with files.replacing(path) as new:
+            new.write_bytes(b"ours")
+            path.write_bytes(b"precious")
+    assert path.read_bytes() == b"precious" and (tmp_path / "film-2.mp4").read_bytes() == b"ours"
+    with pytest.raises(LumigraphError, match="what was made is"), files.replacing_folder(folder) as new:
+        (new / "0.png").write_bytes(b"ours")
+        put_there(str(folder), "folder")
+    assert names(folder) == ["photograph.jpg"] and names(tmp_path / "film-2") == ["0.png"]
+
+
+def test_leftovers_of_killed_processes_go_and_others_stay(tmp_path):
+    """A name of that form is a leftover only if no living process holds its lock."""
+    dead = tmp_path / ".lumigraph-0123456789abcdef.partial"
+    dead.mkdir()
+    (dead / "half").touch()
+    for theirs in ("x.partial", ".lumigraph-mine.partial", ".lumigraph-0123456789ABCDEF.partial"):
+        put_there(str(tmp_path / theirs), "folder")
+    reading, writing = os.pipe()
+    child = os.fork()
+    if child == 0:
+        with partials.partial(tmp_path):
+            os.write(writing, b"!")
+            signal_never_comes()
+    os.read(reading, 1)
+    before = set(names(tmp_path))
+    partials._swept.clear()
+    files.write_bytes(tmp_path / "a", b"1")
+    assert set(names(tmp_path)) == {*before, "a"} - {dead.name}
+    os.kill(child, 9)
+    os.waitpid(child, 0)
+    partials._swept.clear()
+    files.write_bytes(tmp_path / "a", b"2")
+    left = {".lumigraph-0123456789ABCDEF.partial", ".lumigraph-mine.partial", "x.partial"}
+    assert set(names(tmp_path)) == {"a", *left}
+
+
+def signal_never_comes() -> None:
+    while True:
+        os.read(os.pipe()[0], 1)
