@@ -131,7 +131,8 @@ def typed(kind: type[Kind], value: Any, where: Path | str) -> Kind:
         name = path.rstrip("`").lstrip(".")
         found, wanted = found_at(kind, value, name) if name else (value, kind)
         what = f"{name} is {shown(found)}" if name else f"it holds {shown(found)}"
-        should = f"should be from {domain(wanted)}" if re.match(r"Expected `\w+` [<>]", fault) else fault
+        beyond = domain(wanted) and re.match(r"Expected `\w+` [<>]", fault)
+        should = f"and should be from {domain(wanted)}" if beyond else fault[:1].lower() + fault[1:]
         raise LumigraphError(f"{where} does not hold what it should: {what}, {should}") from error
     if is_dataclass(made):
         coherent(made)

@@ -41,7 +41,6 @@ class Clean:
         from ..run import open_any
         from ..run.picking import check_output, save_picked
 
-        self.part.check()
         opened, device = open_any(self.source), choose_device(self.device)
         check_output(opened, self.output, self.overwrite, [self.source])
         beside = self.output.with_name(f"{self.output.name}.png")

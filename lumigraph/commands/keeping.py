@@ -50,7 +50,7 @@ class Keeping:
         return usual | given if self.clean else given
 
     def check(self) -> None:
-        """Raises LumigraphError for what holds nothing or makes no sense, before anything is opened."""
+        """Raises LumigraphError for numbers that contradict each other."""
         if self.box is not None and self.sphere is not None:
             raise LumigraphError("--box and --sphere are two ways to crop; give one of them")
         if self.box is not None and not all(a < b for a, b in zip(self.box[:3], self.box[3:], strict=True)):

@@ -48,8 +48,11 @@ def with_range(kind: Any) -> Any:
     if not (range := domain(kind)):
         return kind
     hints = [x.help_behavior_hint for x in get_args(kind)[1:] if getattr(x, "help_behavior_hint", None) is not None]
-    said = hints[-1] if hints else "(default: {})"
-    hint = lambda default: f"{said.format(default)[:-1]}; {range})" if said else f"({range})"  # noqa: E731
+
+    def hint(default: str) -> str:
+        said = hints[-1] if hints else f"(default: {default})"
+        return f"{said[:-1]}; {range})" if said else f"({range})"
+
     return Annotated[kind, arg(help_behavior_hint=hint)]
 
 

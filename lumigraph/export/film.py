@@ -37,7 +37,8 @@ def film(method: Method | Sequence[Method], cameras: Camera, path: Path, fps: fl
     assert len(shown) == len(cameras), f"{len(shown)} methods for {len(cameras)} frames"
     for one in shown:
         one.eval()
-    ask_for_picture(*cameras.size[0].tolist(), shown[0].device)
+    width, height = cameras.size[0].tolist()
+    ask_for_picture(width, height, shown[0].device)
     within = film_depth_range(shown, cameras)
     with contextlib.ExitStack() as stack:
         targets = [

@@ -25,6 +25,8 @@ def check_memory(kind: type[Method], frame: Frame, config: Any, device: torch.de
 
     def remedy() -> str:
         smaller = {name: needed(less) for name, less in halved(config)}
+        if not smaller:
+            return "end other programs"
         name = min(smaller, key=smaller.__getitem__)
         return f"give a smaller --{name.replace('_', '-')} than {getattr(config, name):,}"
 
@@ -34,7 +36,8 @@ def check_memory(kind: type[Method], frame: Frame, config: Any, device: torch.de
 def bytes_of(kind: type[Method], frame: Frame, config: Any, learning: bool) -> int:
     """Bytes of a method's parameters, with all that learning keeps of each, of its buffers, and `further_bytes`.
 
-    The method is built of tensors without memory. 0 where it looks at their values, and so cannot be built that way.
+    The method is built of tensors without memory. Where it looks at their values, and so cannot be built that way, only
+    `further_bytes` is known.
     """
     further = kind.further_bytes(frame, config, learning)
     try:

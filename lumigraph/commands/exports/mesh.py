@@ -66,7 +66,6 @@ class ExportMesh:
     """auto, cpu, cuda, cuda:1."""
 
     def run(self) -> int:
-        self._check()
         from ...export.mesh import extract_mesh
         from ...export.mesh_file import ending, write_mesh
 
@@ -100,8 +99,7 @@ class ExportMesh:
         )
         return 0
 
-    def _check(self) -> None:
-        """Raises LumigraphError for numbers that contradict each other, before anything is opened."""
+    def check(self) -> None:
+        """Raises LumigraphError for numbers that contradict each other."""
         if self.extent is not None and self.part.crops:
             raise LumigraphError("--extent and a crop both say how much is meshed; give one of them")
-        self.part.check()

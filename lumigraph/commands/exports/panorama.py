@@ -50,7 +50,6 @@ class ExportPanorama:
 
         picture_format(self.output)
         sphere_size(self.size)
-        self.part.check()
         claim(self.output, "panorama", self.overwrite, [self.source])
         opened, method, cameras = open_method(self.source, self.device, self.told)
         method = self.part.of_method(method)

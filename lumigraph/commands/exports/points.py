@@ -42,7 +42,6 @@ class ExportPoints:
     def run(self) -> int:
         if self.output.suffix.lower() != ".ply":
             raise LumigraphError(f"{self.output} should end in .ply, the one kind of point cloud there is; rename it")
-        self.part.check()
         claim(self.output, "points", self.overwrite, [self.source])
         from ...export.points import extract_points, write_points
 

@@ -38,7 +38,6 @@ class ExportSplats:
         from ...run import open_any
         from ...run.splat_file import frame_of
 
-        self.part.check()
         check_ending(self.output)
         claim(self.output, "splats", self.overwrite, [self.source])
         if is_splat_file(self.source):

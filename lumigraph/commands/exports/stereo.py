@@ -48,7 +48,6 @@ class ExportStereo:
 
         picture_format(self.output)
         sphere_size(self.size)
-        self.part.check()
         claim(self.output, "panorama", self.overwrite, [self.source])
         opened, method, cameras = open_method(self.source, self.device, self.told)
         method = self.part.of_method(method)

@@ -84,8 +84,8 @@ def around(view: FlatView, known: Float[Tensor, "point 3"]) -> tuple[float, floa
 def swept(views: Sequence[FlatView], ranges: Sequence[tuple[float, float]], what: str, seconds: float) -> Points:
     """What the views find, where their neighbours agree: all views, or as many as can be swept in so many seconds."""
     if seconds < math.inf:
-        kept = evenly(list(range(len(views))), affordable(views, ranges, seconds))
-        views, ranges = [views[i] for i in kept], [ranges[i] for i in kept]
+        some = evenly(list(range(len(views))), affordable(views, ranges, seconds))
+        views, ranges = [views[i] for i in some], [ranges[i] for i in some]
     neighbours = choose_neighbours(views, ranges)
     depths = []
     for i in track(range(len(views)), what, len(views)):
