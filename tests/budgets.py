@@ -41,6 +41,7 @@ SHARES: dict[str, tuple[str, float]] = {
     "test_gpu_compiles": ("kernels", 10),
     "test_capture_motion": ("nouns, capture", 20),
     "test_capture": ("nouns, capture", 10),
+    "test_fuzz": ("nouns, capture", 10),
     "test_mesh": ("exports, viewer, web", 25),
     "test_web": ("exports, viewer, web", 15),
     "test_viewer_page": ("exports, viewer, web", 20),

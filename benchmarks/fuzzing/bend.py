@@ -1,0 +1,251 @@
+"""Files made wrong: bytes of any, values of JSON, words of texts, and the headers of formats that have some."""
+
+from __future__ import annotations
+
+import copy
+import gzip
+import json
+import random
+import re
+import struct
+import zlib
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+from . import nasty
+
+EXTREMES = [b"\xff" * 8, b"\0" * 8, b"\xff" * 3 + b"\x7f" + b"\0" * 4, struct.pack("<d", float("nan"))]
+EXTREMES += [struct.pack("<Q", n) for n in (2**31, 2**32, 10**9, 10**12, 2**62, 2**63)]
+EXTREMES += [struct.pack("<ff", *pair) for pair in ((float("nan"), float("inf")), (1e38, -1e38), (0.0, -1.0))]
+COUNTS = [b"0", b"-1", b"1", b"7", b"100000000", b"4294967296", b"99999999999999999999", b"1e9", b"nan", b"x", b""]
+FORMATS_WITH_PLY_TYPES = [b"float", b"double", b"uchar", b"int", b"list uchar int", b"list int float", b"half", b""]
+BOMB = 1 << 26  # zeros in one piece of a stream
+
+Bend = Callable[[bytes, random.Random], bytes]
+
+
+def bend(path: Path, chance: random.Random) -> str:
+    """Change a file in place. Gives the name of what was done to it."""
+    data = path.read_bytes()
+    ways = [*WAYS.get(path.suffix.lower(), ()), raw]
+    way = chance.choices(ways, [3.0] * (len(ways) - 1) + [1.0])[0]
+    for _ in range(chance.choice((1, 1, 1, 2, 3))):
+        data = way(data, chance)
+    path.write_bytes(data)
+    return way.__name__
+
+
+def raw(data: bytes, chance: random.Random) -> bytes:
+    """Bytes, whatever they mean: cut, flipped, repeated, lost, or replaced by extreme numbers."""
+    if not data:
+        return chance.randbytes(64)
+    size, at = len(data), int(len(data) * chance.random() ** 3)  # headers matter more
+    some = min(size - at, chance.choice((1, 4, 8, 64, 1000)))
+    way = chance.randrange(10)
+    if way == 0:
+        return data[:at]
+    if way == 1:
+        return b""
+    if way == 2:
+        return data[:at] + data[at + some :]
+    if way == 3:
+        return data[:at] + data[at : at + some] * chance.choice((2, 100)) + data[at + some :]
+    if way == 4:
+        return data[:at] + chance.randbytes(some) + data[at + some :]
+    if way == 5:
+        return data + chance.randbytes(chance.choice((1, 7, 5000)))
+    if way == 6:
+        return chance.randbytes(min(size, 4096))
+    if way == 7:
+        flipped = bytearray(data)
+        for _ in range(chance.choice((1, 3, 30))):
+            flipped[int(size * chance.random() ** 2)] ^= 1 << chance.randrange(8)
+        return bytes(flipped)
+    extreme = chance.choice(EXTREMES)[: chance.choice((1, 2, 4, 8))]
+    at -= at % len(extreme)
+    return data[:at] + extreme + data[at + len(extreme) :]
+
+
+def values(data: bytes, chance: random.Random) -> bytes:
+    """JSON with one value replaced, lost, doubled, nested or renamed."""
+    try:
+        return nasty.dumped(bent(json.loads(data), chance))
+    except (ValueError, RecursionError):
+        return raw(data, chance)
+
+
+def bent(data: Any, chance: random.Random) -> Any:
+    """A copy of plain data that differs in one place, chosen so that shallow ones are as likely as deep ones."""
+    if not isinstance(data, dict | list) or not data or chance.random() < 0.06:
+        return nasty.value(chance, data)
+    keys = list(data) if isinstance(data, dict) else range(len(data))
+    key = chance.choice(keys)
+    if chance.random() < 0.5:
+        result = copy.copy(data)
+        result[key] = bent(data[key], chance)
+        return result
+    result, way = copy.deepcopy(data), chance.randrange(7)
+    if way == 0:
+        del result[key]
+    elif way == 1:
+        result[key] = {"a": result[key]} if chance.random() < 0.5 else [result[key]]
+    elif way == 2 and isinstance(result, list):
+        result.insert(key, copy.deepcopy(result[key]))
+    elif way == 3 and isinstance(result, dict):
+        result[chance.choice([*nasty.TEXTS, *nasty.PATHS])] = result.pop(key)
+    elif way == 4:
+        other = chance.choice(keys)
+        result[key], result[other] = result[other], result[key]
+    elif way == 5 and isinstance(result, dict):
+        result[chance.choice(nasty.TEXTS)] = nasty.value(chance)
+    else:
+        result[key] = nasty.value(chance, result[key])
+    return result
+
+
+def rows(data: bytes, chance: random.Random) -> bytes:
+    """Lines of JSON, one of them changed."""
+    lines = data.splitlines(keepends=True)
+    at = chance.randrange(len(lines) or 1)
+    return b"".join([*lines[:at], values(lines[at] if lines else b"{}", chance) + b"\n", *lines[at + 1 :]])
+
+
+def words(data: bytes, chance: random.Random) -> bytes:
+    """A text with a word or a line replaced, lost or doubled."""
+    way, parts = chance.randrange(4), re.split(rb"(\s+)", data)
+    at = 2 * chance.randrange((len(parts) + 1) // 2)
+    if way == 0:
+        lines = data.splitlines(keepends=True) or [b""]
+        at = chance.randrange(len(lines))
+        return b"".join([*lines[:at], *lines[at : at + 1] * chance.choice((0, 2, 50)), *lines[at + 1 :]])
+    if way == 1:
+        parts[at] = b""
+    else:
+        word = chance.choice([*map(str, nasty.NUMBERS), *nasty.TEXTS, *nasty.PATHS, "1" * 5000])
+        parts[at] = word.encode("utf-8", errors="replace")
+    return b"".join(parts)
+
+
+def png(data: bytes, chance: random.Random) -> bytes:
+    """A picture that says it is larger, of other bits or colours than it is; its checksum agrees."""
+    size = [chance.choice((0, 1, 3, 30000, 100000, 2**31 - 1, 2**32 - 1)) for _ in range(2)]
+    fields = list(struct.unpack(">IIBBBBB", data[16:29])) if len(data) > 33 else [1, 1, 8, 2, 0, 0, 0]
+    for at in chance.sample(range(7), chance.choice((1, 1, 2))):
+        fields[at] = size[at] if at < 2 else chance.choice((0, 1, 2, 3, 4, 6, 16, 255))
+    header = b"IHDR" + struct.pack(">IIBBBBB", *fields)
+    return data[:12] + header + struct.pack(">I", zlib.crc32(header)) + data[33:]
+
+
+def ply(data: bytes, chance: random.Random) -> bytes:
+    """A header that promises something else."""
+    head, mark, body = data.partition(b"end_header\n")
+    lines, way = head.splitlines(), chance.randrange(5)
+    at = chance.randrange(len(lines) or 1)
+    if not lines or way == 0:
+        return words(head, chance) + mark + body
+    if way == 1:
+        counted = [i for i, line in enumerate(lines) if line.startswith(b"element")]
+        if counted:
+            at = chance.choice(counted)
+            lines[at] = b" ".join([*lines[at].split()[:2], chance.choice(COUNTS)])
+    elif way == 2:
+        kind = chance.choice(FORMATS_WITH_PLY_TYPES)
+        lines[at] = b"property " + kind + b" " + lines[at].split()[-1] if lines[at].split() else kind
+    elif way == 3:
+        lines[at : at + 1] = [lines[at]] * chance.choice((0, 2, 300))
+    else:
+        kinds = (b"ascii", b"binary_little_endian", b"binary_big_endian", b"nonsense")
+        lines[1:2] = [b"format " + chance.choice(kinds) + b" 1.0"]
+    return b"\n".join(lines) + b"\n" + mark + body
+
+
+def npy(data: bytes, chance: random.Random) -> bytes:
+    """An array of other numbers, of another shape or kind than there is, or that promises what is not there."""
+    import io
+
+    import numpy as np
+
+    way = chance.randrange(4)
+    if way == 0:
+        return words(data[:128], chance).ljust(128) + data[128:]
+    if way == 1:
+        kinds = (b"<f4", b"<i8", b"|S8", b"<c16", b"|O", b"|b1", b"<U4", b"<f2", b">f8", b"|V8", b"<M8", b"|u1")
+        return data[:128].replace(b"<f8", chance.choice(kinds)) + data[128:]
+    if way == 2:
+        shapes = (b"(0, 17)", b"(10,)", b"(100000000000, 17)", b"(-1, 17)", b"()", b"(10, 17, 1)", b"(99999999999999,)")
+        head = re.sub(rb"\(\d+, \d+\)", chance.choice(shapes), data[:128])[:127].ljust(127) + b"\n"
+        return head + data[128:]
+    try:
+        table = np.load(io.BytesIO(data), allow_pickle=False)
+        table.flat[chance.randrange(table.size)] = float(chance.choice([n for n in nasty.NUMBERS if abs(n) < 1e301]))
+    except (ValueError, OSError, EOFError, TypeError, OverflowError, IndexError):
+        return raw(data, chance)
+    kept = io.BytesIO()
+    np.save(kept, table)
+    return kept.getvalue()
+
+
+def safetensors(data: bytes, chance: random.Random) -> bytes:
+    """Tensors whose header is not what it was."""
+    if len(data) < 8:
+        return raw(data, chance)
+    (length,) = struct.unpack_from("<Q", data)
+    header = values(data[8 : 8 + length], chance)
+    return struct.pack("<Q", len(header)) + header + data[8 + length :]
+
+
+def numbers(data: bytes, chance: random.Random) -> bytes:
+    """Tensors some of whose numbers are extreme."""
+    if len(data) < 64:
+        return raw(data, chance)
+    changed, begin = bytearray(data), min(8 + struct.unpack_from("<Q", data)[0], len(data) - 16)
+    for _ in range(chance.choice((1, 10, 1000))):
+        at = chance.randrange(begin, len(data) - 8) & ~3
+        changed[at : at + 4] = struct.pack("<f", chance.choice((float("nan"), float("inf"), 1e38, -1e38, -1e30, 1e-45)))
+    return bytes(changed)
+
+
+def zipped(data: bytes, chance: random.Random) -> bytes:
+    """What is inside a stream of gzip, changed."""
+    try:
+        inside = gzip.decompress(data)
+    except (OSError, EOFError, zlib.error):
+        return raw(data, chance)
+    return gzip.compress(raw(inside, chance), 1)
+
+
+def bomb(data: bytes, chance: random.Random) -> bytes:
+    """A small stream that unpacks to gigabytes, behind a header that says so or does not."""
+    header = bytearray(zlib.decompressobj(31).decompress(data, 16) if data[:2] == b"\x1f\x8b" else 16)
+    if chance.random() < 0.7:
+        header[8:12] = struct.pack("<I", chance.choice((10**8, 10**7, 2**31, 2**32 - 1)))
+    return gzip.compress(bytes(header), 1) + zeros() * 100
+
+
+@cache
+def zeros() -> bytes:
+    return gzip.compress(bytes(BOMB), 9)
+
+
+def counts(data: bytes, chance: random.Random) -> bytes:
+    """A binary model whose first number, how many there are, or one of those that follow, is another."""
+    at = 0 if chance.random() < 0.5 else 8 * chance.randrange(1, 6)
+    return data[:at] + chance.choice(EXTREMES) + data[at + 8 :]
+
+
+WAYS: dict[str, tuple[Bend, ...]] = {
+    ".json": (values,),
+    ".gltf": (values,),
+    ".jsonl": (rows,),
+    ".txt": (words,),
+    ".obj": (words,),
+    ".off": (words,),
+    ".png": (png,),
+    ".ply": (ply,),
+    ".npy": (npy,),
+    ".safetensors": (safetensors, numbers),
+    ".spz": (zipped, zipped, bomb),
+    ".bin": (counts,),
+}
