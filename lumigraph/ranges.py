@@ -97,7 +97,7 @@ def hints(kind: Any) -> dict[str, Any]:
 def outside(value: Any) -> Iterator[tuple[str, Any, Any]]:
     """The fields of a dataclass, and of dataclasses in it, whose numbers are none or beyond their ranges, as
     (name, annotation, value)."""
-    for name, kind in hints(type(value)).items():
+    for name, kind in hints(value.__class__).items():
         found = getattr(value, name)
         if is_dataclass(found):
             yield from outside(found)
@@ -111,7 +111,7 @@ def outside(value: Any) -> Iterator[tuple[str, Any, Any]]:
 def coherent(value: Any) -> None:
     """Ask a dataclass, and dataclasses in it, whether their numbers agree: the `check` of those that have one raises
     LumigraphError."""
-    for name in hints(type(value)):
+    for name in hints(value.__class__):
         if is_dataclass(inner := getattr(value, name)):
             coherent(inner)
     if hasattr(value, "check"):

@@ -55,7 +55,7 @@ def bytes_of(kind: type[Method], frame: Frame, config: Any, learning: bool) -> i
 def halved(config: Any) -> list[tuple[str, Any]]:
     """A Config with each of its whole numbers at half its value, or at the least that its range allows, by name."""
     found = []
-    for name, kind in hints(type(config)).items():
+    for name, kind in hints(config.__class__).items():
         ranges = [range for number, range in numbers(kind) if number is int and range is not None]
         if ranges and isinstance(value := getattr(config, name), int):
             found.append((name, replace(config, **{name: max(value // 2, int(ranges[0].ge or 0))})))
