@@ -37,7 +37,7 @@ class Here:
     def __call__(self, arguments: Sequence[str], log: Path) -> int:
         self.seen.append(arguments[0])
         log.parent.mkdir(parents=True, exist_ok=True)
-        log.write_text("lumigraph: it did not like the weather\n")
+        log.write_text("$ lumigraph told\nlumigraph: it did not like the weather\n")
         code = main([*arguments, *self.more])
         return code if self.code is None else self.code
 
