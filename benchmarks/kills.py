@@ -34,6 +34,7 @@ from fuzzing.watched import Ended, Limits, begun, still_there, watch
 
 CLOUD, SCENE = "given/run", "given/scene"
 TRAIN = ["train", "gaussian-splatting", SCENE, "--steps", "30", "--device", "cpu", *SMALL["gaussian-splatting"]]
+EARLY = 0.9  # of the time that a command takes alone: kills come before
 RECORD = "*.lumigraph"  # of what Lumigraph wrote in a folder
 
 
@@ -171,9 +172,9 @@ def one(task: tuple[str, int, int, float, Path, Path]) -> Kill:
     begin = time.perf_counter()
     child = begun(lambda: warm.run(work.words), folder, notes)
     if chance.random() < 0.5:
-        wait(child, chance.random() * longest)
+        wait(child, chance.random() * EARLY * longest)
     else:
-        wait(child, chance.random() * longest, folder, before)
+        wait(child, chance.random() * EARLY * longest, folder)
         time.sleep(chance.random() * 0.03)
     ended = os.waitpid(child, os.WNOHANG)
     moment = time.perf_counter() - begin
@@ -188,7 +189,7 @@ def one(task: tuple[str, int, int, float, Path, Path]) -> Kill:
     return Kill(name, number, which.name, moment, done, partial, fault)
 
 
-def wait(child: int, seconds: float, folder: Path | None = None, before: dict[str, bytes] | None = None) -> None:
+def wait(child: int, seconds: float, folder: Path | None = None) -> None:
     """Wait until a command has run for so long or is done; with a folder, until something in it changes after that
     share of the way."""
     begin, last = time.perf_counter(), None
