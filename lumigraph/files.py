@@ -8,12 +8,14 @@ all that is in it. Commands ask by `claim` before any work; whoever writes asks 
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import errno
 import itertools
 import json
 import os
 import re
 import stat
+import sys
 from collections.abc import Callable, Iterable, Iterator
 from itertools import accumulate
 from pathlib import Path
@@ -28,6 +30,7 @@ from .partials import partial
 from .partials import remove as remove
 from .ranges import typed
 
+HERE, EXCHANGE = -100, 2  # AT_FDCWD, RENAME_EXCHANGE
 NUMBERS = re.compile(r"\[[-+.eE\d,\s]*\]")
 DEEPEST = 100  # levels that JSON may nest; whoever walks through it again has room for them
 BUT_BRACKETS = bytes(set(range(256)) - set(b"[]{}"))
@@ -133,17 +136,25 @@ def replacing_folder(path: Path, kind: Kind | None = None, ours: bool = False) -
 
 
 def exchange(new: Path, place: Path) -> None:
-    """Put a folder into a place, and delete what was there."""
-    with partial(place.parent, is_folder=True) as aside:
-        old = aside / place.name
-        if seen(place) is not None:
+    """Put a folder into a place. What was there has the folder's name afterwards, and is deleted with it."""
+    if seen(place) is None:
+        os.replace(new, place)
+    elif not swapped(new, place):  # no such call: a kill between these two costs what was there, and was to go
+        with partial(place.parent, is_folder=True) as aside:
+            old = aside / place.name
             os.replace(place, old)
-        try:
-            os.replace(new, place)
-        except BaseException:
-            if seen(old) is not None:
-                os.replace(old, place)
-            raise
+            try:
+                os.replace(new, place)
+            except BaseException:
+                if seen(old) is not None:
+                    os.replace(old, place)
+                raise
+
+
+def swapped(one: Path, other: Path) -> bool:
+    """Let two paths change places in one step; False where the system has no such call (Linux has `renameat2`)."""
+    call = getattr(ctypes.CDLL(None), "renameat2", None) if sys.platform == "linux" else None
+    return call is not None and call(HERE, os.fsencode(one), HERE, os.fsencode(other), EXCHANGE) == 0
 
 
 def place_now(path: Path, ask: Callable[[], None]) -> Path:

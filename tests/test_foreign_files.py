@@ -294,3 +294,14 @@ def test_leftovers_of_killed_processes_go_and_others_stay(tmp_path):
 def signal_never_comes() -> None:
     while True:
         os.read(os.pipe()[0], 1)
+
+
+@pytest.mark.parametrize("can_swap", [True, False])
+def test_a_folder_takes_the_place_of_its_forerunner(tmp_path, monkeypatch, can_swap):
+    if not can_swap:
+        monkeypatch.setattr(files, "swapped", lambda one, other: False)
+    for name in ("first.png", "second.png"):
+        with files.replacing_folder(tmp_path / "film", "pictures of a film") as new:
+            (new / name).write_bytes(b"picture")
+    assert sorted(path.name for path in tmp_path.rglob("*.png")) == ["second.png"]
+    assert [path.name for path in tmp_path.iterdir()] == ["film"]
