@@ -172,7 +172,7 @@ def test_state_json(run):
 
 
 def test_eval_json(run):
-    files.write_json(run.folder / "eval.json", EVALUATION)
+    files.write_json(run.folder / "eval.json", EVALUATION, ours=True)
 
     def shown() -> None:
         said = run.evaluation()
@@ -197,19 +197,21 @@ def test_camera_paths_and_compositions(tmp_path):
     pose = [[1.0, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]]
     keys = [{"pose": pose, "fov": 50.0, "seconds": 0.0}, {"pose": pose, "fov": 50.0, "seconds": 1.0}]
     path = tmp_path / "path.json"
-    files.write_json(path, {"format": "lumigraph camera path 1", "keyframes": keys, "loop": False, "fps": 30.0})
+    files.write_json(
+        path, {"format": "lumigraph camera path 1", "keyframes": keys, "loop": False, "fps": 30.0}, ours=True
+    )
     fly = lambda: CameraPath.load(path).cameras(Frame(), (16, 16), 3)  # noqa: E731
     assert try_all(path, fly) > 50
     lens = Pinhole(torch.full((2, 2), 20.0), torch.full((2, 2), 8.0)).to_json()
     film = {"poses": [pose, pose], "lens": lens, "size": [16, 16], "fps": 30.0, "times": [0.0, 1.0]}
-    files.write_json(path, {**film, "source_from_scene": [*pose, [0, 0, 0, 1]]})
+    files.write_json(path, {**film, "source_from_scene": [*pose, [0, 0, 0, 1]]}, ours=True)
     assert try_all(path, fly) > 50
     place = {"scale": 0.3, "rotation": [1, 0, 0, 0], "translation": [0.5, 0, -0.4]}
     parts = [
         {"source": "a.ply", "place": place, "box": [[-1, -1, 0], [1, 1, 1]]},
         {"source": "b", "place": [*pose, [0, 0, 0, 1]]},
     ]
-    files.write_json(path, {"format": "lumigraph composition 1", "lead": 0, "parts": parts})
+    files.write_json(path, {"format": "lumigraph composition 1", "lead": 0, "parts": parts}, ours=True)
     assert try_all(path, lambda: read_composition(path)) > 50
 
 
@@ -241,7 +243,7 @@ def transforms(folder: Path, **more: Any) -> Path:
     }
     for name in ("train", "test"):
         (folder / f"transforms_{name}.json").unlink()
-    files.write_json(folder / "transforms.json", said)
+    files.write_json(folder / "transforms.json", said, ours=True)
     return folder
 
 
@@ -255,7 +257,7 @@ def test_blender_transforms(ball_folder, tmp_path):
     folder = opaque(Path(shutil.copytree(ball_folder, tmp_path / "ball")))
     file = folder / "transforms_test.json"
     said = json.loads(file.read_text())
-    files.write_json(file, said | {"frames": said["frames"][:1]})
+    files.write_json(file, said | {"frames": said["frames"][:1]}, ours=True)
     assert try_all(file, lambda: judged(blender.read(folder)), every=3) > 10
 
 
@@ -278,7 +280,7 @@ def test_lenses(kind, tmp_path):
         "equirectangular": Equirectangular(two),
         "mixed": mix([Pinhole(two[:1], two[:1]), Equirectangular(two[:1])]),
     }
-    files.write_json(tmp_path / "lens.json", lenses[kind].to_json())
+    files.write_json(tmp_path / "lens.json", lenses[kind].to_json(), ours=True)
     assert (
         try_all(
             tmp_path / "lens.json",
@@ -320,7 +322,7 @@ def test_options_of_a_run_are_those_that_are_known(run):
         {"scales": 10**9},
         {"views": 1.5},
     ):
-        files.write_json(run.folder / "config.json", said | {"scene": said["scene"] | {"options": options}})
+        files.write_json(run.folder / "config.json", said | {"scene": said["scene"] | {"options": options}}, ours=True)
         with pytest.raises(LumigraphError, match=r"scene\.options"):
             Run(run.folder)
 
@@ -339,7 +341,7 @@ def test_an_optimizer_that_does_not_fit_is_refused(run):
     said = json.loads((folder / "state.json").read_text())
     total = checksum(data)
     said["files"]["optimizer.safetensors"] = {"bytes": total.bytes, "crc32": total.crc32}
-    files.write_json(folder / "state.json", said)
+    files.write_json(folder / "state.json", said, ours=True)
     with pytest.raises(LumigraphError, match="has shape"):
         resume(run)
 
@@ -460,7 +462,7 @@ def test_scenes_of_absurd_size_open_or_are_refused(scale, tmp_path):
     for frame in said["frames"]:
         for row in frame["transform_matrix"][:3]:
             row[3] *= scale
-    files.write_json(folder / "transforms.json", said)
+    files.write_json(folder / "transforms.json", said, ours=True)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", LumigraphWarning)
         try:
