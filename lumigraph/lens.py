@@ -132,8 +132,9 @@ class Lens(ABC):
     def _from_json(cls, data: dict[str, Any], where: Any) -> Lens:
         found = {}
         for name, shape in typing.get_type_hints(cls).items():
-            if name in data and hasattr(shape, "dim_str"):  # as in "camera 2"
-                row: Any = tuple[(float,) * int(shape.dim_str.split()[-1])]  # type: ignore[misc]
+            if name in data and hasattr(shape, "dim_str"):  # as in "camera 2", or "camera" alone
+                _, *numbers = shape.dim_str.split()
+                row: Any = tuple[(float,) * int(numbers[0])] if numbers else float  # type: ignore[misc]
                 found[name] = torch.tensor(typed(list[row], data[name], f"{where}: {name}"), dtype=torch.float32)
         lacking = [x.name for x in fields(cls) if x.name not in found and x.default is MISSING]  # type: ignore[arg-type]
         if lacking or len({len(values) for values in found.values()}) != 1:

@@ -238,7 +238,7 @@ def test_the_command(ball_folder, tmp_path, capsys):
     ("more", "why"),
     [
         (["--steps", "3", "--seconds", "3"], "give one of them"),
-        (["--steps", "0"], "above 0"),
+        (["--steps", "0"], "from 1 to"),
         (["--eval-views", "0"], "--eval-views"),
         (["--lpips", "nowhere.pth"], "nowhere.pth"),
         (["--device", "abacus"], "abacus"),

@@ -275,7 +275,7 @@ def test_nothing_fits_together(tmp_path, capsys, monkeypatch):
         (["two"], "3 are the least"),
         (["two", "--output", "two"], "holds the photographs themselves"),
         (["two", "--output", "taken"], "is no capture"),
-        (["two", "--max-size", "50"], "at least 200"),
+        (["two", "--max-size", "50"], "from 200 to"),
         (["two", "--frames", "1"], "at least 3"),
     ],
 )

@@ -309,7 +309,9 @@ def test_the_command_writes_a_file_that_everything_opens(folder, tmp_path, monke
     red, blue = str(folder / "red.ply"), str(folder / "blue.ply")
     said = ["compose", red, blue, "--at", "0", "-0.5", "0", "--scale", "0.5", "--turn", "30"]
     assert cli.main([*said, "--output", "on.json"]) == 0
-    assert cli.main([*said, "--output", "on.json"]) == 2 and "--overwrite" in capsys.readouterr().err
+    assert cli.main([*said, "--output", "on.json"]) == 0  # its own file, which nobody has changed
+    (tmp_path / "theirs.json").write_text("{}")
+    assert cli.main([*said, "--output", "theirs.json"]) == 2 and "--overwrite" in capsys.readouterr().err
     assert cli.main([*said, "--output", "on.json", "--overwrite", "--box", *"-2 -2 -2 2 2 2".split()]) == 0
     assert cli.main([*said, "--output", "on.txt"]) == 2 and cli.main([*said, "--output", "x.json", "--scale", "0"]) == 2
     first, second = json.loads((tmp_path / "on.json").read_text())["parts"]

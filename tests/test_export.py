@@ -326,7 +326,7 @@ def test_a_film_along_keyframes(ball_run, tmp_path, capsys):
     (tmp_path / "nonsense.json").write_text('{"format": "lumigraph camera path 1", "keyframes": [1]}')
     for name, output, words in (
         ("walk.json", "walk.mp4", "would be replaced"),
-        ("nonsense.json", "a.mp4", "damaged camera path"),
+        ("nonsense.json", "a.mp4", r"nonsense.json does not hold"),
         ("none.json", "a.mp4", "does not exist"),
         ("obrit", "a.mp4", "does not exist|There is no path called"),
     ):
@@ -394,7 +394,7 @@ def test_the_report_is_one_file_that_loads_nothing(ball_run):
     path = camera_path("orbit", ball_run.cameras()["train"], ball_run.frame, 6, (24, 24))
     film(ball_run.method(), path, ball_run.folder / "renders" / "orbit.mp4")
     evaluation = evaluate(ball_run.method(), tiny.scene())
-    result = evaluation.to_json() | {"evaluated_on": "cpu"}
+    result = evaluation.to_json() | {"evaluated_on": "cpu", "steps": 3}
     (ball_run.folder / "eval.json").write_text(json.dumps(result))
     save_picture(ball_run.folder / "eval.png", evaluation.contact_sheet("ball"))
     text = write_report(ball_run).read_text()

@@ -303,8 +303,8 @@ def test_the_commands_on_a_splat_file(tmp_path, capsys, one_thread):
     [
         (["panorama", "{run}", "{new}.tif"], "should end in"),
         (["panorama", "{run}", "{new}.png", "--size", "101"], "101 pixels wide"),
-        (["stereo", "{run}", "{new}.png", "--size", "20"], "20 pixels wide"),
-        (["stereo", "{run}", "{new}.png", "--interpupillary", "0"], "Eyes cannot be 0 apart"),
+        (["stereo", "{run}", "{new}.png", "--size", "20"], "--size cannot be 20"),
+        (["stereo", "{run}", "{new}.png", "--interpupillary", "0"], "--interpupillary cannot be 0"),
         (["stereo", "{run}", "{new}.png", "--interpupillary", "9"], "do not fit"),
         (["panorama", "{new}", "{new}.png"], "new"),
     ],

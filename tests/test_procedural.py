@@ -372,7 +372,7 @@ def test_open_scene_makes_a_scene_in_the_worlds_own_frame():
         ("still-lif", "choose one of courtyard, room, still-life"),
         ("still-life,colour=3", "no option 'colour'; there are size, views, seed"),
         ("still-life,size=big", "size must be a whole number, as in size=20; got 'big'"),
-        ("still-life,views=0", "views must be a whole number"),
+        ("still-life,views=0", "views is 0, and should be from 1"),
     ],
 )
 def test_what_does_not_exist_is_named(request_, sentence):

@@ -109,7 +109,11 @@ def test_an_absurd_number_in_a_run_ends_in_a_sentence(method, field, value, rang
     with pytest.raises(LumigraphError) as refused:
         Run(run.folder).new_method()
     told = str(refused.value)
-    assert "config.json" in told and f"{field} is {value}" in told and range in told and "\n" not in told
+    assert "config.json" in told and "\n" not in told
+    if math.isfinite(value):
+        assert f"{field} is {value}" in told and range in told
+    else:
+        assert "cannot be read as JSON" in told  # which knows no such numbers
 
 
 @pytest.mark.parametrize("value", ["16", 16.0, True, None, [16], {"n": 16}, 10**400])
@@ -122,8 +126,8 @@ def test_what_is_no_number_is_refused(value, tmp_path):
 
 def test_a_number_that_no_method_has_is_refused(tmp_path):
     run = tiny.new_run(tmp_path / "run")
-    write_json(run.folder / "config.json", run.settings.to_json() | {"config": {"hidden_wdith": 3}})
-    with pytest.raises(LumigraphError, match=r"config\.json .* voxel-grid has no hidden_wdith"):
+    write_json(run.folder / "config.json", run.settings.to_json() | {"config": {"hidden_wdith": 3}}, ours=True)
+    with pytest.raises(LumigraphError, match=r"config\.json does not hold .* 'hidden_wdith'"):
         Run(run.folder).new_method()
 
 

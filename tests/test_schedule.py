@@ -69,7 +69,7 @@ def test_a_minute_on_a_slow_machine_grows(strategy, events, monkeypatch):
 
 def test_resets_leave_time_to_recover(events):
     """Twelve intervals: after the ninth there are too few left, and the cloud is refined no more after the sixth."""
-    fit(new(opacity_reset_interval=5), tiny.scene(), steps=60, show=False, rehearsal=False)
+    fit(new(opacity_reset_interval=5, half_resolution_until=0.3), tiny.scene(), steps=60, show=False, rehearsal=False)
     resets = [round(60 * progress) for what, progress in events if what == "reset"]
     assert resets and max(resets) <= 45
 

@@ -64,7 +64,7 @@ def test_networks_that_a_signal_left_unfinished_are_not_explained(number, tmp_pa
     Image.new("RGB", (16, 16), "teal").save(tmp_path / "picture.png")
     begun = []
     monkeypatch.setattr(FourierFeatures, "after_step", lambda self, step: step == 2 and signal.raise_signal(number))
-    monkeypatch.setattr(FourierFeatures, "begin", lambda self, data: begun.append(self))
+    monkeypatch.setattr(FourierFeatures, "begin", lambda self, data, seconds: begun.append(self))
     page = tmp_path / "page"
     command = ["explain", "encodings", str(tmp_path / "picture.png"), "--steps", "9", "--output", str(page)]
     assert main(command) == 128 + number

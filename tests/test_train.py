@@ -22,7 +22,7 @@ def final_state(run: Run) -> tuple[dict[str, torch.Tensor], str]:
     tensors: dict[str, torch.Tensor] = {}
     for name in ("weights.safetensors", "optimizer.safetensors"):
         tensors |= {f"{name}/{key}": value for key, value in states._read_tensors(states.latest, name).items()}
-    return tensors, json.dumps(states._about(states.latest)["optimizers"])
+    return tensors, json.dumps(states._about(states.latest).optimizers)
 
 
 def train(run: Run, **options):

@@ -38,7 +38,7 @@ class CaptureCommand:
     """What is compared: neighbours in order, all pairs, or those that look alike; auto goes by kind and number."""
     camera: Literal["auto", "single", "per-device", "per-image"] = "auto"
     """Which photographs share a lens; auto goes by what the files say."""
-    max_size: Annotated[int, between(64, 65_536), option("PIXELS")] = 1600
+    max_size: Annotated[int, between(200, 65_536), option("PIXELS")] = 1600
     """Longer side to which photographs are reduced when details are looked for."""
 
     mask_object: bool = False
