@@ -12,7 +12,7 @@ from __future__ import annotations
 import re
 import types
 import typing
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import fields, is_dataclass
 from functools import cache
 from pathlib import Path
@@ -152,18 +152,23 @@ def typed(kind: Any, value: Any, where: Path | str, closed: bool = False) -> Any
             what = f"{name or 'it'} is {shown(found)}, and should {should}"
         raise LumigraphError(f"{where} does not hold what it should: {what}") from error
     if key is not None:
-        raise LumigraphError(f"{where} does not hold what it should: nothing is known of {key!r}")
+        raise LumigraphError(f"{where} does not hold what it should: nothing is known of {shown(key)}")
     return made
 
 
 def surplus(said: Any, known: Any) -> str | None:
     """A key of plain JSON that its typed value, made plain again, has not; None if there is none."""
     if isinstance(said, dict) and isinstance(known, dict):
-        new = next((key for key in said if key not in known), None)
-        return new or next(filter(None, (surplus(value, known[key]) for key, value in said.items())), None)
+        new = [key for key in said if key not in known]
+        return new[0] if new else first_of(surplus(value, known[key]) for key, value in said.items())
     if isinstance(said, list | tuple) and isinstance(known, list | tuple):
-        return next(filter(None, map(surplus, said, known)), None)
+        return first_of(map(surplus, said, known))
     return None
+
+
+def first_of(found: Iterable[str | None]) -> str | None:
+    """The first that is not None; None if all are."""
+    return next((key for key in found if key is not None), None)
 
 
 def found_at(kind: Any, value: Any, path: str) -> tuple[Any, Any]:

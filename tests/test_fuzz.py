@@ -166,5 +166,5 @@ def test_options(tmp_path, monkeypatch, capsys):
         said = capsys.readouterr().err
         if code:
             assert code == 2, f"{number}, {words}: {code}"
-            assert said.count("lumigraph:") == 1 or "╭" in said, f"{number}, {words}: {said}"
+            assert said.count("lumigraph:") == 1 or "For full helptext" in said, f"{number}, {words}: {said}"
     assert not list(tmp_path.rglob("*.partial*"))

@@ -165,14 +165,14 @@ def test_a_drag_keeps_the_ball_where_it_is(viewer, page, size):
 def test_a_click_on_a_camera_flies_there(viewer, page):
     visitor = visit(viewer, page)
     camera = viewer.subject.cameras["train"][1]
-    away = camera.position[0] - 0.9 * camera.forward[0]
+    away = camera.position[0] - 2.0 * camera.forward[0]
     behind = torch.cat([camera.pose[0, :, :3], away[:, None]], 1).double().numpy()  # it is in the middle of the view
 
     def arrived() -> bool:
         return np.abs(np.array(visitor.request().pose) - camera.pose[0].numpy()).max() < 2e-3
 
     for _ in range(8):  # software draws slowly: until the frustum is there to be clicked, and the last pose told
-        visitor.flight.place(behind, 3.9, 0.9)
+        visitor.flight.place(behind, 5.0, 0.9)
         time.sleep(1)
         page.mouse.click(SIZE[0] / 2, SIZE[1] / 2)
         try:

@@ -180,7 +180,7 @@ def npy(data: bytes, chance: random.Random) -> bytes:
     try:
         table = np.load(io.BytesIO(data), allow_pickle=False)
         table.flat[chance.randrange(table.size)] = float(chance.choice([n for n in nasty.NUMBERS if abs(n) < 1e301]))
-    except (ValueError, OSError, EOFError, TypeError, OverflowError, IndexError):
+    except (ValueError, OSError, EOFError, TypeError, OverflowError, IndexError, MemoryError):
         return raw(data, chance)
     kept = io.BytesIO()
     np.save(kept, table)

@@ -85,7 +85,7 @@ def outcome_of(ended: Ended) -> tuple[str, str]:
     lines = [line for line in ended.said.splitlines() if line.startswith("lumigraph:")]
     if ended.code == 2 and len(lines) == 1:
         return "sentence", lines[0]
-    if ended.code == 2 and not lines and "╭" in ended.said:
+    if ended.code == 2 and not lines and "For full helptext" in ended.said:
         return "usage", ""
     return "no sentence", f"code {ended.code}, {len(lines)} sentences: {ended.said.strip()[-200:]}"
 
