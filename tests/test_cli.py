@@ -133,6 +133,8 @@ BAD = {
     "photographs in the way": ["train", "voxel-grid", "{photographs}", "--steps", "3", "--output", "{photographs}"],
     "no such device": ["train", "voxel-grid", "{photographs}", "--steps", "3", "--device", "abacus"],
     "no such preset": ["train", "voxel-grid", "{photographs}", "--steps", "3", "--device", "cuda:99"],
+    "a device without numbers": ["eval", "{trained}", "--device", "meta"],
+    "no name of a host": ["view", "{trained}", "--host", "9" * 200],
     "evaluate nothing": ["eval", "{new}/nowhere"],
     "evaluate photographs": ["eval", "{photographs}"],
     "evaluate no views": ["eval", "{trained}", "--split", "val"],

@@ -61,6 +61,8 @@ def choose_device(name: str) -> Any:
     try:
         device = torch.device("cuda" if name == "gpu" else name)
         torch.empty(1, device=device)
+        if device.type == "meta":
+            raise RuntimeError("it holds no numbers")
     except (RuntimeError, AssertionError) as error:
         reason = str(error).partition("\n")[0].rstrip(".")
         raise LumigraphError(f"Device {name!r} is not usable here ({reason}); try --device cpu") from error

@@ -69,9 +69,10 @@ def free_port(host: str, port: int) -> int | None:
         family, kind, *_, place = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)[0]
         with socket.create_server(place[:2], family=family, reuse_port=False) as listening:
             return listening.getsockname()[1]
-    except socket.gaierror as error:
+    except (socket.gaierror, UnicodeError) as error:  # the latter for what is no name at all
+        reason = getattr(error, "strerror", None) or "it is no name of a host"
         raise LumigraphError(
-            f"Host {host!r} is not known ({error.strerror}); give --host an address of this machine"
+            f"Host {host[:60]!r} is not known ({reason}); give --host an address of this machine"
         ) from error
     except PermissionError as error:
         raise LumigraphError(f"Port {port} may not be used by this user; give --port one from 1024 on") from error
