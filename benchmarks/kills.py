@@ -182,7 +182,8 @@ def one(task: tuple[str, int, int, float, Path, Path]) -> Kill:
         os.kill(child, which)
         ended = os.waitpid(child, 0)
     done = os.WIFEXITED(ended[1]) and os.WEXITSTATUS(ended[1]) == 0
-    said = (notes / "stderr").read_text("utf-8", errors="replace")
+    told = notes / "stderr"
+    said = told.read_text("utf-8", errors="replace") if told.exists() else ""  # it may have ended before it could speak
     fault = after_a_kill(work, which, ended[1], said, still_there(child), folder, before)
     fault = fault or onward(work, done, folder, notes, before)
     partial = sum(is_left_over(path) for path in snapshot(folder))

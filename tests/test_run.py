@@ -276,3 +276,17 @@ def test_methods_are_found_by_file_name():
     assert methods.name_of(tiny.method()) == "voxel-grid"
     with pytest.raises(LumigraphError, match="did you mean voxel-grid"):
         methods.find("voxel-grit")
+
+
+def test_a_run_begins_where_one_was_killed_before_it_had_begun(tmp_path):
+    run = tiny.new_run(tmp_path / "run")
+    (run.folder / "config.json").unlink()
+    (run.folder / ".lumigraph-0123456789abcdef.partial").write_bytes(b"{")
+    assert tiny.new_run(tmp_path / "run").folder == run.folder
+
+
+def test_no_run_begins_beside_somebodys_cameras(tmp_path):
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / "cameras.json").write_text("{}")
+    with pytest.raises(LumigraphError, match="not an empty folder"):
+        tiny.new_run(tmp_path / "run")

@@ -24,7 +24,7 @@ from typing import Any
 
 import torch
 
-from .. import files, methods
+from .. import files, marks, methods
 from ..camera import Camera, ring
 from ..dataset import Dataset
 from ..errors import LumigraphError
@@ -32,6 +32,7 @@ from ..locks import NAME as LOCK
 from ..locks import check_place, held
 from ..marks import NAME as RECORD
 from ..method import Method
+from ..partials import FORM
 from ..plain import understood
 from ..ranges import check
 from ..scene import Frame, Scene
@@ -92,7 +93,7 @@ class Run(Opened):
         with held(folder, "made a run"):
             check_new(folder)  # again, for somebody else may have been quicker
             if isinstance(data, Scene):
-                files.write_json(folder / "cameras.json", cameras.to_json(data), ours=True)
+                files.write_json(folder / "cameras.json", cameras.to_json(data))
             settings.write(folder / "config.json")  # last: a folder with it is a run
         return cls(folder)
 
@@ -297,9 +298,14 @@ def check_new(folder: Path) -> None:
             f"{folder} already holds a run; go on with it by `lumigraph resume {folder}`, or choose another --output"
         )
     with files.explained(folder):
-        if folder.exists() and (not folder.is_dir() or {path.name for path in folder.iterdir()} - {LOCK, RECORD}):
+        if folder.exists() and not (folder.is_dir() and all(map(is_leftover, folder.iterdir()))):
             raise LumigraphError(f"{folder} is not an empty folder; choose another --output")
     check_place(folder)
+
+
+def is_leftover(path: Path) -> bool:
+    """Whether something in a folder is of a run that was killed before it had begun."""
+    return path.name in (LOCK, RECORD) or FORM.fullmatch(path.name) is not None or marks.is_ours(path, "file")
 
 
 def versions() -> dict[str, str]:
