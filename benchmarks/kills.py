@@ -228,7 +228,11 @@ def after_a_kill(
         return "a process is left"
     if any(tale in said for tale in TELLTALES) or "*** " in said:
         return f"it printed more than a sentence: {said[-300:]}"
-    if which == signal.SIGTERM and os.waitstatus_to_exitcode(status) not in (0, 143):
+    if which == signal.SIGTERM and os.waitstatus_to_exitcode(status) not in (
+        0,
+        143,
+        -15,
+    ):  # the last ahead of any handler
         return f"SIGTERM ended it with {os.waitstatus_to_exitcode(status)}: {said[-200:]}"
     if foreign := touched(before, after, [*allowed(work.words), *work.results, RECORD]):
         return f"{foreign[0]} is not as it was"
@@ -248,7 +252,7 @@ def onward(work: Work, done: bool, folder: Path, notes: Path, before: dict[str, 
     if done and words[0] in ("train", "resume"):
         return ""
     ended = run(words, folder, notes)
-    if ended.code:
+    if ended.code and "has spent its budget" not in ended.said:  # a signal that came when all was done
         return f"{' '.join(words[:2])} does not go on: {ended.said.strip()[-300:]}"
     after = snapshot(folder)
     if foreign := touched(before, after, [*allowed(words), *work.results, RECORD]):
