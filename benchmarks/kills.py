@@ -228,11 +228,8 @@ def after_a_kill(
         return "a process is left"
     if any(tale in said for tale in TELLTALES) or "*** " in said:
         return f"it printed more than a sentence: {said[-300:]}"
-    if which == signal.SIGTERM and os.waitstatus_to_exitcode(status) not in (
-        0,
-        143,
-        -15,
-    ):  # the last ahead of any handler
+    expected = (0, 143, -signal.SIGTERM)  # the last ahead of any handler
+    if which == signal.SIGTERM and os.waitstatus_to_exitcode(status) not in expected:
         return f"SIGTERM ended it with {os.waitstatus_to_exitcode(status)}: {said[-200:]}"
     if foreign := touched(before, after, [*allowed(work.words), *work.results, RECORD]):
         return f"{foreign[0]} is not as it was"
