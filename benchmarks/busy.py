@@ -162,7 +162,7 @@ def learner(method: str, scene: str) -> None:
     data, kind, device = open_scene(scene), methods.find(method), torch.device("cpu")
     config = kind.preset(device)
     if method == "gaussian-splatting":
-        config = dataclasses.replace(config, refine_every=1 << 60)
+        config = dataclasses.replace(config, refine_every=1_000_000_000)
     model = build(kind, data.frame, config, device, 0).train()
     optimizers, generator, step = model.optimizers(), torch.Generator().manual_seed(0), 0
     model.begin(data)
