@@ -12,7 +12,7 @@ An input is its class, its number and the seed; `--only CLASS` tries one class, 
 
 from __future__ import annotations
 
-from fuzzing import warm  # ahead of PyTorch, isort: skip
+from fuzzing import alone, warm  # noqa: F401, ahead of PyTorch, isort: skip
 import json
 import multiprocessing
 import shlex

@@ -11,7 +11,7 @@ is there, as it was or whole and new; no process is left. At last the same comma
 
 from __future__ import annotations
 
-from fuzzing import warm  # ahead of PyTorch, isort: skip
+from fuzzing import alone, warm  # noqa: F401, ahead of PyTorch, isort: skip
 import json
 import multiprocessing
 import os
@@ -270,8 +270,8 @@ def show(found: list[Kill], longest: dict[str, float], seconds: float) -> None:
         signals = Counter(kill.signal for kill in some)
         numbers = (len(some), sum(not kill.ended for kill in some), signals["SIGKILL"], signals["SIGTERM"])
         partial, faults = sum(kill.partial > 0 for kill in some), sum(bool(kill.fault) for kill in some)
-        alone = f"{longest[name]:.1f}" if name else ""
-        table.add_row(name or "all", alone, *map(str, (*numbers, partial, faults)))
+        by_itself = f"{longest[name]:.1f}" if name else ""
+        table.add_row(name or "all", by_itself, *map(str, (*numbers, partial, faults)))
     console(width=140).print(table)
     print(f"{len(found)} kills in {seconds:.0f} s, {sum(bool(kill.fault) for kill in found)} of them lost something")
 

@@ -1,14 +1,9 @@
 """A process that has loaded all there is to load, so that copies of it begin a command at once.
 
-Copies are made by fork, which no threads survive. So everything has one thread here, and nothing is computed.
+Copies are made by fork, which no threads survive. So everything has one thread (`alone`), and nothing is computed.
 """
 
 from __future__ import annotations
-
-import os
-
-os.environ |= {"OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1"}
-os.environ["NUMBA_THREADING_LAYER"] = "workqueue"  # GNU's OpenMP ends a program that uses it after a fork
 
 import lumigraph  # ahead of PyTorch, as the command line does; isort: skip
 import contextlib
