@@ -52,7 +52,7 @@ SHARES: dict[str, tuple[str, float]] = {
     "test_benchmark": ("runs, commands, benchmark", 20),
     "test_cli": ("runs, commands, benchmark", 18),
     "test_run": ("runs, commands, benchmark", 8),
-    "test_train": ("runs, commands, benchmark", 8),
+    "test_train": ("runs, commands, benchmark", 16),
     "test_signals": ("runs, commands, benchmark", 15),
     "test_ranges": ("methods", 20),
     "test_memory": ("runs, commands, benchmark", 12),
