@@ -17,6 +17,7 @@ from ...kernels.harmonic_grid import COEFFICIENTS
 from ...kernels.sparse_grid.cpu import CHUNK, corners
 
 Cells = tuple[int, int, int]  # of a grid, along each axis
+SHARE = 0.05  # of a fine grid's nodes that are not pruned, about
 
 
 class SparseVoxels(nn.Module):
@@ -51,10 +52,10 @@ class SparseVoxels(nn.Module):
 
     @staticmethod
     def bytes_of(cells: Cells, learning: bool) -> int:
-        """What a grid with all its nodes takes at most: index and values, and where it learns, their mean squares and
-        the values and gradients of a step."""
+        """What a grid takes at least: its index, and the values of such a share of nodes as is left of most scenes; where
+        it learns, as much again for their mean squares."""
         nodes = (cells[0] + 1) * (cells[1] + 1) * (cells[2] + 1)
-        return nodes * (12 + 4 * (1 + 3 * COEFFICIENTS) * (4 if learning else 1))
+        return 4 * nodes + int(SHARE * nodes) * 4 * (1 + 3 * COEFFICIENTS) * (2 if learning else 1)
 
     @property
     def nodes(self) -> Nodes:
@@ -83,13 +84,14 @@ class SparseVoxels(nn.Module):
     @torch.no_grad()
     def touched(self, places: Float[Tensor, "sample 3"]) -> Int[Tensor, " some"]:
         """Rows of the nodes around these coordinates, rising."""
-        marks = torch.zeros(len(self), dtype=torch.bool, device=places.device)
         if places.is_cuda:
+            marks = torch.zeros(len(self), dtype=torch.bool, device=places.device)
             for row in _rows_around(places * 0.5 + 0.5, self.nodes):
                 marks[row[row >= 0]] = True
-        else:
-            _mark((places * 0.5 + 0.5).contiguous().numpy(), *_arrays(self.nodes), marks.numpy())
-        return marks.nonzero()[:, 0]
+            return marks.nonzero()[:, 0]
+        found = np.zeros(len(self), np.bool_)
+        _mark((places * 0.5 + 0.5).contiguous().numpy(), *_arrays(self.nodes), found)
+        return torch.from_numpy(np.flatnonzero(found))
 
     @torch.no_grad()
     def note(self, places: Float[Tensor, "sample 3"], weights: Float[Tensor, " sample"]) -> None:
@@ -103,7 +105,9 @@ class SparseVoxels(nn.Module):
     @torch.no_grad()
     def important(self, weight: float) -> Bool[Tensor, "x y z"]:
         """Cells with a node at which some sample weighed so much; the others next to each such node stay too, which
-        makes room for what was missed (the paper's dilation)."""
+        makes room for what was missed (the paper's dilation). All cells, where no sample ever weighed so much."""
+        if not (self.weights > weight).any():
+            return torch.ones(*self.cells.tolist(), dtype=torch.bool, device=self.numbers.device)
         shape = tuple((self.cells + 1).tolist())
         nodes = torch.zeros(shape, dtype=torch.bool, device=self.numbers.device)
         nodes.view(-1)[self.numbers[self.weights > weight].long()] = True
@@ -174,7 +178,9 @@ def _resized(kept: Bool[Tensor, "x y z"], cells: Cells) -> Bool[Tensor, "x_new y
         old = kept.shape[axis]
         edges = torch.arange(size, device=kept.device) * old
         first, last = edges // size, (edges + old - 1) // size
-        span = [kept.index_select(axis, (first + i).clamp(max=old - 1).minimum(last)) for i in range(-(-old // size) + 1)]
+        span = [
+            kept.index_select(axis, (first + i).clamp(max=old - 1).minimum(last)) for i in range(-(-old // size) + 1)
+        ]
         kept = torch.stack(span).any(0)
     return kept
 

@@ -8,7 +8,7 @@ from numba import njit, prange
 from .._dispatch import empty
 from .._lanes import fetch, put, put_where
 from ..sparse_grid.cpu import CHUNK, corners, in_slabs
-from ..spherical_harmonics import K1, K00, K20, K21, K22
+from ..spherical_harmonics import K00, K1, K20, K21, K22
 
 ZERO, ONE, THREE = np.float32(0), np.float32(1), np.float32(3)
 Y0, Y1, Y20, Y21, Y22 = (np.float32(k) for k in (K00, K1, K20, K21, K22))

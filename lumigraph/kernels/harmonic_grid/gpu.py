@@ -10,7 +10,7 @@ from torch import Tensor
 from .._dispatch import empty
 from ..sparse_grid import Nodes
 from ..sparse_grid.gpu import cell_of, row_of, share
-from ..spherical_harmonics import K1, K00, K20, K21, K22
+from ..spherical_harmonics import K00, K1, K20, K21, K22
 
 Y0, Y1, Y20, Y21, Y22 = (tl.constexpr(k) for k in (K00, K1, K20, K21, K22))
 BLOCK = 64
@@ -31,9 +31,7 @@ def _basis(directions, i, here, c):
 
 
 @triton.jit(do_not_specialize=["S"])
-def _forward(
-    points, directions, index, rows, density, harmonics, to_density, to_rgb, S, X, Y, Z, BLOCK: tl.constexpr
-):
+def _forward(points, directions, index, rows, density, harmonics, to_density, to_rgb, S, X, Y, Z, BLOCK: tl.constexpr):
     i = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
     c = tl.arange(0, 32)
     here = i < S
@@ -56,9 +54,7 @@ def _forward(
 
 
 @triton.jit(do_not_specialize=["S"])
-def _backward(
-    d_sigma, d_rgb, points, directions, index, rows, d_density, d_harmonics, S, X, Y, Z, BLOCK: tl.constexpr
-):
+def _backward(d_sigma, d_rgb, points, directions, index, rows, d_density, d_harmonics, S, X, Y, Z, BLOCK: tl.constexpr):
     i = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
     c = tl.arange(0, 32)
     here = i < S
@@ -79,7 +75,7 @@ def _backward(
 class _HarmonicGrid(torch.autograd.Function):
     @staticmethod
     def forward(ctx, points, directions, nodes, density, harmonics):
-        ctx.index, ctx.shapes = (nodes.index.contiguous(), nodes.rows), (density.shape, harmonics.shape)
+        ctx.index, ctx.shapes = (nodes.index.contiguous(), nodes.named), (density.shape, harmonics.shape)
         ctx.sizes = (len(points), *nodes.index.shape)
         ctx.save_for_backward(points, directions)
         out = empty(len(points), device=points.device), empty(len(points), 3, device=points.device)

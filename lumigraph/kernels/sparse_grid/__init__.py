@@ -23,7 +23,8 @@ class Nodes:
     last on the cube's faces. A node's number is (x Y + y) Z + z.
 
     index: a row for each node, -1 where it has none; no row belongs to two nodes
-    rows:  int32; the row of a table with `count` rows for each that `index` names, -1 for none
+    rows:  int32; the row of a table with `count` rows for each that `index` names, -1 for none; empty where these are the
+           rows that `index` names
     """
 
     index: Int32[Tensor, "x y z"]
@@ -41,7 +42,7 @@ class Nodes:
         rows = torch.arange(len(numbers), dtype=torch.int32, device=numbers.device)
         index[numbers] = rows
         require(torch.equal(index[numbers], rows), "two rows belong to one node")
-        return cls(index.view(shape), rows, len(rows))
+        return cls(index.view(shape), rows[:0], len(rows))
 
     @classmethod
     def all(cls, shape: tuple[int, int, int]) -> Nodes:
@@ -50,9 +51,14 @@ class Nodes:
 
     def part(self, rows: Int[Tensor, " some"]) -> Nodes:
         """The same nodes for a table that holds these rows alone, in this order. The index is shared."""
-        here = torch.full_like(self.rows, -1)
+        here = torch.full_like(self.named, -1)
         here[rows] = torch.arange(len(rows), dtype=torch.int32, device=rows.device)
         return Nodes(self.index, here, len(rows))
+
+    @property
+    def named(self) -> Int32[Tensor, " row"]:
+        """`rows`, written out where they are left empty."""
+        return self.rows if len(self.rows) else torch.arange(self.count, dtype=torch.int32, device=self.index.device)
 
     def to(self, device: torch.device | str) -> Nodes:
         return Nodes(self.index.to(device), self.rows.to(device), self.count)

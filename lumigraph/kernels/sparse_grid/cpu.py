@@ -25,22 +25,25 @@ def cell_of(x, cells):
 def row_of(index, rows, x, y, z):
     """The row of a node, -1 where it has none."""
     row = index[x, y, z]
-    return rows[row] if row >= 0 else row
+    return rows[row] if row >= 0 and len(rows) else row
 
 
 @njit(inline="always")
 def corners(points, i, index, rows, at, weights):
-    """Rows and weights of the eight nodes around sample i. Those without a row are left out; returns how many are left."""
+    """Rows and weights of those of the eight nodes around sample i that have a row; returns how many there are."""
     cx, fx = cell_of(points[i, 0], index.shape[0] - 1)
     cy, fy = cell_of(points[i, 1], index.shape[1] - 1)
     cz, fz = cell_of(points[i, 2], index.shape[2] - 1)
-    count = 0
+    count, some = 0, len(rows) > 0
     for x in range(2):
         for y in range(2):
             across = (fx if x else ONE - fx) * (fy if y else ONE - fy)
+            line = index[np.uint64(cx + x), np.uint64(cy + y)]
             for z in range(2):
-                row = row_of(index, rows, cx + x, cy + y, cz + z)
-                at[count] = max(row, 0)
+                row = line[np.uint64(cz + z)]
+                if some and row >= 0:
+                    row = rows[np.uint64(row)]
+                at[count] = max(row, np.int32(0))
                 weights[count] = across * (fz if z else ONE - fz)
                 count += row >= 0
     return count
@@ -50,7 +53,8 @@ def corners(points, i, index, rows, at, weights):
 def slabs_of(first, cells):
     """Samples by slabs of cells, in their order: as cut, so that each slab has about as many samples.
 
-    first: each sample's cell along x.  Returns the samples' numbers, and where each slab's begin; an even number of slabs
+    first: each sample's cell along x.
+    Returns the samples' numbers, and where those of each slab begin; the slabs are an even number.
     """
     counts = np.zeros(cells + 1, np.int64)
     for i in range(len(first)):

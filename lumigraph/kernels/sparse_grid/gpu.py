@@ -102,7 +102,7 @@ class _SparseGrid(torch.autograd.Function):
     @staticmethod
     def forward(ctx, points, nodes, values):
         channels = values.shape[1]
-        ctx.index = nodes.index.contiguous(), nodes.rows
+        ctx.index = nodes.index.contiguous(), nodes.named
         ctx.sizes = (len(points), *nodes.index.shape)
         ctx.meta = {"C": channels, "WIDTH": triton.next_power_of_2(max(channels, 1)), "BLOCK": BLOCK}
         ctx.save_for_backward(points, values)

@@ -26,5 +26,5 @@ def run(points: Tensor, nodes: Nodes, values: Tensor) -> Tensor:
 def _at(place: Tensor, nodes: Nodes, values: Tensor) -> Tensor:
     """Values of nodes, 0 where one has no row."""
     row = nodes.index[place[:, 0], place[:, 1], place[:, 2]]
-    row = torch.where(row >= 0, torch.cat([nodes.rows, nodes.rows.new_full((1,), -1)])[row.long()], -1)
+    row = torch.where(row >= 0, torch.cat([nodes.named, nodes.rows.new_full((1,), -1)])[row.long()], -1)
     return torch.cat([values, values.new_zeros(1, values.shape[1])])[row.long()]

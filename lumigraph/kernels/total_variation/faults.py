@@ -5,7 +5,7 @@ By name: the engine, the function, what stands there, and what is put in its pla
 
 FAULTS = {
     "a neighbour's slope forgotten": ("gpu", "_vary", "dy / length", "0 * dy"),
-    "nothing where a neighbour has no row": ("gpu", "_after", "tl.where(after >= 0, after, row)", "after"),
+    "an axis forgotten": ("gpu", "_vary", "dz * dz + FLAT_", "FLAT_"),
     "slope's sign": ("cpu", "_vary", "out[down, c] += per * dy", "out[down, c] -= per * dy"),
     "a node's own slope forgotten": ("cpu", "_vary", "per * (dx + dy + dz)", "per * (dx + dy)"),
 }

@@ -72,7 +72,7 @@ class _TotalVariation(torch.autograd.Function):
         if len(chosen):
             sizes = len(chosen), *nodes.index.shape
             meta = {"C": channels, "WIDTH": triton.next_power_of_2(channels), "SLOPED": sloped, "BLOCK": BLOCK}
-            index = nodes.index.contiguous(), nodes.rows
+            index = nodes.index.contiguous(), nodes.named
             _vary[(triton.cdiv(len(chosen), BLOCK),)](chosen, *index, values, total, slope, *sizes, **meta)
         ctx.save_for_backward(slope)
         return total / ctx.count

@@ -10,7 +10,9 @@ from . import FLAT
 
 
 def run(chosen: Tensor, nodes: Nodes, values: Tensor) -> Tensor:
-    rows = torch.where(nodes.index >= 0, torch.cat([nodes.rows, nodes.rows.new_full((1,), -1)])[nodes.index.long()], -1)
+    rows = torch.where(
+        nodes.index >= 0, torch.cat([nodes.named, nodes.rows.new_full((1,), -1)])[nodes.index.long()], -1
+    )
     place = torch.stack(torch.unravel_index(chosen, rows.shape), -1)
     here = rows[tuple(place.T)]
     square = values.new_full((len(chosen), values.shape[1]), FLAT)
