@@ -157,7 +157,7 @@ class Plenoxels(RayMethod):
 
     def looks(self, rays: Rays) -> list[Look]:
         samples, _ = self._reached(rays)
-        return [Look("samples", samples, *self._field(*samples.along(rays), self.voxels))]
+        return [Look("samples", samples, *self.field(*samples.along(rays)))]
 
     def _reached(
         self, rays: Rays, jitter: Float[Tensor, " ray"] | None = None
