@@ -100,7 +100,7 @@ class Plenoxels(RayMethod):
             return Config()
         return Config(
             base_resolution=128,
-            max_resolution=256,
+            max_resolution=192,
             occupancy_resolution=128,
             rays_per_step=4096,
             refine_until=0.4,
