@@ -116,7 +116,12 @@ class Field(nn.Module):
         self, places: Float[Tensor, "sample 3"], directions: Float[Tensor, "sample 3"]
     ) -> Float[Tensor, "sample 3"]:
         """sRGB-encoded colour S(B [products], d) (eq. 6)."""
-        features = self.basis(self.appearance_grid(places))
+        return self.shade(self.basis(self.appearance_grid(places)), directions)
+
+    def shade(
+        self, features: Float[Tensor, "sample feature"], directions: Float[Tensor, "sample 3"]
+    ) -> Float[Tensor, "sample 3"]:
+        """S: features become a colour seen along directions."""
         if self.config.shading == "sh":
             harmonics = spherical_harmonics(directions, self.config.sh_bands)
             return torch.sigmoid((features.view(len(features), 3, -1) * harmonics[:, None]).sum(-1))
@@ -325,9 +330,7 @@ class TensoRF(RayMethod):
             if bool((high > low).all()):
                 self.box = torch.stack([low, high])
 
-    def _resample(
-        self, resolution: int, old: Float[Tensor, "2 3"], fresh: torch.Generator | None = None
-    ) -> None:
+    def _resample(self, resolution: int, old: Float[Tensor, "2 3"], fresh: torch.Generator | None = None) -> None:
         """Give the grids a resolution in the present box; its nodes are between those that they have in the old box, or
         random ones. The optimizer begins anew with them, as the code does."""
         nodes = nodes_in(self.box, resolution)
