@@ -88,7 +88,8 @@ def factor_grid(
 
 def cases(generator: torch.Generator) -> Iterator[tuple]:
     """Inputs that every engine must agree on: both kinds, widths that lanes divide and others, borders and beyond."""
-    for kind in ("vm", "cp"):
+    kinds: tuple[Kind, Kind] = ("vm", "cp")
+    for kind in kinds:
         for samples, nodes, components, summed in [
             (0, (4, 5, 6), 16, False),
             (1, (2, 3, 2), 1, True),
@@ -98,7 +99,7 @@ def cases(generator: torch.Generator) -> Iterator[tuple]:
             (3, (3, 2, 3), 2, True),
         ]:
             yield _inputs(samples, Factors(kind, nodes), components, summed, generator)
-    for kind in ("vm", "cp"):
+    for kind in kinds:
         _, table, factors, summed = _inputs(0, Factors(kind, (3, 5, 4)), 16, True, generator)
         yield torch.cartesian_prod(*[torch.tensor([-0.5, 0.0, 0.28125, 1.0, 1.5])] * 3), table, factors, summed
 
