@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from ..components.fields.factorised import FactorGrid, nodes_in
 from ..components.fields.mlp import MLP
 from ..components.sampling.carving import visual_hull
-from ..components.sampling.marching import rays_for
+from ..components.sampling.marching import rays_for, reached
 from ..components.sampling.occupancy import OccupancyGrid
 from ..components.sampling.spaces import Box, space_of
 from ..components.training.exchange import exchange
@@ -55,6 +55,7 @@ class Config:
     cone_angle: Share = 1 / 128  # growth of steps with distance, in captures without bounds
     rays_per_step: BatchSize = 4096  # section 5; at most
     samples_per_step: Annotated[int, between(64, 1 << 24)] = 1 << 20  # that these rays may meet in occupied cells
+    transmittance_threshold: Share = 1e-4  # at which a ray is spent
     weight_threshold: Share = 1e-4  # weight of a sample below which it gets no colour, the code's
     l1_weight: NonNegative = 8e-5  # of objects, of density's factors, the code's
     final_l1_weight: NonNegative = 4e-5  # once the box has shrunk, the code's
@@ -177,6 +178,8 @@ class TensoRF(RayMethod):
             samples_per_step=1 << 17,
             step_ratio=1.0,
             density_shift=-5.0,
+            transmittance_threshold=1e-3,
+            weight_threshold=1e-3,
         )
 
     @classmethod
@@ -233,20 +236,20 @@ class TensoRF(RayMethod):
         return composite(look.samples, look.density, look.rgb, background)
 
     def looks(self, rays: Rays, jitter: Float[Tensor, " ray"] | None = None) -> list[Look]:
-        open_ = self.frame.reach > 1
-        samples = self.occupancy.sample(
-            rays, self.frame.near, self._step(), self.config.cone_angle if open_ else 0.0, jitter=jitter
-        )
+        c, growth = self.config, self.config.cone_angle if self.frame.reach > 1 else 0.0
+        found = self.occupancy.sample(rays, self.frame.near, self._step(), growth, jitter=jitter)
+        samples, asked = reached(rays, found, self.density, c.transmittance_threshold)
         ray = samples.ray_index
         towards = rays.directions.index_select(0, ray)
         points = rays.origins.index_select(0, ray) + samples.t[:, None] * towards
         places, inside = self._places(points)
         density = self._density(points, places, inside)
-        weighty = weights_of(samples, density.detach()) > self.config.weight_threshold
-        coloured = weighty.nonzero()[:, 0]
+        heavy = weights_of(samples, density.detach()) > c.weight_threshold
+        coloured = heavy.nonzero()[:, 0]
         rgb = self.network.colour(places.index_select(0, coloured), towards.index_select(0, coloured))
         rgb = rgb.new_zeros(len(samples), 3).index_copy(0, coloured, rgb)
-        self.figures |= {"rays": len(rays), "samples": len(samples), "coloured_samples": len(coloured)}
+        self.figures |= {"rays": len(rays), "samples": asked, "visible_samples": len(samples)}
+        self.figures["coloured_samples"] = len(coloured)
         return [Look("samples", samples, density, rgb)]
 
     def loss(self, batch: Batch, step: int) -> dict[str, Tensor]:
