@@ -177,7 +177,9 @@ class TensoRF(RayMethod):
             rays_per_step=4096,
             samples_per_step=1 << 17,
             step_ratio=1.0,
-            density_shift=-5.0,
+            density_shift=-8.0,
+            l1_weight=0.0,
+            final_l1_weight=0.0,
             transmittance_threshold=1e-3,
             weight_threshold=1e-3,
         )
@@ -244,7 +246,8 @@ class TensoRF(RayMethod):
         points = rays.origins.index_select(0, ray) + samples.t[:, None] * towards
         places, inside = self._places(points)
         density = self._density(points, places, inside)
-        heavy = weights_of(samples, density.detach()) > c.weight_threshold
+        least = c.weight_threshold if self.stage else 0.0  # on the first grid nothing has much weight yet
+        heavy = weights_of(samples, density.detach()) > least
         coloured = heavy.nonzero()[:, 0]
         rgb = self.network.colour(places.index_select(0, coloured), towards.index_select(0, coloured))
         rgb = rgb.new_zeros(len(samples), 3).index_copy(0, coloured, rgb)
