@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numba
 import pytest
+import tiny
 import torch
 
 from lumigraph import kernels
@@ -150,3 +153,25 @@ def test_before_the_plane_of_a_forward_capture_is_nothing():
     method = TensoRF(Frame(reach=8.0, forward=AHEAD), TensoRF.smallest())
     found = method.density(torch.tensor([[0.0, 0.0, -0.6], [0.0, 0.0, -0.4]]))
     assert found[0] == 0 < found[1]
+
+
+@pytest.mark.parametrize(("factors", "shading"), [("cp", "mlp"), ("vm", "sh")])
+def test_other_factors_and_shading_learn(factors, shading):
+    """A few steps through all upsamplings lower the loss."""
+    scene = tiny.scene()
+    method = TensoRF(scene.frame, replace(TensoRF.smallest(), factors=factors, shading=shading)).train()
+    optimizers, losses = method.optimizers(), []
+    method.begin(scene)
+    for step in range(24):
+        method.before_step(step, step / 24)
+        batch = method.batch(scene, torch.Generator().manual_seed(step))
+        terms = method.loss(batch, step)
+        for optimizer in optimizers:
+            optimizer.zero_grad(set_to_none=True)
+        sum(terms.values()).backward()
+        for optimizer in optimizers:
+            optimizer.step()
+        method.after_step(step)
+        losses.append(method.figures["mse"])
+    assert int(method.stage) == len(UPSAMPLINGS)
+    assert sum(losses[-4:]) < 0.7 * sum(losses[:4])
