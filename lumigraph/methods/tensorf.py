@@ -182,6 +182,8 @@ class TensoRF(RayMethod):
             l1_weight=0.0,
             final_l1_weight=0.0,
             tv_interval=8,
+            cone_angle=1 / 64,
+            occupancy_threshold=0.05,
             transmittance_threshold=1e-3,
             weight_threshold=1e-3,
         )
