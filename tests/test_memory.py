@@ -85,6 +85,7 @@ GREEDY = {  # what would take most, by method, and the option to name
     "mip-nerf": ({"occupancy_resolution": 512, "rays_per_step": 1}, "occupancy-resolution"),
     "dvgo": ({"voxels": 1 << 29}, "voxels"),
     "fourier-features": ({"hidden_width": 8192, "layers": 64}, "hidden-width"),
+    "tensorf": ({"final_resolution": 2048, "samples_per_step": 4096}, "final-resolution"),
 }
 
 
@@ -109,7 +110,7 @@ def test_it_is_told_how_large_a_grid_would_fit(monkeypatch):
     assert bytes_of(kind, frame, kind.Config(voxels=fitting, coarse_voxels=4096), learning=True) <= 400_000_000
 
 
-@pytest.mark.parametrize("name", ["instant-ngp", "nerf", "mip-nerf", "dvgo", "fourier-features", "voxel-grid"])
+@pytest.mark.parametrize("name", ["instant-ngp", "nerf", "mip-nerf", "dvgo", "fourier-features", "tensorf", "voxel-grid"])
 def test_the_estimate_is_what_a_method_takes(name):
     kind, frame = methods.find(name), tiny.scene().frame
     config = kind.smallest()
