@@ -38,7 +38,7 @@ from .commands.view import ViewCommand
 from .errors import LumigraphError, LumigraphWarning
 from .files import refusal
 from .signals import exit_code, listening, number_of
-from .threads import considerate
+from .threads import considerate, share_one_arena
 
 COMMANDS: dict[str, type] = {
     "demo": Demo,
@@ -72,6 +72,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if arguments in (["--version"], ["-V"]):
         print(f"lumigraph {__version__}")
         return 0
+    share_one_arena()
     try:
         with listening(), told_warnings(), considerate():
             return parse(arguments).run()

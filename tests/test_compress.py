@@ -144,7 +144,9 @@ def test_a_rendering_is_a_photograph_with_straight_alpha(cloud_run):
     assert bytes_of(seen, None).shape[-1] == 3
 
 
-@pytest.mark.parametrize(("text", "bytes_"), [("5MB", 5e6), ("800 kb", 8e5), ("2MiB", 2**21), ("0.5g", 5e8), ("17", 17)])
+@pytest.mark.parametrize(
+    ("text", "bytes_"), [("5MB", 5e6), ("800 kb", 8e5), ("2MiB", 2**21), ("0.5g", 5e8), ("17", 17)]
+)
 def test_sizes_as_people_write_them(text, bytes_):
     assert bytes_in(text) == bytes_
 

@@ -22,6 +22,24 @@ unbend(none, numpy.zeros(0, int), none, none, none, none, 1, 0.1, numpy.zeros((0
 print(torch.ones(1 << 18).exp().sum())
 """
 
+ARENAS = """
+import ctypes, threading
+from lumigraph import cli
+cli.main(["methods"])
+libc = ctypes.CDLL(None)
+libc.malloc.restype = ctypes.c_void_p
+def take():
+    for _ in range(1000):
+        libc.malloc(1000)
+takers = [threading.Thread(target=take) for _ in range(4)]
+for taker in takers:
+    taker.start()
+for taker in takers:
+    taker.join()
+libc.malloc_info(0, ctypes.c_void_p.in_dll(libc, "stdout"))
+libc.fflush(None)
+"""
+
 LOOKING = """
 import threading, time
 from lumigraph import threads
@@ -125,3 +143,12 @@ def test_crowded_threads_hardly_look_for_work():
     told = subprocess.run([sys.executable, "-c", LOOKING], env=environment, capture_output=True, text=True, check=True)
     alone, crowded = map(float, told.stdout.split())
     assert crowded < 0.5 * alone
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="arenas are of GNU's C library")
+@pytest.mark.parametrize(("own", "most"), [(None, 1), ("3", 3)])
+def test_commands_take_memory_from_one_place_unless_a_user_says_otherwise(own: str | None, most: int) -> None:
+    environment = {name: value for name, value in os.environ.items() if name != threads.ARENAS}
+    environment |= {threads.ARENAS: own} if own else {}
+    done = subprocess.run([sys.executable, "-c", ARENAS], env=environment, capture_output=True, text=True, check=True)
+    assert done.stdout.count("<heap nr") == most

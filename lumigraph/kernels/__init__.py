@@ -3,6 +3,8 @@
 from ._dispatch import Engine as Engine
 from ._dispatch import using as using
 from .composite import composite as composite
+from .factor_grid import Factors as Factors
+from .factor_grid import factor_grid as factor_grid
 from .hash_encode import HashLevels as HashLevels
 from .hash_encode import hash_encode as hash_encode
 from .march import march as march

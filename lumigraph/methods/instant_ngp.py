@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Annotated, Any, ClassVar
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor, nn
 
 from .. import kernels
@@ -16,18 +16,20 @@ from ..components.fields.activations import truncated_exp
 from ..components.fields.mlp import MLP
 from ..components.sampling.carving import visual_hull
 from ..components.sampling.importance import importance
+from ..components.sampling.marching import FIRST_RAYS, rays_for, reached
 from ..components.sampling.occupancy import OccupancyGrid
 from ..components.training.corrections import Exposure, PoseRefinement
 from ..components.training.lazy_adam import LazyAdam
+from ..components.training.photometric import backdrop, residuals
 from ..components.training.schedules import falling
 from ..controls import Control
 from ..errors import LumigraphError
 from ..method import RayMethod
 from ..packing import Stored, most_important
 from ..ranges import Layers, LearningRate, NonNegative, PositiveShare, Seed, Share, Steps, Width, between
-from ..rays import Look, Rays, Rendering, Samples
+from ..rays import Look, Rays, Rendering
 from ..scene import Batch, Frame, Scene
-from ..volume import composite, visible
+from ..volume import composite
 
 
 @dataclass(frozen=True)
@@ -80,7 +82,6 @@ STAGES = ((0.0, 1 / 4, 1 / 4), (0.04, 1 / 2, 1 / 2), (0.12, 1, 2 / 3), (0.75, 1,
 LOOKS = 4  # cells updated at most, for each sample of a step
 PROBES = 0.02  # share of all cells updated at random, in case something has grown there
 SAMPLES_OF_A_RAY = 24  # that a ray needs, about, once empty space is known
-BATCH_GROWTH = 1.5  # rays per step at most, from one step to the next
 
 
 class Field(nn.Module):
@@ -154,7 +155,7 @@ class InstantNGP(RayMethod):
         self.poses = PoseRefinement(frame.image_count) if config.refine_cameras else None
         self.occupancy = OccupancyGrid(frame.reach, max(4, int(config.occupancy_resolution * STAGES[0][1])))
         self._set_steps(1.0)
-        self.register_buffer("rays_per_step", torch.tensor(256))
+        self.register_buffer("rays_per_step", torch.tensor(FIRST_RAYS))
 
     @classmethod
     def preset(cls, device: torch.device) -> Any:
@@ -222,47 +223,19 @@ class InstantNGP(RayMethod):
     def looks(self, rays: Rays, jitter: Float[Tensor, " ray"] | None = None) -> list[Look]:
         step = 2 * math.sqrt(3) / self.steps_per_diagonal
         found = self.occupancy.sample(rays, self.frame.near, step, self.cone_angle, jitter=jitter)
-        samples = found.keep(self._visible(rays, found))
+        samples, asked = reached(rays, found, self.density, self.config.transmittance_threshold)
         points, directions = samples.along(rays)
         density, rgb = self.field(points, directions)
-        self.figures |= {"rays": len(rays), "visible_samples": len(samples)}
+        self.figures |= {"rays": len(rays), "samples": asked, "visible_samples": len(samples)}
         return [Look("samples", samples, density, rgb)]
-
-    @torch.no_grad()
-    def _visible(self, rays: Rays, found: Samples) -> Bool[Tensor, " sample"]:
-        """Which samples light reaches, by a first pass without gradients; most lie behind what their ray sees."""
-        ray, t, length = found.ray_index, found.t, found.length
-        asked_in_all = 0
-
-        def thickness_of(asked: Tensor) -> Tensor:
-            nonlocal asked_in_all
-            asked_in_all += len(asked)
-            on = ray[asked]
-            return self.density(rays.origins[on] + t[asked][:, None] * rays.directions[on]) * length[asked]
-
-        seen = visible(found, thickness_of, self.config.transmittance_threshold)
-        self.figures["samples"] = asked_in_all
-        return seen
 
     def loss(self, batch: Batch, step: int) -> dict[str, Tensor]:
         generator = self.random(step)
         jitter = torch.rand(len(batch), generator=generator).to(self.device)
-        rays = batch.rays
-        background = self.background
-        if batch.alpha is not None:  # a random colour behind each ray, so that only opacity can imitate opacity
-            background = torch.rand(len(batch), 3, generator=generator).to(self.device)
-        if self.poses:
-            rays = self.poses(rays)
+        background = backdrop(batch, self.background, generator)
+        rays = self.poses(batch.rays) if self.poses else batch.rays
         rendering = self.render_rays(rays, background, jitter)
-        rgb = rendering.rgb
-        if self.exposure and rays.image_index is not None:  # the gain is the scene's, not the background's
-            behind = (1 - rendering.opacity)[:, None] * background
-            rgb = self.exposure(rgb - behind, rays.image_index) + behind
-        residual = rgb - batch.before(background)
-        self.figures["mse"] = float(residual.detach().square().mean())
-        if batch.alpha is not None:  # and before the opposite colour, where only what opacity lacks looks different
-            lacking = (batch.alpha - rendering.opacity)[:, None]
-            residual = torch.cat([residual, residual + lacking * (1 - 2 * background)])
+        residual, self.figures["mse"] = residuals(rendering, batch, background, self.exposure)
         # Divided by delta, so that the linear part has slope 1.
         delta = self.config.huber_delta
         return {"huber": nn.functional.huber_loss(residual, torch.zeros_like(residual), delta=delta) / delta}
@@ -296,9 +269,8 @@ class InstantNGP(RayMethod):
 
     def after_step(self, step: int) -> None:
         """Set the next step's number of rays so that they give about `samples_per_step` samples."""
-        rays = int(self.rays_per_step)
-        wanted = rays * self.config.samples_per_step / max(self.figures["samples"], 1)
-        self.rays_per_step.fill_(int(min(max(wanted, 64), BATCH_GROWTH * rays, self.config.samples_per_step)))
+        rays = rays_for(self.config.samples_per_step, int(self.rays_per_step), self.figures["samples"])
+        self.rays_per_step.fill_(rays)
 
     def field(
         self, points: Float[Tensor, "point 3"], directions: Float[Tensor, "point 3"]

@@ -1,0 +1,43 @@
+"""Colours against photographs: what lies behind rays while a method learns, and by how much what it sees is wrong."""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from ...rays import Rendering
+from ...scene import Batch
+from .corrections import Exposure
+
+
+def backdrop(batch: Batch, background: Float[Tensor, "1 3"], generator: torch.Generator) -> Float[Tensor, "#ray 3"]:
+    """The colours behind a batch's rays: the scene's own, or where photographs have alpha a random one for each ray, so
+    that only opacity can imitate opacity."""
+    if batch.alpha is None:
+        return background
+    return torch.rand(len(batch), 3, generator=generator).to(background.device)
+
+
+def residuals(
+    rendering: Rendering,
+    batch: Batch,
+    background: Float[Tensor, "#ray 3"],
+    exposure: Exposure | None = None,
+) -> tuple[Float[Tensor, "row 3"], float]:
+    """What a rendering before a background has too much of each colour, and the mean square of that.
+
+    Where photographs have alpha, as many rows again say the same before the opposite colours, 1 - background, where
+    only what opacity lacks looks different; they are not in the mean.
+    exposure: gains of the photographs, which are the scene's and not the background's
+    """
+    rgb = rendering.rgb
+    if exposure and batch.rays.image_index is not None:
+        behind = (1 - rendering.opacity)[:, None] * background
+        rgb = exposure(rgb - behind, batch.rays.image_index) + behind
+    residual = rgb - batch.before(background)
+    mse = float(residual.detach().square().mean())
+    if batch.alpha is not None:
+        lacking = (batch.alpha - rendering.opacity)[:, None]
+        residual = torch.cat([residual, residual + lacking * (1 - 2 * background)])
+    return residual, mse
