@@ -84,7 +84,7 @@ class CanCompress(Protocol):
         """How much each row of tensors, by name, adds to one picture (Li 2023, eq. 4): the sum over pixels of the
         compositing weights that it has a share in."""
 
-    def thin(self, importance: dict[str, Float[Tensor, " row"]], share: float) -> dict[str, Float[Tensor, " row"]]:
+    def thin(self, importance: dict[str, Float[Tensor, " row"]], share: float) -> dict[str, Float[Tensor, " kept"]]:
         """Take out the rows that matter least, which together have a share of all importance; gives the importance of
         the rows that there are now."""
 

@@ -93,7 +93,7 @@ class Model:
             raise LumigraphError("Tuning stopped because the loss is not finite; give fewer --steps or --seconds")
         loss.backward()
         reached = [
-            (some, table.taken(parameter.grad))
+            (some, table.taken(parameter.grad.to_dense()))
             for (parameter, table), some in zip(self.tuned, values, strict=True)
             if parameter.grad is not None and some.requires_grad
         ]

@@ -346,8 +346,8 @@ class GaussianSplatting(Method):
         return {"cloud.harmonics": gain[:, 0].mean(-1)}
 
     @torch.no_grad()
-    def thin(self, importance: dict[str, Float[Tensor, " row"]], share: float) -> dict[str, Float[Tensor, " row"]]:
-        """Leave the least important Gaussians out, and put the others along Morton's curve, where neighbours are alike."""
+    def thin(self, importance: dict[str, Float[Tensor, " row"]], share: float) -> dict[str, Float[Tensor, " kept"]]:
+        """Leave the least important Gaussians out; the others lie along Morton's curve, where neighbours are alike."""
         weights, cloud = importance["cloud.harmonics"], self.cloud.gaussians()
         kept = most_important(weights, 1 - share).nonzero()[:, 0]
         kept = kept[torch.from_numpy(morton_order(cloud.means[kept].detach().cpu().numpy()))]

@@ -300,7 +300,7 @@ class InstantNGP(RayMethod):
         return {"network.table": shares.mean(-1)}
 
     @torch.no_grad()
-    def thin(self, importance: dict[str, Float[Tensor, " row"]], share: float) -> dict[str, Float[Tensor, " row"]]:
+    def thin(self, importance: dict[str, Float[Tensor, " row"]], share: float) -> dict[str, Float[Tensor, " kept"]]:
         """Set the least important entries of the table to zero."""
         self.network.table[~most_important(importance["network.table"], 1 - share)] = 0.0
         return importance

@@ -319,7 +319,7 @@ class TensoRF(RayMethod):
         return {f"network.{name}.table": shares[:, 0] for name in GRIDS}
 
     @torch.no_grad()
-    def thin(self, importance: dict[str, Float[Tensor, " row"]], share: float) -> dict[str, Float[Tensor, " row"]]:
+    def thin(self, importance: dict[str, Float[Tensor, " row"]], share: float) -> dict[str, Float[Tensor, " kept"]]:
         """Set the least important nodes to zero, and the least important components; see `truncate`."""
         network = self.network
         for name, grid in zip(GRIDS, (network.density_grid, network.appearance_grid), strict=True):

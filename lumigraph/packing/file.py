@@ -27,9 +27,8 @@ from ..memory import free_memory, gigabytes
 from ..ranges import Coordinate, Name, between, typed
 from .forms import FORMS
 from .storage import Layout
-from .streams import Extent, Number, Stream
+from .streams import Extent, Number, Stream, kind_of, unpacked
 from .streams import packed as to_stream
-from .streams import unpacked
 from .table import Table
 
 MAGIC = b"LUMIPACK"
@@ -76,7 +75,7 @@ class Streams:
         self.about: list[Stream] = []
         self.data: list[bytes] = []
 
-    def add(self, array: Shaped[np.ndarray, "..."]) -> int:
+    def add(self, array: Shaped[np.ndarray, "*shape"]) -> int:
         """Its number."""
         stream, data = to_stream(array)
         for number, (other, known) in enumerate(zip(self.about, self.data, strict=True)):
@@ -93,7 +92,7 @@ def write(tensors: dict[str, Tensor | Table]) -> bytes:
     for name, value in tensors.items():
         if isinstance(value, Tensor):
             array = value.detach().cpu().numpy()
-            entries[name] = Entry(array.shape, array.dtype.name, streams.add(array))
+            entries[name] = Entry(array.shape, kind_of(array), streams.add(array))
             continue
         kept = None if value.kept is None else streams.add(value.kept.numpy())
         parts = tuple(Part(form.name, tuple(map(streams.add, form.streams()))) for form in value.forms)
@@ -137,6 +136,8 @@ def tensor_of(entry: Entry, arrays: list[np.ndarray]) -> Tensor:
     if entry.exact is not None:
         return torch.from_numpy(arrays[entry.exact].copy()).reshape(entry.shape)
     kept = None if entry.kept is None else torch.from_numpy(arrays[entry.kept])
+    if kept is not None and (kept.dtype != torch.bool or kept.dim() != 1):
+        raise ValueError("a mask marks no rows")
     forms = []
     for part in entry.parts:
         kind, count = FORMS[part.form]

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int, Shaped
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from .clusters import clustered
@@ -19,8 +19,6 @@ from .clusters import clustered
 WIDEST = 8.0  # standard deviations that the levels of a whole number span; what lies beyond has more levels
 MOST = (1 << 16) - 1  # the largest whole number
 NOTICED = 0.02  # of a float16's typical size: what tuning takes for its unit
-
-Array = Shaped[np.ndarray, "..."]
 
 
 class Form(ABC):
@@ -42,7 +40,7 @@ class Form(ABC):
         """What learns, each with the error that storing it made: the natural unit of its steps."""
 
     @abstractmethod
-    def streams(self) -> list[Array]:
+    def streams(self) -> list[np.ndarray]:
         """The arrays that a file keeps."""
 
 
@@ -60,11 +58,11 @@ class Half(Form):
     def learning(self) -> list[tuple[Tensor, float]]:
         return [(self.exact, NOTICED * rms(self.exact))]
 
-    def streams(self) -> list[Array]:
+    def streams(self) -> list[np.ndarray]:
         return [self.exact.detach().half().numpy()]
 
     @staticmethod
-    def read(streams: Sequence[Array]) -> Half:
+    def read(streams: Sequence[np.ndarray]) -> Half:
         (halves,) = streams
         return Half(torch.from_numpy(halves.astype(np.float32)))
 
@@ -87,7 +85,7 @@ class Scaled(Form):
     def learning(self) -> list[tuple[Tensor, float]]:
         return [(self.exact, float(self.step.mean()))]
 
-    def streams(self) -> list[Array]:
+    def streams(self) -> list[np.ndarray]:
         codes = self._codes()
         kind = np.uint8 if not len(codes) or codes.max() < 256 else np.uint16
         return [torch.stack([self.low, self.step]).numpy(), codes.numpy().astype(kind)]
@@ -96,7 +94,7 @@ class Scaled(Form):
         return ((self.exact.detach() - self.low) / self.step).round_().clamp_(0, MOST)
 
     @staticmethod
-    def read(streams: Sequence[Array]) -> Scaled:
+    def read(streams: Sequence[np.ndarray]) -> Scaled:
         scales, codes = streams
         found = Scaled.__new__(Scaled)
         found.low, found.step = torch.from_numpy(scales.astype(np.float32))
@@ -142,12 +140,12 @@ class Coded(Form):
     def learning(self) -> list[tuple[Tensor, float]]:
         return [(self.book.exact, self.error), *self.own.learning()]
 
-    def streams(self) -> list[Array]:
+    def streams(self) -> list[np.ndarray]:
         codes = self.codes.numpy().astype(np.uint16)[:, None]
         return [*self.book.streams(), codes, self.apart.numpy(), *self.own.streams()]
 
     @staticmethod
-    def read(streams: Sequence[Array]) -> Coded:
+    def read(streams: Sequence[np.ndarray]) -> Coded:
         *book, codes, apart, scales, own = streams
         found = Coded.__new__(Coded)
         found.book, found.own, found.error = Scaled.read(book), Scaled.read([scales, own]), 0.0

@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-
 Layout = Literal["rows", "cells", "channels"]
 
 
@@ -17,8 +16,8 @@ class Stored:
            ones scaled; "half", as float16; "nothing", because pictures do not need it: `fill` comes back.
            A tensor that nothing is said of is stored to the bit; of marks (bool) that is one bit each
     bits:  of a whole number
-    layout: what is a row: "rows", whatever the first axis counts; "cells", of (x, y, z, channel) or a plane; "channels",
-           the cells of (grid, channel, x, y, z)
+    layout: what is a row: "rows", whatever the first axis counts; "cells", of (..., channel); "channels", the cells of
+           (grid, channel, x, y, z)
     plain: columns at the front that are scaled, also where the others are coded
     fill:  what every number of a row is where there is nothing; such rows are not stored
     """

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, cast, get_args
 
 import numpy as np
 import zstandard
@@ -42,11 +42,17 @@ class Stream:
 
 def packed(array: Shaped[np.ndarray, "*shape"]) -> tuple[Stream, bytes]:
     """An array as a stream, whichever way is smaller."""
-    ways = (False, True) if array.dtype in (np.uint8, np.uint16) and array.ndim == 2 else (False,)
+    ways = (False, True) if array.dtype.kind in "ui" and array.ndim else (False,)
     coder = zstandard.ZstdCompressor(level=LEVEL)
     found = [(delta, coder.compress(_bytes(_differences(array) if delta else array))) for delta in ways]
     delta, data = min(found, key=lambda pair: len(pair[1]))
-    return Stream(array.dtype.name, array.shape, len(data), delta), data
+    return Stream(kind_of(array), array.shape, len(data), delta), data
+
+
+def kind_of(array: Shaped[np.ndarray, "*shape"]) -> Number:
+    """The name of an array's numbers, one of those that a file may hold."""
+    assert array.dtype.name in get_args(Number)
+    return cast(Number, array.dtype.name)
 
 
 def unpacked(stream: Stream, data: bytes) -> Shaped[np.ndarray, "*shape"]:
@@ -60,7 +66,7 @@ def unpacked(stream: Stream, data: bytes) -> Shaped[np.ndarray, "*shape"]:
     array = _array(raw, stream.dtype, stream.shape)
     if not stream.delta:
         return array
-    if array.ndim != 2 or array.dtype.kind != "u":
+    if array.dtype.kind not in "ui" or not array.ndim:
         raise ValueError(f"differences of {stream.dtype} mean nothing")
     return np.cumsum(array, 0, dtype=array.dtype)
 
@@ -77,7 +83,7 @@ def take(stream: Any, size: int) -> bytes:
     return b"".join(pieces)
 
 
-def _differences(array: Shaped[np.ndarray, "row column"]) -> Shaped[np.ndarray, "row column"]:
+def _differences(array: Shaped[np.ndarray, "*shape"]) -> Shaped[np.ndarray, "*shape"]:
     return np.diff(array, axis=0, prepend=np.zeros_like(array[:1]))
 
 

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from .forms import Coded, Form, Half, Scaled
 from .storage import Layout, Stored
-from .streams import Number
+from .streams import Number, kind_of
 
 FEWEST = 8  # rows for each code; with fewer a codebook would be no smaller than what it stands for
 LEAST_BITS = 2
@@ -90,7 +90,7 @@ def as_rows(tensor: Shaped[Tensor, "*shape"], layout: Layout) -> Shaped[Tensor, 
 
 @torch.no_grad()
 def packed(
-    tensor: Float[Tensor, "*shape"],
+    tensor: Shaped[Tensor, "*shape"],
     how: Stored,
     recipe: Recipe,
     weights: Float[Tensor, " row"] | None,
@@ -99,7 +99,7 @@ def packed(
     """A tensor in the form that its method says. weights: importance of each of its rows; None where all are alike"""
     shape, bits = tuple(tensor.shape), max(how.bits - recipe.coarser, LEAST_BITS)
     if how.how == "nothing":
-        return Table(shape, how.layout, how.fill, None, dtype=tensor.cpu().numpy().dtype.name)
+        return Table(shape, how.layout, how.fill, None, dtype=kind_of(tensor.detach().cpu().numpy()))
     rows = as_rows(tensor.detach().cpu().float().contiguous(), how.layout)
     rows = rows.reshape(-1, rows.shape[-1])
     some = (rows != how.fill).any(-1)
