@@ -123,7 +123,12 @@ class Field(nn.Module):
         self, places: Float[Tensor, "sample 3"], directions: Float[Tensor, "sample 3"]
     ) -> Float[Tensor, "sample 3"]:
         """sRGB-encoded colour S(B [products], d) (eq. 6)."""
-        features = self.basis(self.appearance_grid(places))
+        return self.shade(self.basis(self.appearance_grid(places)), directions)
+
+    def shade(
+        self, features: Float[Tensor, "sample feature"], directions: Float[Tensor, "sample 3"]
+    ) -> Float[Tensor, "sample 3"]:
+        """S: features become a colour seen along directions."""
         if self.config.shading == "sh":
             harmonics = kernels.spherical_harmonics(directions, self.config.sh_bands)
             return torch.sigmoid((features.view(len(features), 3, -1) * harmonics[:, None]).sum(-1))
