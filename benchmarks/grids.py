@@ -2,9 +2,9 @@
 
     python benchmarks/grids.py SCENE --output FOLDER
 
-Each method is trained for equally long and compared, as `lumigraph bench methods` does; then its run is pressed down the
-ladder of `lumigraph compress`. FOLDER/grids.md is the table, grids.svg the chart of dB against bytes, grids.json the
-figures; runs lie in FOLDER/runs. The same command goes on where it was stopped. About eleven minutes by default.
+Each method is trained for equally long and compared, as `lumigraph bench methods` does; then its run is pressed down
+the ladder of `lumigraph compress`. FOLDER/grids.md is the table, grids.svg the chart of dB against bytes, and what
+each run came to lies beside it in FOLDER/runs. The same command goes on where it was stopped. About eleven minutes.
 """
 
 from __future__ import annotations
