@@ -14,7 +14,7 @@ from ..console import console
 from ..errors import LumigraphError
 from ..quality import Quality
 from ..ranges import Codes, Count, Decibels, Seconds, Steps
-from .common import choose_device, needed, option, show
+from .common import choose_device, needed, option, show, typed
 
 LOSSES: Mapping[Quality, float] = {"draft": 1.0, "good": 0.3, "best": 0.1}  # dB that each quality may lose
 DEFAULT: Quality = "good"
@@ -69,7 +69,11 @@ class Compress:
         aim = Aim(size, loss, self.codebook, self.steps, seconds, self.views)
         made = compress(Run(self.run_folder), self.output, aim, self.scene, choose_device(self.device))
         console().print(table(made))
-        show({"saved": str(self.output), "next": f"lumigraph view {self.output}"})
+        against = made.compared_with
+        if made.psnr_before is None:
+            against += ", for its photographs cannot be opened; --scene says where they are"
+        rows = {"compared with": f"{made.views} held-out {against}", "saved": str(self.output)}
+        show(rows | {"next": typed("view", self.output)})
         return 0
 
 
@@ -86,13 +90,12 @@ def table(made: Any) -> Any:
     """Before and after."""
     from rich.table import Table
 
-    against = "PSNR" if made.psnr_before is not None else "PSNR against the run's own renderings"
     rows = Table("", "before", "after", "")
     rows.add_row("model", size(made.bytes_before), size(made.bytes_after), f"{made.times:.1f} times smaller")
     rows.add_row("whole run", size(made.folder_before), size(made.folder_after), "")
     before = "" if made.psnr_before is None else f"{made.psnr_before:.2f} dB"
     change = "" if made.psnr_before is None else f"{made.psnr_after - made.psnr_before:+.2f} dB"
-    rows.add_row(f"{against}, {made.views} held-out views", before, f"{made.psnr_after:.2f} dB", change)
+    rows.add_row("PSNR", before, f"{made.psnr_after:.2f} dB", change)
     return rows
 
 
