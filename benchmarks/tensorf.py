@@ -13,19 +13,18 @@ from __future__ import annotations
 import dataclasses
 import statistics
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import torch
 import tyro
-from torch import Tensor
 
 from lumigraph.capture import open_scene
 from lumigraph.files import write_json
 from lumigraph.methods.tensorf import Config, TensoRF
 from lumigraph.run import build, processor
-from lumigraph.scene import Scene
+from lumigraph.scene import Batch, Scene
 from lumigraph.train import fit
 from lumigraph.volume import composite, weights_of
 
@@ -62,11 +61,12 @@ def learnt(scene: Scene, options: Options, device: torch.device) -> TensoRF:
     size = options.resolution
     config = Config(initial_resolution=size, final_resolution=size, rays_per_step=1024, samples_per_step=1 << 22)
     method = build(TensoRF, scene.frame, config, device, 0)
+    assert isinstance(method, TensoRF)
     fit(method, scene, steps=options.before, show=False)
     return method
 
 
-def step(method: TensoRF, scene: Scene, rays: int, repeats: int) -> Iterator[tuple[str, float]] | dict[str, float]:
+def step(method: TensoRF, scene: Scene, rays: int, repeats: int) -> dict[str, float]:
     """Seconds of a whole step, and of its parts."""
     method.train()
     generator = torch.Generator().manual_seed(0)
@@ -74,15 +74,15 @@ def step(method: TensoRF, scene: Scene, rays: int, repeats: int) -> Iterator[tup
     method.rays_per_step.fill_(rays)
     found: dict[str, list[float]] = {}
 
-    def timed(name: str, part: Callable[[], Tensor | None]) -> Tensor | None:
+    def timed(name: str, part: Callable[..., Any], *given: Any) -> Any:
         synchronize(method.device)
         begin = time.perf_counter()
-        value = part()
+        value = part(*given)
         synchronize(method.device)
         found.setdefault(name, []).append(time.perf_counter() - begin)
         return value
 
-    def whole(batch) -> None:
+    def whole(batch: Batch) -> None:
         terms = method.loss(batch, 0)
         torch.stack(list(terms.values())).sum().backward()
         descend()
@@ -94,7 +94,7 @@ def step(method: TensoRF, scene: Scene, rays: int, repeats: int) -> Iterator[tup
 
     for _ in range(repeats + 1):
         batch = method.batch(scene, generator)
-        timed("seconds per step", lambda batch=batch: whole(batch))
+        timed("seconds per step", whole, batch)
         parts(method, batch, timed)
         timed("seconds of optimisers", descend)
     numbers = method.figures
@@ -105,7 +105,7 @@ def step(method: TensoRF, scene: Scene, rays: int, repeats: int) -> Iterator[tup
     }
 
 
-def parts(method: TensoRF, batch, timed: Callable) -> None:
+def parts(method: TensoRF, batch: Batch, timed: Callable[..., Any]) -> None:
     """The parts of a step one by one, each with its way back."""
     network, rays = method.network, batch.rays
 
@@ -126,7 +126,7 @@ def parts(method: TensoRF, batch, timed: Callable) -> None:
     at, directions = places[coloured], rays.directions[ray[coloured]]
 
     def appearance():
-        found = network.basis(network.appearance_grid(at))
+        found = network.features(at)
         found.sum().backward()
         return found.detach()
 

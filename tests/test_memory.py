@@ -84,6 +84,7 @@ GREEDY = {  # what would take most, by method, and the option to name
     "nerf": ({"hidden_width": 8192, "depth": 32, "occupancy_resolution": 16}, "hidden-width"),
     "mip-nerf": ({"occupancy_resolution": 512, "rays_per_step": 1}, "occupancy-resolution"),
     "fourier-features": ({"hidden_width": 8192, "layers": 64}, "hidden-width"),
+    "tensorf": ({"final_resolution": 2048, "samples_per_step": 4096}, "final-resolution"),
 }
 
 
@@ -99,7 +100,7 @@ def test_what_memory_does_not_hold_is_told_before_it_is_made(name, monkeypatch):
         build(kind, tiny.scene().frame, kind.Config(**numbers), CPU, 0, learning=True)
 
 
-@pytest.mark.parametrize("name", ["instant-ngp", "nerf", "mip-nerf", "fourier-features", "voxel-grid"])
+@pytest.mark.parametrize("name", ["instant-ngp", "nerf", "mip-nerf", "fourier-features", "tensorf", "voxel-grid"])
 def test_the_estimate_is_what_a_method_takes(name):
     kind, frame = methods.find(name), tiny.scene().frame
     config = kind.smallest()

@@ -11,9 +11,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
-from .. import kernels
 from ..camera import Camera
-from ..components.fields.encodings import FrequencyEncoding
 from ..components.fields.factorised import FactorGrid, nodes_in
 from ..components.fields.mlp import MLP
 from ..components.fields.truncation import truncate
@@ -27,6 +25,7 @@ from ..components.training.lazy_adam import LazyAdam
 from ..components.training.photometric import backdrop, residuals
 from ..components.training.schedules import falling
 from ..errors import LumigraphError
+from ..kernels import factor_grid, spherical_harmonics
 from ..kernels.factor_grid import Factors
 from ..method import RayMethod
 from ..packing import Stored, most_important
@@ -109,10 +108,8 @@ class Field(nn.Module):
         features = c.appearance_features if c.shading == "mlp" else 3 * c.sh_bands**2
         self.basis = nn.Linear(products, features, bias=False)  # B of eq. 6
         if c.shading == "mlp":
-            self.encode_features = FrequencyEncoding(features, c.feature_frequencies, base=1.0)
-            self.encode_directions = FrequencyEncoding(3, c.direction_frequencies, base=1.0)
-            inputs, width = self.encode_features.width + self.encode_directions.width, c.hidden_width
-            self.network = MLP(inputs + 1, width, width, 3)
+            inputs = features * (1 + 2 * c.feature_frequencies) + 3 * (1 + 2 * c.direction_frequencies)
+            self.network = MLP(inputs + 1, c.hidden_width, c.hidden_width, 3)
 
     def density(self, places: Float[Tensor, "sample 3"]) -> Float[Tensor, " sample"]:
         """Density per unit of the coordinates: softplus of the sum over all components (eq. 5)."""
@@ -123,18 +120,29 @@ class Field(nn.Module):
         self, places: Float[Tensor, "sample 3"], directions: Float[Tensor, "sample 3"]
     ) -> Float[Tensor, "sample 3"]:
         """sRGB-encoded colour S(B [products], d) (eq. 6)."""
-        return self.shade(self.basis(self.appearance_grid(places)), directions)
+        return self.shade(self.features(places), directions)
+
+    def features(self, places: Float[Tensor, "sample 3"]) -> Float[Tensor, "sample feature"]:
+        """B [products]; in memory one feature of all samples after another, as the network likes them."""
+        return (self.basis.weight @ self.appearance_grid(places).t()).t()
 
     def shade(
         self, features: Float[Tensor, "sample feature"], directions: Float[Tensor, "sample 3"]
     ) -> Float[Tensor, "sample 3"]:
         """S: features become a colour seen along directions."""
-        if self.config.shading == "sh":
-            harmonics = kernels.spherical_harmonics(directions, self.config.sh_bands)
+        c = self.config
+        if c.shading == "sh":
+            harmonics = spherical_harmonics(directions, c.sh_bands)
             return torch.sigmoid((features.view(len(features), 3, -1) * harmonics[:, None]).sum(-1))
-        constant = torch.ones_like(features[:, :1])  # in place of biases
-        inputs = torch.cat([self.encode_features(features), self.encode_directions(directions), constant], -1)
-        return torch.sigmoid(self.network(inputs))
+        encoded = octaves(features.t(), c.feature_frequencies), octaves(directions.t(), c.direction_frequencies)
+        constant = torch.ones_like(features.t()[:1])  # in place of biases
+        return torch.sigmoid(self.network(torch.cat([*encoded, constant]).t()))
+
+
+def octaves(x: Float[Tensor, "input sample"], count: int) -> Float[Tensor, "feature sample"]:
+    """x, and sines and cosines of 1, 2, 4 ... times x, as the paper's code encodes features and directions."""
+    angles = [2.0**k * x for k in range(count)]
+    return torch.cat([x, *(a.sin() for a in angles), *(a.cos() for a in angles)])
 
 
 class TensoRF(RayMethod):
@@ -237,12 +245,13 @@ class TensoRF(RayMethod):
             rays, self.frame.near, self._step(), self.config.cone_angle if open_ else 0.0, jitter=jitter
         )
         ray = samples.ray_index
-        points = rays.origins[ray] + samples.t[:, None] * rays.directions[ray]
+        towards = rays.directions.index_select(0, ray)
+        points = rays.origins.index_select(0, ray) + samples.t[:, None] * towards
         places, inside = self._places(points)
         density = self._density(points, places, inside)
         weighty = weights_of(samples, density.detach()) > self.config.weight_threshold
         coloured = weighty.nonzero()[:, 0]
-        rgb = self.network.colour(places[coloured], rays.directions[ray[coloured]])
+        rgb = self.network.colour(places.index_select(0, coloured), towards.index_select(0, coloured))
         rgb = rgb.new_zeros(len(samples), 3).index_copy(0, coloured, rgb)
         self.figures |= {"rays": len(rays), "samples": len(samples), "coloured_samples": len(coloured)}
         return [Look("samples", samples, density, rgb)]
@@ -318,7 +327,7 @@ class TensoRF(RayMethod):
         ones = torch.ones(factors.rows, 1, device=self.device, requires_grad=True)
 
         def lookup(points: Float[Tensor, "sample 3"]) -> Float[Tensor, "sample 1"]:
-            return kernels.factor_grid(self._places(points)[0], ones, factors, True)
+            return factor_grid(self._places(points)[0], ones, factors, True)
 
         (shares,) = importance(self, camera, lookup, [ones])
         return {f"network.{name}.table": shares[:, 0] for name in GRIDS}
@@ -370,10 +379,10 @@ class TensoRF(RayMethod):
         """Give the grids a resolution in the present box; its nodes are between those that they have in the old box, or
         random ones. The optimizer begins anew with them, as the code does."""
         nodes = nodes_in(self.box, resolution)
-        part = ((self.box - old[0]) / (old[1] - old[0])).unbind()
+        low, high = (self.box - old[0]) / (old[1] - old[0])
         for grid in (self.network.density_grid, self.network.appearance_grid):
             if fresh is None:
-                table = grid.resampled(nodes, part)
+                table = grid.resampled(nodes, (low, high))
             else:
                 shape = Factors(grid.kind, nodes).rows, grid.table.shape[1]
                 table = 0.1 * torch.randn(shape, generator=fresh)

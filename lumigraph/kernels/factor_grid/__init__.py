@@ -88,7 +88,8 @@ def factor_grid(
 
 def cases(generator: torch.Generator) -> Iterator[tuple]:
     """Inputs that every engine must agree on: both kinds, widths that lanes divide and others, borders and beyond."""
-    for kind in ("vm", "cp"):
+    kinds: tuple[Kind, Kind] = ("vm", "cp")
+    for kind in kinds:
         for samples, nodes, components, summed in [
             (0, (4, 5, 6), 16, False),
             (1, (2, 3, 2), 1, True),
@@ -98,18 +99,18 @@ def cases(generator: torch.Generator) -> Iterator[tuple]:
             (3, (3, 2, 3), 2, True),
         ]:
             yield _inputs(samples, Factors(kind, nodes), components, summed, generator)
-    for kind in ("vm", "cp"):
+    for kind in kinds:
         _, table, factors, summed = _inputs(0, Factors(kind, (3, 5, 4)), 16, True, generator)
         yield torch.cartesian_prod(*[torch.tensor([-0.5, 0.0, 0.28125, 1.0, 1.5])] * 3), table, factors, summed
 
 
 def benchmark_case(generator: torch.Generator, size: int = 2**18) -> tuple:
-    """A training step's samples for VM-192's appearance at 128^3: runs of 32 through the cube, half a node apart."""
+    """Density of VM-192 at 128^3 at a training step's samples: runs of 32 through the cube, half a node apart."""
     start = 0.2 + 0.6 * torch.rand(size // 32, 1, 3, generator=generator)
     direction = torch.nn.functional.normalize(torch.randn(size // 32, 1, 3, generator=generator), dim=-1)
     points = (start + direction * torch.arange(32)[:, None] / 256).reshape(-1, 3)
     factors = Factors("vm", (128, 128, 128))
-    return points, (0.1 * torch.randn(factors.rows, 48, generator=generator)).requires_grad_(), factors, False
+    return points, (0.1 * torch.randn(factors.rows, 16, generator=generator)).requires_grad_(), factors, True
 
 
 def _inputs(samples: int, factors: Factors, components: int, summed: bool, generator: torch.Generator) -> tuple:

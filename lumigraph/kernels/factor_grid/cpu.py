@@ -121,10 +121,10 @@ def _spread_planes(grad, cells, fractions, table, nodes, starts, axes, edges, wi
             for at in range(start + row * down + c, start + (row + 1) * down, width):
                 put(out, at, fetch(NONE, 0))
         for i in range(samples):
-            row = np.int64(cells[first, i])
+            row = cells[first, i]
             if row + 1 < begin or row >= end or (summed and grad[i] == ZERO):
                 continue
-            column, node = np.int64(cells[second, i]), np.int64(cells[beside, i])
+            column, node = cells[second, i], cells[beside, i]
             f, g, h = fractions[first, i], fractions[second, i], fractions[beside, i]
             at, on = start + row * down + column * width + c, along + node * width + c
             slope = _slope(grad, i, (i * 3 + mode) * width + c, summed)
@@ -182,7 +182,7 @@ class _FactorGrid(torch.autograd.Function):
         points, table = ctx.saved_tensors
         factors, starts, summed = ctx.about
         nodes, width = np.array(factors.nodes), table.shape[1]
-        cells, fractions = np.empty((3, len(points)), np.int32), np.empty((3, len(points)), np.float32)
+        cells, fractions = np.empty((3, len(points)), np.int64), np.empty((3, len(points)), np.float32)
         _places(_flat(points, 2), nodes, cells, fractions)
         found, lines = empty(*table.shape), sum(factors.sizes[-3:])
         sums = torch.zeros(BANDS, lines, width)
