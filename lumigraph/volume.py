@@ -38,10 +38,10 @@ def composite(
     return Rendering(colour, depth, opacity, dict(zip(values, rest, strict=True)))
 
 
-def weights_of(samples: Samples, density: Float[Tensor, " sample"]) -> Float[Tensor, " sample"]:
+def weights_of(samples: Samples, density: Float[Tensor, " sample"], stop: float = 0.0) -> Float[Tensor, " sample"]:
     """Each sample's share of what the eye gets, T_i (1 - exp(-sigma_i delta_i)); see `composite`."""
     tau = density * samples.length
-    return kernels.composite(tau, tau[:, None], samples.ray_starts)[2]
+    return kernels.composite(tau, tau[:, None], samples.ray_starts, stop)[2]
 
 
 STRETCH = 8  # samples of a ray that are asked about at first; each time after that, twice as many

@@ -5,7 +5,7 @@ import pytest
 from numba import njit
 
 from lumigraph.kernels import _lanes
-from lumigraph.kernels._lanes import LANES, exp2, fetch, inverse, put
+from lumigraph.kernels._lanes import LANES, exp2, fetch, inverse, put, put_where
 
 
 @njit
@@ -18,6 +18,12 @@ def each_exp2(x, out):
 def each_inverse(x, out):
     for i in range(0, len(x), LANES):
         put(out, i, inverse(fetch(x, i)))
+
+
+@njit
+def put_large(x, least, out, at):
+    row = fetch(x, 0)
+    put_where(row >= fetch(least, 0), out, at, row)
 
 
 EXPONENTS = np.concatenate([np.linspace(-126, 127, 1 << 16), np.linspace(-1, 1, 1 << 16)])
@@ -40,3 +46,13 @@ def test_far_below_exp2_is_next_to_nothing():
     each_exp2(x, out)
     np.testing.assert_array_equal(out, _lanes.exp2(x))
     assert (out[:5] == np.float32(2.0**-126)).all()
+
+
+def test_lanes_are_put_where_a_mask_holds_and_nowhere_else():
+    x, least = np.arange(16, dtype=np.float32), np.array([0, 99] * 8, np.float32)
+    out, plain = (np.full(24, -1, np.float32) for _ in range(2))
+    put_large(x, least, out, 5)
+    put_where(x >= least, plain, 5, x)
+    np.testing.assert_array_equal(out, plain)
+    np.testing.assert_array_equal(out[5:21], np.where(x >= least, x, -1))
+    assert (out[:5] == -1).all() and (out[21:] == -1).all()

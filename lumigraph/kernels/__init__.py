@@ -5,6 +5,7 @@ from ._dispatch import using as using
 from .composite import composite as composite
 from .factor_grid import Factors as Factors
 from .factor_grid import factor_grid as factor_grid
+from .harmonic_grid import harmonic_grid as harmonic_grid
 from .hash_encode import HashLevels as HashLevels
 from .hash_encode import hash_encode as hash_encode
 from .march import march as march
@@ -13,7 +14,10 @@ from .plane_sweep import plane_sweep as plane_sweep
 from .project import View as View
 from .project import project as project
 from .rasterize import rasterize as rasterize
+from .sparse_grid import Nodes as Nodes
+from .sparse_grid import sparse_grid as sparse_grid
 from .spherical_harmonics import spherical_harmonics as spherical_harmonics
 from .ssim import ssim as ssim
 from .tile import Tiles as Tiles
 from .tile import tile as tile
+from .total_variation import total_variation as total_variation

@@ -96,6 +96,13 @@ def put(array, at, x):
     array[at : at + LANES] = x
 
 
+def put_where(condition, array, at, x):
+    """array[at : at + 16] = x where the mask holds; the other numbers are not touched."""
+    if not 0 <= at <= len(array) - LANES:
+        raise IndexError(f"lanes from {at} of {len(array)}")
+    array[at : at + LANES][condition] = x[condition]
+
+
 def where(condition, x, y):
     """x where the mask holds, y elsewhere."""
     return np.where(condition, x, y)
@@ -166,6 +173,20 @@ def _put(typing, array, at, x):
         return context.get_dummy_value()
 
     return types.void(array, types.int64, lanes), generate
+
+
+@intrinsic
+def _put_where(typing, condition, array, at, x):
+    def generate(context, builder, sig, args):
+        (array_,) = data(context, builder, sig, args, 1)
+        place = vector_at(builder, array_, args[2])
+        kind = ir.FunctionType(ir.VoidType(), [FLOATS, FLOATS.as_pointer(), I32, BOOLS])
+        name = f"llvm.masked.store.v{LANES}f32.p0"
+        masked = cgutils.get_or_insert_function(builder.module, kind, name)
+        builder.call(masked, [args[3], place, ir.Constant(I32, 4), args[0]])
+        return context.get_dummy_value()
+
+    return types.void(mask, array, types.int64, lanes), generate
 
 
 @intrinsic
@@ -309,6 +330,7 @@ def _first_bit(typing, x):
 
 overload(fetch)(lambda array, at: lambda array, at: _fetch(array, at))
 overload(put)(lambda array, at, x: lambda array, at, x: _put(array, at, x))
+overload(put_where)(lambda condition, array, at, x: lambda condition, array, at, x: _put_where(condition, array, at, x))
 overload(where)(lambda condition, x, y: lambda condition, x, y: _where(condition, x, y))
 overload(lowest)(lambda x, y: lambda x, y: _lowest(x, y))
 overload(highest)(lambda x, y: lambda x, y: _highest(x, y))

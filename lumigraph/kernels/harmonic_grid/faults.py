@@ -1,0 +1,18 @@
+"""Faults that the tests write into a copy of an engine, one at a time, to see their comparison turn red.
+
+By name: the engine, the function, what stands there, and what is put in its place.
+"""
+
+FAULTS = {
+    "corner forgotten": ("gpu", "_backward", "tl.static_range(8)", "tl.static_range(7)"),
+    "weight forgotten": ("gpu", "_backward", "weight[:, None] * g", "g"),
+    "another colour's coefficient": ("gpu", "_forward", "c[None, :] % 3 == colour", "c[None, :] // 9 == colour"),
+    "direction of another sample": ("cpu", "_gradient", "if _turned(directions, i, before):", "if before < 0:"),
+    "lanes of both registers, twice": ("cpu", "_gradient", "put_where(own, ", "put("),
+    "density without weight": ("cpu", "_gradient", "weight * d_density[i]", "d_density[i]"),
+}
+
+# These let an index leave its array.
+ASTRAY = {
+    "a register beyond the last row": ("cpu", "_look_up", "row * WIDTH + SECOND", "row * WIDTH + SECOND + 16"),
+}

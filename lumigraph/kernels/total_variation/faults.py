@@ -1,0 +1,16 @@
+"""Faults that the tests write into a copy of an engine, one at a time, to see their comparison turn red.
+
+By name: the engine, the function, what stands there, and what is put in its place.
+"""
+
+FAULTS = {
+    "a neighbour's slope forgotten": ("gpu", "_vary", "dy / length", "0 * dy"),
+    "an axis forgotten": ("gpu", "_vary", "dz * dz + FLAT_", "FLAT_"),
+    "slope's sign": ("cpu", "_vary", "out[down, c] += per * dy", "out[down, c] -= per * dy"),
+    "a node's own slope forgotten": ("cpu", "_vary", "per * (dx + dy + dz)", "per * (dx + dy)"),
+}
+
+# These let an index leave its array.
+ASTRAY = {
+    "after the last node": ("cpu", "_after", "x >= index.shape[0]", "x > index.shape[0]"),
+}

@@ -1,0 +1,329 @@
+"""Plenoxels: a sparse grid of density and harmonics, no network (Fridovich-Keil and Yu 2022, arXiv 2112.05131)."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Annotated, Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from ..camera import Camera
+from ..components.fields.sparse_voxels import Cells, Part, SparseVoxels
+from ..components.sampling.carving import visual_hull
+from ..components.sampling.forward_march import march_forward
+from ..components.sampling.importance import importance
+from ..components.sampling.occupancy import OccupancyGrid
+from ..components.sampling.spaces import NDC, Contraction, space_of
+from ..components.training.corrections import Exposure
+from ..components.training.lazy_rmsprop import LazyRMSprop
+from ..components.training.photometric import backdrop, residuals
+from ..components.training.schedules import falling
+from ..controls import Control
+from ..errors import LumigraphError
+from ..kernels import total_variation
+from ..method import RayMethod
+from ..packing import Stored, most_important
+from ..ranges import BatchSize, LearningRate, NonNegative, Positive, PositiveShare, Seed, Share, Steps, between
+from ..rays import Look, Rays, Rendering, Samples
+from ..scene import Batch, Frame, Scene
+from ..volume import composite, weights_of
+
+Resolution = Annotated[int, between(4, 1024)]
+DensityRate = Annotated[float, between(1e-6, 1e4)]
+
+
+@dataclass(frozen=True)
+class Config:
+    """The paper's numbers for synthetic scenes (section 3, and the authors' release); `Plenoxels.preset` says what a
+    plain CPU does otherwise."""
+
+    base_resolution: Resolution = 256  # voxels per axis at first, section 3.3
+    max_resolution: Resolution = 512  # and in the end, doubled in between
+    refine_until: Share = 0.3  # share of the budget at which the grid is as fine as it gets
+    step_size: Annotated[float, between(0.05, 4)] = 0.5  # of samples along a ray, in voxels
+    initial_density: Positive = 0.1  # per unit of coordinates
+    transmittance_threshold: Share = 1e-4  # at which a ray is spent
+    weight_threshold: Share = 5e-3  # of a sample in a picture, below which its voxel is pruned, section 3.3
+    occupancy_resolution: Annotated[int, between(4, 512)] = 256  # cells per axis of the grid that rays march through
+    occupancy_threshold: NonNegative = 1e-2  # optical thickness across a cell below which it is skipped
+    occupancy_interval: Steps = 64  # steps between updates of the occupancy grid
+    rays_per_step: BatchSize = 5000  # section 4
+    density_learning_rate: DensityRate = 30.0  # per unit of coordinates
+    final_density_learning_rate: DensityRate = 0.05
+    density_delay: Share = 0.12  # share of the budget in which the density's learning rate comes up to that
+    harmonics_learning_rate: LearningRate = 1e-2
+    final_harmonics_learning_rate: LearningRate = 5e-6
+    tv_density: NonNegative = 1e-5  # weight of the density's total variation, eq. 3
+    tv_harmonics: NonNegative = 1e-3
+    tv_share: PositiveShare = 0.01  # of the nodes that a step touches: those that total variation looks at
+    tv_interval: Steps = 1  # steps from one look at it to the next
+    sparsity: NonNegative = 1e-11  # weight of the densities' Cauchy loss, eq. 4
+    beta: NonNegative = 0.0  # weight of the loss of opacities between 0 and 1, eq. 5; for captures without alpha
+    exposure_correction: bool = False  # learn a gain per photograph
+    seed: Seed = 0
+
+    def check(self) -> None:
+        """Raises LumigraphError for numbers that contradict each other."""
+        if self.base_resolution > self.max_resolution:
+            raise LumigraphError(
+                f"A grid cannot begin finer than it ends: --base-resolution {self.base_resolution:,} is above "
+                f"--max-resolution {self.max_resolution:,}"
+            )
+
+
+DELAYED = 0.01  # what the density's learning rate begins with, as a share
+REMEMBERED = 0.9  # of a cell's density, from one look of the occupancy grid to the next
+NOTED = 4  # steps between those whose samples' weights are remembered for pruning
+EDGE = 1e-3  # opacities are kept so far from 0 and 1 in the beta loss
+
+
+class Plenoxels(RayMethod):
+    """Rays are sampled in occupied cells; a first pass looks up density alone, and what light reaches is looked up once
+    more, with colour. Values belong to the nodes of a grid over the coordinates of a `Space`: an object as it is, a
+    forward-facing capture in normalised device coordinates, anything else contracted into a ball."""
+
+    Config = Config
+
+    def __init__(self, frame: Frame, config: Any = None):
+        config = config or Config()
+        super().__init__(frame, config)
+        self.space = space_of(frame)
+        self.voxels = SparseVoxels(cells_of(frame, config.base_resolution), config.initial_density)
+        self.occupancy = OccupancyGrid(reach_of(frame), config.occupancy_resolution)
+        self.exposure = Exposure(frame.image_count) if config.exposure_correction else None
+        self._table: LazyRMSprop | None = None
+
+    @classmethod
+    def preset(cls, device: torch.device) -> Any:
+        """On a GPU the paper's numbers. On a CPU, what learns most in a minute."""
+        if device.type == "cuda":
+            return Config()
+        return Config(
+            base_resolution=128,
+            max_resolution=256,
+            occupancy_resolution=128,
+            rays_per_step=4096,
+            transmittance_threshold=1e-3,
+            final_density_learning_rate=1.0,
+            harmonics_learning_rate=0.1,
+            final_harmonics_learning_rate=0.01,
+            tv_share=0.1,
+            tv_interval=8,
+            sparsity=0.0,
+        )
+
+    @classmethod
+    def smallest(cls) -> Any:
+        """A grid of three sizes with every loss, within some twenty quick steps."""
+        return Config(
+            base_resolution=8,
+            max_resolution=32,
+            refine_until=0.5,
+            step_size=1.0,
+            occupancy_resolution=16,
+            occupancy_interval=4,
+            rays_per_step=128,
+            density_delay=0.1,
+            density_learning_rate=3.0,
+            final_density_learning_rate=0.5,
+            harmonics_learning_rate=0.2,
+            final_harmonics_learning_rate=0.05,
+            tv_share=0.5,
+            tv_interval=2,
+            sparsity=1e-5,
+            beta=1e-4,
+            exposure_correction=True,
+        )
+
+    @classmethod
+    def further_bytes(cls, frame: Frame, config: Any, learning: bool) -> int:
+        grown = SparseVoxels.bytes_of(cells_of(frame, config.max_resolution), learning)
+        return grown + OccupancyGrid.bytes_of(reach_of(frame), config.occupancy_resolution)
+
+    def rays_in_a_step(self, data: Scene) -> float:
+        return self.config.rays_per_step
+
+    # Being seen
+
+    def render_rays(self, rays: Rays, background: Float[Tensor, "#ray 3"]) -> Rendering:
+        (look,) = self.looks(rays)
+        return composite(look.samples, look.density, look.rgb, background)
+
+    def looks(self, rays: Rays) -> list[Look]:
+        samples, _ = self._reached(rays)
+        return [Look("samples", samples, *self._field(*samples.along(rays), self.voxels))]
+
+    def _reached(
+        self, rays: Rays, jitter: Float[Tensor, " ray"] | None = None
+    ) -> tuple[Samples, Float[Tensor, " sample"]]:
+        """The samples of rays that light reaches and that are not quite clear, and how much each weighs in a picture."""
+        step = self.config.step_size * 2 / int(self.voxels.cells.amax())
+        if isinstance(self.space, NDC):
+            found = march_forward(self.space, self.occupancy, rays, step, jitter)
+        else:  # the inner half of a contraction's coordinates has the scene's own shape; beyond, voxels grow evenly
+            open_ = isinstance(self.space, Contraction)
+            first, growth = (2 * step, step) if open_ else (step, 0.0)
+            found = self.occupancy.sample(rays, self.frame.near, first, growth, jitter=jitter)
+        with torch.no_grad():  # a lookup of density is so quick that all are asked about at once
+            density = self.density(found.along(rays)[0])
+            weights = weights_of(found, density, self.config.transmittance_threshold)
+        seen = weights > 0
+        samples = found.keep(seen)
+        self.figures |= {"rays": len(rays), "samples": len(found), "visible_samples": len(samples)}
+        return samples, weights[seen]
+
+    def field(
+        self, points: Float[Tensor, "point 3"], directions: Float[Tensor, "point 3"]
+    ) -> tuple[Float[Tensor, " point"], Float[Tensor, "point 3"]]:
+        """Density per scene unit, and sRGB-encoded colour seen along unit directions."""
+        density, rgb = self._field(points, directions, self.voxels)
+        return density, rgb * self.exposure.gain(self.told) if self.told and self.exposure else rgb
+
+    def _field(
+        self, points: Float[Tensor, "point 3"], directions: Float[Tensor, "point 3"], voxels: SparseVoxels | Part
+    ) -> tuple[Float[Tensor, " point"], Float[Tensor, "point 3"]]:
+        density, rgb = voxels.at(self.space.warp(points), directions)
+        return density.relu() * self.space.stretch(points), rgb.sigmoid()
+
+    def density(self, points: Float[Tensor, "point 3"]) -> Float[Tensor, " point"]:
+        """Density per scene unit."""
+        return self._density(self.space.warp(points)) * self.space.stretch(points)
+
+    def _density(self, places: Float[Tensor, "point 3"]) -> Float[Tensor, " point"]:
+        """Density per unit of coordinates."""
+        return self.voxels.density_at(places).relu()
+
+    def storage(self) -> dict[str, Stored]:
+        """Harmonics by a codebook, density as whole numbers; of the grid, marks alone are needed for pictures."""
+        return {
+            "voxels.density": Stored("scaled"),
+            "voxels.harmonics": Stored("coded"),
+            "voxels.weights": Stored("nothing"),
+            "occupancy.density": Stored("nothing"),
+            "occupancy.possible": Stored("nothing", fill=1.0),
+        }
+
+    def importance(self, camera: Camera) -> dict[str, Float[Tensor, " row"]]:
+        """How much each voxel adds to one picture; see `components.sampling.importance`."""
+
+        def lookup(points: Float[Tensor, "sample 3"]) -> Float[Tensor, "sample 1"]:
+            return self.voxels.density_at(self.space.warp(points))[:, None]
+
+        (shares,) = importance(self, camera, lookup, [self.voxels.density])
+        return {"voxels.harmonics": shares[:, 0]}
+
+    @torch.no_grad()
+    def thin(self, importance: dict[str, Float[Tensor, " row"]], share: float) -> dict[str, Float[Tensor, " kept"]]:
+        """Leave the least important voxels out."""
+        weights = importance["voxels.harmonics"]
+        kept = most_important(weights, 1 - share)
+        self.voxels.keep(kept)
+        return {"voxels.harmonics": weights[kept]}
+
+    @property
+    def controls(self) -> tuple[Control, ...]:
+        return self.exposure.controls if self.exposure else ()
+
+    # Learning
+
+    def begin(self, scene: Scene, seconds: float = math.inf) -> None:
+        if scene.images.has_alpha and self.frame.reach == 1:
+            hull = visual_hull(scene, self.config.occupancy_resolution)
+            self.occupancy.rule_out(hull[None])
+            self.voxels.rebuild(hull, self.cells, self._table)
+
+    @property
+    def cells(self) -> Cells:
+        x, y, z = self.voxels.cells.tolist()
+        return x, y, z
+
+    def loss(self, batch: Batch, step: int) -> dict[str, Tensor]:
+        config, generator = self.config, self.random(step)
+        jitter = torch.rand(len(batch), generator=generator).to(self.device)
+        samples, weights = self._reached(batch.rays, jitter)
+        points, directions = samples.along(batch.rays)
+        places = self.space.warp(points)
+        if step % NOTED == 0:
+            self.voxels.note(places, weights)
+        rows = self.voxels.touched(places)
+        part = self.voxels.part(rows)
+        density, rgb = self._field(points, directions, part)
+        background = backdrop(batch, self.background, generator)
+        rendering = composite(samples, density, rgb, background)
+        residual, self.figures["mse"] = residuals(rendering, batch, background, self.exposure)
+        self.figures |= {"voxels": len(self.voxels), "touched": len(rows)}
+        terms = {"colour": residual.square().mean()}
+        if config.sparsity:
+            terms["sparsity"] = config.sparsity * cauchy(density, len(batch))
+        if step % config.tv_interval == 0:
+            drawn = torch.rand(len(rows), generator=generator).to(rows.device) < config.tv_share
+            chosen = self.voxels.numbers[rows[drawn]].long()
+            for name, weight in (("density", config.tv_density), ("harmonics", config.tv_harmonics)):
+                if weight:
+                    terms[f"tv_{name}"] = weight * total_variation(chosen, part.nodes, getattr(part, name))
+        if config.beta and batch.alpha is None:
+            terms["beta"] = config.beta * undecided(rendering.opacity)
+        return terms
+
+    def optimizers(self) -> list[torch.optim.Optimizer]:
+        density = {"params": [self.voxels.density], "name": "density"}
+        harmonics = {"params": [self.voxels.harmonics], "name": "harmonics"}
+        self._table = LazyRMSprop([density, harmonics])
+        if not self.exposure:
+            return [self._table]
+        gains = {"params": [*self.exposure.parameters()], "name": "harmonics", "scale": 0.05}
+        return [self._table, torch.optim.Adam([gains])]
+
+    def learning_rate(self, step: int, progress: float) -> dict[str, float]:
+        """Exponential decay; the density's rate comes up slowly at first (the release's delayed rates)."""
+        c = self.config
+        up = math.sin(0.5 * math.pi * min(1.0, progress / c.density_delay)) if c.density_delay else 1.0
+        return {
+            "density": (DELAYED + (1 - DELAYED) * up)
+            * falling(c.density_learning_rate, c.final_density_learning_rate, progress),
+            "harmonics": falling(c.harmonics_learning_rate, c.final_harmonics_learning_rate, progress),
+        }
+
+    def before_step(self, step: int, progress: float) -> None:
+        c = self.config
+        wanted = cells_of(self.frame, self._resolution(progress))
+        finer = wanted > self.cells
+        if finer:
+            self.voxels.rebuild(self.voxels.important(c.weight_threshold), wanted, self._table)
+            self.occupancy.density.zero_()
+        if finer or (step and step % c.occupancy_interval == 0):
+            density_at = self._density if isinstance(self.space, NDC) else self.density
+            self.occupancy.update(density_at, c.occupancy_threshold, self.random(~step), REMEMBERED)
+
+    def _resolution(self, progress: float) -> int:
+        """Voxels per axis at a share of the budget: doubled at equal intervals up to `refine_until`."""
+        c = self.config
+        doublings = math.ceil(math.log2(c.max_resolution / c.base_resolution))
+        done = doublings if progress >= c.refine_until else int(doublings * progress / c.refine_until)
+        return min(c.base_resolution << done, c.max_resolution)
+
+
+def cells_of(frame: Frame, resolution: int) -> Cells:
+    """Voxels along each axis. A forward-facing capture has few depths and many pixels."""
+    if isinstance(space_of(frame), NDC):
+        return resolution + resolution // 2, resolution + resolution // 2, resolution // 2
+    return resolution, resolution, resolution
+
+
+def reach_of(frame: Frame) -> float:
+    """Half-size of the cube that rays march through: the scene's own, or that of normalised device coordinates."""
+    return 1.0 if isinstance(space_of(frame), NDC) else frame.reach
+
+
+def cauchy(density: Float[Tensor, " sample"], rays: int) -> Tensor:
+    """Mean over rays of the sum of log(1 + 2 sigma^2) along each (eq. 4)."""
+    return torch.log1p(2 * density.square()).sum() / max(rays, 1)
+
+
+def undecided(opacity: Float[Tensor, " ray"]) -> Tensor:
+    """Mean of log(T) + log(1 - T), which is least where light passes wholly or not at all (eq. 5)."""
+    light = (1 - opacity).clamp(EDGE, 1 - EDGE)
+    return (light.log() + (1 - light).log()).mean()
