@@ -25,7 +25,7 @@ from .measure import Truth, truth_of
 from .model import Model
 
 LOOKED_AT = 6  # photographs that were learnt from, by which a rung is judged; held-out ones judge the outcome alone
-WEIGHED = 60  # photographs that say what is important
+WEIGHED = 40  # photographs that say what is important
 TRIAL = 1 / 6  # of all tuning, for each rung that is tried; as much as is left goes to the one that stays
 
 
