@@ -1,4 +1,4 @@
-"""Plenoxels: the grid keeps its values when it grows and is pruned, its optimizer follows, its losses are the paper's."""
+"""Plenoxels: a grid keeps its values when it grows and is pruned, its optimizer follows, losses are the paper's."""
 
 import math
 
@@ -89,7 +89,7 @@ def test_the_optimizer_follows_a_rebuilt_grid():
     number = voxels.numbers[middle]
     x, y, z = (int(i) for i in torch.unravel_index(number, (5, 7, 9)))
     voxels.rebuild(torch.ones(1, 1, 1, dtype=torch.bool), (8, 12, 16), optimizer)
-    assert optimizer.param_groups[0]["params"][0] is voxels.density and len(optimizer.state) == 1
+    assert optimizer.param_groups[0]["params"][0] is voxels.density and len(optimizer.state) == 2
     moved = optimizer.state[voxels.density]["square"].view(9, 13, 17)
     torch.testing.assert_close(moved[2 * x, 2 * y, 2 * z], square[middle, 0])
 

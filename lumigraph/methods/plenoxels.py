@@ -159,7 +159,7 @@ class Plenoxels(RayMethod):
     def _reached(
         self, rays: Rays, jitter: Float[Tensor, " ray"] | None = None
     ) -> tuple[Samples, Float[Tensor, " sample"]]:
-        """The samples of rays that light reaches and that are not quite clear, and how much each weighs in a picture."""
+        """The samples of rays that light reaches and that are not clear, and how much each weighs in a picture."""
         step = self.config.step_size * 2 / int(self.voxels.cells.amax())
         if isinstance(self.space, NDC):
             found = march_forward(self.space, self.occupancy, rays, step, jitter)

@@ -52,8 +52,8 @@ class SparseVoxels(nn.Module):
 
     @staticmethod
     def bytes_of(cells: Cells, learning: bool) -> int:
-        """What a grid takes at least: its index, and the values of such a share of nodes as is left of most scenes; where
-        it learns, as much again for their mean squares."""
+        """What a grid takes at least: its index, and the values of as many nodes as are left of most scenes; where it
+        learns, as much again for their mean squares."""
         nodes = (cells[0] + 1) * (cells[1] + 1) * (cells[2] + 1)
         return 4 * nodes + int(SHARE * nodes) * 4 * (1 + 3 * COEFFICIENTS) * (2 if learning else 1)
 

@@ -15,11 +15,9 @@ Y0, Y1, Y20, Y21, Y22 = (np.float32(k) for k in (K00, K1, K20, K21, K22))
 WIDTH = 27  # coefficients of a row, colours next to each other
 SECOND = 11  # where a row's second register begins
 # Of the two registers: which lanes are of each colour, and in the last row, which are a row's own.
-LANES_OF = np.zeros((4, 2, 16), np.float32)
-for lane in range(16):
-    LANES_OF[lane % 3, 0, lane] = LANES_OF[(SECOND + lane) % 3, 1, lane] = ONE
-    LANES_OF[3, :, lane] = ONE, ONE if lane + SECOND >= 16 else ZERO
-LANES_OF = LANES_OF.reshape(-1)
+_PLACES = np.stack([np.arange(16), np.arange(SECOND, WIDTH)])  # in a row, of each lane
+_MASKS = [*(_PLACES % 3 == colour for colour in range(3)), _PLACES >= [[0], [16]]]
+LANES_OF = np.stack(_MASKS).astype(np.float32).reshape(-1)
 
 
 @njit(inline="always")

@@ -23,8 +23,8 @@ class Nodes:
     last on the cube's faces. A node's number is (x Y + y) Z + z.
 
     index: a row for each node, -1 where it has none; no row belongs to two nodes
-    rows:  int32; the row of a table with `count` rows for each that `index` names, -1 for none; empty where these are the
-           rows that `index` names
+    rows:  int32; the row of a table with `count` rows for each that `index` names, -1 for none; empty where those
+           are the rows meant
     """
 
     index: Int32[Tensor, "x y z"]

@@ -8,7 +8,7 @@ from numba import njit, prange
 from ..sparse_grid.cpu import row_of, slabs_of
 from . import FLAT
 
-ZERO, ONE = np.float32(0), np.float32(1)
+ONE = np.float32(1)
 FLAT_ = np.float32(FLAT)
 
 
@@ -38,19 +38,17 @@ def _vary(chosen, index, rows, values, order, starts, sloped, sums, out):
                 right = _after(index, rows, x + 1, y, z, here)
                 down = _after(index, rows, x, y + 1, z, here)
                 ahead = _after(index, rows, x, y, z + 1, here)
-                some = ZERO
                 for c in range(channels):
                     value = values[here, c]
                     dx, dy, dz = values[right, c] - value, values[down, c] - value, values[ahead, c] - value
                     length = np.sqrt(dx * dx + dy * dy + dz * dz + FLAT_)
-                    some += length
+                    total += length
                     if sloped:
                         per = ONE / length
                         out[here, c] -= per * (dx + dy + dz)
                         out[right, c] += per * dx
                         out[down, c] += per * dy
                         out[ahead, c] += per * dz
-                total += some
             sums[slab] = total
 
 
