@@ -58,6 +58,7 @@ SHARES: dict[str, tuple[str, float]] = {
     "test_compress": ("runs, commands, benchmark", 15),
     "test_memory": ("runs, commands, benchmark", 12),
     "test_nerf": ("methods", 16),
+    "test_tensorf": ("methods", 5),
     "test_instant_ngp": ("methods", 10),
     "test_gaussian_splatting": ("methods", 10),
     "test_fourier_features": ("methods", 12),

@@ -60,12 +60,19 @@ def test_a_part_of_the_cube_keeps_its_values(kind):
     torch.testing.assert_close(part(points), made(low + points * (high - low)))
 
 
+@pytest.mark.parametrize("nodes", [(4, 5, 4), (4, 1, 8), (-4, 5, 3)])
+def test_a_table_that_does_not_fit_its_nodes_is_refused(nodes):
+    made = grid("vm", (4, 5, 3))
+    with pytest.raises(RuntimeError, match="rows|nodes"):
+        made.load_state_dict(made.state_dict() | {"nodes": torch.tensor(nodes)})
+
+
 def test_variation_and_sparsity_are_means_over_each_factor():
     made = grid("cp", (3, 3, 3), components=1)
     with torch.no_grad():
         made.table.copy_(torch.tensor([[0.0], [1], [3], [2], [2], [2], [-1], [0], [1]]))
-    assert float(made.variation()) == pytest.approx((1 + 4) / 2 + 0 + 1)
-    assert float(made.sparsity()) == pytest.approx(4 / 3 + 2 + 2 / 3)
+    assert float(made.variation().detach()) == pytest.approx((1 + 4) / 2 + 0 + 1)
+    assert float(made.sparsity().detach()) == pytest.approx(4 / 3 + 2 + 2 / 3)
 
 
 def test_nodes_are_as_far_apart_along_all_axes():

@@ -32,6 +32,7 @@ class FactorGrid(nn.Module):
         self.kind: Kind = kind
         self.register_buffer("nodes", torch.tensor(nodes))
         self.table = nn.Parameter(deviation * torch.randn(Factors(kind, nodes).rows, components))
+        self.register_load_state_dict_post_hook(_check_rows)
 
     @property
     def factors(self) -> Factors:
@@ -67,6 +68,16 @@ class FactorGrid(nn.Module):
             for axis in range(part.ndim - 1):
                 terms.append(part.diff(dim=axis).square().mean())
         return torch.stack(terms).sum()
+
+
+def _check_rows(grid: FactorGrid, keys: object) -> None:
+    """Raise RuntimeError, as PyTorch does where weights do not fit, unless a loaded table has its nodes' rows."""
+    try:
+        rows = grid.factors.rows
+    except ValueError as error:
+        raise RuntimeError(str(error)) from error
+    if len(grid.table) != rows:
+        raise RuntimeError(f"a table of {len(grid.table):,} rows, where {grid.nodes.tolist()} nodes have {rows:,}")
 
 
 def nodes_in(box: Float[Tensor, "2 3"], resolution: int) -> Nodes:
