@@ -173,8 +173,8 @@ class DVGO(RayMethod):
         return density, torch.sigmoid(logits)
 
     def storage(self) -> dict[str, Stored]:
-        """Features by a codebook, density as whole numbers, the network as halves; of the mask of free space, marks alone
-        are needed for pictures."""
+        """Features by a codebook, density as whole numbers, the network as halves; of the mask, marks alone are needed
+        for pictures."""
         networks = [f"colour_network.{name}" for name, _ in self.colour_network.named_parameters()]
         return {
             "density_grid.values": Stored("scaled", fill=GONE),
