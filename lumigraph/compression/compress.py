@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from bisect import bisect_left
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -99,17 +100,16 @@ class Ladder:
 
     def by_size(self, most: int) -> Model:
         """The lowest rung that is as small. Tuning changes the size a little, so that it may take the next one."""
-        reached = []
-        for number in range(len(LADDER)):
-            model = self.at(number)
-            if (size := len(model.packed())) <= most:
-                self.tune(model, 1 - self.tuned)
-                if (size := len(model.packed())) <= most:
-                    return model
-                self.tuned = 0.0
-            reached.append(size)
+        rungs = range(len(LADDER))
+        first = bisect_left(rungs, True, key=lambda number: len(self.at(number).packed()) <= most)
+        for number in rungs[first:]:
+            model, self.tuned = self.at(number), 0.0
+            self.tune(model, 1.0)
+            if len(model.packed()) <= most:
+                return model
+        smallest = len(self.at(len(LADDER) - 1).packed())
         raise LumigraphError(
-            f"{self.run.folder} cannot be made as small as {told(most)}; the smallest reached is {told(min(reached))}"
+            f"{self.run.folder} cannot be made as small as {told(most)}; the smallest reached is {told(smallest)}"
         )
 
     def at(self, number: int) -> Model:
