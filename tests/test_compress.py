@@ -27,7 +27,7 @@ from lumigraph.train import fit
 def cloud_run(tmp_path_factory) -> Run:
     """Gaussians that have learnt the tiny scene for some steps."""
     method, run = new(tmp_path_factory.mktemp("runs") / "cloud")
-    fit(method, tiny.scene(), run, steps=60, show=False, rehearsal=False)
+    fit(method, tiny.scene(), run, steps=30, show=False, rehearsal=False)
     return run
 
 
@@ -37,7 +37,7 @@ def large(ball_folder, tmp_path_factory) -> Run:
     scene, kind = open_scene(ball_folder), methods.find("gaussian-splatting")
     method = build(kind, scene.frame, kind.smallest(), torch.device("cpu"), 0)
     run = Run.create(tmp_path_factory.mktemp("large") / "run", method, scene)
-    fit(method, scene, run, steps=60, show=False, rehearsal=False)
+    fit(method, scene, run, steps=30, show=False, rehearsal=False)
     return run
 
 
@@ -119,7 +119,7 @@ def test_each_rung_is_smaller_than_the_one_before(cloud_run):
     for rung in LADDER[::2]:
         method = cloud_run.method()
         weights = {"cloud.harmonics": torch.rand(len(method.cloud), generator=torch.Generator().manual_seed(0))}
-        sizes.append(len(Model(method, weights, rung, 60).packed()))
+        sizes.append(len(Model(method, weights, rung, 30).packed()))
     assert sizes == sorted(sizes, reverse=True) and sizes[-1] < sizes[0] / 1.5
 
 
@@ -134,9 +134,9 @@ def test_importance_is_what_a_picture_gains(cloud_run):
 def test_tuning_mends_what_storing_broke(cloud_run):
     scene, method = tiny.scene(), cloud_run.method()
     weights = {"cloud.harmonics": torch.ones(len(method.cloud))}
-    model = Model(method, weights, LADDER[-1], 60)
+    model = Model(method, weights, LADDER[-1], 30)
     broken = squared_error(method, scene, "train", 9)
-    model.tune(scene, 60, None)
+    model.tune(scene, 40, None)
     assert squared_error(method, scene, "train", 9) < 0.95 * broken
     shown = {name: x.clone() for name, x in method.state_dict().items()}
     for name, table in model.tables.items():
@@ -167,3 +167,10 @@ def test_what_compressing_came_to_is_read_by_its_layout(small, tmp_path):
     (tmp_path / "compress.json").write_text(json.dumps(said | {"bytes_after": -1}))
     with pytest.raises(LumigraphError, match="bytes_after is -1"):
         Compressed.read(tmp_path)
+
+
+def test_a_psnr_at_a_size_lies_between_the_rungs_beside_it():
+    from grids import at_size
+
+    lines = [{"bytes": size, "psnr": psnr} for size, psnr in ((4e6, 30.0), (1e6, 28.0), (1e5, 20.0))]
+    assert [at_size(lines, size) for size in (1e6, 2e6, 9e6, 1e4)] == ["28.00", "29.00", "(30.00)", "(20.00)"]
