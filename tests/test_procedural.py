@@ -353,6 +353,33 @@ def test_the_still_life_fills_its_bounds_and_no_more(still_life):
     assert signed_distance(still_life.world, edge).min() > 0
 
 
+def test_tourists_have_a_light_each_and_the_truth_without_them():
+    scene = open_scene("procedural:tourists,size=24,views=6")
+    photographs = torch.stack([scene.photograph(i).rgb for i in range(len(scene))])
+    clean = torch.stack([scene.photograph(i, layers=("clean",)).extra["clean"] for i in range(len(scene))])
+    train, test = scene.splits["train"], scene.splits["test"]
+    assert torch.equal(photographs[test], clean[test])  # nobody is before what is held out
+    passing = ((photographs - clean).abs() > 0.05).any(-1).float().mean((1, 2))
+    assert (passing[train] > 0).float().mean() > 0.8 and passing.max() < 0.7
+    brightness = clean.mean((1, 2))
+    assert brightness.std(0).min() > 0.02 and (brightness[:, 0] / brightness[:, 2]).std() > 0.05  # light, and its tint
+    focal = scene.cameras.lens.focal[:, 0]
+    assert focal.max() > 1.1 * focal.min()
+
+
+def test_jittered_poses_are_off_by_as_much_as_asked_and_their_pictures_are_the_same():
+    exact, off = (open_scene(f"procedural:still-life,size=16,views=4{more}") for more in ("", ",jitter_poses=2"))
+    train, test = exact.splits["train"], exact.splits["test"]
+    turned = exact.cameras.pose[train, :, :3].mT @ off.cameras.pose[train, :, :3]
+    angle = ((turned.diagonal(dim1=1, dim2=2).sum(-1) - 1) / 2).acos().rad2deg()
+    moved = (exact.cameras.position - off.cameras.position)[train].norm(dim=-1)
+    low, high = (torch.tensor(x) for x in scenes.stage("still-life").bounds)
+    torch.testing.assert_close(angle, torch.full((4,), 2.0), atol=0.02, rtol=0)
+    torch.testing.assert_close(moved, 0.02 * (high - low).max().expand(4), rtol=1e-3, atol=0)
+    assert torch.equal(exact.cameras.pose[test], off.cameras.pose[test])
+    assert torch.equal(exact.photograph(0).rgb, off.photograph(0).rgb)
+
+
 def test_open_scene_makes_a_scene_in_the_worlds_own_frame():
     scene = open_scene("procedural:still-life,size=32,views=6,seed=1")
     assert len(scene.splits["train"]) == 6 and len(scene.splits["test"]) >= 2

@@ -4,6 +4,7 @@
     render(stage.world, stage.cameras["test"][0])         picture, exact depth, normals, masks, albedo
     signed_distance(stage.world, points)                  exact geometry
     open_scene("procedural:still-life,size=400")          the same as any other capture
+    open_scene("procedural:tourists,jitter_poses=2")      with poses that are 2 degrees and 2 % off
     render(stage.world_of(camera), camera)                the same, of a scene that moves: `swing`
     write_blender(stage, folder)                          the same for other tools
 
@@ -13,7 +14,7 @@ A new scene is a new file in `scenes/`; nothing is compiled for it.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import dataclass, fields
 from functools import partial
 from typing import Annotated
 
@@ -25,6 +26,7 @@ from ...ranges import Seed, between, typed
 from ..capture import Capture, Plane, Shot
 from . import scenes as scenes
 from .blender_folder import write_blender as write_blender
+from .jitter import jittered as jittered
 from .rendering import eight_bits, photograph
 from .rendering import render as render
 from .rendering import signed_distance as signed_distance
@@ -43,11 +45,13 @@ DIGITS = 20  # of a number, at most
 
 @dataclass(frozen=True)
 class Options:
-    """size: of the square pictures, pixels; views: number of photographs to learn from; seed: where cameras stand."""
+    """size: of the square pictures, pixels; views: number of photographs to learn from; seed: where cameras stand;
+    jitter_poses: degrees, and percent of the box of interest, by which poses to learn from are off."""
 
     size: Annotated[int, between(1, 8192)] = 200
     views: Annotated[int, between(1, 10_000)] = 100
     seed: Seed = 0
+    jitter_poses: Annotated[int, between(0, 45)] = 0
 
 
 def read(request: str) -> Capture:
@@ -57,7 +61,8 @@ def read(request: str) -> Capture:
     """
     name, *rest = request.split(",")
     options = typed(Options, dict(parse(request, text) for text in rest), f"procedural:{request}")
-    return capture(scenes.stage(name, **asdict(options)), f"procedural:{request}")
+    stage = scenes.stage(name, options.size, options.views, options.seed)
+    return capture(stage, f"procedural:{request}", jittered(stage, options.jitter_poses, options.seed))
 
 
 def parse(request: str, text: str) -> tuple[str, int]:
@@ -71,13 +76,14 @@ def parse(request: str, text: str) -> tuple[str, int]:
     return name, int(value)
 
 
-def capture(stage: Stage, source: str) -> Capture:
-    """A stage as photographs with known poses."""
+def capture(stage: Stage, source: str, found: dict[str, Camera] | None = None) -> Capture:
+    """A stage as photographs with known poses. found: the cameras as they are said to be, where that differs."""
     visible = stage.world.sky.visible
+    said = found or stage.cameras
     shots = [
         Shot(
             name=f"{split}_{i:04d}",
-            pose=cameras.pose[i].double().numpy(),
+            pose=said[split].pose[i].double().numpy(),
             lens=cameras.lens[i],
             size=(int(cameras.size[i, 0]), int(cameras.size[i, 1])),
             image=partial(picture, stage, cameras[i]),
@@ -99,12 +105,22 @@ def known_planes(stage: Stage, camera: Camera) -> dict[str, Plane]:
         values = partial(known, stage, camera, name)
         return Plane(values, encoding, dtype=np.dtype(dtype), channels=channels, names=tuple(names))
 
-    return {
+    clean = partial(without_passers_by, stage, camera)
+    lasting = (
+        {} if stage.lasting is None else {"clean": Plane(clean, "sRGB", 1 / 255, dtype=np.dtype(np.uint8), channels=3)}
+    )
+    return lasting | {
         "depth": plane("depth", "distance", np.float32),
         "normals": plane("normals", "direction", np.float32, 3),
         "labels": plane("labels", "index", np.int64, names=stage.world.names),
         "albedo": plane("albedo", "linear", np.float32, 3),
     }
+
+
+def without_passers_by(stage: Stage, camera: Camera) -> np.ndarray:
+    """The photograph as it would be in its own light with nobody there, bytes (height, width, 3)."""
+    assert stage.lasting is not None and camera.image_index is not None
+    return eight_bits(*photograph(stage.lasting(int(camera.image_index)), camera), alpha=False)
 
 
 def known(stage: Stage, camera: Camera, name: str) -> np.ndarray:

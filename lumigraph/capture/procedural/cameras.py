@@ -21,10 +21,12 @@ def look_at(eye, target, up=(0.0, 0.0, 1.0)) -> Float[np.ndarray, "3 4"]:
     return geometry.look_at(eye, target - eye, up).numpy()
 
 
-def pinhole(poses: Float[np.ndarray, "camera 3 4"], size: int, field_of_view: float) -> Camera:
-    """The lens of square pictures of `size` pixels, `field_of_view` degrees wide."""
-    count, focal = len(poses), 0.5 * size / math.tan(math.radians(field_of_view) / 2)
-    lens = Pinhole(torch.full((count, 2), focal), torch.full((count, 2), size / 2))
+def pinhole(poses: Float[np.ndarray, "camera 3 4"], size: int, field_of_view: float | np.ndarray) -> Camera:
+    """The lens of square pictures of `size` pixels, `field_of_view` degrees wide, or of each camera."""
+    count = len(poses)
+    angles = np.broadcast_to(np.radians(field_of_view), count)
+    focal = torch.from_numpy(0.5 * size / np.tan(angles / 2)).float()[:, None].expand(-1, 2)
+    lens = Pinhole(focal, torch.full((count, 2), size / 2))
     return Camera(torch.from_numpy(np.asarray(poses)).float(), lens, torch.full((count, 2), size))
 
 

@@ -19,6 +19,9 @@ class Stage:
     reach:   half-size of the cube around the origin that holds everything worth modelling
     near:    distance from every camera within which there is nothing
     moving:  the world at a moment; None where nothing moves
+    differing: the world when a photograph was taken, by its `image_index`, where light or people differ from one to the
+             next; None where they do not
+    lasting: the same without whatever only passed by
     """
 
     world: World
@@ -27,7 +30,11 @@ class Stage:
     reach: float
     near: float
     moving: Callable[[float], World] | None = None
+    differing: Callable[[int], World] | None = None
+    lasting: Callable[[int], World] | None = None
 
     def world_of(self, camera: Camera) -> World:
         """The world at the moment when a camera (a batch of one) takes its photograph."""
+        if self.differing is not None and camera.image_index is not None:
+            return self.differing(int(camera.image_index))
         return self.world if self.moving is None or camera.time is None else self.moving(float(camera.time))

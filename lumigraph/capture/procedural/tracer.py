@@ -244,7 +244,7 @@ def _build(sources: int):
             c, t, n, k, own = look(objects, materials, lights, sky[0], nodes, o, d, radius[i], ray, aims)
             depth[i], identity[i] = t, k
             for axis in range(3):
-                radiance[i, axis] = film(sky[0].exposure * c[axis])
+                radiance[i, axis] = film(sky[0].exposure[axis] * c[axis])
                 normal[i, axis], reflectance[i, axis] = n[axis], own[axis]
 
     @njit(cache=True, **FAST)
@@ -259,8 +259,8 @@ def _build(sources: int):
                 i = samples * pixel + s
                 o, d = vec(origins[i]), vec(directions[i])
                 c, _, _, k, _ = look(objects, materials, lights, sky[0], nodes, o, d, radius[i], begin + s, aims)
-                c = scale(c, sky[0].exposure)
-                c = (film(c[0]), film(c[1]), film(c[2]))
+                e = sky[0].exposure
+                c = (film(e[0] * c[0]), film(e[1] * c[1]), film(e[2] * c[2]))
                 low = (min(low[0], c[0]), min(low[1], c[1]), min(low[2], c[2]))
                 high = (max(high[0], c[0]), max(high[1], c[1]), max(high[2], c[2]))
                 total = along(total, 1.0, c)

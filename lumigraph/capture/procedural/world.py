@@ -52,7 +52,7 @@ SKY = np.dtype(
         ("clouds", "f8"),
         ("haze", "f8"),
         ("reach", "f8"),
-        ("exposure", "f8"),
+        ("exposure", "f8", 3),
     ]
 )
 
@@ -171,6 +171,7 @@ class Sky:
     haze:    share of light lost per scene unit to the horizon's colour
     reach:   how far things darken each other's corners (ambient occlusion), scene units
     exposure: factor on all radiance before the film's response
+    balance: further factors on red, green and blue: the camera's white balance
     """
 
     zenith: Colour = (1.0, 1.0, 1.0)
@@ -182,10 +183,12 @@ class Sky:
     haze: float = 0.0
     reach: float = 0.25
     exposure: float = 1.0
+    balance: Colour = (1.0, 1.0, 1.0)
 
     def describe(self):
         colours = (_linear(c) * self.light for c in (self.zenith, self.horizon, self.ground))
-        return int(self.visible), *colours, self.clouds, self.haze, self.reach, self.exposure
+        exposure = self.exposure * np.array(self.balance)
+        return int(self.visible), *colours, self.clouds, self.haze, self.reach, exposure
 
 
 @dataclass(frozen=True)
