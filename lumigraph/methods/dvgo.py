@@ -209,7 +209,8 @@ class DVGO(RayMethod):
     def _activated(self, raw: Float[Tensor, " sample"], points: Float[Tensor, "sample 3"]) -> Float[Tensor, " sample"]:
         """softplus(raw + b) for each voxel's edge of the last grid of this stage: contracted voxels are larger."""
         thickness = nn.functional.softplus(raw + self.shift)
-        return thickness * (self.space.stretch(points) / self.edge) if self.frame.reach > 1 else thickness / self.edge
+        density = thickness * float(1 / self.edge)
+        return density * self.space.stretch(points) if self.frame.reach > 1 else density
 
     # Along rays
 
@@ -307,8 +308,7 @@ class DVGO(RayMethod):
             seen[(x * n + y) * n + z] = 1
             counts += seen
         lattice = (counts / counts.max().clamp_min(1)).view(n, n, n, 1)
-        unit = torch.tensor([[0.0] * 3, [1.0] * 3], device=self.device)
-        return kernels.dense_grid(corners(unit, self.density_grid.shape), lattice)[:, 0].contiguous()
+        return kernels.dense_grid(corners(box, self.density_grid.shape), lattice, box)[:, 0].contiguous()
 
     def before_step(self, step: int, progress: float) -> None:
         c = self.config

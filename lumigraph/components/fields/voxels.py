@@ -73,8 +73,7 @@ class VoxelGrid(nn.Module):
         return float(((self.box[1] - self.box[0]) / (self.size - 1)).prod() ** (1 / 3))
 
     def forward(self, coordinates: Float[Tensor, "sample 3"]) -> Float[Tensor, "sample channel"]:
-        places = (coordinates - self.box[0]) / (self.box[1] - self.box[0])
-        return kernels.dense_grid(places, self.values.view(*self.shape, -1))
+        return kernels.dense_grid(coordinates, self.values.view(*self.shape, -1), self.box)
 
     @torch.no_grad()
     def rebuild(self, box: Box, voxels: int, optimizer: torch.optim.Optimizer | None = None) -> None:

@@ -26,14 +26,13 @@ def reached(
     density_at: per scene unit
     stop:       transmittance below which a ray is spent
     """
-    ray, t, length = found.ray_index, found.t, found.length
+    (points, _), length = found.along(rays), found.length
     asked_in_all = 0
 
     def thickness_of(asked: Int[Tensor, " asked"]) -> Float[Tensor, " asked"]:
         nonlocal asked_in_all
         asked_in_all += len(asked)
-        on = ray[asked]
-        return density_at(rays.origins[on] + t[asked][:, None] * rays.directions[on]) * length[asked]
+        return density_at(points.index_select(0, asked)) * length.index_select(0, asked)
 
     seen = visible(found, thickness_of, stop)
     return found.keep(seen), asked_in_all

@@ -14,18 +14,18 @@ ZERO, ONE = np.float32(0), np.float32(1)
 
 
 @njit(inline="always")
-def _axis(x, size):
+def _axis(x, low, scale, size):
     """Along one axis: the corner at or below a coordinate, and the place between it and the next; clamped."""
-    s = min(max(x, ZERO), ONE) * np.float32(size - 1)
+    s = min(max((x - low) * scale, ZERO), np.float32(size - 1))
     corner = max(min(np.int32(s), np.int32(size - 2)), np.int32(0))  # the last also where x is no number
     return corner, s - np.float32(corner)
 
 
 @njit(**FAST)
-def _sides(y, z, shape):
+def _sides(y, z, box, shape):
     """The four corners around a point within a plane of x: where they lie from the plane's first on, and weights."""
-    cy, fy = _axis(y, shape[1])
-    cz, fz = _axis(z, shape[2])
+    cy, fy = _axis(y, box[0, 1], box[1, 1], shape[1])
+    cz, fz = _axis(z, box[0, 2], box[1, 2], shape[2])
     across = np.uint32(shape[2]) * np.uint32(shape[3])
     first = np.uint32(cy) * across + np.uint32(cz) * np.uint32(shape[3])
     entries = first, first + across, first + np.uint32(shape[3]), first + across + np.uint32(shape[3])
@@ -33,7 +33,7 @@ def _sides(y, z, shape):
 
 
 @njit(parallel=True, **FAST)
-def _look_up(points, grid, shape, lanes, out):
+def _look_up(points, grid, box, shape, lanes, out):
     n = len(points)
     plane = np.uint32(shape[1]) * np.uint32(shape[2]) * np.uint32(shape[3])
     for block in prange((n + BLOCK - 1) // BLOCK):
@@ -41,8 +41,8 @@ def _look_up(points, grid, shape, lanes, out):
         first = block * BLOCK
         count = min(BLOCK, n - first)
         for i in range(count):
-            cx, fx = _axis(points[first + i, 0], shape[0])
-            places, shares = _sides(points[first + i, 1], points[first + i, 2], shape)
+            cx, fx = _axis(points[first + i, 0], box[0, 0], box[1, 0], shape[0])
+            places, shares = _sides(points[first + i, 1], points[first + i, 2], box, shape)
             for side in range(4):
                 entry = np.uint32(cx) * plane + places[side]
                 entries[2 * side * BLOCK + i], entries[(2 * side + 1) * BLOCK + i] = entry, entry + plane
@@ -53,7 +53,7 @@ def _look_up(points, grid, shape, lanes, out):
 
 
 @njit(parallel=True, **FAST)
-def _grid_gradient(grad, points, slabs, shape, lanes, out):
+def _grid_gradient(grad, points, slabs, box, shape, lanes, out):
     """slabs: the plane of x at which each thread's own begin"""
     n = len(points)
     plane = np.uint32(shape[1]) * np.uint32(shape[2]) * np.uint32(shape[3])
@@ -62,10 +62,10 @@ def _grid_gradient(grad, points, slabs, shape, lanes, out):
         low, high = slabs[slab], slabs[slab + 1]
         out[np.int64(low) * plane : np.int64(high) * plane] = ZERO
         for i in range(n):
-            cx, fx = _axis(points[i, 0], shape[0])
+            cx, fx = _axis(points[i, 0], box[0, 0], box[1, 0], shape[0])
             below, above = low <= cx < high, low <= cx + 1 < high
             if below or above:
-                places, shares = _sides(points[i, 1], points[i, 2], shape)
+                places, shares = _sides(points[i, 1], points[i, 2], box, shape)
                 # A plane that is another thread's is replaced by one's own, with no weight.
                 here = np.uint32(cx if below else cx + 1) * plane
                 there = np.uint32(cx + 1 if above else cx) * plane
@@ -80,13 +80,13 @@ def _grid_gradient(grad, points, slabs, shape, lanes, out):
 
 
 @njit(parallel=True, **FAST)
-def _point_gradient(grad, points, grid, out):
+def _point_gradient(grad, points, grid, box, out):
     """The slope of the blend along each axis: corners' values, signed by side."""
     nx, ny, nz, channels = grid.shape
     for i in prange(len(points)):
-        cx, fx = _axis(points[i, 0], nx)
-        cy, fy = _axis(points[i, 1], ny)
-        cz, fz = _axis(points[i, 2], nz)
+        cx, fx = _axis(points[i, 0], box[0, 0], box[1, 0], nx)
+        cy, fy = _axis(points[i, 1], box[0, 1], box[1, 1], ny)
+        cz, fz = _axis(points[i, 2], box[0, 2], box[1, 2], nz)
         dx, dy, dz = ZERO, ZERO, ZERO
         for corner in range(8):
             bx, by, bz = corner & 1, corner >> 1 & 1, corner >> 2
@@ -97,17 +97,20 @@ def _point_gradient(grad, points, grid, out):
             dx += value * (2 * bx - 1) * wy * wz
             dy += value * (2 * by - 1) * wx * wz
             dz += value * (2 * bz - 1) * wx * wy
-        out[i, 0] = dx * np.float32(nx - 1) if ZERO < points[i, 0] < ONE else ZERO
-        out[i, 1] = dy * np.float32(ny - 1) if ZERO < points[i, 1] < ONE else ZERO
-        out[i, 2] = dz * np.float32(nz - 1) if ZERO < points[i, 2] < ONE else ZERO
+        inside = ZERO < (points[i, 0] - box[0, 0]) * box[1, 0] < np.float32(nx - 1)
+        out[i, 0] = dx * box[1, 0] if inside else ZERO
+        inside = ZERO < (points[i, 1] - box[0, 1]) * box[1, 1] < np.float32(ny - 1)
+        out[i, 1] = dy * box[1, 1] if inside else ZERO
+        inside = ZERO < (points[i, 2] - box[0, 2]) * box[1, 2] < np.float32(nz - 1)
+        out[i, 2] = dz * box[1, 2] if inside else ZERO
 
 
 @njit(cache=True)
-def _slabs(points, planes, parts):
+def _slabs(points, box, planes, parts):
     """Planes of x at which to part the grid so that each part has about as many points. It changes no sum."""
     counts = np.zeros(planes, np.int64)
     for i in range(len(points)):
-        counts[_axis(points[i, 0], planes)[0]] += 1
+        counts[_axis(points[i, 0], box[0, 0], box[1, 0], planes)[0]] += 1
     starts = np.zeros(parts + 1, np.int64)
     plane, seen = 0, 0
     for part in range(1, parts):
@@ -121,11 +124,12 @@ def _slabs(points, planes, parts):
 
 class _Lookup(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, points, grid):
+    def forward(ctx, points, grid, box):
         ctx.save_for_backward(points, grid)
+        ctx.box = _scaled(box, grid).numpy()
         out = empty(grid.shape[3], len(points))
         lanes = (ONE,) * grid.shape[3]
-        given = points.detach().numpy(), grid.detach().numpy().reshape(-1)
+        given = points.detach().numpy(), grid.detach().numpy().reshape(-1), ctx.box
         _look_up(*given, np.array(grid.shape), lanes, out.numpy().reshape(-1))
         return out.t()
 
@@ -136,15 +140,20 @@ class _Lookup(torch.autograd.Function):
         to_points = to_grid = None
         if ctx.needs_input_grad[0]:
             to_points = empty(*points.shape)
-            _point_gradient(grad, points.numpy(), grid.numpy(), to_points.numpy())
+            _point_gradient(grad, points.numpy(), grid.numpy(), ctx.box, to_points.numpy())
         if ctx.needs_input_grad[1]:
             to_grid = empty(*grid.shape)
-            slabs = _slabs(points.numpy(), len(grid), max(2, get_num_threads()))
+            slabs = _slabs(points.numpy(), ctx.box, len(grid), max(2, get_num_threads()))
             lanes = (ONE,) * grid.shape[3]
             flat = to_grid.numpy().reshape(-1)
-            _grid_gradient(grad.reshape(-1), points.numpy(), slabs, np.array(grid.shape), lanes, flat)
-        return to_points, to_grid
+            _grid_gradient(grad.reshape(-1), points.numpy(), slabs, ctx.box, np.array(grid.shape), lanes, flat)
+        return to_points, to_grid, None
 
 
-def run(points, grid):
-    return _Lookup.apply(points.contiguous(), grid.contiguous())
+def _scaled(box, grid):
+    """The box's lower corner, and voxels for a unit along each axis."""
+    return torch.stack([box[0], (torch.tensor(grid.shape[:3]) - 1) / (box[1] - box[0])])
+
+
+def run(points, grid, box):
+    return _Lookup.apply(points.contiguous(), grid.contiguous(), box)
