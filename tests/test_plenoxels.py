@@ -129,7 +129,8 @@ def test_losses_are_the_papers():
 def test_the_density_learns_slowly_at_first():
     method = Plenoxels(tiny.scene().frame, Plenoxels.smallest())
     early, late = method.learning_rate(0, 0.0), method.learning_rate(0, method.config.density_delay)
-    assert early["density"] == pytest.approx(0.01 * method.config.density_learning_rate)
+    share = method.config.base_resolution / 256
+    assert early["density"] == pytest.approx(0.01 * share * method.config.density_learning_rate)
     assert late["density"] > 50 * early["density"] and late["harmonics"] < early["harmonics"]
 
 

@@ -51,7 +51,7 @@ class Config:
     occupancy_threshold: NonNegative = 1e-2  # optical thickness across a cell below which it is skipped
     occupancy_interval: Steps = 64  # steps between updates of the occupancy grid
     rays_per_step: BatchSize = 5000  # section 4
-    density_learning_rate: DensityRate = 30.0  # per unit of coordinates
+    density_learning_rate: DensityRate = 30.0  # per unit of coordinates, of 256 voxels per axis; in proportion to them
     final_density_learning_rate: DensityRate = 0.05
     density_delay: Share = 0.12  # share of the budget in which the density's learning rate comes up to that
     harmonics_learning_rate: LearningRate = 1e-2
@@ -75,7 +75,7 @@ class Config:
 
 
 DELAYED = 0.01  # what the density's learning rate begins with, as a share
-REMEMBERED = 0.9  # of a cell's density, from one look of the occupancy grid to the next
+REMEMBERED = 0.9  # of a cell's density and a voxel's weight, from one look of the occupancy grid to the next
 NOTED = 4  # steps between those whose samples' weights are remembered for pruning
 EDGE = 1e-3  # opacities are kept so far from 0 and 1 in the beta loss
 
@@ -106,10 +106,16 @@ class Plenoxels(RayMethod):
             max_resolution=256,
             occupancy_resolution=128,
             rays_per_step=4096,
+            refine_until=0.4,
+            step_size=1.0,
             transmittance_threshold=1e-3,
-            final_density_learning_rate=1.0,
-            harmonics_learning_rate=0.1,
-            final_harmonics_learning_rate=0.01,
+            occupancy_threshold=0.02,
+            occupancy_interval=16,
+            density_learning_rate=40.0,
+            final_density_learning_rate=4.0,
+            density_delay=0.2,
+            harmonics_learning_rate=0.15,
+            final_harmonics_learning_rate=0.02,
             tv_share=0.1,
             tv_interval=8,
             sparsity=0.0,
@@ -127,8 +133,8 @@ class Plenoxels(RayMethod):
             occupancy_interval=4,
             rays_per_step=128,
             density_delay=0.1,
-            density_learning_rate=3.0,
-            final_density_learning_rate=0.5,
+            density_learning_rate=60.0,
+            final_density_learning_rate=10.0,
             harmonics_learning_rate=0.2,
             final_harmonics_learning_rate=0.05,
             tv_share=0.5,
@@ -154,7 +160,7 @@ class Plenoxels(RayMethod):
 
     def looks(self, rays: Rays) -> list[Look]:
         samples, _ = self._reached(rays)
-        return [Look("samples", samples, *self._field(*samples.along(rays), self.voxels))]
+        return [Look("samples", samples, *self.field(*samples.along(rays)))]
 
     def _reached(
         self, rays: Rays, jitter: Float[Tensor, " ray"] | None = None
@@ -278,12 +284,13 @@ class Plenoxels(RayMethod):
         return [self._table, torch.optim.Adam([gains])]
 
     def learning_rate(self, step: int, progress: float) -> dict[str, float]:
-        """Exponential decay; the density's rate comes up slowly at first (the release's delayed rates)."""
-        c = self.config
+        """Exponential decay; the density's rate comes up slowly at first (the release's delayed rates). It is in
+        proportion to the resolution, for it is density times a voxel's size that stops light."""
+        c, share = self.config, self._resolution(progress) / 256
         up = math.sin(0.5 * math.pi * min(1.0, progress / c.density_delay)) if c.density_delay else 1.0
+        density = c.density_learning_rate, c.final_density_learning_rate
         return {
-            "density": (DELAYED + (1 - DELAYED) * up)
-            * falling(c.density_learning_rate, c.final_density_learning_rate, progress),
+            "density": share * (DELAYED + (1 - DELAYED) * up) * falling(*density, progress),
             "harmonics": falling(c.harmonics_learning_rate, c.final_harmonics_learning_rate, progress),
         }
 
@@ -294,6 +301,8 @@ class Plenoxels(RayMethod):
         if finer:
             self.voxels.rebuild(self.voxels.important(c.weight_threshold), wanted, self._table)
             self.occupancy.density.zero_()
+        if step % c.occupancy_interval == 0:
+            self.voxels.weights *= REMEMBERED
         if finer or (step and step % c.occupancy_interval == 0):
             density_at = self._density if isinstance(self.space, NDC) else self.density
             self.occupancy.update(density_at, c.occupancy_threshold, self.random(~step), REMEMBERED)

@@ -27,7 +27,8 @@ class SparseVoxels(nn.Module):
     numbers:   of the nodes that have rows, rising (see `kernels.Nodes`)
     density:   (row, 1), before activation
     harmonics: (row, 27), before activation: 9 coefficients times 3 colours
-    weights:   the largest weight in a picture that a sample next to each node had since `rebuild`
+    weights:   the largest weight in a picture that a sample next to each node had since `rebuild`; who trains the grid
+               lets it decay
     """
 
     grows: ClassVar[tuple[str, ...]] = ("numbers", "density", "harmonics", "weights")
@@ -105,7 +106,7 @@ class SparseVoxels(nn.Module):
     @torch.no_grad()
     def important(self, weight: float) -> Bool[Tensor, "x y z"]:
         """Cells with a node at which some sample weighed so much; the others next to each such node stay too, which
-        makes room for what was missed (the paper's dilation). All cells, where no sample ever weighed so much."""
+        makes room for what was missed (the paper's dilation). All cells, where no sample weighed so much."""
         if not (self.weights > weight).any():
             return torch.ones(*self.cells.tolist(), dtype=torch.bool, device=self.numbers.device)
         shape = tuple((self.cells + 1).tolist())
