@@ -17,7 +17,7 @@ from ..components.fields.mlp import MLP
 from ..components.fields.truncation import truncate
 from ..components.sampling.carving import visual_hull
 from ..components.sampling.importance import importance
-from ..components.sampling.marching import rays_for
+from ..components.sampling.marching import rays_for, reached
 from ..components.sampling.occupancy import OccupancyGrid
 from ..components.sampling.spaces import Box, space_of
 from ..components.training.exchange import exchange
@@ -59,6 +59,7 @@ class Config:
     cone_angle: Share = 1 / 128  # growth of steps with distance, in captures without bounds
     rays_per_step: BatchSize = 4096  # section 5; at most
     samples_per_step: Annotated[int, between(64, 1 << 24)] = 1 << 20  # that these rays may meet in occupied cells
+    transmittance_threshold: Share = 1e-4  # at which a ray is spent
     weight_threshold: Share = 1e-4  # weight of a sample below which it gets no colour, the code's
     l1_weight: NonNegative = 8e-5  # of objects, of density's factors, the code's
     final_l1_weight: NonNegative = 4e-5  # once the box has shrunk, the code's
@@ -183,7 +184,11 @@ class TensoRF(RayMethod):
             rays_per_step=4096,
             samples_per_step=1 << 17,
             step_ratio=1.0,
-            density_shift=-5.0,
+            density_shift=-8.0,
+            l1_weight=0.0,
+            final_l1_weight=0.0,
+            transmittance_threshold=1e-3,
+            weight_threshold=1e-3,
         )
 
     @classmethod
@@ -240,20 +245,21 @@ class TensoRF(RayMethod):
         return composite(look.samples, look.density, look.rgb, background)
 
     def looks(self, rays: Rays, jitter: Float[Tensor, " ray"] | None = None) -> list[Look]:
-        open_ = self.frame.reach > 1
-        samples = self.occupancy.sample(
-            rays, self.frame.near, self._step(), self.config.cone_angle if open_ else 0.0, jitter=jitter
-        )
+        c, growth = self.config, self.config.cone_angle if self.frame.reach > 1 else 0.0
+        found = self.occupancy.sample(rays, self.frame.near, self._step(), growth, jitter=jitter)
+        samples, asked = reached(rays, found, self.density, c.transmittance_threshold)
         ray = samples.ray_index
         towards = rays.directions.index_select(0, ray)
         points = rays.origins.index_select(0, ray) + samples.t[:, None] * towards
         places, inside = self._places(points)
         density = self._density(points, places, inside)
-        weighty = weights_of(samples, density.detach()) > self.config.weight_threshold
-        coloured = weighty.nonzero()[:, 0]
+        least = c.weight_threshold if self.stage else 0.0  # on the first grid nothing has much weight yet
+        heavy = weights_of(samples, density.detach()) > least
+        coloured = heavy.nonzero()[:, 0]
         rgb = self.network.colour(places.index_select(0, coloured), towards.index_select(0, coloured))
         rgb = rgb.new_zeros(len(samples), 3).index_copy(0, coloured, rgb)
-        self.figures |= {"rays": len(rays), "samples": len(samples), "coloured_samples": len(coloured)}
+        self.figures |= {"rays": len(rays), "samples": asked, "visible_samples": len(samples)}
+        self.figures["coloured_samples"] = len(coloured)
         return [Look("samples", samples, density, rgb)]
 
     def loss(self, batch: Batch, step: int) -> dict[str, Tensor]:

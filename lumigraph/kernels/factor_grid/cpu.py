@@ -215,4 +215,4 @@ def run(points, table, factors, summed):
     found = _FactorGrid.apply(points.contiguous(), table, factors, summed)
     if summed or width == table.shape[1]:
         return found
-    return found.view(len(points), factors.products, -1)[:, :, :width].flatten(1)
+    return found.view(len(points), factors.products, table.shape[1])[:, :, :width].flatten(1)
