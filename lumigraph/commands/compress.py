@@ -69,7 +69,7 @@ class Compress:
         aim = Aim(size, loss, self.codebook, self.steps, seconds, self.views)
         made = compress(Run(self.run_folder), self.output, aim, self.scene, choose_device(self.device))
         console().print(table(made))
-        against = made.compared_with
+        against = str(made.compared_with)
         if made.psnr_before is None:
             against += ", for its photographs cannot be opened; --scene says where they are"
         rows = {"compared with": f"{made.views} held-out {against}", "saved": str(self.output)}
