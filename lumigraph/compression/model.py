@@ -60,12 +60,12 @@ class Model:
         """The file of it."""
         return packing.write(self.tensors)
 
-    def tune(self, scene: Scene, steps: int | None, seconds: float | None, seed: int = 0) -> None:
+    def tune(self, scene: Scene, steps: int | None, seconds: float | None) -> None:
         """Learn from photographs with the rows' codes as they are: codebooks, rows apart from them and scaled numbers
         descend together, through the rounding, at a pace that falls with progress."""
         rates = [(latent.requires_grad_(), unit) for _, table in self.tuned for latent, unit in learning(table)]
         optimizer = torch.optim.Adam([{"params": [x], "lr": 0.0, "unit": unit} for x, unit in rates], betas=BETAS)
-        generator, begin, taken = torch.Generator().manual_seed(seed), time.perf_counter(), 0
+        generator, begin, taken = torch.Generator().manual_seed(self.steps), time.perf_counter(), 0
         self.method.train()
         total = steps if steps is not None else round(seconds or 0)
         with counting("Tuning", total) as done:
@@ -73,13 +73,13 @@ class Model:
                 for group in optimizer.param_groups:
                     group["lr"] = PACE * LAST_PACE**share * group["unit"]
                 self._descend(self.method.batch(scene, generator), optimizer)
-                taken += 1
+                taken, self.steps = taken + 1, self.steps + 1
                 done(int(share * total))
         self.method.eval()
         for latent, _ in rates:
             latent.requires_grad_(False)
         self.show()
-        self.steps, self.seconds = self.steps + taken, self.seconds + time.perf_counter() - begin
+        self.seconds += time.perf_counter() - begin
 
     def _descend(self, batch: Any, optimizer: torch.optim.Optimizer) -> None:
         """One step: gradients reach the method's own tensors, and from there what their rows were made of."""
