@@ -98,7 +98,8 @@ class Samples:
     def keep(self, mask: Bool[Tensor, " sample"]) -> Samples:
         """The samples that a mask picks, still packed by ray."""
         before = torch.nn.functional.pad(mask.cumsum(0), (1, 0))
-        return Samples(self.t_start[mask], self.t_end[mask], before[self.ray_starts])
+        kept = mask.nonzero()[:, 0]
+        return Samples(self.t_start.index_select(0, kept), self.t_end.index_select(0, kept), before[self.ray_starts])
 
     def along(self, rays: Rays) -> tuple[Float[Tensor, "sample 3"], Float[Tensor, "sample 3"]]:
         """Midpoints as positions, and the direction each is seen along."""

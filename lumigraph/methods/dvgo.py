@@ -17,7 +17,7 @@ from ..components.fields.mlp import MLP
 from ..components.fields.voxels import VoxelGrid, corners, tight_box
 from ..components.sampling.carving import visual_hull
 from ..components.sampling.importance import importance
-from ..components.sampling.marching import FIRST_RAYS, rays_for, reached
+from ..components.sampling.marching import FIRST_RAYS, rays_for, weighty
 from ..components.sampling.occupancy import OccupancyGrid
 from ..components.sampling.spaces import space_of
 from ..components.training.lazy_adam import LazyAdam
@@ -52,6 +52,7 @@ class Config:
     step_size: PositiveShare = 0.5  # of a voxel's edge, section 6.1
     cone_angle: Share = 1 / 256  # growth of steps with distance, where there is no bound
     transmittance_threshold: Share = 1e-4  # at which a ray is spent
+    weight_threshold: Share = 1e-4  # of a sample, below which it is asked for no colour in the fine stage
     samples_per_step: Annotated[int, between(64, 1 << 24)] = 1 << 20  # 8192 rays, section 6.1
     occupancy_resolution: Annotated[int, between(4, 512)] = 128  # cells per axis of the mask of known free space
     occupancy_threshold: NonNegative = 0.05  # optical thickness across a cell below which it is free
@@ -166,11 +167,11 @@ class DVGO(RayMethod):
         coordinates = self.space.warp(points)
         density = self._activated(self.density_grid(coordinates)[:, 0], points)
         features = self.feature_grid(coordinates)
-        logits = features[:, :3]
-        if self.stage > 0:  # the coarse stage knows one colour for all directions (section 4.2)
-            harmonics = kernels.spherical_harmonics(directions, self.config.sh_bands)
-            logits = logits + self.colour_network(torch.cat([features.t(), harmonics.t()]).t())
-        return density, torch.sigmoid(logits)
+        harmonics = kernels.spherical_harmonics(directions, self.config.sh_bands)
+        if self.stage == 0:  # which knows one colour for all directions (section 4.2)
+            harmonics = harmonics * (torch.arange(harmonics.shape[1], device=harmonics.device) == 0)
+        seen = self.colour_network(torch.cat([features.t(), harmonics.t()]).t())
+        return density, torch.sigmoid(features[:, :3] + seen)
 
     def storage(self) -> dict[str, Stored]:
         """Features by a codebook, density as whole numbers, the network as halves; of the mask, marks alone are needed
@@ -216,10 +217,12 @@ class DVGO(RayMethod):
 
     def looks(self, rays: Rays, jitter: Float[Tensor, " ray"] | None = None) -> list[Look]:
         found = self._march(rays, jitter)
-        samples, asked = reached(rays, found, self.density, self.config.transmittance_threshold)
+        c = self.config
+        least = c.weight_threshold if self.stage > 0 else 0.0  # in the coarse stage all is thin at first
+        samples = weighty(rays, found, self.density, c.transmittance_threshold, least)
         points, directions = samples.along(rays)
         density, rgb = self.field(points, directions)
-        self.figures |= {"rays": len(rays), "samples": asked, "visible_samples": len(samples)}
+        self.figures |= {"rays": len(rays), "samples": len(found), "visible_samples": len(samples)}
         return [Look("samples", samples, density, rgb)]
 
     def _march(self, rays: Rays, jitter: Float[Tensor, " ray"] | None) -> Samples:

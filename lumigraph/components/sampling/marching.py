@@ -8,6 +8,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from ...kernels import composite
 from ...rays import Rays, Samples
 from ...volume import visible
 
@@ -36,6 +37,23 @@ def reached(
 
     seen = visible(found, thickness_of, stop)
     return found.keep(seen), asked_in_all
+
+
+@torch.no_grad()
+def weighty(
+    rays: Rays,
+    found: Samples,
+    density_at: Callable[[Float[Tensor, "point 3"]], Float[Tensor, " point"]],
+    stop: float,
+    least: float,
+) -> Samples:
+    """The samples with more than the least weight in their ray's colour, asking about all of them at once.
+
+    Where density costs no more than a lookup, this is quicker than `reached`, and free space that is nearly but not
+    quite empty is left out too (as the published code of Sun 2022 does before it asks for colours).
+    """
+    tau = density_at(found.along(rays)[0]) * found.length
+    return found.keep(composite(tau, tau[:, None], found.ray_starts, stop)[2] > least)
 
 
 def rays_for(wanted: int, rays: int, samples: float) -> int:

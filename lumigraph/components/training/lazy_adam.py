@@ -8,6 +8,8 @@ import numpy as np
 import torch
 from numba import njit, prange
 
+BLOCK = 64  # elements that are passed over together where no gradient has a bit set
+
 
 class LazyAdam(torch.optim.Optimizer):
     """Adam (Kingma and Ba 2015) that leaves an element alone, moments and all, where its gradient is exactly zero.
@@ -78,8 +80,15 @@ def _move(p, grad, mean, square, i, rate, b1, b2, eps, keep):
 
 @njit(parallel=True, fastmath=True, cache=True)
 def _touched_cpu(p, grad, mean, square, rate, b1, b2, eps, keep):
-    for i in prange(len(p)):
-        _move(p, grad, mean, square, i, rate, b1, b2, eps, keep)
+    bits = grad.view(np.int32)
+    for block in prange((len(p) + BLOCK - 1) // BLOCK):
+        first, last = block * BLOCK, min(len(p), (block + 1) * BLOCK)
+        some = np.int32(0)
+        for i in range(first, last):
+            some |= bits[i]
+        if some:
+            for i in range(first, last):
+                _move(p, grad, mean, square, i, rate, b1, b2, eps, keep)
 
 
 @njit(parallel=True, fastmath=True, cache=True)

@@ -60,7 +60,6 @@ def _grid_gradient(grad, points, slabs, box, shape, lanes, out):
     for slab in prange(len(slabs) - 1):
         entries, weights = np.empty(8 * BLOCK, np.uint32), np.empty(8 * BLOCK, np.float32)
         low, high = slabs[slab], slabs[slab + 1]
-        out[np.int64(low) * plane : np.int64(high) * plane] = ZERO
         for i in range(n):
             cx, fx = _axis(points[i, 0], box[0, 0], box[1, 0], shape[0])
             below, above = low <= cx < high, low <= cx + 1 < high
@@ -142,7 +141,8 @@ class _Lookup(torch.autograd.Function):
             to_points = empty(*points.shape)
             _point_gradient(grad, points.numpy(), grid.numpy(), ctx.box, to_points.numpy())
         if ctx.needs_input_grad[1]:
-            to_grid = empty(*grid.shape)
+            # Zeros that the system gives as they are touched: a step's samples touch a small part of a large grid.
+            to_grid = torch.from_numpy(np.zeros(grid.shape, np.float32))
             slabs = _slabs(points.numpy(), ctx.box, len(grid), max(2, get_num_threads()))
             lanes = (ONE,) * grid.shape[3]
             flat = to_grid.numpy().reshape(-1)
