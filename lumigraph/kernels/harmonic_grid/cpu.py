@@ -6,7 +6,7 @@ import torch
 from numba import njit, prange
 
 from .._dispatch import empty
-from .._lanes import fetch, put, put_where
+from .._lanes import fetch, put, put_where, totals
 from ..sparse_grid.cpu import CHUNK, corners, in_slabs
 from ..spherical_harmonics import K00, K1, K20, K21, K22
 
@@ -47,11 +47,14 @@ def _turned(directions, i, before):
 
 
 @njit(parallel=True, fastmath=True, cache=True)
-def _look_up(points, directions, index, rows, density, harmonics, to_density, to_rgb):
+def _look_up(points, directions, index, rows, density, harmonics, lanes_of, to_density, to_rgb):
     n = len(points)
     for chunk in prange((n + CHUNK - 1) // CHUNK):
         at, weights = np.empty(9, np.int64), np.empty(9, np.float32)
-        basis, products = np.zeros(32, np.float32), np.zeros(32, np.float32)
+        basis, colours = np.zeros(32, np.float32), np.zeros(16, np.float32)
+        red0, red1 = fetch(lanes_of, 0), fetch(lanes_of, 16)
+        green0, green1 = fetch(lanes_of, 32), fetch(lanes_of, 48)
+        blue0, blue1 = fetch(lanes_of, 64), fetch(lanes_of, 80)
         before = -1
         for i in range(chunk * CHUNK, min(n, (chunk + 1) * CHUNK)):
             if _turned(directions, i, before):
@@ -64,16 +67,11 @@ def _look_up(points, directions, index, rows, density, harmonics, to_density, to
                 total += weight * density[row]
                 v0 = v0 + weight * fetch(harmonics, row * WIDTH)
                 v1 = v1 + weight * fetch(harmonics, row * WIDTH + SECOND)
-            put(products, 0, v0 * b0)
-            put(products, 16, v1 * b1)
+            v0, v1 = v0 * b0, v1 * b1
+            put(colours, 0, totals((v0 * red0 + v1 * red1, v0 * green0 + v1 * green1, v0 * blue0 + v1 * blue1)))
             to_density[i] = total
             for c in range(3):
-                colour = ZERO
-                for j in range(c, 16, 3):
-                    colour += products[j]
-                for j in range(21 + (c + 2) % 3, 32, 3):
-                    colour += products[j]
-                to_rgb[i, c] = colour
+                to_rgb[i, c] = colours[c]
 
 
 @njit(parallel=True, fastmath=True, cache=True)
@@ -112,7 +110,7 @@ class _HarmonicGrid(torch.autograd.Function):
         to_density, to_rgb = empty(len(points)), empty(len(points), 3)
         tables = density.detach().numpy(), harmonics.detach().view(-1).numpy()
         given = points.detach().numpy(), directions.detach().numpy(), nodes.index.numpy(), nodes.rows.numpy()
-        _look_up(*given, *tables, to_density.numpy(), to_rgb.numpy())
+        _look_up(*given, *tables, LANES_OF, to_density.numpy(), to_rgb.numpy())
         return to_density, to_rgb
 
     @staticmethod
