@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numba
 import pytest
+import tiny
 import torch
 
 from lumigraph import kernels
 from lumigraph.components.fields.factorised import FactorGrid, nodes_in
 from lumigraph.kernels.factor_grid import Factors
 from lumigraph.methods.tensorf import UPSAMPLINGS, TensoRF
-from lumigraph.scene import Frame
+from lumigraph.scene import Forward, Frame
 
 WHOLE = (torch.zeros(3), torch.ones(3))
 
@@ -126,3 +129,49 @@ def test_nothing_is_outside_the_box():
     method.box = torch.tensor([[-0.5] * 3, [0.5] * 3])
     found = method.density(torch.tensor([[0.6, 0.0, 0.0], [0.0, 0.0, 0.0]]))
     assert found[0] == 0 < found[1]
+
+
+AHEAD = Forward(((1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, -1.0)), (1.0, 1.0), 0.5)
+
+
+@pytest.mark.parametrize("frame", [Frame(reach=8.0), Frame(reach=8.0, forward=AHEAD)], ids=["contracted", "ahead"])
+def test_in_the_open_density_is_per_unit_of_the_scene(frame):
+    """A length of the scene is `stretch` times as long in coordinates, on which the grid's density lies."""
+    method = TensoRF(frame, TensoRF.smallest())
+    points = torch.tensor([[0.1, 0.2, 0.3], [0.5, -0.4, 3.0], [-1.0, 1.0, 6.0]])
+    places = method.space.warp(points) / 2 + 0.5
+    expected = method.network.density(places) * method.space.stretch(points)
+    torch.testing.assert_close(method.density(points), expected)
+    density, rgb = method.field(points, torch.tensor([[0.0, 0.0, 1.0]]).expand(3, 3))
+    assert density.equal(method.density(points)) and rgb.shape == (3, 3) and method._step() > 0
+    before = method.box.clone()
+    method._shrink()
+    assert method.box.equal(before)
+
+
+def test_before_the_plane_of_a_forward_capture_is_nothing():
+    method = TensoRF(Frame(reach=8.0, forward=AHEAD), TensoRF.smallest())
+    found = method.density(torch.tensor([[0.0, 0.0, -0.6], [0.0, 0.0, -0.4]]))
+    assert found[0] == 0 < found[1]
+
+
+@pytest.mark.parametrize(("factors", "shading"), [("cp", "mlp"), ("vm", "sh")])
+def test_other_factors_and_shading_learn(factors, shading):
+    """A few steps through all upsamplings lower the loss."""
+    scene = tiny.scene()
+    method = TensoRF(scene.frame, replace(TensoRF.smallest(), factors=factors, shading=shading)).train()
+    optimizers, losses = method.optimizers(), []
+    method.begin(scene)
+    for step in range(24):
+        method.before_step(step, step / 24)
+        batch = method.batch(scene, torch.Generator().manual_seed(step))
+        terms = method.loss(batch, step)
+        for optimizer in optimizers:
+            optimizer.zero_grad(set_to_none=True)
+        sum(terms.values()).backward()
+        for optimizer in optimizers:
+            optimizer.step()
+        method.after_step(step)
+        losses.append(method.figures["mse"])
+    assert int(method.stage) == len(UPSAMPLINGS)
+    assert sum(losses[-4:]) < 0.7 * sum(losses[:4])

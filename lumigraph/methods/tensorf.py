@@ -63,8 +63,9 @@ class Config:
     weight_threshold: Share = 1e-4  # weight of a sample below which it gets no colour, the code's
     l1_weight: NonNegative = 8e-5  # of objects, of density's factors, the code's
     final_l1_weight: NonNegative = 4e-5  # once the box has shrunk, the code's
-    tv_density_weight: NonNegative = 0.01  # of captures without bounds, the code's 1.0 times 1e-2
-    tv_appearance_weight: NonNegative = 0.01  # the same, of appearance
+    tv_density_weight: NonNegative = 0.02  # of captures without bounds, the code's 1.0 for forward-facing ones
+    tv_appearance_weight: NonNegative = 0.02  # the same, of appearance
+    tv_interval: Steps = 1  # steps between looks at the total variation, each as much stronger
     occupancy_resolution: Annotated[int, between(4, 512)] = 128  # cells per axis and cascade
     occupancy_threshold: NonNegative = 0.005  # optical thickness across a cell below which it is empty
     occupancy_interval: Steps = 16  # steps between updates of the occupancy grid
@@ -187,6 +188,9 @@ class TensoRF(RayMethod):
             density_shift=-8.0,
             l1_weight=0.0,
             final_l1_weight=0.0,
+            tv_interval=8,
+            cone_angle=1 / 64,
+            occupancy_threshold=0.05,
             transmittance_threshold=1e-3,
             weight_threshold=1e-3,
         )
@@ -271,11 +275,12 @@ class TensoRF(RayMethod):
         if self.frame.reach <= 1:
             if weight := c.final_l1_weight if self.stage else c.l1_weight:
                 terms["l1"] = weight * self.network.density_grid.sparsity()
-        else:
-            if c.tv_density_weight:
-                terms["tv_density"] = c.tv_density_weight * self.network.density_grid.variation()
-            if c.tv_appearance_weight:
-                terms["tv_appearance"] = c.tv_appearance_weight * self.network.appearance_grid.variation()
+        elif step % c.tv_interval == 0:
+            grids = self.network.density_grid, self.network.appearance_grid
+            weights = c.tv_density_weight, c.tv_appearance_weight
+            for name, grid, weight in zip(("tv_density", "tv_appearance"), grids, weights, strict=True):
+                if weight:
+                    terms[name] = c.tv_interval * weight * grid.variation()
         return terms
 
     def optimizers(self) -> list[torch.optim.Optimizer]:
