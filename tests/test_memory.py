@@ -101,6 +101,15 @@ def test_what_memory_does_not_hold_is_told_before_it_is_made(name, monkeypatch):
         build(kind, tiny.scene().frame, kind.Config(**numbers), CPU, 0, learning=True)
 
 
+def test_it_is_told_how_large_a_grid_would_fit(monkeypatch):
+    kind, frame = methods.find("dvgo"), tiny.scene().frame
+    monkeypatch.setattr(memory, "free_memory", lambda: 400_000_000)
+    with pytest.raises(LumigraphError, match="--voxels than 536,870,912; ([0-9,]+) would fit") as told:
+        build(kind, frame, kind.Config(voxels=1 << 29, coarse_voxels=4096), CPU, 0, learning=True)
+    fitting = int(str(told.value).split("; ")[-1].split()[0].replace(",", ""))
+    assert bytes_of(kind, frame, kind.Config(voxels=fitting, coarse_voxels=4096), learning=True) <= 400_000_000
+
+
 ESTIMATED = ["instant-ngp", "nerf", "mip-nerf", "dvgo", "fourier-features", "tensorf", "voxel-grid"]
 
 
