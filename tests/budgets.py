@@ -55,6 +55,7 @@ SHARES: dict[str, tuple[str, float]] = {
     "test_train": ("runs, commands, benchmark", 16),
     "test_signals": ("runs, commands, benchmark", 15),
     "test_ranges": ("methods", 20),
+    "test_compress": ("runs, commands, benchmark", 15),
     "test_memory": ("runs, commands, benchmark", 12),
     "test_nerf": ("methods", 16),
     "test_tensorf": ("methods", 5),

@@ -36,6 +36,7 @@ WRITES: dict[str, tuple[str, tuple[str, ...]]] = {
     "export stereo": ("export stereo ball eyes.jpg", ("eyes.jpg",)),
     "clean": ("clean gs --output some.ply", ("some.ply", "some.ply.png")),
     "clean, to a run": ("clean gs --output fewer", ("fewer/",)),
+    "compress": ("compress gs --output small", ("small/", "small")),
     "compose": ("compose gs gs --output two.json", ("two.json",)),
     "report": ("report ball", ("ball/report.html",)),
     "eval": ("eval ball --scene photographs", ("ball/eval.json", "ball/eval.png")),

@@ -110,9 +110,10 @@ def test_it_is_told_how_large_a_grid_would_fit(monkeypatch):
     assert bytes_of(kind, frame, kind.Config(voxels=fitting, coarse_voxels=4096), learning=True) <= 400_000_000
 
 
-@pytest.mark.parametrize(
-    "name", ["instant-ngp", "nerf", "mip-nerf", "dvgo", "fourier-features", "tensorf", "voxel-grid"]
-)
+ESTIMATED = ["instant-ngp", "nerf", "mip-nerf", "dvgo", "fourier-features", "tensorf", "voxel-grid"]
+
+
+@pytest.mark.parametrize("name", ESTIMATED)
 def test_the_estimate_is_what_a_method_takes(name):
     kind, frame = methods.find(name), tiny.scene().frame
     config = kind.smallest()

@@ -11,10 +11,12 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from .. import kernels
+from ..camera import Camera
 from ..choice import evenly
 from ..components.fields.mlp import MLP
 from ..components.fields.voxels import VoxelGrid, corners, tight_box
 from ..components.sampling.carving import visual_hull
+from ..components.sampling.importance import importance
 from ..components.sampling.marching import FIRST_RAYS, rays_for, weighty
 from ..components.sampling.occupancy import OccupancyGrid
 from ..components.sampling.spaces import space_of
@@ -22,6 +24,7 @@ from ..components.training.lazy_adam import LazyAdam
 from ..components.training.photometric import backdrop, residuals
 from ..components.training.schedules import falling
 from ..method import RayMethod
+from ..packing import Stored, most_important
 from ..ranges import Layers, LearningRate, NonNegative, PositiveShare, Seed, Share, Steps, Width, between
 from ..rays import Look, Rays, Rendering, Samples
 from ..scene import Batch, Frame, Scene
@@ -64,6 +67,7 @@ class Config:
     seed: Seed = 0
 
 
+GONE = -5.0  # of density, where compression has taken a corner out: a softplus of less than 0.0001
 PROBES, LOOKS = 0.02, 4  # share of cells looked at again at random; cells at most for each sample of a step
 WARM = 0.5  # share of the coarse stage before anything counts as free: at first all density is alike
 SAMPLES_OF_A_RAY = 32  # that a ray needs, about, once free space is known
@@ -168,6 +172,35 @@ class DVGO(RayMethod):
             harmonics = harmonics * (torch.arange(harmonics.shape[1], device=harmonics.device) == 0)
         seen = self.colour_network(torch.cat([features.t(), harmonics.t()]).t())
         return density, torch.sigmoid(features[:, :3] + seen)
+
+    def storage(self) -> dict[str, Stored]:
+        """Features by a codebook, density as whole numbers, the network as halves; of the mask, marks alone are needed
+        for pictures."""
+        networks = [f"colour_network.{name}" for name, _ in self.colour_network.named_parameters()]
+        return {
+            "density_grid.values": Stored("scaled", fill=GONE),
+            "feature_grid.values": Stored("coded"),
+            **dict.fromkeys(networks, Stored("half")),
+            "occupancy.density": Stored("nothing"),
+            "occupancy.possible": Stored("nothing", fill=1.0),
+        }
+
+    def importance(self, camera: Camera) -> dict[str, Float[Tensor, " row"]]:
+        """How much each corner adds to one picture; see `components.sampling.importance`."""
+
+        def lookup(points: Float[Tensor, "sample 3"]) -> Float[Tensor, "sample 1"]:
+            return self.density_grid(self.space.warp(points))
+
+        (shares,) = importance(self, camera, lookup, [self.density_grid.values])
+        return {"feature_grid.values": shares[:, 0]}
+
+    @torch.no_grad()
+    def thin(self, importance: dict[str, Float[Tensor, " row"]], share: float) -> dict[str, Float[Tensor, " kept"]]:
+        """Leave nothing at the least important corners."""
+        gone = ~most_important(importance["feature_grid.values"], 1 - share)
+        self.density_grid.values[gone] = GONE
+        self.feature_grid.values[gone] = 0.0
+        return importance
 
     @property
     def shift(self) -> float:

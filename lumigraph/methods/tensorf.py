@@ -11,9 +11,12 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
+from ..camera import Camera
 from ..components.fields.factorised import FactorGrid, nodes_in
 from ..components.fields.mlp import MLP
+from ..components.fields.truncation import truncate
 from ..components.sampling.carving import visual_hull
+from ..components.sampling.importance import importance
 from ..components.sampling.marching import rays_for, reached
 from ..components.sampling.occupancy import OccupancyGrid
 from ..components.sampling.spaces import Box, space_of
@@ -22,9 +25,10 @@ from ..components.training.lazy_adam import LazyAdam
 from ..components.training.photometric import backdrop, residuals
 from ..components.training.schedules import falling
 from ..errors import LumigraphError
-from ..kernels import spherical_harmonics
+from ..kernels import factor_grid, spherical_harmonics
 from ..kernels.factor_grid import Factors
 from ..method import RayMethod
+from ..packing import Stored, most_important
 from ..ranges import BatchSize, LearningRate, NonNegative, Positive, Seed, Share, Steps, Width, between
 from ..rays import Look, Rays, Rendering
 from ..scene import Batch, Frame, Scene
@@ -88,6 +92,9 @@ LOOKS = 1 << 18  # cells updated at most
 PROBES = 0.02  # share of all cells updated at random, in case something has grown there
 SAMPLES_OF_A_RAY = 32  # that a ray meets, about, once empty space is known
 FIRST_RAYS = 256  # of a step, before anybody knows how many samples a ray meets
+
+
+GRIDS = ("density_grid", "appearance_grid")
 
 
 class Field(nn.Module):
@@ -317,6 +324,35 @@ class TensoRF(RayMethod):
     def density(self, points: Float[Tensor, "point 3"]) -> Float[Tensor, " point"]:
         """Density per scene unit."""
         return self._density(points, *self._places(points))
+
+    def storage(self) -> dict[str, Stored]:
+        """Factors as whole numbers, basis and network as halves; of the grid, marks alone are needed for pictures."""
+        grids = {f"network.{name}.table": Stored("scaled") for name in GRIDS}
+        others = [name for name, _ in self.named_parameters() if name not in grids]
+        nothing = {"occupancy.density": Stored("nothing"), "occupancy.possible": Stored("nothing", fill=1.0)}
+        return grids | dict.fromkeys(others, Stored("half")) | nothing
+
+    def importance(self, camera: Camera) -> dict[str, Float[Tensor, " row"]]:
+        """How much each node of planes and lines adds to one picture, by its share in interpolating there."""
+        factors = self.network.density_grid.factors
+        ones = torch.ones(factors.rows, 1, device=self.device, requires_grad=True)
+
+        def lookup(points: Float[Tensor, "sample 3"]) -> Float[Tensor, "sample 1"]:
+            return factor_grid(self._places(points)[0], ones, factors, True)
+
+        (shares,) = importance(self, camera, lookup, [ones])
+        return {f"network.{name}.table": shares[:, 0] for name in GRIDS}
+
+    @torch.no_grad()
+    def thin(self, importance: dict[str, Float[Tensor, " row"]], share: float) -> dict[str, Float[Tensor, " kept"]]:
+        """Set the least important nodes to zero, and the least important components; see `truncate`."""
+        network = self.network
+        for name, grid in zip(GRIDS, (network.density_grid, network.appearance_grid), strict=True):
+            grid.table[~most_important(importance[f"network.{name}.table"], 1 - share)] = 0.0
+        truncate(network.density_grid, share)
+        products = network.appearance_grid.factors.products
+        truncate(network.appearance_grid, share, network.basis.weight.norm(dim=0).view(products, -1))
+        return importance
 
     def _places(self, points: Float[Tensor, "point 3"]) -> tuple[Float[Tensor, "point 3"], Bool[Tensor, " point"]]:
         """Where in the grid's cube points are, and which are in it."""
