@@ -7,9 +7,11 @@ from typing import Any, Protocol, runtime_checkable
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from .camera import Camera
 from .errors import LumigraphError
 from .gaussians import Gaussians
 from .mesh import Mesh
+from .packing import Stored
 from .rays import Look, Rays
 
 
@@ -71,6 +73,22 @@ class HasLooks(Protocol):
         """What lies along rays, one entry for each pass, the one that is composited into the picture last."""
 
 
+@runtime_checkable
+class CanCompress(Protocol):
+    """Says how it may be stored in fewer bytes."""
+
+    def storage(self) -> dict[str, Stored]:
+        """How tensors of `state_dict` may be stored, by name; those that are not named are stored to the bit."""
+
+    def importance(self, camera: Camera) -> dict[str, Float[Tensor, " row"]]:
+        """How much each row of tensors, by name, adds to one picture (Li 2023, eq. 4): the sum over pixels of the
+        compositing weights that it has a share in."""
+
+    def thin(self, importance: dict[str, Float[Tensor, " row"]], share: float) -> dict[str, Float[Tensor, " kept"]]:
+        """Take out the rows that matter least, which together have a share of all importance; gives the importance of
+        the rows that there are now."""
+
+
 LACKING = {
     HasDensity: "holds no density at points; what is made of it comes from its renderings instead",
     HasField: "holds no density and colour at points, so it can be neither baked nor converted",
@@ -78,6 +96,7 @@ LACKING = {
     HasGaussians: "holds no Gaussians, so no splats can be made of it; train gaussian-splatting",
     CanPrune: "cannot learn on with fewer Gaussians; write a splat file instead, by an --output that ends in .ply",
     HasMesh: "is no mesh; `lumigraph export mesh` makes one of what it renders",
+    CanCompress: "cannot be stored in fewer bytes; methods of grids, hash tables and Gaussians can",
     HasLooks: "takes no samples along rays, so there is nothing to draw of one",
 }
 

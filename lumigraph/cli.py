@@ -22,6 +22,7 @@ from .commands.capture import CaptureCommand
 from .commands.clean import Clean
 from .commands.common import say
 from .commands.compose import Compose
+from .commands.compress import Compress
 from .commands.demo import Demo
 from .commands.eval import Eval
 from .commands.explain import Explain
@@ -49,6 +50,7 @@ COMMANDS: dict[str, type] = {
     "view": ViewCommand,
     "clean": Clean,
     "compose": Compose,
+    "compress": Compress,
     "export": Export,
     "report": Report,
     "explain": Explain,

@@ -1,4 +1,4 @@
-"""The loops that every batch goes through before any method sees it: finding pixels, and undoing lenses (Numba).
+"""The loops that every batch goes through before any field is asked: finding pixels, undoing lenses, samples (Numba).
 
 Lenses are defined in lens.py on whole tensors; here the same equations go one ray at a time, without a tensor's traffic
 for each term and without gradients.
@@ -50,6 +50,18 @@ def look_up(
             rgba[i] = pixels[first[k] + position]
             if len(where):
                 where[i] = first[k] + position
+
+
+@njit(parallel=True, cache=True, error_model="numpy")
+def along(origins, directions, t_start, t_end, ray_starts, positions, seen_along):
+    """Fill in where the middle of each sample is, and the direction it is seen along, as `Samples.along` says."""
+    half = origins.dtype.type(0.5)
+    for ray in prange(len(origins)):
+        for i in range(ray_starts[ray], ray_starts[ray + 1]):
+            t = half * (t_start[i] + t_end[i])
+            for axis in range(3):
+                positions[i, axis] = origins[ray, axis] + t * directions[ray, axis]
+                seen_along[i, axis] = directions[ray, axis]
 
 
 @njit(inline="always")

@@ -52,6 +52,8 @@ SphereSize = Annotated[int, between(64, 16_384)]  # width of a picture of the wh
 FramesPerSecond = Annotated[float, between(0.01, 1000)]
 Downscale = Annotated[int, between(1, 1024)]
 Scales = Annotated[int, between(1, 12)]  # of a picture, each half as large as the one before
+Codes = Annotated[int, between(1, 65_536)]  # rows of a codebook
+Decibels = Annotated[float, between(0, 100)]
 Port = Annotated[int, between(1, 65_535)]
 
 # What files hold besides.

@@ -9,6 +9,8 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from . import loops
+
 
 @dataclass(frozen=True)
 class Rays:
@@ -96,13 +98,20 @@ class Samples:
     def keep(self, mask: Bool[Tensor, " sample"]) -> Samples:
         """The samples that a mask picks, still packed by ray."""
         before = torch.nn.functional.pad(mask.cumsum(0), (1, 0))
-        return Samples(self.t_start[mask], self.t_end[mask], before[self.ray_starts])
+        kept = mask.nonzero()[:, 0]
+        return Samples(self.t_start.index_select(0, kept), self.t_end.index_select(0, kept), before[self.ray_starts])
 
     def along(self, rays: Rays) -> tuple[Float[Tensor, "sample 3"], Float[Tensor, "sample 3"]]:
         """Midpoints as positions, and the direction each is seen along."""
+        given = rays.origins, rays.directions, self.t_start, self.t_end
+        if not rays.origins.is_cuda and not (torch.is_grad_enabled() and any(x.requires_grad for x in given)):
+            positions, directions = (self.t_start.new_empty(len(self), 3) for _ in range(2))
+            tensors = *given, self.ray_starts, positions, directions
+            loops.along(*(x.detach().contiguous().numpy() for x in tensors))
+            return positions, directions
         ray = self.ray_index
-        directions = rays.directions[ray]
-        return rays.origins[ray] + self.t[:, None] * directions, directions
+        directions = rays.directions.index_select(0, ray)
+        return rays.origins.index_select(0, ray) + self.t[:, None] * directions, directions
 
 
 @dataclass(frozen=True)

@@ -108,18 +108,25 @@ def make_way(over: threading.Event, held: Callable[[], float]) -> None:
     Whether others are still there shows best once threads look for work again: those that sleep may be woken on one
     processor, where they hold up each other.
     """
-    leave: threading.Event | None = None
+    crowding: tuple[threading.Thread, threading.Event] | None = None
     looks = 0
     while not over.wait(EVERY):
         looks, share = looks + 1, held()
-        if leave is None and share > MUCH and "torch" in sys.modules:
+        if crowding is None and share > MUCH and "torch" in sys.modules:
             leave, looks = threading.Event(), 0
-            threading.Thread(target=crowd, args=(leave,), name="crowd", daemon=True).start()
-        elif leave is not None and looks >= WHILE:
-            leave.set()
-            leave = None
-    if leave is not None:
-        leave.set()
+            crowding = threading.Thread(target=crowd, args=(leave,), name="crowd", daemon=True), leave
+            crowding[0].start()
+        elif crowding is not None and looks >= WHILE:
+            disperse(*crowding)
+            crowding = None
+    if crowding is not None:
+        disperse(*crowding)
+
+
+def disperse(thread: threading.Thread, leave: threading.Event) -> None:
+    """Let the crowd go, and wait until it is gone: Python that ends while a thread is inside PyTorch aborts."""
+    leave.set()
+    thread.join()
 
 
 def crowd(leave: threading.Event) -> None:

@@ -55,10 +55,13 @@ SHARES: dict[str, tuple[str, float]] = {
     "test_train": ("runs, commands, benchmark", 16),
     "test_signals": ("runs, commands, benchmark", 15),
     "test_ranges": ("methods", 20),
+    "test_compress": ("runs, commands, benchmark", 15),
     "test_memory": ("runs, commands, benchmark", 12),
     "test_nerf": ("methods", 16),
+    "test_tensorf": ("methods", 5),
     "test_instant_ngp": ("methods", 10),
     "test_gaussian_splatting": ("methods", 10),
+    "test_dvgo": ("methods", 8),
     "test_fourier_features": ("methods", 12),
 }
 A_METHOD = 6.0  # by contract, of each method, beside what its own file takes

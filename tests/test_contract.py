@@ -10,6 +10,7 @@ from __future__ import annotations
 import dataclasses
 import math
 import re
+import shutil
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -22,8 +23,10 @@ import torch
 import lumigraph
 from lumigraph import methods
 from lumigraph.camera import Camera
-from lumigraph.capabilities import HasDensity, HasDistance, HasField, HasGaussians, HasLooks, HasMesh, can
+from lumigraph.capabilities import CanCompress, HasDensity, HasDistance, HasField, HasGaussians, HasLooks, HasMesh, can
 from lumigraph.cli import main
+from lumigraph.compression import LADDER
+from lumigraph.compression.model import Model
 from lumigraph.errors import LumigraphError
 from lumigraph.evaluate import evaluate
 from lumigraph.exchange import read_gaussians
@@ -37,9 +40,11 @@ from lumigraph.export.splats import export_splats
 from lumigraph.lens import Equirectangular, Fisheye, Lens, OmnidirectionalStereo, OpenCV, Pinhole
 from lumigraph.mesh import Mesh
 from lumigraph.method import Method, RayMethod
+from lumigraph.metrics import psnr
 from lumigraph.paths import camera_path
 from lumigraph.rays import Rays, Rendering
 from lumigraph.run import Run, build
+from lumigraph.run.checkpoint import Checkpoints
 from lumigraph.scene import Scene
 from lumigraph.train import fit
 
@@ -423,6 +428,32 @@ def test_its_gaussians_become_splats(taught, tmp_path):
             torch.testing.assert_close(getattr(back, field.name), value.detach().cpu(), atol=1e-4, rtol=1e-4)
     splats_page(tmp_path / "page.html", cloud, opening_of_scene("tiny", taught.cameras, taught.method.frame))
     assert (tmp_path / "page.html").stat().st_size > 1000
+
+
+def test_it_can_be_stored_in_fewer_bytes(taught, tmp_path):
+    """Pressed as little as it can be it looks as it did, and pressed hard it still learns, opens and is smaller."""
+    if not can(taught.method, CanCompress):
+        return
+    run, camera = taught.straight, taught.cameras[SHOWN]
+    important = dict.fromkeys(taught.method.importance(camera), 0)
+    for view in (taught.cameras[i] for i in range(len(taught.cameras))):
+        for name, weights in taught.method.importance(view).items():
+            assert len(weights) and (weights >= 0).all() and weights.isfinite().all()
+            important[name] = important[name] + weights
+    assert set(taught.method.storage()) <= set(taught.method.state_dict())
+    sizes = []
+    for rung in (LADDER[0], LADDER[-1]):
+        model = Model(run.method(taught.device), important, rung, STEPS)
+        if rung.pruned:
+            model.tune(taught.data, 2, None)
+        sizes.append(len(packed := model.packed()))
+        folder = tmp_path / str(sizes[-1])
+        shutil.copytree(run.folder, folder, ignore=shutil.ignore_patterns("checkpoints"))
+        Checkpoints(folder, taught.name).save_packed(run.state, packed)
+        seen = Run(folder).method(taught.device).render(camera).cpu()
+        assert torch.equal(seen.rgb, model.method.render(camera).rgb.cpu())
+        assert psnr(seen.rgb, taught.seen.rgb) > (15 if rung.pruned else 28)
+    assert sizes[1] < sizes[0] < run.model_bytes / 2
 
 
 def test_rays_that_meet_nothing_show_the_background(taught):

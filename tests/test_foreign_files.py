@@ -36,11 +36,13 @@ WRITES: dict[str, tuple[str, tuple[str, ...]]] = {
     "export stereo": ("export stereo ball eyes.jpg", ("eyes.jpg",)),
     "clean": ("clean gs --output some.ply", ("some.ply", "some.ply.png")),
     "clean, to a run": ("clean gs --output fewer", ("fewer/",)),
+    "compress": ("compress gs --output small", ("small/", "small")),
     "compose": ("compose gs gs --output two.json", ("two.json",)),
     "report": ("report ball", ("ball/report.html",)),
     "eval": ("eval ball --scene photographs", ("ball/eval.json", "ball/eval.png")),
     "eval, pictures": ("eval ball --scene photographs --save-images", ("ball/eval/ball_4.png",)),
     "explain ray": ("explain ray ball --output ray.svg", ("ray.svg", "ray.json")),
+    "explain activation": ("explain activation --steps 2 --output edge.png", ("edge.png",)),
     "explain encodings": ("explain encodings one.png --output told", ("told/index.html", "told/figures.json")),
     "bench kernels": ("bench kernels --output speed.json", ("speed.json",)),
     "bench methods": (

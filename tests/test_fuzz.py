@@ -19,6 +19,7 @@ import torch
 from fuzzing import flags, templates
 from fuzzing.bend import bend
 
+from lumigraph import packing
 from lumigraph.capture import open_dataset
 from lumigraph.cli import main
 from lumigraph.commands.info_tree import run_tree
@@ -129,6 +130,18 @@ def everything(folder: Path) -> None:
     views = run.cameras()["train"]
     method.render(views[0].resized(0.3))
     run.view_names()
+
+
+def test_packed_tensors(tmp_path):
+    chance = torch.Generator().manual_seed(SEED)
+    recipe = packing.Recipe(codebook=8, apart=0.3)
+    tables = {
+        how: packing.packed(torch.randn(90, 6, generator=chance), packing.Stored(how), recipe, None, chance)
+        for how in ("scaled", "coded", "half", "nothing")
+    }
+    path = tmp_path / "weights.packed"
+    path.write_bytes(packing.write({**tables, "marks": torch.rand(4, 50, generator=chance) < 0.5}))
+    opened_or_told("packed", tmp_path, ("*.packed",), 150, lambda _: packing.read(path.read_bytes(), path))
 
 
 def test_camera_paths(tmp_path):

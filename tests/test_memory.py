@@ -83,7 +83,9 @@ GREEDY = {  # what would take most, by method, and the option to name
     "instant-ngp": ({"log2_hashmap_size": 26, "levels": 16, "max_resolution": 4096}, "log2-hashmap-size"),
     "nerf": ({"hidden_width": 8192, "depth": 32, "occupancy_resolution": 16}, "hidden-width"),
     "mip-nerf": ({"occupancy_resolution": 512, "rays_per_step": 1}, "occupancy-resolution"),
+    "dvgo": ({"voxels": 1 << 29}, "voxels"),
     "fourier-features": ({"hidden_width": 8192, "layers": 64}, "hidden-width"),
+    "tensorf": ({"final_resolution": 2048, "samples_per_step": 4096}, "final-resolution"),
 }
 
 
@@ -99,7 +101,19 @@ def test_what_memory_does_not_hold_is_told_before_it_is_made(name, monkeypatch):
         build(kind, tiny.scene().frame, kind.Config(**numbers), CPU, 0, learning=True)
 
 
-@pytest.mark.parametrize("name", ["instant-ngp", "nerf", "mip-nerf", "fourier-features", "voxel-grid"])
+def test_it_is_told_how_large_a_grid_would_fit(monkeypatch):
+    kind, frame = methods.find("dvgo"), tiny.scene().frame
+    monkeypatch.setattr(memory, "free_memory", lambda: 400_000_000)
+    with pytest.raises(LumigraphError, match="--voxels than 536,870,912; ([0-9,]+) would fit") as told:
+        build(kind, frame, kind.Config(voxels=1 << 29, coarse_voxels=4096), CPU, 0, learning=True)
+    fitting = int(str(told.value).split("; ")[-1].split()[0].replace(",", ""))
+    assert bytes_of(kind, frame, kind.Config(voxels=fitting, coarse_voxels=4096), learning=True) <= 400_000_000
+
+
+ESTIMATED = ["instant-ngp", "nerf", "mip-nerf", "dvgo", "fourier-features", "tensorf", "voxel-grid"]
+
+
+@pytest.mark.parametrize("name", ESTIMATED)
 def test_the_estimate_is_what_a_method_takes(name):
     kind, frame = methods.find(name), tiny.scene().frame
     config = kind.smallest()

@@ -63,7 +63,10 @@ def run(name: str, share: float, *files: str) -> Kind:
         f"export points {folder} out/new.ply --size 16 --views 2",
         f"explain ray {folder} --output out/new.svg" if is_grid else f"export splats {folder} out/new.splat",
     )
-    return Kind("grid-run" if is_grid else "run", tuple(f"{name}/{file}" for file in files), uses, share)
+    home = {"instant-ngp": "grid-run", "small": "small-run"}.get(name, "run")
+    if home == "small-run":
+        uses = tuple(use for use in uses if not use.startswith("resume"))
+    return Kind(home, tuple(f"{name}/{file}" for file in files), uses, share)
 
 
 CLOUD, GRID = "gaussian-splatting", "instant-ngp"
@@ -99,6 +102,7 @@ KINDS: dict[str, Kind] = {
     "eval.json": run(CLOUD, 0.6, "eval.json"),
     "safetensors": run(CLOUD, 0.7, "checkpoints/*/*.safetensors"),
     "safetensors of a grid": run(GRID, 0.7, "checkpoints/*/*.safetensors"),
+    "packed weights": run("small", 1.0, "checkpoints/*/weights.packed", "compress.json"),
     "camera path": Kind("camera-path", ("keys.json", "film.json"), (f"{PATH} {{file}}",)),
     "composition": Kind(
         "composition",

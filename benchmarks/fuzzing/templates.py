@@ -21,6 +21,7 @@ SCENE = "given/scene"  # of whatever home holds a run
 HOMES = {  # and what lies in each, beside the photographs
     "run": ("gaussian-splatting",),
     "grid-run": ("instant-ngp",),
+    "small-run": ("small",),
     "composition": ("gaussian-splatting", "cloud.ply", "both.json"),
     "camera-path": ("gaussian-splatting", "film.json", "keys.json"),
     "flags": ("gaussian-splatting", "instant-ngp", "cloud.ply", "cloud.spz", "pictures", "photographs", "shapes"),
@@ -171,6 +172,7 @@ def write_runs(root: Path) -> None:
         config = run / "config.json"
         config.write_text(config.read_text().replace(str(photographs.resolve()), SCENE))
     cloud = made / "gaussian-splatting"
+    must("compress", cloud, "--output", made / "small", "--steps", "2", "--views", "1", "--scene", photographs)
     for suffix in (".ply", ".compressed.ply", ".splat", ".spz"):
         must("export", "splats", cloud, made / f"cloud{suffix}")
         shutil.copy(made / f"cloud{suffix}", home(root, f"cloud{suffix}") / "given")

@@ -21,6 +21,7 @@ FIGURES: dict[tuple[str, str], Published] = {
     ("mip-nerf", "lego"): Published(35.70, "800x800", "Barron et al. 2021"),
     ("instant-ngp", "lego"): Published(36.39, "800x800", "Müller et al. 2022, black background"),
     ("gaussian-splatting", "lego"): Published(35.78, "800x800", "Kerbl et al. 2023"),
+    ("tensorf", "lego"): Published(36.46, "800x800", "Chen et al. 2022"),
 }
 
 

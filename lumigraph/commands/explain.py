@@ -7,11 +7,16 @@ from typing import Annotated
 
 from tyro.conf import OmitArgPrefixes, OmitSubcommandPrefixes, subcommand
 
+from .explains.activation import ExplainActivation
 from .explains.encodings import ExplainEncodings
 from .explains.ray import ExplainRay
 
 # One line for each thing that can be explained; the files are in explains/.
-What = Annotated[ExplainEncodings, subcommand("encodings")] | Annotated[ExplainRay, subcommand("ray")]
+What = (
+    Annotated[ExplainActivation, subcommand("activation")]
+    | Annotated[ExplainEncodings, subcommand("encodings")]
+    | Annotated[ExplainRay, subcommand("ray")]
+)
 
 
 @dataclass(frozen=True)

@@ -16,6 +16,7 @@ from ..gaussians import Gaussians
 from ..metrics import scores_of
 from ..names import natural
 from ..run import Run
+from ..run.compressed import Compressed
 from ..scene import Frame, Scene
 from ..shapes import Shapes
 
@@ -38,6 +39,9 @@ def run_tree(run: Run) -> Tree:
             "trained",
             rows | {"budget": said.budget and str(Budget.from_json(said.budget)), "seed": said.seed, "on": said.device},
         )
+    if made := Compressed.read(run.folder):
+        smaller = f"{made.times:.1f} times smaller, {made.bytes_after / 1e6:.3g} MB of {made.bytes_before / 1e6:.3g} MB"
+        branch(tree, "compressed", {"from": made.source, "model": smaller, "dB": f"{made.psnr_after:.2f}"})
     if evaluation := run.evaluation():
         figures: dict[str, Any] = {score.name: str(score) for score in scores_of(evaluation)}
         figures["seconds per view"] = evaluation.get("seconds_per_view")

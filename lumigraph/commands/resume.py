@@ -56,6 +56,8 @@ class Resume:
         from .outcome import tell_outcome
         from .view import keep_showing, watching
 
+        if run.compressed:
+            raise LumigraphError(f"{run.folder} was compressed and cannot be resumed; resume the run it was made of")
         told = told_budget(self.steps, self.seconds, self.quality)
         if self.quality is None:
             budget = budget_from_now(run, told)

@@ -23,7 +23,6 @@ import struct
 import zlib
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import zstandard
@@ -32,6 +31,8 @@ from jaxtyping import Float, UInt8
 from ..errors import LumigraphError
 from ..files import write_bytes
 from ..gaussians import Gaussians
+from ..packing.streams import DENSEST as DENSEST_ZSTD
+from ..packing.streams import take
 from .checks import check_room
 from .codes import LOGITS, alpha_to_byte, array, cloud, to_byte, with_largest, without_largest
 
@@ -44,9 +45,8 @@ MOST_BITS = 16  # behind the binary point; Niantic's metres have 12, ours are un
 FARTHEST = 2**23 - 1
 COLOUR = 0.15  # instead of Y_00 = 0.28, so that colours outside [0, 1] have a place
 STEPS = 8, 16  # of 1/128, for harmonics of degree 1 and beyond: 5 and 4 bits
-DENSEST, DENSEST_ZSTD = 1032, 1 << 15  # times that deflate, and zstd, can shrink what they are given
+DENSEST = 1032  # times that deflate can shrink what it is given
 LONGEST_EXTENSIONS = 1 << 20  # bytes
-PIECE = 1 << 24  # bytes
 LEVEL = 4  # of gzip; 6, the usual one, takes up to four times as long and saves 1% at most
 
 # Half a turn around x, as signs. Of harmonics: y, z, x | xy, yz, z^2, xz, x^2 - y^2 | and so on.
@@ -112,7 +112,7 @@ def encode(gaussians: Gaussians, name: str = "a .spz file", steps: tuple[int, in
 
 def _decode(path: Path, stream: io.BufferedIOBase, limit: int) -> Gaussians:
     """The Gaussians of an opened stream that cannot hold more than `limit` bytes."""
-    magic, version = struct.unpack("<4sI", _take(stream, 8))
+    magic, version = struct.unpack("<4sI", take(stream, 8))
     if magic != MAGIC:
         raise LumigraphError(f"{path} is no .spz file, for inside it does not begin with NGSP; name another one")
     if not 1 <= version < NEWEST:
@@ -120,12 +120,12 @@ def _decode(path: Path, stream: io.BufferedIOBase, limit: int) -> Gaussians:
             f"{path} is of version {version} of .spz, of which 1 to {NEWEST} can be read; "
             f"save it as version {VERSION} or as .ply, for instance with splat-transform"
         )
-    count, degree, bits, flags, _ = struct.unpack("<IBBBB", _take(stream, 8))
+    count, degree, bits, flags, _ = struct.unpack("<IBBBB", take(stream, 8))
     widths = _widths(path, version, degree)
     if count * sum(widths) > limit:
         raise EOFError(f"{count} Gaussians are promised and cannot be there")
     check_room(path, count, (degree + 1) ** 2, limit // DENSEST, count * sum(widths))
-    columns = [np.frombuffer(_take(stream, count * width), np.uint8).reshape(count, width) for width in widths]
+    columns = [np.frombuffer(take(stream, count * width), np.uint8).reshape(count, width) for width in widths]
     behind = stream.read(LONGEST_EXTENSIONS + 1)  # to the end, where gzip's checksum is
     if len(behind) > (LONGEST_EXTENSIONS if flags & EXTENDED else 0):
         raise LumigraphError(f"{path} goes on after the {count} Gaussians that it promises; copy or download it again")
@@ -151,7 +151,7 @@ def _decode_tabled(path: Path, data: bytes) -> Gaussians:
             if unpacked > DENSEST_ZSTD * packed:
                 raise EOFError(f"{count} Gaussians are promised and cannot be there")
             reader = zstandard.ZstdDecompressor().stream_reader(data[at : at + packed])
-            found = _take(reader, unpacked)
+            found = take(reader, unpacked)
         columns.append(np.frombuffer(found, np.uint8).reshape(count, width))
         at += packed
     return _cloud(columns, version, bits, flags)
@@ -179,18 +179,6 @@ def _cloud(columns: list[np.ndarray], version: int, bits: int, flags: int) -> Ga
         harmonics * TURN_HARMONICS[: harmonics.shape[1]],
         bool(flags & ANTIALIASED),
     )
-
-
-def _take(stream: Any, size: int) -> bytes:
-    """Exactly `size` bytes, in pieces, so that memory grows with what is there and not with what is promised."""
-    pieces = []
-    while size:
-        piece = stream.read(min(size, PIECE))
-        if not piece:
-            raise EOFError("it ends early")
-        pieces.append(piece)
-        size -= len(piece)
-    return b"".join(pieces)
 
 
 def _fixed_point(positions: UInt8[np.ndarray, "gaussian 9"]) -> Float[np.ndarray, "gaussian 3"]:

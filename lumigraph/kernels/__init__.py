@@ -3,6 +3,9 @@
 from ._dispatch import Engine as Engine
 from ._dispatch import using as using
 from .composite import composite as composite
+from .dense_grid import dense_grid as dense_grid
+from .factor_grid import Factors as Factors
+from .factor_grid import factor_grid as factor_grid
 from .harmonic_grid import harmonic_grid as harmonic_grid
 from .hash_encode import HashLevels as HashLevels
 from .hash_encode import hash_encode as hash_encode

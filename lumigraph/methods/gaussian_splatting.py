@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import math
 import warnings
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated, Any, ClassVar, Literal
 
 import torch
-from jaxtyping import Bool
-from torch import Tensor
+from jaxtyping import Bool, Float
+from torch import Tensor, nn
 
 from .. import kernels
 from ..blending import over
@@ -22,10 +22,12 @@ from ..components.clouds.smoothing import sampling_interval, smoothed
 from ..components.training.rhythm import Rhythm, haste, intervals
 from ..components.training.schedules import falling
 from ..errors import LumigraphWarning
+from ..exchange.morton import morton_order
 from ..gaussians import Gaussians
 from ..gaussians.splatting import Splatted, render, splat, view_of
 from ..memory import room_for
 from ..method import Method
+from ..packing import Stored, most_important
 from ..ranges import CloudSize, LearningRate, NonNegative, PositiveShare, Seed, Share, Steps, between
 from ..rays import Rendering
 from ..scene import Frame, Photograph, Scene
@@ -67,6 +69,15 @@ class Config:
     seed: Seed = 0
 
 
+STORAGE = {  # of tensors, where a run is compressed; positions need the most bits
+    "cloud.means": Stored("scaled", 16),
+    "cloud.quaternions": Stored("scaled"),
+    "cloud.log_scales": Stored("scaled"),
+    "cloud.opacities": Stored("scaled"),
+    "cloud.harmonics": Stored("coded", plain=3),
+    "density_control.pulls": Stored("nothing"),
+    "density_control.sightings": Stored("nothing"),
+}
 SWEEPING = 0.08  # of the budget: the share that looking for points to begin at may take
 NEAR = 0.1  # times the scene's near distance: the near plane of splats
 SMALLEST = 64  # pixels of a photograph's shorter side that are kept when it is reduced
@@ -320,6 +331,33 @@ class GaussianSplatting(Method):
         self.density_control.prune(keep)
         if self.config.filter_3d:
             self.interval = self.interval[keep]
+
+    def storage(self) -> dict[str, Stored]:
+        """Harmonics beyond the plain colour by a codebook; of what density control counts, nothing."""
+        return STORAGE
+
+    def importance(self, camera: Camera) -> dict[str, Float[Tensor, " row"]]:
+        """How much each Gaussian adds to one picture: what the picture gains where it alone gets brighter."""
+        cloud = self.gaussians()
+        grey = torch.zeros(len(cloud), 1, 3, device=self.device, requires_grad=True)
+        with torch.enable_grad():
+            seen = splat(replace(cloud, harmonics=grey), view_of(camera.to(self.device), self._near), 1)
+            (gain,) = torch.autograd.grad(seen.rgb.sum(), grey)
+        return {"cloud.harmonics": gain[:, 0].mean(-1)}
+
+    @torch.no_grad()
+    def thin(self, importance: dict[str, Float[Tensor, " row"]], share: float) -> dict[str, Float[Tensor, " kept"]]:
+        """Leave the least important Gaussians out; the others lie along Morton's curve, where neighbours are alike."""
+        weights, cloud = importance["cloud.harmonics"], self.cloud.gaussians()
+        kept = most_important(weights, 1 - share).nonzero()[:, 0]
+        kept = kept[torch.from_numpy(morton_order(cloud.means[kept].detach().cpu().numpy()))]
+        upright = nn.functional.normalize(cloud.quaternions, dim=-1)
+        upright = torch.where(upright[:, :1] < 0, -upright, upright)  # the same rotations, which fewer numbers say
+        self.cloud.replace(replace(cloud, quaternions=upright)[kept])
+        self.density_control.begin(len(kept))
+        if self.config.filter_3d:
+            self.interval = self.interval[kept]
+        return {"cloud.harmonics": weights[kept]}
 
     def gaussians(self) -> Gaussians:
         """The cloud, in the scene's frame; with the 3-D filter in it, where that is used."""

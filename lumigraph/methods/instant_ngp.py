@@ -15,6 +15,7 @@ from ..camera import Camera
 from ..components.fields.activations import truncated_exp
 from ..components.fields.mlp import MLP
 from ..components.sampling.carving import visual_hull
+from ..components.sampling.importance import importance
 from ..components.sampling.marching import FIRST_RAYS, rays_for, reached
 from ..components.sampling.occupancy import OccupancyGrid
 from ..components.training.corrections import Exposure, PoseRefinement
@@ -24,6 +25,7 @@ from ..components.training.schedules import falling
 from ..controls import Control
 from ..errors import LumigraphError
 from ..method import RayMethod
+from ..packing import Stored, most_important
 from ..ranges import Layers, LearningRate, NonNegative, PositiveShare, Seed, Share, Steps, Width, between
 from ..rays import Look, Rays, Rendering
 from ..scene import Batch, Frame, Scene
@@ -281,6 +283,27 @@ class InstantNGP(RayMethod):
     def density(self, points: Float[Tensor, "sample 3"]) -> Float[Tensor, " sample"]:
         """Density per scene unit."""
         return self.network.density(self.network.encode(points))[0]
+
+    def storage(self) -> dict[str, Stored]:
+        """The table as whole numbers, the networks as halves; of the grid, marks alone are needed for pictures."""
+        networks = [name for name, _ in self.named_parameters() if "_network." in name]
+        return {
+            "network.table": Stored("scaled"),
+            **dict.fromkeys(networks, Stored("half")),
+            "occupancy.density": Stored("nothing"),
+            "occupancy.possible": Stored("nothing", fill=1.0),
+        }
+
+    def importance(self, camera: Camera) -> dict[str, Float[Tensor, " row"]]:
+        """How much each entry of the table adds to one picture; see `components.sampling.importance`."""
+        (shares,) = importance(self, camera, self.network.encode, [self.network.table])
+        return {"network.table": shares.mean(-1)}
+
+    @torch.no_grad()
+    def thin(self, importance: dict[str, Float[Tensor, " row"]], share: float) -> dict[str, Float[Tensor, " kept"]]:
+        """Set the least important entries of the table to zero."""
+        self.network.table[~most_important(importance["network.table"], 1 - share)] = 0.0
+        return importance
 
     @property
     def controls(self) -> tuple[Control, ...]:

@@ -10,9 +10,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from ..camera import Camera
 from ..components.fields.sparse_voxels import Cells, Part, SparseVoxels
 from ..components.sampling.carving import visual_hull
 from ..components.sampling.forward_march import march_forward
+from ..components.sampling.importance import importance
 from ..components.sampling.occupancy import OccupancyGrid
 from ..components.sampling.spaces import NDC, Contraction, space_of
 from ..components.training.corrections import Exposure
@@ -23,6 +25,7 @@ from ..controls import Control
 from ..errors import LumigraphError
 from ..kernels import total_variation
 from ..method import RayMethod
+from ..packing import Stored, most_important
 from ..ranges import BatchSize, LearningRate, NonNegative, Positive, PositiveShare, Seed, Share, Steps, between
 from ..rays import Look, Rays, Rendering, Samples
 from ..scene import Batch, Frame, Scene
@@ -198,6 +201,33 @@ class Plenoxels(RayMethod):
     def _density(self, places: Float[Tensor, "point 3"]) -> Float[Tensor, " point"]:
         """Density per unit of coordinates."""
         return self.voxels.density_at(places).relu()
+
+    def storage(self) -> dict[str, Stored]:
+        """Harmonics by a codebook, density as whole numbers; of the grid, marks alone are needed for pictures."""
+        return {
+            "voxels.density": Stored("scaled"),
+            "voxels.harmonics": Stored("coded"),
+            "voxels.weights": Stored("nothing"),
+            "occupancy.density": Stored("nothing"),
+            "occupancy.possible": Stored("nothing", fill=1.0),
+        }
+
+    def importance(self, camera: Camera) -> dict[str, Float[Tensor, " row"]]:
+        """How much each voxel adds to one picture; see `components.sampling.importance`."""
+
+        def lookup(points: Float[Tensor, "sample 3"]) -> Float[Tensor, "sample 1"]:
+            return self.voxels.density_at(self.space.warp(points))[:, None]
+
+        (shares,) = importance(self, camera, lookup, [self.voxels.density])
+        return {"voxels.harmonics": shares[:, 0]}
+
+    @torch.no_grad()
+    def thin(self, importance: dict[str, Float[Tensor, " row"]], share: float) -> dict[str, Float[Tensor, " kept"]]:
+        """Leave the least important voxels out."""
+        weights = importance["voxels.harmonics"]
+        kept = most_important(weights, 1 - share)
+        self.voxels.keep(kept)
+        return {"voxels.harmonics": weights[kept]}
 
     @property
     def controls(self) -> tuple[Control, ...]:

@@ -1,6 +1,7 @@
 """Checkpoints: complete states of a run, each in a folder named after its step.
 
     000800/     weights.safetensors · optimizer.safetensors · state.json
+    000800/     weights.packed · state.json     of a run that was compressed
 
 One is written beside the one before and renamed once it is whole; only then does the older one go, by way of a name
 that whoever reads passes over. So there is a complete state whenever there was one before, however the writer ended.
@@ -21,7 +22,7 @@ import safetensors.torch
 import torch
 from torch import Tensor, nn
 
-from .. import files
+from .. import files, packing
 from ..errors import LumigraphError
 from ..method import Method
 from ..partials import partial
@@ -31,6 +32,7 @@ from ..ranges import Lasted, Tally, typed
 FORMAT = "lumigraph checkpoint 1"
 GRID = 4  # axes of a grid of cells, of which the first says which of several grids
 WEIGHTS, OPTIMIZER, STATE = "weights.safetensors", "optimizer.safetensors", "state.json"
+PACKED = "weights.packed"  # in the place of both
 STRUCTURE = "optimizers"
 NAME = re.compile(r"\d+")
 OLD_PARTIAL = re.compile(r"\d+(\.partial)+")  # what older versions had begun to write or to delete
@@ -128,10 +130,24 @@ class Checkpoints:
             if path != folder and is_state(path):
                 retire(path)
 
+    def save_packed(self, state: State, weights: bytes) -> None:
+        """Write the state of a run that was compressed, in which there is nothing yet. weights: see `packing.write`"""
+        with files.replacing_folder(self.folder / f"{state.step:06d}") as new:
+            (new / PACKED).write_bytes(weights)
+            known = {PACKED: asdict(checksum(weights))}
+            about = {"format": FORMAT, "method": self.method, **asdict(state), "files": known, STRUCTURE: []}
+            (new / STATE).write_text(json.dumps(about), "utf-8")
+
+    @property
+    def weights(self) -> Path:
+        """The file of the latest state's weights."""
+        packed = self.latest / PACKED
+        return packed if files.is_file(packed) else self.latest / WEIGHTS
+
     def load_weights(self, method: Method) -> None:
         """Give a method the latest state's weights."""
         checkpoint = self.latest
-        tensors = self._read_tensors(checkpoint, WEIGHTS)
+        tensors = self._read_tensors(checkpoint, self.weights.name)
         tensors = renamed_weights(tensors, method.formerly_weights)
         try:
             take_shapes(method, tensors)
@@ -144,6 +160,10 @@ class Checkpoints:
     def load_training(self, optimizers: Iterable[torch.optim.Optimizer], generator: torch.Generator) -> None:
         """Give optimizers and random numbers the latest state."""
         checkpoint = self.latest
+        if self.weights.name == PACKED:
+            raise LumigraphError(
+                f"{self.run} was compressed, which keeps nothing to go on learning with; resume the run it was made of"
+            )
         tensors = self._read_tensors(checkpoint, OPTIMIZER)
         about = self._about(checkpoint)
         structure = about.optimizers
@@ -182,6 +202,8 @@ class Checkpoints:
             data = path.read_bytes()
         if checksum(data) != expected:
             raise LumigraphError(f"{path} is damaged: its checksum is not the one it was saved with; restore a copy")
+        if name == PACKED:
+            return packing.read(data, path)
         try:
             return safetensors.torch.load(data)
         except Exception as error:  # of a library that keeps no list of them
@@ -252,7 +274,7 @@ def is_state(path: Path) -> bool:
     named = NAME.fullmatch(path.name) or OLD_PARTIAL.fullmatch(path.name)
     if not named or path.is_symlink() or not path.is_dir():
         return False
-    return all(file.name in (WEIGHTS, OPTIMIZER, STATE) and not file.is_dir() for file in path.iterdir())
+    return all(file.name in (WEIGHTS, OPTIMIZER, STATE, PACKED) and not file.is_dir() for file in path.iterdir())
 
 
 def retire(path: Path) -> None:

@@ -37,7 +37,7 @@ from ..plain import understood
 from ..ranges import check
 from ..scene import Frame, Scene
 from . import cameras
-from .checkpoint import WEIGHTS, Checkpoints, State
+from .checkpoint import PACKED, Checkpoints, State
 from .measured import read_evaluation, read_rows
 from .needs import check_memory
 from .opened import Opened
@@ -218,9 +218,14 @@ class Run(Opened):
         return bool(self._checkpoints)
 
     @property
+    def compressed(self) -> bool:
+        """Whether it was made by `lumigraph compress`, so that it cannot go on learning."""
+        return self.has_state and self._checkpoints.weights.name == PACKED
+
+    @property
     def model_bytes(self) -> int:
         """Size of the trained weights, which are all that rendering needs."""
-        return (self._checkpoints.latest / WEIGHTS).stat().st_size
+        return self._checkpoints.weights.stat().st_size
 
     def save(
         self, state: State, method: Method, optimizers: Iterable[torch.optim.Optimizer], generator: torch.Generator

@@ -9,7 +9,7 @@ import torch
 
 from .. import methods
 from ..errors import LumigraphError
-from ..memory import ask_for
+from ..memory import ask_for, free_on
 from ..method import Method
 from ..ranges import hints, numbers
 from ..scene import Frame
@@ -28,7 +28,11 @@ def check_memory(kind: type[Method], frame: Frame, config: Any, device: torch.de
         if not smaller:
             return "end other programs"
         name = min(smaller, key=smaller.__getitem__)
-        return f"give a smaller --{name.replace('_', '-')} than {getattr(config, name):,}"
+        less = config
+        while needed(less) > free_on(device) and (half := dict(halved(less))[name]) != less:
+            less = half
+        fits = f"; {getattr(less, name):,} would fit" if needed(less) <= free_on(device) else ""
+        return f"give a smaller --{name.replace('_', '-')} than {getattr(config, name):,}{fits}"
 
     ask_for(needed(config), device, f"{methods.name_of(kind)} with these numbers", remedy)
 

@@ -13,6 +13,7 @@ from numba import njit, prange
 from torch import Tensor, nn
 
 from ...gaussians import Gaussians
+from ..training.exchange import exchange
 
 NAMES = ("means", "quaternions", "log_scales", "opacities", "harmonics")
 
@@ -45,7 +46,7 @@ class Cloud(nn.Module):
     def replace(self, gaussians: Gaussians, optimizer: CloudAdam | None = None) -> None:
         """Put another cloud in this one's place; the optimizer updates it from now on, with fresh moments."""
         for name in NAMES:
-            self._exchange(name, getattr(gaussians, name).detach().clone(), optimizer)
+            exchange(self, name, getattr(gaussians, name).detach().clone(), optimizer)
 
     @torch.no_grad()
     def rebuild(self, optimizer: CloudAdam, source: Int[Tensor, " new"], fresh: Bool[Tensor, " new"]) -> None:
@@ -60,19 +61,7 @@ class Cloud(nn.Module):
                 for moment in ("mean", "square", "last"):
                     state[moment] = state[moment][source]
                     state[moment][fresh] = state["step"] if moment == "last" else 0
-            self._exchange(name, old.data[source], optimizer, state)
-
-    def _exchange(self, name: str, values: Tensor, optimizer: CloudAdam | None, state: dict | None = None) -> None:
-        """A new parameter for an old one, whose size the graph of the last step still remembers."""
-        old = getattr(self, name)
-        new = nn.Parameter(values.to(old.device))
-        setattr(self, name, new)
-        if optimizer is not None:
-            optimizer.state.pop(old, None)
-            if state:
-                optimizer.state[new] = state
-            for group in optimizer.param_groups:
-                group["params"] = [new if p is old else p for p in group["params"]]
+            exchange(self, name, old.data[source], optimizer, state)
 
 
 class CloudAdam(torch.optim.Optimizer):

@@ -115,6 +115,12 @@ class SparseVoxels(nn.Module):
         return _of_corners(nodes)
 
     @torch.no_grad()
+    def keep(self, rows: Bool[Tensor, " row"]) -> None:
+        """Leave some rows; where a node has none any more, there is nothing."""
+        self.numbers, self.weights = self.numbers[rows], self.weights[rows]
+        self.density, self.harmonics = nn.Parameter(self.density[rows]), nn.Parameter(self.harmonics[rows])
+
+    @torch.no_grad()
     def rebuild(
         self, kept: Bool[Tensor, "x y z"], cells: Cells, optimizer: torch.optim.Optimizer | None = None
     ) -> None:

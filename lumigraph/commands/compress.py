@@ -1,0 +1,103 @@
+"""`lumigraph compress`: a trained run becomes a smaller one."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+from tyro.conf import Positional, arg
+
+from ..console import console
+from ..errors import LumigraphError
+from ..quality import Quality
+from ..ranges import Codes, Count, Decibels, Seconds, Steps
+from .common import choose_device, needed, option, show, typed
+
+LOSSES: Mapping[Quality, float] = {"draft": 1.0, "good": 0.3, "best": 0.1}  # dB that each quality may lose
+DEFAULT: Quality = "good"
+DEFAULT_SECONDS = 60.0
+UNITS = {"": 1, "k": 1e3, "m": 1e6, "g": 1e9, "ki": 2**10, "mi": 2**20, "gi": 2**30}
+SIZE = re.compile(r"\s*(\d+(?:\.\d+)?)\s*([kmg]?i?)b?\s*", re.IGNORECASE)
+ABOUT = "How much may be lost: " + ", ".join(f"{name} {dB:g} dB" for name, dB in LOSSES.items()) + "."
+
+
+@dataclass(frozen=True)
+class Compress:
+    """Make a trained run small enough to send; what comes of it opens like any other run.
+
+    What pictures hardly need goes, features become rows of a codebook, numbers get 8 or 16 bits, and what is left is
+    tuned on the photographs and packed. NEW opens wherever RUN does, but cannot be resumed. NEW/compress.json says size
+    and PSNR of held-out views before and after. Without its photographs a run is compared with its own renderings.
+    """
+
+    run_folder: Annotated[Positional[Path], needed("RUN")]
+    """Folder of the run, which stays as it is."""
+    output: Annotated[Path, arg(metavar="NEW", help_behavior_hint="")]
+    """New folder for the smaller run."""
+    to: Annotated[str | None, option("SIZE", "as --quality")] = None
+    """Make the model as small as this, losing as little as that allows: 5MB, 800kB, 2MiB."""
+    quality: Annotated[Quality | None, option("draft|good|best", DEFAULT, ABOUT)] = None
+    max_loss: Annotated[Decibels | None, option("DB", "as --quality")] = None
+    """Make it as small as possible with so much PSNR lost at most, of photographs that it learnt from."""
+    codebook: Annotated[Codes | None, option("N", "up to 4096, fewer where much may be lost")] = None
+    """Rows of the codebook."""
+    seconds: Annotated[Seconds | None, option("S", f"{DEFAULT_SECONDS:.0f}")] = None
+    """Tune for so long, all that is tried together."""
+    steps: Annotated[Steps | None, option("N", "as long as --seconds")] = None
+    """Tune for so many steps instead."""
+    views: Annotated[Count | None, option("N", "all")] = None
+    """Compare so many held-out views only, evenly spread."""
+    scene: Annotated[str | None, option("SCENE", "where they were")] = None
+    """Where the photographs are now, if they have moved."""
+    device: Annotated[str, option("NAME")] = "auto"
+    """auto, cpu, cuda, cuda:1."""
+
+    def run(self) -> int:
+        from ..compression import Aim, compress
+        from ..run import Run
+
+        if sum(told is not None for told in (self.to, self.quality, self.max_loss)) > 1:
+            raise LumigraphError("--to, --quality and --max-loss are ways to say how small; give one of them")
+        if self.steps is not None and self.seconds is not None:
+            raise LumigraphError("--steps and --seconds are two ways to say how long; give one of them")
+        size = None if self.to is None else bytes_in(self.to)
+        loss = None if size is not None else LOSSES[self.quality or DEFAULT] if self.max_loss is None else self.max_loss
+        seconds = None if self.steps is not None else self.seconds or DEFAULT_SECONDS
+        aim = Aim(size, loss, self.codebook, self.steps, seconds, self.views)
+        made = compress(Run(self.run_folder), self.output, aim, self.scene, choose_device(self.device))
+        console().print(table(made))
+        against = str(made.compared_with)
+        if made.psnr_before is None:
+            against += ", for its photographs cannot be opened; --scene says where they are"
+        rows = {"compared with": f"{made.views} held-out {against}", "saved": str(self.output)}
+        show(rows | {"next": typed("view", self.output)})
+        return 0
+
+
+def bytes_in(text: str) -> int:
+    """A size as people write it, 5MB or 800 kB. Raises LumigraphError for what is none."""
+    found = SIZE.fullmatch(text)
+    size = float(found[1][:20]) * UNITS[found[2].lower()] if found and found[2].lower() in UNITS else 0.0
+    if not 1 <= size <= 1e15:
+        raise LumigraphError(f"--to cannot be {text[:60]!r}; give it a size such as 5MB or 800kB")
+    return int(size)
+
+
+def table(made: Any) -> Any:
+    """Before and after."""
+    from rich.table import Table
+
+    rows = Table("", "before", "after", "")
+    rows.add_row("model", size(made.bytes_before), size(made.bytes_after), f"{made.times:.1f} times smaller")
+    rows.add_row("whole run", size(made.folder_before), size(made.folder_after), "")
+    before = "" if made.psnr_before is None else f"{made.psnr_before:.2f} dB"
+    change = "" if made.psnr_before is None else f"{made.psnr_after - made.psnr_before:+.2f} dB"
+    rows.add_row("PSNR", before, f"{made.psnr_after:.2f} dB", change)
+    return rows
+
+
+def size(count: int) -> str:
+    return f"{count / 1e6:.2f} MB" if count >= 1e6 else f"{count / 1e3:.1f} kB"

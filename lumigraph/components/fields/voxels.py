@@ -1,0 +1,95 @@
+"""Voxel grids that learn: values at the corners of voxels in a box, which may be made finer and the box tighter."""
+
+from __future__ import annotations
+
+import math
+from typing import ClassVar
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor, nn
+
+from ... import kernels
+
+LARGEST = 1 << 20  # corners that are looked up at a time where a grid is made anew
+
+Box = Float[Tensor, "2 3"]  # the lower corner and the upper
+
+
+def shape_of(sides: Float[Tensor, " 3"] | list[float], voxels: int) -> tuple[int, int, int]:
+    """Corners along each axis of about so many cubic voxels in a box with these sides, two at least."""
+    sides = [float(x) for x in sides]
+    edge = (math.prod(sides) / voxels) ** (1 / 3)
+    x, y, z = (max(1, round(side / edge)) + 1 for side in sides)
+    return x, y, z
+
+
+def corners(box: Box, shape: tuple[int, int, int]) -> Float[Tensor, "corner 3"]:
+    """Coordinates of a grid's corners, the last axis fastest."""
+    axes = [torch.linspace(0, 1, n, device=box.device) for n in shape]
+    return box[0] + torch.cartesian_prod(*axes) * (box[1] - box[0])
+
+
+def tight_box(box: Box, inside: Bool[Tensor, "x y z"]) -> Box:
+    """The smallest box around the corners that a mask picks, and a voxel around it; the whole box if it picks none.
+
+    Too large a box wastes voxels on what is empty; in one that cuts something off, that is learnt as background.
+    """
+    if not inside.any():
+        return box.clone()
+    size = torch.tensor(inside.shape, device=box.device)
+    found = inside.nonzero()
+    low, high = (found.amin(0) - 1).clamp_min(0), torch.minimum(found.amax(0) + 1, size - 1)
+    return box[0] + torch.stack([low, high]) / (size - 1) * (box[1] - box[0])
+
+
+class VoxelGrid(nn.Module):
+    """A row of channels at each corner of a box's voxels, zero at first, blended in between (see `kernels.dense_grid`).
+
+    values: (corner, channel), the last axis fastest; `size` says how many corners there are along each
+    Coordinates beyond the box have the values of its faces.
+    """
+
+    grows: ClassVar[tuple[str, ...]] = ("values",)
+    size: Tensor
+    box: Tensor
+
+    def __init__(self, box: list[list[float]], voxels: int, channels: int):
+        super().__init__()
+        shape = shape_of([high - low for low, high in zip(*box, strict=True)], voxels)
+        self.register_buffer("size", torch.tensor(shape))
+        self.register_buffer("box", torch.tensor(box))
+        self.values = nn.Parameter(torch.zeros(math.prod(shape), channels))
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """Corners along each axis."""
+        x, y, z = self.size.tolist()
+        return x, y, z
+
+    @property
+    def edge(self) -> float:
+        """Length of a voxel, as a cube of its volume has it."""
+        return float(((self.box[1] - self.box[0]) / (self.size - 1)).prod() ** (1 / 3))
+
+    def forward(self, coordinates: Float[Tensor, "sample 3"]) -> Float[Tensor, "sample channel"]:
+        return kernels.dense_grid(coordinates, self.values.view(*self.shape, -1), self.box)
+
+    @torch.no_grad()
+    def rebuild(self, box: Box, voxels: int, optimizer: torch.optim.Optimizer | None = None) -> None:
+        """About so many voxels in a box within one's own, that blend as those before do. A new parameter takes the old
+        one's place; what an optimizer remembered of that is forgotten."""
+        shape = shape_of((box[1] - box[0]).cpu(), voxels)
+        values = torch.cat([self(part) for part in corners(box, shape).split(LARGEST)])
+        self.size.copy_(torch.tensor(shape))
+        self.box.copy_(box)
+        self.replace(values.contiguous(), optimizer)
+
+    def replace(self, values: Float[Tensor, "corner channel"], optimizer: torch.optim.Optimizer | None = None) -> None:
+        """Other values, of which there may be another number, as a new parameter: the graph of the last step still
+        remembers the old one's size."""
+        old, self.values = self.values, nn.Parameter(values)
+        if optimizer is not None:
+            optimizer.state.pop(old, None)
+            for group in optimizer.param_groups:
+                group["params"] = [self.values if p is old else p for p in group["params"]]
