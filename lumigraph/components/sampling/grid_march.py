@@ -1,0 +1,50 @@
+"""Marching past a grid over a space's coordinates: steps that suit its voxels, past those that are known to be empty."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from ...rays import Rays, Samples
+from ...scene import Frame
+from .forward_march import march_forward
+from .occupancy import OccupancyGrid
+from .spaces import NDC, Space, space_of
+
+Density = Callable[[Float[Tensor, "point 3"]], Float[Tensor, " point"]]
+
+
+def reach_of(frame: Frame) -> float:
+    """Half-size of the cube that rays march through: the scene's own, or that of normalised device coordinates."""
+    return 1.0 if isinstance(space_of(frame), NDC) else frame.reach
+
+
+def march(
+    space: Space,
+    occupancy: OccupancyGrid,
+    rays: Rays,
+    near: float,
+    step: float,
+    growth: float,
+    jitter: Float[Tensor, " ray"] | None = None,
+) -> Samples:
+    """Samples in the occupied cells of a grid of `reach_of(frame)`; their distances are the scene's.
+
+    step:   in coordinates. Near the middle of a scene, one of its units is `space.stretch` of them
+    growth: of steps with distance, where space is contracted; voxels of an object and steps in normalised device
+            coordinates stay as they are
+    jitter: in [0, 1), moves each ray's lattice by that share of a step
+    """
+    if isinstance(space, NDC):
+        return march_forward(space, occupancy, rays, step, jitter)
+    middle = float(space.stretch(torch.zeros(1, 3, device=rays.origins.device)))
+    return occupancy.sample(rays, near, step / middle, growth, jitter=jitter)
+
+
+def asked_by_cells(space: Space, density: Density, of_coordinates: Density) -> Density:
+    """The density for that grid to look at: per scene unit at points, or per unit of coordinates where its cells are
+    those of normalised device coordinates."""
+    return of_coordinates if isinstance(space, NDC) else density
