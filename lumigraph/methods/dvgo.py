@@ -16,7 +16,7 @@ from ..choice import evenly
 from ..components.fields.mlp import MLP
 from ..components.fields.voxels import VoxelGrid, corners, tight_box
 from ..components.sampling.carving import visual_hull
-from ..components.sampling.grid_march import asked_by_cells, march, reach_of
+from ..components.sampling.grid_march import UNSETTLED, asked_by_cells, march, reach_of
 from ..components.sampling.importance import importance
 from ..components.sampling.marching import FIRST_RAYS, rays_for, weighty
 from ..components.sampling.occupancy import OccupancyGrid
@@ -75,8 +75,7 @@ class Config:
 
 GONE = -5.0  # of density, where compression has taken a corner out: a softplus of less than 0.0001
 PROBES, LOOKS = 0.02, 4  # share of cells looked at again at random; cells at most for each sample of a step
-WARM = 0.5  # share of the coarse stage before anything counts as free: at first all density is alike,
-# and where there is no bound what is far is found late
+WARM = 0.5  # share of the coarse stage before anything counts as free: at first all density is alike
 SAMPLES_OF_A_RAY = 32  # that a ray needs, about, once free space is known
 FLAT = (1.5, 1.5, 0.5)  # a forward-facing capture has few depths and many pixels
 SMOOTHED = 1 << 14  # voxels at which total variation is taken, of those that a step's samples are in
@@ -341,8 +340,9 @@ class DVGO(RayMethod):
         c = self.config
         if self._stage_at(progress) > int(self.stage):
             self._advance(self._stage_at(progress))
-            self._look(step, 1.0)
-        elif progress >= (WARM if self.frame.reach <= 1 else 1.0) * c.coarse_share and step % c.occupancy_interval == 0:
+            if self.frame.reach <= 1 or progress >= UNSETTLED:
+                self._look(step, 1.0)
+        elif progress >= (WARM * c.coarse_share if self.frame.reach <= 1 else UNSETTLED) and step % c.occupancy_interval == 0:
             self._look(step, PROBES)
 
     def after_step(self, step: int) -> None:

@@ -13,7 +13,7 @@ from torch import Tensor
 from ..camera import Camera
 from ..components.fields.sparse_voxels import Cells, Part, SparseVoxels
 from ..components.sampling.carving import visual_hull
-from ..components.sampling.grid_march import asked_by_cells, march, reach_of
+from ..components.sampling.grid_march import UNSETTLED, asked_by_cells, march, reach_of
 from ..components.sampling.importance import importance
 from ..components.sampling.marching import FIRST_RAYS, rays_for
 from ..components.sampling.occupancy import OccupancyGrid
@@ -335,7 +335,8 @@ class Plenoxels(RayMethod):
             self.occupancy.density.zero_()
         if step % c.occupancy_interval == 0:
             self.voxels.weights *= REMEMBERED
-        if finer or (step and step % c.occupancy_interval == 0):
+        settled = self.frame.reach <= 1 or progress >= UNSETTLED
+        if settled and (finer or (step and step % c.occupancy_interval == 0)):
             density_at = asked_by_cells(self.space, self.density, self._density)
             self.occupancy.update(density_at, c.occupancy_threshold, self.random(~step), REMEMBERED)
 

@@ -16,7 +16,7 @@ from ..components.fields.factorised import FactorGrid, nodes_in
 from ..components.fields.mlp import MLP
 from ..components.fields.truncation import truncate
 from ..components.sampling.carving import visual_hull
-from ..components.sampling.grid_march import asked_by_cells, march, reach_of
+from ..components.sampling.grid_march import UNSETTLED, asked_by_cells, march, reach_of
 from ..components.sampling.importance import importance
 from ..components.sampling.marching import rays_for, reached
 from ..components.sampling.occupancy import OccupancyGrid
@@ -417,6 +417,8 @@ class TensoRF(RayMethod):
         while self.occupancy.resolution < wanted:
             self.occupancy.refine()
             finer = True
+        if self.frame.reach > 1 and progress < UNSETTLED:
+            return
         if finer or step % (4 if step < 32 else c.occupancy_interval) == 0:
             share, budget = (1.0, None) if finer or step < 32 else (PROBES, LOOKS)
             self.occupancy.update(

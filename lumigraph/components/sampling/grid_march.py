@@ -14,6 +14,10 @@ from .forward_march import march_forward
 from .occupancy import OccupancyGrid
 from .spaces import NDC, Space, space_of
 
+# Share of the budget before anything counts as empty where there is no bound. At first all density is alike: cells
+# below its mean, which `OccupancyGrid.update` leaves out, would be half of the scene, by chance, and for good.
+UNSETTLED = 0.15
+
 Density = Callable[[Float[Tensor, "point 3"]], Float[Tensor, " point"]]
 
 
