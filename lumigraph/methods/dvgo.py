@@ -16,7 +16,7 @@ from ..choice import evenly
 from ..components.fields.mlp import MLP
 from ..components.fields.voxels import VoxelGrid, corners, tight_box
 from ..components.sampling.carving import visual_hull
-from ..components.sampling.grid_march import UNSETTLED, asked_by_cells, march, reach_of
+from ..components.sampling.grid_march import UNSETTLED, asked_by_cells, empty_below, march, reach_of
 from ..components.sampling.importance import importance
 from ..components.sampling.marching import FIRST_RAYS, rays_for, weighty
 from ..components.sampling.occupancy import OccupancyGrid
@@ -253,7 +253,7 @@ class DVGO(RayMethod):
         """Eqs. 11 to 13: squared error of rays, of each sample by its weight, entropy of opacity."""
         generator = self.random(step)
         jitter = torch.rand(len(batch), generator=generator).to(self.device)
-        background = backdrop(batch, self.background, generator)
+        background = backdrop(batch, self.background, generator, self.frame.reach > 1)
         (look,) = self.looks(batch.rays, jitter)
         rendering = composite(look.samples, look.density, look.rgb, background)
         residual, self.figures["mse"] = residuals(rendering, batch, background)
@@ -338,11 +338,12 @@ class DVGO(RayMethod):
 
     def before_step(self, step: int, progress: float) -> None:
         c = self.config
+        settled = progress >= (WARM * c.coarse_share if self.frame.reach <= 1 else UNSETTLED)
         if self._stage_at(progress) > int(self.stage):
             self._advance(self._stage_at(progress))
-            if self.frame.reach <= 1 or progress >= UNSETTLED:
+            if settled:
                 self._look(step, 1.0)
-        elif progress >= (WARM * c.coarse_share if self.frame.reach <= 1 else UNSETTLED) and step % c.occupancy_interval == 0:
+        elif settled and step % c.occupancy_interval == 0:
             self._look(step, PROBES)
 
     def after_step(self, step: int) -> None:
@@ -371,8 +372,8 @@ class DVGO(RayMethod):
 
     @torch.no_grad()
     def _enter_fine(self, voxels: int) -> None:
-        """Shrink to the box around all that is dense, where there is a bound. What was found stays as dense as it was; what is thinner than
-        free space at the beginning of the fine stage begins as that does."""
+        """Shrink to the box around all that is dense, where there is a bound. What was found stays as dense as it was;
+        what is thinner than free space at the beginning of the fine stage begins as that does."""
         c, grid = self.config, self.density_grid
         thickness = nn.functional.softplus(grid.values[:, 0] + self.shift)
         dense = 1 - torch.exp(-thickness) > c.box_alpha
@@ -396,4 +397,5 @@ class DVGO(RayMethod):
         budget = c.samples_per_step * LOOKS if share < 1 else None
         generator = self.random(~step)
         density = asked_by_cells(self.space, self.density, self._density)
-        self.occupancy.update(density, c.occupancy_threshold, generator, c.occupancy_decay, share, budget)
+        least = empty_below(self.frame, c.occupancy_threshold, self.occupancy.resolution)
+        self.occupancy.update(density, least, generator, c.occupancy_decay, share, budget)

@@ -7,13 +7,13 @@ from dataclasses import dataclass
 from typing import Annotated, Any
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from ..camera import Camera
 from ..components.fields.sparse_voxels import Cells, Part, SparseVoxels
 from ..components.sampling.carving import visual_hull
-from ..components.sampling.grid_march import UNSETTLED, asked_by_cells, march, reach_of
+from ..components.sampling.grid_march import UNSETTLED, asked_by_cells, empty_below, march, reach_of
 from ..components.sampling.importance import importance
 from ..components.sampling.marching import FIRST_RAYS, rays_for
 from ..components.sampling.occupancy import OccupancyGrid
@@ -89,6 +89,7 @@ class Config:
 
 DELAYED = 0.01  # what the density's learning rate begins with, as a share
 REMEMBERED = 0.9  # of a cell's density and a voxel's weight, from one look of the occupancy grid to the next
+PROBES, LOOKS = 0.02, 4  # where there is no bound: share of cells looked at again at random; cells for each sample
 NOTED = 4  # steps between those whose samples' weights are remembered for pruning
 SAMPLES_OF_A_RAY = 64  # that a ray meets, about, where there is no bound
 EDGE = 1e-3  # opacities are kept so far from 0 and 1 in the beta loss
@@ -287,7 +288,7 @@ class Plenoxels(RayMethod):
         rows = self.voxels.touched(places)
         part = self.voxels.part(rows)
         density, rgb = self._field(points, directions, part)
-        background = backdrop(batch, self.background, generator)
+        background = backdrop(batch, self.background, generator, self.frame.reach > 1)
         rendering = composite(samples, density, rgb, background)
         residual, self.figures["mse"] = residuals(rendering, batch, background, self.exposure)
         self.figures |= {"voxels": len(self.voxels), "touched": len(rows)}
@@ -331,14 +332,26 @@ class Plenoxels(RayMethod):
         wanted = cells_of(self.frame, self._resolution(progress))
         finer = wanted > self.cells
         if finer:
-            self.voxels.rebuild(self.voxels.important(c.weight_threshold), wanted, self._table)
+            self.voxels.rebuild(self._kept(), wanted, self._table)
             self.occupancy.density.zero_()
         if step % c.occupancy_interval == 0:
             self.voxels.weights *= REMEMBERED
         settled = self.frame.reach <= 1 or progress >= UNSETTLED
         if settled and (finer or (step and step % c.occupancy_interval == 0)):
             density_at = asked_by_cells(self.space, self.density, self._density)
-            self.occupancy.update(density_at, c.occupancy_threshold, self.random(~step), REMEMBERED)
+            whole = finer or self.frame.reach <= 1
+            share, budget = (1.0, None) if whole else (PROBES, LOOKS * c.samples_per_step)
+            generator = self.random(~step)
+            least = empty_below(self.frame, c.occupancy_threshold, c.occupancy_resolution)
+            self.occupancy.update(density_at, least, generator, REMEMBERED, share, budget)
+
+    def _kept(self) -> Bool[Tensor, "x y z"]:
+        """Cells that are not pruned. Where there is no bound, a step's few long rays leave most nodes without a known
+        weight; there a voxel goes that would stop less light than the threshold, as in the release."""
+        least = self.config.weight_threshold
+        if self.frame.reach <= 1:
+            return self.voxels.important(least)
+        return self.voxels.dense(least * int(self.voxels.cells.amax()) / 2)
 
     def _resolution(self, progress: float) -> int:
         """Voxels per axis at a share of the budget: doubled at equal intervals up to `refine_until`."""

@@ -16,7 +16,7 @@ from ..components.fields.factorised import FactorGrid, nodes_in
 from ..components.fields.mlp import MLP
 from ..components.fields.truncation import truncate
 from ..components.sampling.carving import visual_hull
-from ..components.sampling.grid_march import UNSETTLED, asked_by_cells, march, reach_of
+from ..components.sampling.grid_march import UNSETTLED, asked_by_cells, empty_below, march, reach_of
 from ..components.sampling.importance import importance
 from ..components.sampling.marching import rays_for, reached
 from ..components.sampling.occupancy import OccupancyGrid
@@ -270,7 +270,7 @@ class TensoRF(RayMethod):
     def loss(self, batch: Batch, step: int) -> dict[str, Tensor]:
         generator, c = self.random(step), self.config
         jitter = torch.rand(len(batch), generator=generator).to(self.device)
-        background = backdrop(batch, self.background, generator)
+        background = backdrop(batch, self.background, generator, self.frame.reach > 1)
         residual, self.figures["mse"] = residuals(self.render_rays(batch.rays, background, jitter), batch, background)
         terms = {"colour": residual.square().mean()}
         if self.frame.reach <= 1:
@@ -423,6 +423,9 @@ class TensoRF(RayMethod):
             share, budget = (1.0, None) if finer or step < 32 else (PROBES, LOOKS)
             self.occupancy.update(
                 asked_by_cells(self.space, self.density, self._density_in),
-                c.occupancy_threshold,
-                self.random(~step), c.occupancy_decay, share, budget
+                empty_below(self.frame, c.occupancy_threshold, self.occupancy.resolution),
+                self.random(~step),
+                c.occupancy_decay,
+                share,
+                budget,
             )

@@ -1,4 +1,4 @@
-"""Marching past a grid over a space's coordinates: steps that suit its voxels, past those that are known to be empty."""
+"""Marching through a grid over a space's coordinates, a share of a voxel at a time, past what is known to be empty."""
 
 from __future__ import annotations
 
@@ -17,6 +17,7 @@ from .spaces import NDC, Space, space_of
 # Share of the budget before anything counts as empty where there is no bound. At first all density is alike: cells
 # below its mean, which `OccupancyGrid.update` leaves out, would be half of the scene, by chance, and for good.
 UNSETTLED = 0.15
+FOG = 0.25  # optical thickness along a whole ray, at most, that may be skipped there
 
 Density = Callable[[Float[Tensor, "point 3"]], Float[Tensor, " point"]]
 
@@ -24,6 +25,12 @@ Density = Callable[[Float[Tensor, "point 3"]], Float[Tensor, " point"]]
 def reach_of(frame: Frame) -> float:
     """Half-size of the cube that rays march through: the scene's own, or that of normalised device coordinates."""
     return 1.0 if isinstance(space_of(frame), NDC) else frame.reach
+
+
+def empty_below(frame: Frame, thickness: float, resolution: int) -> float:
+    """Optical thickness below which a cell is skipped: less than what is asked for where there is no bound. A ray passes
+    as many cells as there are along an axis, and what all of them stop is a good part of what is seen at first."""
+    return thickness if frame.reach <= 1 else min(thickness, FOG / resolution)
 
 
 def march(
