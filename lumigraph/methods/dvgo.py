@@ -344,7 +344,8 @@ class DVGO(RayMethod):
             if settled:
                 self._look(step, 1.0)
         elif settled and step % c.occupancy_interval == 0:
-            self._look(step, PROBES)
+            first = self.frame.reach > 1 and not self.occupancy.density.any()  # a cell not looked at counts as empty
+            self._look(step, 1.0 if first else PROBES)
 
     def after_step(self, step: int) -> None:
         rays = rays_for(self.config.samples_per_step, int(self.rays_per_step), self.figures["samples"])

@@ -124,10 +124,10 @@ class Plenoxels(RayMethod):
             base_resolution=128,
             max_resolution=192,
             open_base_resolution=64,
-            open_max_resolution=256,
+            open_max_resolution=128,
             occupancy_resolution=128,
             rays_per_step=4096,
-            samples_per_step=1 << 17,
+            samples_per_step=1 << 16,
             refine_until=0.4,
             step_size=1.0,
             transmittance_threshold=1e-3,
@@ -339,7 +339,8 @@ class Plenoxels(RayMethod):
         settled = self.frame.reach <= 1 or progress >= UNSETTLED
         if settled and (finer or (step and step % c.occupancy_interval == 0)):
             density_at = asked_by_cells(self.space, self.density, self._density)
-            whole = finer or self.frame.reach <= 1
+            first = not self.occupancy.density.any()  # a cell that was never looked at counts as empty
+            whole = finer or first or self.frame.reach <= 1
             share, budget = (1.0, None) if whole else (PROBES, LOOKS * c.samples_per_step)
             generator = self.random(~step)
             least = empty_below(self.frame, c.occupancy_threshold, c.occupancy_resolution)

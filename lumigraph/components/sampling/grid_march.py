@@ -17,7 +17,7 @@ from .spaces import NDC, Space, space_of
 # Share of the budget before anything counts as empty where there is no bound. At first all density is alike: cells
 # below its mean, which `OccupancyGrid.update` leaves out, would be half of the scene, by chance, and for good.
 UNSETTLED = 0.15
-FOG = 0.25  # optical thickness along a whole ray, at most, that may be skipped there
+FOG = 1.0  # optical thickness along a whole ray, at most, that may be skipped there
 
 Density = Callable[[Float[Tensor, "point 3"]], Float[Tensor, " point"]]
 
@@ -28,8 +28,8 @@ def reach_of(frame: Frame) -> float:
 
 
 def empty_below(frame: Frame, thickness: float, resolution: int) -> float:
-    """Optical thickness below which a cell is skipped: less than what is asked for where there is no bound. A ray passes
-    as many cells as there are along an axis, and what all of them stop is a good part of what is seen at first."""
+    """Optical thickness below which a cell is skipped: less than what is asked for where there is no bound. There a ray
+    passes as many cells as lie along an axis, and what all of them stop is a good part of what is seen at first."""
     return thickness if frame.reach <= 1 else min(thickness, FOG / resolution)
 
 
