@@ -25,6 +25,7 @@ from lumigraph.files import write_json
 from lumigraph.methods.tensorf import Config, TensoRF
 from lumigraph.run import build, processor
 from lumigraph.scene import Batch, Scene
+from lumigraph.signals import go_on_unless
 from lumigraph.train import fit
 from lumigraph.volume import composite, weights_of
 
@@ -62,7 +63,7 @@ def learnt(scene: Scene, options: Options, device: torch.device) -> TensoRF:
     config = Config(initial_resolution=size, final_resolution=size, rays_per_step=1024, samples_per_step=1 << 22)
     method = build(TensoRF, scene.frame, config, device, 0)
     assert isinstance(method, TensoRF)
-    fit(method, scene, steps=options.before, show=False)
+    go_on_unless(fit(method, scene, steps=options.before, show=False).signal)
     return method
 
 
