@@ -57,6 +57,7 @@ class Config:
     transmittance_threshold: Share = 1e-4  # at which a ray is spent
     weight_threshold: Share = 1e-4  # of a sample, below which it is asked for no colour in the fine stage
     samples_per_step: Annotated[int, between(64, 1 << 24)] = 1 << 20  # 8192 rays, section 6.1
+    open_samples_per_step: Annotated[int, between(64, 1 << 24)] = 1 << 20  # the same where there is no bound
     occupancy_resolution: Annotated[int, between(4, 512)] = 128  # cells per axis of the mask of known free space
     occupancy_threshold: NonNegative = 0.05  # optical thickness across a cell below which it is free
     occupancy_interval: Steps = 16  # steps between looks at the mask
@@ -130,6 +131,7 @@ class DVGO(RayMethod):
             cone_angle=1 / 96,
             transmittance_threshold=1e-3,
             samples_per_step=1 << 17,
+            open_samples_per_step=1 << 16,
             occupancy_threshold=0.1,
             density_learning_rate=0.6,
             feature_learning_rate=0.2,
@@ -152,6 +154,7 @@ class DVGO(RayMethod):
             doublings=2,
             growing_share=0.5,
             samples_per_step=4096,
+            open_samples_per_step=4096,
             occupancy_resolution=16,
             density_learning_rate=0.5,
             feature_learning_rate=0.2,
@@ -280,7 +283,12 @@ class DVGO(RayMethod):
     # Learning
 
     def rays_in_a_step(self, data: Scene) -> float:
-        return self.config.samples_per_step / SAMPLES_OF_A_RAY
+        return self._samples / SAMPLES_OF_A_RAY
+
+    @property
+    def _samples(self) -> int:
+        """That a step asks about."""
+        return self.config.open_samples_per_step if self.frame.reach > 1 else self.config.samples_per_step
 
     def batch(self, data: Scene, generator: torch.Generator) -> Batch:
         return data.sample_rays(int(self.rays_per_step), generator).to(self.device)
@@ -348,7 +356,7 @@ class DVGO(RayMethod):
             self._look(step, 1.0 if first else PROBES)
 
     def after_step(self, step: int) -> None:
-        rays = rays_for(self.config.samples_per_step, int(self.rays_per_step), self.figures["samples"])
+        rays = rays_for(self._samples, int(self.rays_per_step), self.figures["samples"])
         self.rays_per_step.fill_(rays)
 
     def _stage_at(self, progress: float) -> int:
@@ -395,7 +403,7 @@ class DVGO(RayMethod):
     def _look(self, step: int, share: float) -> None:
         """Look at the mask of known free space again: at all cells, or at the occupied ones and a few more."""
         c = self.config
-        budget = c.samples_per_step * LOOKS if share < 1 else None
+        budget = self._samples * LOOKS if share < 1 else None
         generator = self.random(~step)
         density = asked_by_cells(self.space, self.density, self._density)
         least = empty_below(self.frame, c.occupancy_threshold, self.occupancy.resolution)

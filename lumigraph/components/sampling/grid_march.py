@@ -17,7 +17,7 @@ from .spaces import NDC, Space, space_of
 # Share of the budget before anything counts as empty where there is no bound. At first all density is alike: cells
 # below its mean, which `OccupancyGrid.update` leaves out, would be half of the scene, by chance, and for good.
 UNSETTLED = 0.15
-FOG = 1.0  # optical thickness along a whole ray, at most, that may be skipped there
+FOG = 0.25  # optical thickness along a whole ray, at most, that may be skipped there
 
 Density = Callable[[Float[Tensor, "point 3"]], Float[Tensor, " point"]]
 
