@@ -299,8 +299,8 @@ class Plenoxels(RayMethod):
             drawn = torch.rand(len(rows), generator=generator).to(rows.device) < config.tv_share
             chosen = self.voxels.numbers[rows[drawn]].long()
             open_ = config.open_tv_density, config.open_tv_harmonics
-            weights = open_ if self.frame.reach > 1 else (config.tv_density, config.tv_harmonics)
-            for name, weight in zip(("density", "harmonics"), weights, strict=True):
+            variations = open_ if self.frame.reach > 1 else (config.tv_density, config.tv_harmonics)
+            for name, weight in zip(("density", "harmonics"), variations, strict=True):
                 if weight:
                     terms[f"tv_{name}"] = weight * total_variation(chosen, part.nodes, getattr(part, name))
         if config.beta and batch.alpha is None:
