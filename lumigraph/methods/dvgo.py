@@ -16,13 +16,15 @@ from ..choice import evenly
 from ..components.fields.mlp import MLP
 from ..components.fields.voxels import VoxelGrid, corners, tight_box
 from ..components.sampling.carving import visual_hull
+from ..components.sampling.grid_march import UNSETTLED, asked_by_cells, empty_below, march, reach_of
 from ..components.sampling.importance import importance
 from ..components.sampling.marching import FIRST_RAYS, rays_for, weighty
 from ..components.sampling.occupancy import OccupancyGrid
-from ..components.sampling.spaces import space_of
+from ..components.sampling.spaces import NDC, space_of
 from ..components.training.lazy_adam import LazyAdam
 from ..components.training.photometric import backdrop, residuals
 from ..components.training.schedules import falling
+from ..components.training.smoothness import variation
 from ..method import RayMethod
 from ..packing import Stored, most_important
 from ..ranges import Layers, LearningRate, NonNegative, PositiveShare, Seed, Share, Steps, Width, between
@@ -45,6 +47,7 @@ class Config:
     sh_bands: Annotated[int, between(1, 4)] = 4  # of spherical harmonics of the direction
     coarse_alpha: PositiveShare = 1e-6  # alpha_init of the coarse stage, section 4.1
     fine_alpha: PositiveShare = 1e-2  # alpha_init of the fine stage
+    open_alpha: PositiveShare = 1e-4  # of both stages where there is no bound, the code's: long rays would see fog
     coarse_share: Share = 0.2  # of the budget: 5 of 25 thousand steps
     doublings: Annotated[int, between(0, 12)] = 4  # of the number of voxels in the fine stage, section 5.2
     growing_share: Share = 0.2  # of the fine stage, in which that happens: 4 of 20 thousand steps
@@ -54,6 +57,7 @@ class Config:
     transmittance_threshold: Share = 1e-4  # at which a ray is spent
     weight_threshold: Share = 1e-4  # of a sample, below which it is asked for no colour in the fine stage
     samples_per_step: Annotated[int, between(64, 1 << 24)] = 1 << 20  # 8192 rays, section 6.1
+    open_samples_per_step: Annotated[int, between(64, 1 << 24)] = 1 << 20  # the same where there is no bound
     occupancy_resolution: Annotated[int, between(4, 512)] = 128  # cells per axis of the mask of known free space
     occupancy_threshold: NonNegative = 0.05  # optical thickness across a cell below which it is free
     occupancy_interval: Steps = 16  # steps between looks at the mask
@@ -64,6 +68,9 @@ class Config:
     final_learning_rate: PositiveShare = 0.1  # share of them at the end of the budget, section 6.1
     point_weight: NonNegative = 0.01  # of each sample's own colour in the loss, eq. 12
     entropy_weight: NonNegative = 0.001  # of opacities that are neither 0 nor 1, eq. 13
+    tv_density_weight: NonNegative = 1e-3  # of total variation where there is no bound, as the code has it there
+    tv_feature_weight: NonNegative = 1e-4  # the same, of features
+    tv_interval: Steps = 8  # steps between looks at it, each as much stronger
     seed: Seed = 0
 
 
@@ -71,6 +78,8 @@ GONE = -5.0  # of density, where compression has taken a corner out: a softplus 
 PROBES, LOOKS = 0.02, 4  # share of cells looked at again at random; cells at most for each sample of a step
 WARM = 0.5  # share of the coarse stage before anything counts as free: at first all density is alike
 SAMPLES_OF_A_RAY = 32  # that a ray needs, about, once free space is known
+FLAT = (1.5, 1.5, 0.5)  # a forward-facing capture has few depths and many pixels
+SMOOTHED = 1 << 14  # voxels at which total variation is taken, of those that a step's samples are in
 VIEWS, LATTICE = 24, 32  # photographs, and cells along an axis, that tell how many photographs see a voxel
 
 
@@ -92,13 +101,14 @@ class DVGO(RayMethod):
         super().__init__(frame, config)
         self.space = space_of(frame)
         box = [list(corner) for corner in frame.bounds] if frame.reach <= 1 else [[-1.0] * 3, [1.0] * 3]
-        self.density_grid = VoxelGrid(box, config.coarse_voxels, 1)
-        self.feature_grid = VoxelGrid(box, config.coarse_voxels, config.feature_channels)
+        finer = FLAT if isinstance(self.space, NDC) else (1.0, 1.0, 1.0)
+        self.density_grid = VoxelGrid(box, config.coarse_voxels, 1, finer)
+        self.feature_grid = VoxelGrid(box, config.coarse_voxels, config.feature_channels, finer)
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(config.seed)
             hidden = [config.hidden_width] * config.hidden_layers
             self.colour_network = MLP(config.feature_channels + config.sh_bands**2, *hidden, 3)
-        self.occupancy = OccupancyGrid(frame.reach, config.occupancy_resolution)
+        self.occupancy = OccupancyGrid(reach_of(frame), config.occupancy_resolution)
         self.register_buffer("rays_per_step", torch.tensor(FIRST_RAYS))
         self.register_buffer("stage", torch.tensor(0))  # 0: coarse; k: fine, after k - 1 doublings
         sides = [high - low for low, high in zip(*box, strict=True)]
@@ -121,6 +131,7 @@ class DVGO(RayMethod):
             cone_angle=1 / 96,
             transmittance_threshold=1e-3,
             samples_per_step=1 << 17,
+            open_samples_per_step=1 << 16,
             occupancy_threshold=0.1,
             density_learning_rate=0.6,
             feature_learning_rate=0.2,
@@ -143,6 +154,7 @@ class DVGO(RayMethod):
             doublings=2,
             growing_share=0.5,
             samples_per_step=4096,
+            open_samples_per_step=4096,
             occupancy_resolution=16,
             density_learning_rate=0.5,
             feature_learning_rate=0.2,
@@ -159,6 +171,10 @@ class DVGO(RayMethod):
     def density(self, points: Float[Tensor, "sample 3"]) -> Float[Tensor, " sample"]:
         """Density per scene unit: interpolate, then activate (section 4.1, "post-activation")."""
         return self._activated(self.density_grid(self.space.warp(points))[:, 0], points)
+
+    def _density(self, coordinates: Float[Tensor, "sample 3"]) -> Float[Tensor, " sample"]:
+        """Density per unit of the coordinates."""
+        return nn.functional.softplus(self.density_grid(coordinates)[:, 0] + self.shift) * float(1 / self.edge)
 
     def field(
         self, points: Float[Tensor, "point 3"], directions: Float[Tensor, "point 3"]
@@ -205,7 +221,11 @@ class DVGO(RayMethod):
     @property
     def shift(self) -> float:
         """The b of softplus(grid + b), eq. 9."""
-        return shift_of(self.config.fine_alpha if self.stage > 0 else self.config.coarse_alpha)
+        return self._shift_in(int(self.stage))
+
+    def _shift_in(self, stage: int) -> float:
+        c = self.config
+        return shift_of(c.open_alpha if self.frame.reach > 1 else c.fine_alpha if stage > 0 else c.coarse_alpha)
 
     def _activated(self, raw: Float[Tensor, " sample"], points: Float[Tensor, "sample 3"]) -> Float[Tensor, " sample"]:
         """softplus(raw + b) for each voxel's edge of the last grid of this stage: contracted voxels are larger."""
@@ -227,25 +247,31 @@ class DVGO(RayMethod):
 
     def _march(self, rays: Rays, jitter: Float[Tensor, " ray"] | None) -> Samples:
         """Samples in what is not known to be free, a share of a voxel from one to the next."""
-        middle = self.space.stretch(torch.zeros(1, 3, device=self.device))
-        step = self.config.step_size * self.density_grid.edge / float(middle)
+        grid = self.density_grid
+        step = self.config.step_size * (grid.longest if isinstance(self.space, NDC) else grid.edge)
         growth = self.config.cone_angle if self.frame.reach > 1 else 0.0
-        return self.occupancy.sample(rays, self.frame.near, step, growth, jitter=jitter)
+        return march(self.space, self.occupancy, rays, self.frame.near, step, growth, jitter)
 
     def loss(self, batch: Batch, step: int) -> dict[str, Tensor]:
         """Eqs. 11 to 13: squared error of rays, of each sample by its weight, entropy of opacity."""
         generator = self.random(step)
         jitter = torch.rand(len(batch), generator=generator).to(self.device)
-        background = backdrop(batch, self.background, generator)
+        background = backdrop(batch, self.background, generator, self.frame.reach > 1)
         (look,) = self.looks(batch.rays, jitter)
         rendering = composite(look.samples, look.density, look.rgb, background)
         residual, self.figures["mse"] = residuals(rendering, batch, background)
-        terms = {"colour": residual.square().mean()}
-        if weight := self.config.point_weight:
+        terms, c = {"colour": residual.square().mean()}, self.config
+        if weight := c.point_weight:
             terms["points"] = weight * self._points(look, batch.before(self.background))
-        if weight := self.config.entropy_weight:
+        if weight := c.entropy_weight:
             a = rendering.opacity.clamp(1e-6, 1 - 1e-6)
             terms["entropy"] = weight * -(a * a.log() + (1 - a) * (1 - a).log()).mean()
+        if self.frame.reach > 1 and step % c.tv_interval == 0 and len(look.samples):
+            coordinates = self.space.warp(look.samples.along(batch.rays)[0])
+            grids = ("density", self.density_grid), ("feature", self.feature_grid)
+            for (name, grid), weight in zip(grids, (c.tv_density_weight, c.tv_feature_weight), strict=True):
+                if weight:
+                    terms[f"tv_{name}"] = c.tv_interval * weight * variation(grid, coordinates, SMOOTHED, generator)
         return terms
 
     def _points(self, look: Look, target: Float[Tensor, "ray 3"]) -> Float[Tensor, ""]:
@@ -257,7 +283,12 @@ class DVGO(RayMethod):
     # Learning
 
     def rays_in_a_step(self, data: Scene) -> float:
-        return self.config.samples_per_step / SAMPLES_OF_A_RAY
+        return self._samples / SAMPLES_OF_A_RAY
+
+    @property
+    def _samples(self) -> int:
+        """That a step asks about."""
+        return self.config.open_samples_per_step if self.frame.reach > 1 else self.config.samples_per_step
 
     def batch(self, data: Scene, generator: torch.Generator) -> Batch:
         return data.sample_rays(int(self.rays_per_step), generator).to(self.device)
@@ -315,14 +346,17 @@ class DVGO(RayMethod):
 
     def before_step(self, step: int, progress: float) -> None:
         c = self.config
+        settled = progress >= (WARM * c.coarse_share if self.frame.reach <= 1 else UNSETTLED)
         if self._stage_at(progress) > int(self.stage):
             self._advance(self._stage_at(progress))
-            self._look(step, 1.0)
-        elif progress >= WARM * c.coarse_share and step % c.occupancy_interval == 0:
-            self._look(step, PROBES)
+            if settled:
+                self._look(step, 1.0)
+        elif settled and step % c.occupancy_interval == 0:
+            first = self.frame.reach > 1 and not self.occupancy.density.any()  # a cell not looked at counts as empty
+            self._look(step, 1.0 if first else PROBES)
 
     def after_step(self, step: int) -> None:
-        rays = rays_for(self.config.samples_per_step, int(self.rays_per_step), self.figures["samples"])
+        rays = rays_for(self._samples, int(self.rays_per_step), self.figures["samples"])
         self.rays_per_step.fill_(rays)
 
     def _stage_at(self, progress: float) -> int:
@@ -347,16 +381,17 @@ class DVGO(RayMethod):
 
     @torch.no_grad()
     def _enter_fine(self, voxels: int) -> None:
-        """Shrink to the box around all that is dense. What was found stays as dense as it was; what is thinner than
-        free space at the beginning of the fine stage begins as that does."""
+        """Shrink to the box around all that is dense, where there is a bound. What was found stays as dense as it was;
+        what is thinner than free space at the beginning of the fine stage begins as that does."""
         c, grid = self.config, self.density_grid
         thickness = nn.functional.softplus(grid.values[:, 0] + self.shift)
         dense = 1 - torch.exp(-thickness) > c.box_alpha
-        box = tight_box(grid.box, dense.view(grid.shape))
+        inside = dense.view(grid.shape)
+        box = tight_box(grid.box, inside) if self.frame.reach <= 1 else grid.box.clone()
         volume = float((box[1] - box[0]).prod())
         edge = (volume / c.voxels) ** (1 / 3)
         thickness = thickness * (edge / float(self.edge))
-        raw = thickness + torch.log(-torch.expm1(-thickness)).clamp_min(-50) - shift_of(c.fine_alpha)
+        raw = thickness + torch.log(-torch.expm1(-thickness)).clamp_min(-50) - self._shift_in(1)
         grid.replace(raw.clamp_min(0)[:, None], self._adam)
         self.edge.fill_(edge)
         for each in (grid, self.feature_grid):
@@ -368,6 +403,8 @@ class DVGO(RayMethod):
     def _look(self, step: int, share: float) -> None:
         """Look at the mask of known free space again: at all cells, or at the occupied ones and a few more."""
         c = self.config
-        budget = c.samples_per_step * LOOKS if share < 1 else None
+        budget = self._samples * LOOKS if share < 1 else None
         generator = self.random(~step)
-        self.occupancy.update(self.density, c.occupancy_threshold, generator, c.occupancy_decay, share, budget)
+        density = asked_by_cells(self.space, self.density, self._density)
+        least = empty_below(self.frame, c.occupancy_threshold, self.occupancy.resolution)
+        self.occupancy.update(density, least, generator, c.occupancy_decay, share, budget)

@@ -7,14 +7,15 @@ from dataclasses import dataclass
 from typing import Annotated, Any
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from ..camera import Camera
 from ..components.fields.sparse_voxels import Cells, Part, SparseVoxels
 from ..components.sampling.carving import visual_hull
-from ..components.sampling.forward_march import march_forward
+from ..components.sampling.grid_march import UNSETTLED, asked_by_cells, empty_below, march, reach_of
 from ..components.sampling.importance import importance
+from ..components.sampling.marching import FIRST_RAYS, rays_for
 from ..components.sampling.occupancy import OccupancyGrid
 from ..components.sampling.spaces import NDC, Contraction, space_of
 from ..components.training.corrections import Exposure
@@ -42,6 +43,8 @@ class Config:
 
     base_resolution: Resolution = 256  # voxels per axis at first, section 3.3
     max_resolution: Resolution = 512  # and in the end, doubled in between
+    open_base_resolution: Resolution = 128  # the same where there is no bound, the release's
+    open_max_resolution: Resolution = 640
     refine_until: Share = 0.3  # share of the budget at which the grid is as fine as it gets
     step_size: Annotated[float, between(0.05, 4)] = 0.5  # of samples along a ray, in voxels
     initial_density: Positive = 0.1  # per unit of coordinates
@@ -50,7 +53,8 @@ class Config:
     occupancy_resolution: Annotated[int, between(4, 512)] = 256  # cells per axis of the grid that rays march through
     occupancy_threshold: NonNegative = 1e-2  # optical thickness across a cell below which it is skipped
     occupancy_interval: Steps = 64  # steps between updates of the occupancy grid
-    rays_per_step: BatchSize = 5000  # section 4
+    rays_per_step: BatchSize = 5000  # section 4; at most
+    samples_per_step: Annotated[int, between(64, 1 << 24)] = 1 << 20  # that these may meet where there is no bound
     density_learning_rate: DensityRate = 30.0  # per unit of coordinates, of 256 voxels per axis; in proportion to them
     final_density_learning_rate: DensityRate = 0.05
     density_delay: Share = 0.12  # share of the budget in which the density's learning rate comes up to that
@@ -58,6 +62,8 @@ class Config:
     final_harmonics_learning_rate: LearningRate = 5e-6
     tv_density: NonNegative = 1e-5  # weight of the density's total variation, eq. 3
     tv_harmonics: NonNegative = 1e-3
+    open_tv_density: NonNegative = 5e-4  # the same where there is no bound, the release's
+    open_tv_harmonics: NonNegative = 5e-3
     tv_share: PositiveShare = 0.01  # of the nodes that a step touches: those that total variation looks at
     tv_interval: Steps = 1  # steps from one look at it to the next
     sparsity: NonNegative = 1e-11  # weight of the densities' Cauchy loss, eq. 4
@@ -67,16 +73,25 @@ class Config:
 
     def check(self) -> None:
         """Raises LumigraphError for numbers that contradict each other."""
-        if self.base_resolution > self.max_resolution:
-            raise LumigraphError(
-                f"A grid cannot begin finer than it ends: --base-resolution {self.base_resolution:,} is above "
-                f"--max-resolution {self.max_resolution:,}"
-            )
+        for name, (base, most) in {"": self.resolutions(False), "open-": self.resolutions(True)}.items():
+            if base > most:
+                raise LumigraphError(
+                    f"A grid cannot begin finer than it ends: --{name}base-resolution {base:,} is above "
+                    f"--{name}max-resolution {most:,}"
+                )
+
+    def resolutions(self, unbounded: bool) -> tuple[int, int]:
+        """Voxels per axis, at first and in the end."""
+        if unbounded:
+            return self.open_base_resolution, self.open_max_resolution
+        return self.base_resolution, self.max_resolution
 
 
 DELAYED = 0.01  # what the density's learning rate begins with, as a share
 REMEMBERED = 0.9  # of a cell's density and a voxel's weight, from one look of the occupancy grid to the next
+PROBES, LOOKS = 0.02, 4  # where there is no bound: share of cells looked at again at random; cells for each sample
 NOTED = 4  # steps between those whose samples' weights are remembered for pruning
+SAMPLES_OF_A_RAY = 64  # that a ray meets, about, where there is no bound
 EDGE = 1e-3  # opacities are kept so far from 0 and 1 in the beta loss
 
 
@@ -86,14 +101,18 @@ class Plenoxels(RayMethod):
     forward-facing capture in normalised device coordinates, anything else contracted into a ball."""
 
     Config = Config
+    rays_per_step: Tensor
 
     def __init__(self, frame: Frame, config: Any = None):
         config = config or Config()
         super().__init__(frame, config)
         self.space = space_of(frame)
-        self.voxels = SparseVoxels(cells_of(frame, config.base_resolution), config.initial_density)
+        first, _ = config.resolutions(frame.reach > 1)
+        self.voxels = SparseVoxels(cells_of(frame, first), config.initial_density)
         self.occupancy = OccupancyGrid(reach_of(frame), config.occupancy_resolution)
         self.exposure = Exposure(frame.image_count) if config.exposure_correction else None
+        first = config.rays_per_step if frame.reach <= 1 else min(FIRST_RAYS, config.rays_per_step)
+        self.register_buffer("rays_per_step", torch.tensor(first))
         self._table: LazyRMSprop | None = None
 
     @classmethod
@@ -104,8 +123,11 @@ class Plenoxels(RayMethod):
         return Config(
             base_resolution=128,
             max_resolution=192,
+            open_base_resolution=64,
+            open_max_resolution=128,
             occupancy_resolution=128,
             rays_per_step=4096,
+            samples_per_step=1 << 16,
             refine_until=0.4,
             step_size=1.0,
             transmittance_threshold=1e-3,
@@ -127,6 +149,8 @@ class Plenoxels(RayMethod):
         return Config(
             base_resolution=8,
             max_resolution=32,
+            open_base_resolution=8,
+            open_max_resolution=32,
             refine_until=0.5,
             step_size=1.0,
             occupancy_resolution=16,
@@ -146,11 +170,22 @@ class Plenoxels(RayMethod):
 
     @classmethod
     def further_bytes(cls, frame: Frame, config: Any, learning: bool) -> int:
-        grown = SparseVoxels.bytes_of(cells_of(frame, config.max_resolution), learning)
+        _, last = config.resolutions(frame.reach > 1)
+        grown = SparseVoxels.bytes_of(cells_of(frame, last), learning)
         return grown + OccupancyGrid.bytes_of(reach_of(frame), config.occupancy_resolution)
 
     def rays_in_a_step(self, data: Scene) -> float:
-        return self.config.rays_per_step
+        c = self.config
+        return min(c.rays_per_step, c.samples_per_step / SAMPLES_OF_A_RAY) if self.frame.reach > 1 else c.rays_per_step
+
+    def batch(self, data: Scene, generator: torch.Generator) -> Batch:
+        return data.sample_rays(int(self.rays_per_step), generator).to(self.device)
+
+    def after_step(self, step: int) -> None:
+        """Where rays are long, set the next step's number of them so that they meet `samples_per_step` samples."""
+        if self.frame.reach > 1:
+            rays = rays_for(self.config.samples_per_step, int(self.rays_per_step), self.figures["samples"])
+            self.rays_per_step.fill_(min(rays, self.config.rays_per_step))
 
     # Being seen
 
@@ -167,12 +202,8 @@ class Plenoxels(RayMethod):
     ) -> tuple[Samples, Float[Tensor, " sample"]]:
         """The samples of rays that light reaches and that are not clear, and how much each weighs in a picture."""
         step = self.config.step_size * 2 / int(self.voxels.cells.amax())
-        if isinstance(self.space, NDC):
-            found = march_forward(self.space, self.occupancy, rays, step, jitter)
-        else:  # the inner half of a contraction's coordinates has the scene's own shape; beyond, voxels grow evenly
-            open_ = isinstance(self.space, Contraction)
-            first, growth = (2 * step, step) if open_ else (step, 0.0)
-            found = self.occupancy.sample(rays, self.frame.near, first, growth, jitter=jitter)
+        growth = step if isinstance(self.space, Contraction) else 0.0  # beyond its inner half, voxels grow evenly
+        found = march(self.space, self.occupancy, rays, self.frame.near, step, growth, jitter)
         with torch.no_grad():  # a lookup of density is so quick that all are asked about at once
             density = self.density(found.along(rays)[0])
             weights = weights_of(found, density, self.config.transmittance_threshold)
@@ -257,7 +288,7 @@ class Plenoxels(RayMethod):
         rows = self.voxels.touched(places)
         part = self.voxels.part(rows)
         density, rgb = self._field(points, directions, part)
-        background = backdrop(batch, self.background, generator)
+        background = backdrop(batch, self.background, generator, self.frame.reach > 1)
         rendering = composite(samples, density, rgb, background)
         residual, self.figures["mse"] = residuals(rendering, batch, background, self.exposure)
         self.figures |= {"voxels": len(self.voxels), "touched": len(rows)}
@@ -267,7 +298,9 @@ class Plenoxels(RayMethod):
         if step % config.tv_interval == 0:
             drawn = torch.rand(len(rows), generator=generator).to(rows.device) < config.tv_share
             chosen = self.voxels.numbers[rows[drawn]].long()
-            for name, weight in (("density", config.tv_density), ("harmonics", config.tv_harmonics)):
+            open_ = config.open_tv_density, config.open_tv_harmonics
+            variations = open_ if self.frame.reach > 1 else (config.tv_density, config.tv_harmonics)
+            for name, weight in zip(("density", "harmonics"), variations, strict=True):
                 if weight:
                     terms[f"tv_{name}"] = weight * total_variation(chosen, part.nodes, getattr(part, name))
         if config.beta and batch.alpha is None:
@@ -299,20 +332,35 @@ class Plenoxels(RayMethod):
         wanted = cells_of(self.frame, self._resolution(progress))
         finer = wanted > self.cells
         if finer:
-            self.voxels.rebuild(self.voxels.important(c.weight_threshold), wanted, self._table)
+            self.voxels.rebuild(self._kept(), wanted, self._table)
             self.occupancy.density.zero_()
         if step % c.occupancy_interval == 0:
             self.voxels.weights *= REMEMBERED
-        if finer or (step and step % c.occupancy_interval == 0):
-            density_at = self._density if isinstance(self.space, NDC) else self.density
-            self.occupancy.update(density_at, c.occupancy_threshold, self.random(~step), REMEMBERED)
+        settled = self.frame.reach <= 1 or progress >= UNSETTLED
+        if settled and (finer or (step and step % c.occupancy_interval == 0)):
+            density_at = asked_by_cells(self.space, self.density, self._density)
+            first = not self.occupancy.density.any()  # a cell that was never looked at counts as empty
+            whole = finer or first or self.frame.reach <= 1
+            share, budget = (1.0, None) if whole else (PROBES, LOOKS * c.samples_per_step)
+            generator = self.random(~step)
+            least = empty_below(self.frame, c.occupancy_threshold, c.occupancy_resolution)
+            self.occupancy.update(density_at, least, generator, REMEMBERED, share, budget)
+
+    def _kept(self) -> Bool[Tensor, "x y z"]:
+        """Cells that are not pruned. Where there is no bound, a step's few long rays leave most nodes without a known
+        weight; there a voxel goes that would stop less light than the threshold, as in the release."""
+        least = self.config.weight_threshold
+        if self.frame.reach <= 1:
+            return self.voxels.important(least)
+        return self.voxels.dense(least * int(self.voxels.cells.amax()) / 2)
 
     def _resolution(self, progress: float) -> int:
         """Voxels per axis at a share of the budget: doubled at equal intervals up to `refine_until`."""
         c = self.config
-        doublings = math.ceil(math.log2(c.max_resolution / c.base_resolution))
+        first, last = c.resolutions(self.frame.reach > 1)
+        doublings = math.ceil(math.log2(last / first))
         done = doublings if progress >= c.refine_until else int(doublings * progress / c.refine_until)
-        return min(c.base_resolution << done, c.max_resolution)
+        return min(first << done, last)
 
 
 def cells_of(frame: Frame, resolution: int) -> Cells:
@@ -320,11 +368,6 @@ def cells_of(frame: Frame, resolution: int) -> Cells:
     if isinstance(space_of(frame), NDC):
         return resolution + resolution // 2, resolution + resolution // 2, resolution // 2
     return resolution, resolution, resolution
-
-
-def reach_of(frame: Frame) -> float:
-    """Half-size of the cube that rays march through: the scene's own, or that of normalised device coordinates."""
-    return 1.0 if isinstance(space_of(frame), NDC) else frame.reach
 
 
 def cauchy(density: Float[Tensor, " sample"], rays: int) -> Tensor:

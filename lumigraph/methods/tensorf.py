@@ -16,6 +16,7 @@ from ..components.fields.factorised import FactorGrid, nodes_in
 from ..components.fields.mlp import MLP
 from ..components.fields.truncation import truncate
 from ..components.sampling.carving import visual_hull
+from ..components.sampling.grid_march import UNSETTLED, asked_by_cells, empty_below, march, reach_of
 from ..components.sampling.importance import importance
 from ..components.sampling.marching import rays_for, reached
 from ..components.sampling.occupancy import OccupancyGrid
@@ -167,7 +168,7 @@ class TensoRF(RayMethod):
         self.register_buffer("box", torch.tensor(whole))  # in the space's coordinates: where the grid is
         self.register_buffer("stage", torch.tensor(0))  # how often the grid has become finer
         self.register_buffer("rays_per_step", torch.tensor(min(FIRST_RAYS, config.rays_per_step)))
-        self.occupancy = OccupancyGrid(frame.reach, max(4, int(config.occupancy_resolution * MASKS[0][1])))
+        self.occupancy = OccupancyGrid(reach_of(frame), max(4, int(config.occupancy_resolution * MASKS[0][1])))
         self._optimizer: torch.optim.Optimizer | None = None
 
     @classmethod
@@ -227,7 +228,7 @@ class TensoRF(RayMethod):
         width = config.density_components + config.appearance_components
         step = 4 * config.samples_per_step * 32
         grown = 4 * (last - first) * width * (4 if learning else 1)
-        return OccupancyGrid.bytes_of(frame.reach, config.occupancy_resolution) + grown + step * learning
+        return OccupancyGrid.bytes_of(reach_of(frame), config.occupancy_resolution) + grown + step * learning
 
     def rays_in_a_step(self, data: Scene) -> float:
         return min(self.config.rays_per_step, self.config.samples_per_step / SAMPLES_OF_A_RAY)
@@ -250,7 +251,7 @@ class TensoRF(RayMethod):
 
     def looks(self, rays: Rays, jitter: Float[Tensor, " ray"] | None = None) -> list[Look]:
         c, growth = self.config, self.config.cone_angle if self.frame.reach > 1 else 0.0
-        found = self.occupancy.sample(rays, self.frame.near, self._step(), growth, jitter=jitter)
+        found = march(self.space, self.occupancy, rays, self.frame.near, self._step(), growth, jitter)
         samples, asked = reached(rays, found, self.density, c.transmittance_threshold)
         ray = samples.ray_index
         towards = rays.directions.index_select(0, ray)
@@ -269,7 +270,7 @@ class TensoRF(RayMethod):
     def loss(self, batch: Batch, step: int) -> dict[str, Tensor]:
         generator, c = self.random(step), self.config
         jitter = torch.rand(len(batch), generator=generator).to(self.device)
-        background = backdrop(batch, self.background, generator)
+        background = backdrop(batch, self.background, generator, self.frame.reach > 1)
         residual, self.figures["mse"] = residuals(self.render_rays(batch.rays, background, jitter), batch, background)
         terms = {"colour": residual.square().mean()}
         if self.frame.reach <= 1:
@@ -356,9 +357,19 @@ class TensoRF(RayMethod):
 
     def _places(self, points: Float[Tensor, "point 3"]) -> tuple[Float[Tensor, "point 3"], Bool[Tensor, " point"]]:
         """Where in the grid's cube points are, and which are in it."""
+        return self._in_cube(self.space.warp(points))
+
+    def _in_cube(
+        self, coordinates: Float[Tensor, "point 3"]
+    ) -> tuple[Float[Tensor, "point 3"], Bool[Tensor, " point"]]:
         low, high = self.box
-        places = (self.space.warp(points) - low) / (high - low)
+        places = (coordinates - low) / (high - low)
         return places, ((places > 0) & (places < 1)).all(-1)  # what lies before the plane of a forward capture is on it
+
+    def _density_in(self, coordinates: Float[Tensor, "point 3"]) -> Float[Tensor, " point"]:
+        """Density per unit of the coordinates."""
+        places, inside = self._in_cube(coordinates)
+        return self.network.density(places) * inside
 
     def _density(
         self, points: Float[Tensor, "point 3"], places: Float[Tensor, "point 3"], inside: Bool[Tensor, " point"]
@@ -367,11 +378,10 @@ class TensoRF(RayMethod):
         return density if isinstance(self.space, Box) else density * self.space.stretch(points)
 
     def _step(self) -> float:
-        """Length of a sample in scene units, near the middle of the scene."""
+        """Length of a sample in the coordinates."""
         extent = (self.box[1] - self.box[0]).double().cpu()
         nodes = self.network.density_grid.nodes.double().cpu()
-        spacing = float((extent / (nodes - 1)).mean()) / float(self.space.stretch(torch.zeros(1, 3)))
-        return self.config.step_ratio * spacing
+        return self.config.step_ratio * float((extent / (nodes - 1)).mean())
 
     def _resolution(self, stage: int) -> int:
         """Evenly in the logarithm from the first resolution to the last (section 5)."""
@@ -407,8 +417,15 @@ class TensoRF(RayMethod):
         while self.occupancy.resolution < wanted:
             self.occupancy.refine()
             finer = True
+        if self.frame.reach > 1 and progress < UNSETTLED:
+            return
         if finer or step % (4 if step < 32 else c.occupancy_interval) == 0:
             share, budget = (1.0, None) if finer or step < 32 else (PROBES, LOOKS)
             self.occupancy.update(
-                self.density, c.occupancy_threshold, self.random(~step), c.occupancy_decay, share, budget
+                asked_by_cells(self.space, self.density, self._density_in),
+                empty_below(self.frame, c.occupancy_threshold, self.occupancy.resolution),
+                self.random(~step),
+                c.occupancy_decay,
+                share,
+                budget,
             )

@@ -107,11 +107,19 @@ class SparseVoxels(nn.Module):
     def important(self, weight: float) -> Bool[Tensor, "x y z"]:
         """Cells with a node at which some sample weighed so much; the others next to each such node stay too, which
         makes room for what was missed (the paper's dilation). All cells, where no sample weighed so much."""
-        if not (self.weights > weight).any():
+        return self._around(self.weights > weight)
+
+    @torch.no_grad()
+    def dense(self, density: float) -> Bool[Tensor, "x y z"]:
+        """Cells with a node of such a density, and those next to it, as above."""
+        return self._around(self.density[:, 0] > density)
+
+    def _around(self, rows: Bool[Tensor, " row"]) -> Bool[Tensor, "x y z"]:
+        if not rows.any():
             return torch.ones(*self.cells.tolist(), dtype=torch.bool, device=self.numbers.device)
         shape = tuple((self.cells + 1).tolist())
         nodes = torch.zeros(shape, dtype=torch.bool, device=self.numbers.device)
-        nodes.view(-1)[self.numbers[self.weights > weight].long()] = True
+        nodes.view(-1)[self.numbers[rows].long()] = True
         return _of_corners(nodes)
 
     @torch.no_grad()

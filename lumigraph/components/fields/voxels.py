@@ -13,11 +13,12 @@ from ... import kernels
 
 LARGEST = 1 << 20  # corners that are looked up at a time where a grid is made anew
 
+Finer = tuple[float, float, float]
 Box = Float[Tensor, "2 3"]  # the lower corner and the upper
 
 
 def shape_of(sides: Float[Tensor, " 3"] | list[float], voxels: int) -> tuple[int, int, int]:
-    """Corners along each axis of about so many cubic voxels in a box with these sides, two at least."""
+    """Corners along each axis of about so many voxels, as long as wide, in a box with these sides, two at least."""
     sides = [float(x) for x in sides]
     edge = (math.prod(sides) / voxels) ** (1 / 3)
     x, y, z = (max(1, round(side / edge)) + 1 for side in sides)
@@ -47,6 +48,7 @@ class VoxelGrid(nn.Module):
     """A row of channels at each corner of a box's voxels, zero at first, blended in between (see `kernels.dense_grid`).
 
     values: (corner, channel), the last axis fastest; `size` says how many corners there are along each
+    finer: how many times as many voxels as a cube's there are along each axis; cubes at first
     Coordinates beyond the box have the values of its faces.
     """
 
@@ -54,9 +56,10 @@ class VoxelGrid(nn.Module):
     size: Tensor
     box: Tensor
 
-    def __init__(self, box: list[list[float]], voxels: int, channels: int):
+    def __init__(self, box: list[list[float]], voxels: int, channels: int, finer: Finer = (1.0, 1.0, 1.0)):
         super().__init__()
-        shape = shape_of([high - low for low, high in zip(*box, strict=True)], voxels)
+        self.finer = finer
+        shape = self._shape(torch.tensor(box, device="cpu"), voxels)
         self.register_buffer("size", torch.tensor(shape))
         self.register_buffer("box", torch.tensor(box))
         self.values = nn.Parameter(torch.zeros(math.prod(shape), channels))
@@ -72,6 +75,11 @@ class VoxelGrid(nn.Module):
         """Length of a voxel, as a cube of its volume has it."""
         return float(((self.box[1] - self.box[0]) / (self.size - 1)).prod() ** (1 / 3))
 
+    @property
+    def longest(self) -> float:
+        """Length of a voxel along the axis along which it is longest."""
+        return float(((self.box[1] - self.box[0]) / (self.size - 1)).max())
+
     def forward(self, coordinates: Float[Tensor, "sample 3"]) -> Float[Tensor, "sample channel"]:
         return kernels.dense_grid(coordinates, self.values.view(*self.shape, -1), self.box)
 
@@ -79,11 +87,14 @@ class VoxelGrid(nn.Module):
     def rebuild(self, box: Box, voxels: int, optimizer: torch.optim.Optimizer | None = None) -> None:
         """About so many voxels in a box within one's own, that blend as those before do. A new parameter takes the old
         one's place; what an optimizer remembered of that is forgotten."""
-        shape = shape_of((box[1] - box[0]).cpu(), voxels)
+        shape = self._shape(box, voxels)
         values = torch.cat([self(part) for part in corners(box, shape).split(LARGEST)])
         self.size.copy_(torch.tensor(shape))
         self.box.copy_(box)
         self.replace(values.contiguous(), optimizer)
+
+    def _shape(self, box: Box, voxels: int) -> tuple[int, int, int]:
+        return shape_of((box[1] - box[0]).cpu() * torch.tensor(self.finer, device="cpu"), voxels)
 
     def replace(self, values: Float[Tensor, "corner channel"], optimizer: torch.optim.Optimizer | None = None) -> None:
         """Other values, of which there may be another number, as a new parameter: the graph of the last step still

@@ -11,10 +11,16 @@ from ...scene import Batch
 from .corrections import Exposure
 
 
-def backdrop(batch: Batch, background: Float[Tensor, "1 3"], generator: torch.Generator) -> Float[Tensor, "#ray 3"]:
+def backdrop(
+    batch: Batch, background: Float[Tensor, "1 3"], generator: torch.Generator, opaque: bool = False
+) -> Float[Tensor, "#ray 3"]:
     """The colours behind a batch's rays: the scene's own, or where photographs have alpha a random one for each ray, so
-    that only opacity can imitate opacity."""
-    if batch.alpha is None:
+    that only opacity can imitate opacity.
+
+    opaque: every ray ends at something. Random colours behind it then keep thin fog before black from passing for what
+            is dark, and before white for what is bright
+    """
+    if batch.alpha is None and not opaque:
         return background
     return torch.rand(len(batch), 3, generator=generator).to(background.device)
 

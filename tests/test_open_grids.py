@@ -1,0 +1,71 @@
+"""What grids without a bound share: steps that suit voxels, smoothness, thin beginnings."""
+
+import tiny
+import torch
+
+from lumigraph.components.fields.voxels import VoxelGrid, corners
+from lumigraph.components.sampling.grid_march import march, reach_of
+from lumigraph.components.sampling.occupancy import OccupancyGrid
+from lumigraph.components.sampling.spaces import space_of
+from lumigraph.components.training.smoothness import variation
+from lumigraph.methods.dvgo import DVGO
+from lumigraph.rays import Rays
+from lumigraph.scene import Forward, Frame
+from lumigraph.volume import weights_of
+
+CUBE = [[-1.0] * 3, [1.0] * 3]
+AHEAD = Forward(((1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0)), (1.0, 1.0), 1.0)
+FORWARD = Frame(reach=8.0, near=0.05, forward=AHEAD)
+
+
+def straight_ahead(count: int = 3) -> Rays:
+    across = torch.linspace(-0.2, 0.2, count)
+    directions = torch.stack([across, across / 2, torch.ones(count)], -1)
+    return Rays(torch.zeros(count, 3), torch.nn.functional.normalize(directions, dim=-1), torch.full((count,), 1e-3))
+
+
+def test_steps_are_even_where_the_grid_sees_them():
+    """In the cube of device coordinates; in the middle of contracted space, which has half the scene's scale."""
+    rays = straight_ahead()
+    for frame in (FORWARD, Frame(reach=8.0, near=0.05), Frame()):
+        space = space_of(frame)
+        found = march(space, OccupancyGrid(reach_of(frame), 4), rays, frame.near, 0.02, 0.0)
+        first, last = (space.warp(rays.origins[:1] + t * rays.directions[:1]) for t in found.t_start[[0, 20]])
+        torch.testing.assert_close((last - first).norm(), torch.tensor(0.4), atol=2e-3, rtol=0)
+
+
+def test_only_what_samples_touch_is_smoothed(generator):
+    grid = VoxelGrid(CUBE, 8**3, 2, (1.0, 1.0, 0.5))
+    x, y, z = grid.shape
+    assert x == y == 2 * (z - 1) + 1
+    grid.values.data = torch.randn(grid.values.shape, generator=generator)
+    sample = torch.tensor([[0.01, -0.99, 0.3]])
+    variation(grid, sample, 5, generator).backward()
+    touched = (grid.values.grad != 0).any(-1)
+    away = (corners(grid.box, grid.shape) - sample).abs() >= 2 / (grid.size - 1)
+    assert 0 < int(touched.sum()) <= 4 and not (touched & away.any(-1)).any()
+
+
+def test_a_plane_varies_as_it_rises(generator):
+    grid = VoxelGrid(CUBE, 8**3, 1)
+    grid.values.data = 3 * corners(grid.box, grid.shape)[:, :1]
+    inside = torch.rand(50, 3, generator=generator) - 0.5
+    rise = 3 * 2 / (grid.shape[0] - 1)
+    torch.testing.assert_close(variation(grid, inside, 200, generator), torch.tensor(rise), atol=1e-4, rtol=1e-4)
+
+
+def test_what_no_photograph_has_shown_yet_is_no_fog():
+    """Long rays through a new grid pass nearly all light, whatever the stage."""
+    for frame in (FORWARD, Frame(reach=8.0, near=0.05)):
+        for stage in (0, 1):
+            method = DVGO(frame, DVGO.smallest())
+            method.stage.fill_(stage)
+            (look,) = method.looks(straight_ahead())
+            assert float(weights_of(look.samples, look.density).sum()) < 0.1
+
+
+def test_smoothness_is_learnt_in_the_open_alone():
+    scene = tiny.scene()
+    method = DVGO(scene.frame, DVGO.smallest())
+    terms = method.loss(scene.sample_rays(32, torch.Generator().manual_seed(0)), 0)
+    assert ("tv_density" in terms) == (scene.frame.reach > 1)
