@@ -18,7 +18,7 @@ from ..components.fields.truncation import truncate
 from ..components.sampling.carving import visual_hull
 from ..components.sampling.grid_march import UNSETTLED, asked_by_cells, empty_below, march, reach_of
 from ..components.sampling.importance import importance
-from ..components.sampling.marching import rays_for, reached
+from ..components.sampling.marching import FIRST_RAYS, rays_for, reached
 from ..components.sampling.occupancy import OccupancyGrid
 from ..components.sampling.spaces import Box, space_of
 from ..components.training.exchange import exchange
@@ -92,7 +92,6 @@ MASKS = ((0.0, 1 / 4), (0.03, 1 / 2), (0.1, 1))
 LOOKS = 1 << 18  # cells updated at most
 PROBES = 0.02  # share of all cells updated at random, in case something has grown there
 SAMPLES_OF_A_RAY = 32  # that a ray meets, about, once empty space is known
-FIRST_RAYS = 256  # of a step, before anybody knows how many samples a ray meets
 
 
 GRIDS = ("density_grid", "appearance_grid")

@@ -15,6 +15,7 @@ from ... import kernels
 from ...kernels import Nodes
 from ...kernels.harmonic_grid import COEFFICIENTS
 from ...kernels.sparse_grid.cpu import CHUNK, corners
+from ..training.exchange import exchange
 
 Cells = tuple[int, int, int]  # of a grid, along each axis
 SHARE = 0.05  # of a fine grid's nodes that are not pruned, about
@@ -144,14 +145,9 @@ class SparseVoxels(nn.Module):
         old = self.nodes
         for name in ("density", "harmonics"):
             table = getattr(self, name)
-            state = optimizer.state.pop(table, {}) if optimizer else {}
-            new = nn.Parameter(kernels.sparse_grid(points, old, table.data))
-            setattr(self, name, new)
-            if optimizer:
-                if state:
-                    optimizer.state[new] = {key: kernels.sparse_grid(points, old, x) for key, x in state.items()}
-                for group in optimizer.param_groups:
-                    group["params"] = [new if p is table else p for p in group["params"]]
+            known = optimizer.state.get(table, {}) if optimizer else {}
+            state = {key: kernels.sparse_grid(points, old, x) for key, x in known.items()}
+            exchange(self, name, kernels.sparse_grid(points, old, table.data), optimizer, state)
         self.cells = torch.tensor(cells, device=numbers.device)
         self.numbers = numbers.to(torch.int32)
         self.weights = torch.zeros(len(numbers), device=numbers.device)

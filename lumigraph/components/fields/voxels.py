@@ -10,6 +10,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from ... import kernels
+from ..training.exchange import exchange
 
 LARGEST = 1 << 20  # corners that are looked up at a time where a grid is made anew
 
@@ -97,10 +98,5 @@ class VoxelGrid(nn.Module):
         return shape_of((box[1] - box[0]).cpu() * torch.tensor(self.finer, device="cpu"), voxels)
 
     def replace(self, values: Float[Tensor, "corner channel"], optimizer: torch.optim.Optimizer | None = None) -> None:
-        """Other values, of which there may be another number, as a new parameter: the graph of the last step still
-        remembers the old one's size."""
-        old, self.values = self.values, nn.Parameter(values)
-        if optimizer is not None:
-            optimizer.state.pop(old, None)
-            for group in optimizer.param_groups:
-                group["params"] = [self.values if p is old else p for p in group["params"]]
+        """Other values, of which there may be another number, as a new parameter; its moments begin at zero."""
+        exchange(self, "values", values, optimizer)
