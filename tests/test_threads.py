@@ -28,9 +28,12 @@ from lumigraph import cli
 cli.main(["methods"])
 libc = ctypes.CDLL(None)
 libc.malloc.restype = ctypes.c_void_p
+alive = threading.Barrier(4)  # who comes after another has ended takes over its arena
 def take():
+    alive.wait()
     for _ in range(1000):
         libc.malloc(1000)
+    alive.wait()
 takers = [threading.Thread(target=take) for _ in range(4)]
 for taker in takers:
     taker.start()
