@@ -16,13 +16,9 @@ from ..components.fields.activations import truncated_exp
 from ..components.fields.mlp import MLP
 from ..components.sampling.carving import visual_hull
 from ..components.sampling.importance import importance
-from ..components.sampling.grid_march import asked_by_cells, empty_below, march, reach_of
 from ..components.sampling.marching import FIRST_RAYS, rays_for, reached
 from ..components.sampling.occupancy import OccupancyGrid
-from ..components.sampling.proposal import Proposal, overlooked
-from ..components.sampling.spaces import Box, space_of
 from ..components.training.corrections import Exposure, PoseRefinement
-from ..components.training.fog import scaled_by_distance, spread
 from ..components.training.lazy_adam import LazyAdam
 from ..components.training.photometric import backdrop, residuals
 from ..components.training.schedules import falling
@@ -33,7 +29,7 @@ from ..packing import Stored, most_important
 from ..ranges import Layers, LearningRate, NonNegative, PositiveShare, Seed, Share, Steps, Width, between
 from ..rays import Look, Rays, Rendering
 from ..scene import Batch, Frame, Scene
-from ..volume import composite, weights_of
+from ..volume import composite
 
 
 @dataclass(frozen=True)
@@ -63,9 +59,6 @@ class Config:
     decay_start: Annotated[float, between(0, 0.99)] = 0.3  # share of the budget before the learning rate falls
     hash_weight_decay: NonNegative = 0.0  # of the table, decoupled; of objects only, for it pulls density towards 1
     huber_delta: PositiveShare = 0.1  # residual at which the loss turns from square to linear
-    contraction: bool = True  # where there is no bound: as Barron 2022, eq. 10, instead of 5.4's box of all there is
-    distortion_weight: NonNegative = 0.01  # where there is no bound; Barron 2022, eq. 15
-    gradient_scaling: bool = True  # where there is no bound, less is learnt from what is near a camera (Philip 2023)
     exposure_correction: bool = False  # learn a gain per photograph
     refine_cameras: bool = False  # learn a correction of each photograph's pose
     seed: Seed = 0
@@ -86,22 +79,6 @@ class Config:
 
 # Coarse to fine: share of the budget from which on, and which part of occupancy_resolution and steps_per_diagonal.
 STAGES = ((0.0, 1 / 4, 1 / 4), (0.04, 1 / 2, 1 / 2), (0.12, 1, 2 / 3), (0.75, 1, 1))
-import os
-STEPF = float(os.environ.get("STEPF", 0.5))
-FINEF = float(os.environ.get("FINEF", 2))
-OPAQUE = int(os.environ.get("OPAQUE", 1))
-SMALLT = int(os.environ.get("SMALLT", 0))
-WARM = float(os.environ.get("WARM", 0))
-PROP = int(os.environ.get("PROP", 1))
-PCELLS = int(os.environ.get("PCELLS", 96))
-PBINS = int(os.environ.get("PBINS", 64))
-PCOUNT = int(os.environ.get("PCOUNT", 24))
-PRATE = float(os.environ.get("PRATE", 5))
-ANNEAL = float(os.environ.get("ANNEAL", 0.3))
-DEPTHW = float(os.environ.get("DEPTHW", 0.1))
-DEPTHN = int(os.environ.get("DEPTHN", 256))
-DEPTHE = float(os.environ.get("DEPTHE", 0.005))
-DEPTHT = float(os.environ.get("DEPTHT", 0.5))
 LOOKS = 4  # cells updated at most, for each sample of a step
 PROBES = 0.02  # share of all cells updated at random, in case something has grown there
 SAMPLES_OF_A_RAY = 24  # that a ray needs, about, once empty space is known
@@ -110,9 +87,10 @@ SAMPLES_OF_A_RAY = 24  # that a ray needs, about, once empty space is known
 class Field(nn.Module):
     """Density from position, colour from position and direction (figure 3 and section 5.4)."""
 
-    def __init__(self, config: Config, extent: float, finest: int):
+    def __init__(self, config: Config, reach: float):
         super().__init__()
-        self.extent, self.bands = extent, config.sh_bands
+        self.reach, self.bands = reach, config.sh_bands
+        finest = int(config.max_resolution * reach)
         self.levels = kernels.HashLevels(
             config.levels, config.features_per_level, config.log2_hashmap_size, config.base_resolution, finest
         )
@@ -122,8 +100,8 @@ class Field(nn.Module):
         hidden = [config.hidden_width] * config.colour_layers
         self.colour_network = MLP(config.geometry_features + self.bands**2, *hidden, 3)
 
-    def encode(self, coordinates: Float[Tensor, "sample 3"]) -> Float[Tensor, "sample width"]:
-        return kernels.hash_encode(coordinates * (0.5 / self.extent) + 0.5, self.table, self.levels)
+    def encode(self, points: Float[Tensor, "sample 3"]) -> Float[Tensor, "sample width"]:
+        return kernels.hash_encode(points * (0.5 / self.reach) + 0.5, self.table, self.levels)
 
     def density(
         self, encoded: Float[Tensor, "sample width"]
@@ -170,14 +148,12 @@ class InstantNGP(RayMethod):
     def __init__(self, frame: Frame, config: Any = None):
         config = config or Config()
         super().__init__(frame, config)
-        self.space = space_of(frame) if config.contraction else Box(frame.bounds, frame.near)
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(config.seed)
-            self.network = Field(config, *self._extent())
+            self.network = Field(config, frame.reach)
         self.exposure = Exposure(frame.image_count) if config.exposure_correction else None
         self.poses = PoseRefinement(frame.image_count) if config.refine_cameras else None
-        self.occupancy = OccupancyGrid(reach_of(frame) if config.contraction else frame.reach, max(4, int(config.occupancy_resolution * STAGES[0][1])))
-        self.proposal = Proposal(self.space, PCELLS, PBINS, PCOUNT) if PROP and frame.reach > 1 else None
+        self.occupancy = OccupancyGrid(frame.reach, max(4, int(config.occupancy_resolution * STAGES[0][1])))
         self._set_steps(1.0)
         self.register_buffer("rays_per_step", torch.tensor(FIRST_RAYS))
 
@@ -232,17 +208,6 @@ class InstantNGP(RayMethod):
         return self.config.samples_per_step / SAMPLES_OF_A_RAY
 
     def begin(self, scene: Scene, seconds: float = math.inf) -> None:
-        if self.proposal and int(os.environ.get("DENSEP", 1)):
-            from ..components.clouds.dense_points import seen_points as dense_points
-            import time
-            t = time.time()
-            found = dense_points(scene, 0.15 * seconds)
-            print("points", len(found.positions), time.time() - t)
-            self._known = found
-            if scene.points is not None:
-                found = torch.cat([found.positions, scene.points])
-            else: found = found.positions
-            self.proposal.begin(found.to(self.device))
         if scene.images.has_alpha and self.frame.reach == 1:
             self.occupancy.rule_out(visual_hull(scene, self.config.occupancy_resolution)[None])
 
@@ -256,64 +221,24 @@ class InstantNGP(RayMethod):
         return composite(look.samples, look.density, look.rgb, background)
 
     def looks(self, rays: Rays, jitter: Float[Tensor, " ray"] | None = None) -> list[Look]:
-        if self.proposal:
-            return self._proposed(rays, jitter)
-        step = 2 * math.sqrt(3) / self.steps_per_diagonal * (1 if self.frame.reach<=1 else STEPF)
-        found = march(self.space, self.occupancy, rays, self.frame.near, step, self.cone_angle, jitter)
+        step = 2 * math.sqrt(3) / self.steps_per_diagonal
+        found = self.occupancy.sample(rays, self.frame.near, step, self.cone_angle, jitter=jitter)
         samples, asked = reached(rays, found, self.density, self.config.transmittance_threshold)
         points, directions = samples.along(rays)
         density, rgb = self.field(points, directions)
-        if jitter is not None and self.config.gradient_scaling and self.frame.reach > 1:
-            density, rgb = scaled_by_distance(density, rgb, samples.t)
         self.figures |= {"rays": len(rays), "samples": asked, "visible_samples": len(samples)}
-        return [Look("samples", samples, density, rgb)]
-
-    def _proposed(self, rays, jitter):
-        if jitter is not None:
-            jitter = torch.stack([jitter, (jitter * 7919) % 1], -1)
-        proposed = self.proposal.sample(rays, jitter)
-        samples = proposed.samples
-        points, directions = samples.along(rays)
-        density, rgb = self.field(points, directions)
-        if jitter is not None:
-            if self.config.gradient_scaling and self.frame.reach > 1:
-                density, rgb = scaled_by_distance(density, rgb, samples.t)
-            self._overlooked = overlooked(proposed, weights_of(samples, density.detach()))
-        self.figures |= {"rays": len(rays), "samples": len(samples), "visible_samples": len(samples)}
         return [Look("samples", samples, density, rgb)]
 
     def loss(self, batch: Batch, step: int) -> dict[str, Tensor]:
         generator = self.random(step)
         jitter = torch.rand(len(batch), generator=generator).to(self.device)
-        background = backdrop(batch, self.background, generator, OPAQUE and self.frame.reach > 1)
+        background = backdrop(batch, self.background, generator)
         rays = self.poses(batch.rays) if self.poses else batch.rays
-        (look,) = self.looks(rays, jitter)
-        rendering = composite(look.samples, look.density, look.rgb, background)
+        rendering = self.render_rays(rays, background, jitter)
         residual, self.figures["mse"] = residuals(rendering, batch, background, self.exposure)
         # Divided by delta, so that the linear part has slope 1.
         delta = self.config.huber_delta
-        terms = {"huber": nn.functional.huber_loss(residual, torch.zeros_like(residual), delta=delta) / delta}
-        if self.config.distortion_weight and self.frame.reach > 1:
-            w = self.config.distortion_weight
-            if self.proposal:
-                terms["proposal"] = self._overlooked
-            terms["distortion"] = w * spread(look.samples, look.density)
-        if DEPTHW and getattr(self, "_known", None) is not None and len(self._known.positions):
-            known = self._known
-            chosen = torch.randint(len(known.positions), (DEPTHN,), generator=generator)
-            at, origins = known.positions[chosen], known.origins[chosen]
-            away = (at - origins).norm(dim=-1)
-            rays = Rays(origins, (at - origins) / away[:, None], batch.rays.radius[:1].expand(DEPTHN))
-            main = self._overlooked
-            figures = dict(self.figures)
-            (look,) = self.looks(rays, jitter[:1].expand(DEPTHN) * 0 + torch.rand(DEPTHN, generator=generator))
-            self.figures = figures
-            w = weights_of(look.samples, look.density)
-            place, at = (t / (1 + t) for t in (look.samples.t, away[look.samples.ray_index]))
-            near = (place - at).abs() < 0.5*(look.samples.length/(1+look.samples.t)**2) + DEPTHE
-            terms["depth"] = DEPTHW * self._weight * (1 - (w * near).sum() / DEPTHN)
-            terms["proposal"] = main + self._overlooked * (DEPTHN / len(batch))
-        return terms
+        return {"huber": nn.functional.huber_loss(residual, torch.zeros_like(residual), delta=delta) / delta}
 
     def optimizers(self) -> list[torch.optim.Optimizer]:
         networks = [*self.network.density_network.parameters(), *self.network.colour_network.parameters()]
@@ -322,9 +247,7 @@ class InstantNGP(RayMethod):
         common = {"lr": self.config.learning_rate, "betas": (0.9, 0.99), "eps": 1e-15}
         decay = self.config.hash_weight_decay if self.frame.reach == 1 else 0.0
         table = LazyAdam([self.network.table], weight_decay=decay, **common)
-        if self.proposal:
-            extra = [LazyAdam([{"params": [self.proposal.grid.values], "scale": PRATE}], **common)]
-            return [table, *extra, torch.optim.Adam(groups, foreach=True, **common)]
+        return [table, torch.optim.Adam(groups, foreach=True, **common)]
 
     def learning_rate(self, step: int, progress: float) -> float:
         """Twenty steps of warm-up, then constant, then exponential decay (section 4 decays likewise)."""
@@ -333,10 +256,6 @@ class InstantNGP(RayMethod):
         return falling(c.learning_rate, c.final_learning_rate, fall) * min(1.0, (step + 1) / 20)
 
     def before_step(self, step: int, progress: float) -> None:
-        if self.proposal:
-            self._weight = max(0.0, 1 - progress / DEPTHT) if DEPTHT else 1.0
-            self.proposal.anneal(min(1.0, progress / ANNEAL))
-            return
         _, cells, steps = max(stage for stage in STAGES if stage[0] <= progress)
         self._set_steps(steps)
         finer = False
@@ -346,13 +265,7 @@ class InstantNGP(RayMethod):
         if finer or step % (4 if step < 32 else self.config.occupancy_interval) == 0:
             share, budget = (1.0, None) if finer or step < 32 else (PROBES, self.config.samples_per_step * LOOKS)
             thickness, decay = self.config.occupancy_threshold, self.config.occupancy_decay
-            if not isinstance(self.space, Box):
-                if progress < WARM:
-                    return
-                if SMALLT:
-                    thickness = empty_below(self.frame, thickness, self.occupancy.resolution)
-            asked = asked_by_cells(self.space, self.density, self._density)
-            self.occupancy.update(asked, thickness, self.random(~step), decay, share, budget)
+            self.occupancy.update(self.density, thickness, self.random(~step), decay, share, budget)
 
     def after_step(self, step: int) -> None:
         """Set the next step's number of rays so that they give about `samples_per_step` samples."""
@@ -363,24 +276,13 @@ class InstantNGP(RayMethod):
         self, points: Float[Tensor, "point 3"], directions: Float[Tensor, "point 3"]
     ) -> tuple[Float[Tensor, " point"], Float[Tensor, "point 3"]]:
         """Density per scene unit, and sRGB-encoded colour seen along unit directions."""
-        density, geometry = self.network.density(self.network.encode(self.space.warp(points)))
-        density = density * self.space.stretch(points)
+        density, geometry = self.network.density(self.network.encode(points))
         rgb = self.network.colour(geometry, directions)
         return density, rgb * self.exposure.gain(self.told) if self.told and self.exposure else rgb
 
     def density(self, points: Float[Tensor, "sample 3"]) -> Float[Tensor, " sample"]:
         """Density per scene unit."""
-        return self._density(self.space.warp(points)) * self.space.stretch(points)
-
-    def _density(self, coordinates: Float[Tensor, "sample 3"]) -> Float[Tensor, " sample"]:
-        """Density per unit of the coordinates."""
-        return self.network.density(self.network.encode(coordinates))[0]
-
-    def _extent(self) -> tuple[float, int]:
-        c = self.config
-        if isinstance(self.space, Box):
-            return self.frame.reach, int(c.max_resolution * self.frame.reach)
-        return 1.0, int(c.max_resolution * FINEF)
+        return self.network.density(self.network.encode(points))[0]
 
     def storage(self) -> dict[str, Stored]:
         """The table as whole numbers, the networks as halves; of the grid, marks alone are needed for pictures."""
