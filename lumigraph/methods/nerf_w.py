@@ -10,12 +10,13 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ..components.fields import hash_field
-from ..components.fields.appearance import AVERAGE, PhotographCodes, drawn, fitted
+from ..components.fields.appearance import PhotographCodes, drawn, fitted
 from ..components.fields.wild_field import of_samples, with_passing
 from ..components.fields.wild_hash import WildHash
 from ..components.fields.wild_networks import WildNetworks
 from ..components.sampling.coarse_to_fine import SAMPLES_OF_A_RAY
 from ..components.sampling.occupancy import OccupancyGrid
+from ..components.training.corrections import AVERAGE
 from ..components.training.photometric import backdrop
 from ..components.training.schedules import held
 from ..controls import Control, Value

@@ -13,8 +13,7 @@ from torch import Tensor, nn
 
 from ...controls import Control, blend
 from ...scene import Batch, Photograph
-
-AVERAGE = "average"  # beside the photographs: the mean of the codes that were learnt
+from ..training.corrections import AVERAGE
 
 
 class PhotographCodes(nn.Module):
