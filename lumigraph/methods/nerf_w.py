@@ -54,6 +54,7 @@ class Config:
     transient_width: Width = 128  # their channels, supplement
     beta_min: PositiveShare = 0.03  # least deviation of a colour, section 5
     transient_weight: NonNegative = 0.01  # lambda_u, of the mean transient density, section 5
+    transient_start: Share = 0.0  # share of the budget before which nobody passes by, so that what stays takes shape
     hidden_width: Width = 256  # channels of a layer, supplement
     learning_rate: LearningRate = 5e-4
     final_learning_rate: LearningRate = 5e-5  # at the end of the budget
@@ -95,7 +96,7 @@ class Config:
 HIDDEN, SHOWN = "hidden", "shown"
 # Finding a photograph's appearance: pixels that are looked at, steps and learning rate of Adam, and the weight in its
 # pixel from which on a sample counts.
-FIT_RAYS, FIT_STEPS, FIT_RATE, FIT_WEIGHT = 2048, 150, 0.1, 1e-3
+FIT_RAYS, FIT_STEPS, FIT_RATE, FIT_WEIGHT = 1024, 100, 0.1, 5e-3
 
 
 class NeRFW(RayMethod):
@@ -112,6 +113,7 @@ class NeRFW(RayMethod):
             self.network = (WildHash if config.field == "hash" else WildNetworks)(frame, config)
         self.appearance = PhotographCodes(frame.image_count, config.appearance_code)
         self.transient = PhotographCodes(frame.image_count, config.transient_code)
+        self.settling = False  # whether nobody passes by yet
         self.found: Tensor | None = None  # the appearance of a photograph that was given
         self.rays_per_chunk = self.network.rays_per_chunk
 
@@ -124,6 +126,7 @@ class NeRFW(RayMethod):
             field="hash",
             transient_layers=2,
             transient_width=32,
+            transient_start=0.1,
             hidden_width=32,
             learning_rate=2e-2,
             final_learning_rate=1e-3,
@@ -193,16 +196,22 @@ class NeRFW(RayMethod):
             seen = composite(places.samples, places.density, rgb, background)
             terms[places.name] = 0.5 * squared(seen.rgb - target).mean()
         rgb = self.network.colour(last, of_samples(appearance, last))
-        passing = self.network.passing(last, of_samples(transient, last))
-        seen = with_passing(last, rgb, passing, background)
-        error, beta = squared(seen.rgb - target), c.beta_min + seen.extra["beta"]
+        if self.settling:
+            seen, beta = (
+                composite(last.samples, last.density, rgb, background),
+                torch.full_like(target[:, 0], c.beta_min),
+            )
+        else:
+            passing = self.network.passing(last, of_samples(transient, last))
+            seen = with_passing(last, rgb, passing, background)
+            beta = c.beta_min + seen.extra["beta"]
+            terms["uncertainty"] = (beta / c.beta_min).log().mean()
+            terms["transient"] = c.transient_weight * mean_along(last.samples, passing.density)
+        error = squared(seen.rgb - target)
+        terms["colour"] = (error / (2 * beta.square())).mean()
         self.figures |= {"mse": float(error.detach().mean()) / 3, "beta": float(beta.detach().mean())}
         self.figures |= {"rays": len(rays), "samples": last.asked}
-        return terms | {
-            "colour": (error / (2 * beta.square())).mean(),
-            "uncertainty": (beta / c.beta_min).log().mean(),
-            "transient": c.transient_weight * mean_along(last.samples, passing.density),
-        }
+        return terms
 
     def optimizers(self) -> list[torch.optim.Optimizer]:
         return self.network.optimizers([self.appearance.codes, self.transient.codes])
@@ -212,6 +221,7 @@ class NeRFW(RayMethod):
         return held(c.learning_rate, c.final_learning_rate, step, progress, c.decay_start)
 
     def before_step(self, step: int, progress: float) -> None:
+        self.settling = progress < self.config.transient_start
         self.network.before_step(step, progress, self.random(~step))
 
     def after_step(self, step: int) -> None:

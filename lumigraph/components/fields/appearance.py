@@ -42,7 +42,8 @@ class PhotographCodes(nn.Module):
         return self.codes[learnt].sum(0) / max(int(learnt.sum()), 1)
 
     def told(self, value: str) -> Float[Tensor, " width"]:
-        """The code that a value of `control` stands for: a photograph's, the average, or one between two."""
+        """The code that a value of `control` stands for: a photograph's, the average, or one between two. A photograph
+        that nobody learnt from has the average."""
         first, second, share = blend(value)
         return torch.lerp(self._of(first), self._of(second), share)
 
@@ -52,7 +53,8 @@ class PhotographCodes(nn.Module):
         return Control(name, AVERAGE, choices=(AVERAGE, *photographs), about=about, of_photographs=True, blends=True)
 
     def _of(self, choice: str) -> Float[Tensor, " width"]:
-        return self.average if choice == AVERAGE else self.codes[int(choice)]
+        known = choice != AVERAGE and bool(self.codes[int(choice)].any())
+        return self.codes[int(choice)] if known else self.average
 
 
 def fitted(
