@@ -54,7 +54,9 @@ class WildHash(WildField):
         points, directions = samples.along(rays)
         encoded = self.scene.encode(points)
         density, geometry = self.scene.density(encoded)
-        return [Places("samples", samples, density, (geometry, directions), encoded, torch.ones_like(density), asked)]
+        # The table is of what stays: the transient head may read it, and has no say in what it learns.
+        unseen, stretch = encoded.detach(), torch.ones_like(density)
+        return [Places("samples", samples, density, (geometry, directions), unseen, stretch, asked)]
 
     def colour(self, places: Places, codes: Float[Tensor, "sample code"]) -> Float[Tensor, "sample 3"]:
         return self.scene.colour(*places.seen, codes)
