@@ -21,6 +21,13 @@ class Stage(NamedTuple):
     steps: float
 
 
+class Lattice(NamedTuple):
+    """Where samples may begin along a ray: the length of a step in scene units, and its growth with distance."""
+
+    step: float
+    growth: float
+
+
 STAGES = Stage(0.0, 1 / 4, 1 / 4), Stage(0.04, 1 / 2, 1 / 2), Stage(0.12, 1, 2 / 3), Stage(0.75, 1, 1)
 OFTEN, AT_FIRST = 4, 32  # steps between looks at the grid, and until which step
 LOOKS = 4  # cells updated at most, for each sample of a step
@@ -38,14 +45,14 @@ def first_grid(config: Any, reach: float) -> OccupancyGrid:
     return OccupancyGrid(reach, max(4, int(config.occupancy_resolution * STAGES[0].cells)))
 
 
-def lattice(config: Any, reach: float, share: float = 1.0) -> tuple[float, float]:
-    """A step's length in scene units, and its growth with distance (Müller 2022, appendix E.1).
+def lattice(config: Any, reach: float, share: float = 1.0) -> Lattice:
+    """The lattice along rays (Müller 2022, appendix E.1).
 
     config: has steps_per_diagonal and cone_angle; objects, of reach 1, have steps of equal length
     share:  of the steps; below 1 both are coarser by as much
     """
     step = 2 * math.sqrt(3) / int(config.steps_per_diagonal * share)
-    return step, config.cone_angle / share if reach > 1 else 0.0
+    return Lattice(step, config.cone_angle / share if reach > 1 else 0.0)
 
 
 def keep_looking(
