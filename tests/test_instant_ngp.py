@@ -144,7 +144,7 @@ def test_an_unbounded_scene_trains_and_renders():
     made = method(scene)
     before = evaluate(made, scene).psnr
     train(made, scene, 40)
-    assert made.cone_angle > 0 and len(made.occupancy.density) == 3
+    assert made.lattice.growth > 0 and len(made.occupancy.density) == 3
     seen = made.render(scene.cameras[0])
     assert torch.isfinite(seen.rgb).all() and torch.isfinite(seen.opacity).all() and not seen.depth.isnan().any()
     assert seen.opacity.max() > 0.5 and evaluate(made, scene).psnr > before + 2

@@ -10,20 +10,18 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from .. import kernels
 from ..camera import Camera
-from ..components.fields.activations import truncated_exp
-from ..components.fields.mlp import MLP
+from ..components.fields.hash_field import HashField, bytes_kept, check_levels
 from ..components.sampling.carving import visual_hull
+from ..components.sampling.coarse_to_fine import SAMPLES_OF_A_RAY, first_grid, keep_looking, lattice, stage
 from ..components.sampling.importance import importance
 from ..components.sampling.marching import FIRST_RAYS, rays_for, reached
 from ..components.sampling.occupancy import OccupancyGrid
 from ..components.training.corrections import Exposure, PoseRefinement
 from ..components.training.lazy_adam import LazyAdam
 from ..components.training.photometric import backdrop, residuals
-from ..components.training.schedules import falling
+from ..components.training.schedules import held
 from ..controls import Control
-from ..errors import LumigraphError
 from ..method import RayMethod
 from ..packing import Stored, most_important
 from ..ranges import Layers, LearningRate, NonNegative, PositiveShare, Seed, Share, Steps, Width, between
@@ -65,57 +63,7 @@ class Config:
 
     def check(self) -> None:
         """Raises LumigraphError for numbers that contradict each other."""
-        if self.base_resolution > self.max_resolution:
-            raise LumigraphError(
-                f"The coarsest level cannot be finer than the finest: --base-resolution {self.base_resolution:,} is "
-                f"above --max-resolution {self.max_resolution:,}"
-            )
-        if self.levels << self.log2_hashmap_size >= 1 << 32:
-            raise LumigraphError(
-                f"--levels {self.levels} with --log2-hashmap-size {self.log2_hashmap_size} make more entries than "
-                f"32 bits count; give a smaller one"
-            )
-
-
-# Coarse to fine: share of the budget from which on, and which part of occupancy_resolution and steps_per_diagonal.
-STAGES = ((0.0, 1 / 4, 1 / 4), (0.04, 1 / 2, 1 / 2), (0.12, 1, 2 / 3), (0.75, 1, 1))
-LOOKS = 4  # cells updated at most, for each sample of a step
-PROBES = 0.02  # share of all cells updated at random, in case something has grown there
-SAMPLES_OF_A_RAY = 24  # that a ray needs, about, once empty space is known
-
-
-class Field(nn.Module):
-    """Density from position, colour from position and direction (figure 3 and section 5.4)."""
-
-    def __init__(self, config: Config, reach: float):
-        super().__init__()
-        self.reach, self.bands = reach, config.sh_bands
-        finest = int(config.max_resolution * reach)
-        self.levels = kernels.HashLevels(
-            config.levels, config.features_per_level, config.log2_hashmap_size, config.base_resolution, finest
-        )
-        self.table = nn.Parameter(torch.empty(self.levels.offsets[-1], config.features_per_level).uniform_(-1e-4, 1e-4))
-        hidden = [config.hidden_width] * config.density_layers
-        self.density_network = MLP(config.levels * config.features_per_level, *hidden, config.geometry_features)
-        hidden = [config.hidden_width] * config.colour_layers
-        self.colour_network = MLP(config.geometry_features + self.bands**2, *hidden, 3)
-
-    def encode(self, points: Float[Tensor, "sample 3"]) -> Float[Tensor, "sample width"]:
-        return kernels.hash_encode(points * (0.5 / self.reach) + 0.5, self.table, self.levels)
-
-    def density(
-        self, encoded: Float[Tensor, "sample width"]
-    ) -> tuple[Float[Tensor, " sample"], Float[Tensor, "sample geometry"]]:
-        """Density per scene unit, and the features of each place that the colour network takes."""
-        geometry = self.density_network(encoded)
-        return truncated_exp(geometry[:, 0]), geometry
-
-    def colour(
-        self, geometry: Float[Tensor, "sample geometry"], directions: Float[Tensor, "sample 3"]
-    ) -> Float[Tensor, "sample 3"]:
-        """sRGB-encoded colour."""
-        harmonics = kernels.spherical_harmonics(directions, self.bands)
-        return torch.sigmoid(self.colour_network(torch.cat([geometry.t(), harmonics.t()]).t()))
+        check_levels(self)
 
 
 class InstantNGP(RayMethod):
@@ -150,11 +98,11 @@ class InstantNGP(RayMethod):
         super().__init__(frame, config)
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(config.seed)
-            self.network = Field(config, frame.reach)
+            self.network = HashField(config, frame.reach)
         self.exposure = Exposure(frame.image_count) if config.exposure_correction else None
         self.poses = PoseRefinement(frame.image_count) if config.refine_cameras else None
-        self.occupancy = OccupancyGrid(frame.reach, max(4, int(config.occupancy_resolution * STAGES[0][1])))
-        self._set_steps(1.0)
+        self.occupancy = first_grid(config, frame.reach)
+        self.lattice = lattice(config, frame.reach)
         self.register_buffer("rays_per_step", torch.tensor(FIRST_RAYS))
 
     @classmethod
@@ -200,9 +148,7 @@ class InstantNGP(RayMethod):
 
     @classmethod
     def further_bytes(cls, frame: Frame, config: Any, learning: bool) -> int:
-        hidden = config.hidden_width * (config.density_layers + config.colour_layers)
-        step = 4 * config.samples_per_step * (config.levels * config.features_per_level + hidden)
-        return OccupancyGrid.bytes_of(frame.reach, config.occupancy_resolution) + step * learning
+        return OccupancyGrid.bytes_of(frame.reach, config.occupancy_resolution) + bytes_kept(config) * learning
 
     def rays_in_a_step(self, data: Scene) -> float:
         return self.config.samples_per_step / SAMPLES_OF_A_RAY
@@ -221,8 +167,7 @@ class InstantNGP(RayMethod):
         return composite(look.samples, look.density, look.rgb, background)
 
     def looks(self, rays: Rays, jitter: Float[Tensor, " ray"] | None = None) -> list[Look]:
-        step = 2 * math.sqrt(3) / self.steps_per_diagonal
-        found = self.occupancy.sample(rays, self.frame.near, step, self.cone_angle, jitter=jitter)
+        found = self.occupancy.sample(rays, self.frame.near, *self.lattice, jitter=jitter)
         samples, asked = reached(rays, found, self.density, self.config.transmittance_threshold)
         points, directions = samples.along(rays)
         density, rgb = self.field(points, directions)
@@ -252,20 +197,11 @@ class InstantNGP(RayMethod):
     def learning_rate(self, step: int, progress: float) -> float:
         """Twenty steps of warm-up, then constant, then exponential decay (section 4 decays likewise)."""
         c = self.config
-        fall = max(0.0, progress - c.decay_start) / (1 - c.decay_start)
-        return falling(c.learning_rate, c.final_learning_rate, fall) * min(1.0, (step + 1) / 20)
+        return held(c.learning_rate, c.final_learning_rate, step, progress, c.decay_start)
 
     def before_step(self, step: int, progress: float) -> None:
-        _, cells, steps = max(stage for stage in STAGES if stage[0] <= progress)
-        self._set_steps(steps)
-        finer = False
-        while self.occupancy.resolution < self.config.occupancy_resolution * cells:
-            self.occupancy.refine()
-            finer = True
-        if finer or step % (4 if step < 32 else self.config.occupancy_interval) == 0:
-            share, budget = (1.0, None) if finer or step < 32 else (PROBES, self.config.samples_per_step * LOOKS)
-            thickness, decay = self.config.occupancy_threshold, self.config.occupancy_decay
-            self.occupancy.update(self.density, thickness, self.random(~step), decay, share, budget)
+        self.lattice = lattice(self.config, self.frame.reach, stage(progress).steps)
+        keep_looking(self.occupancy, self.density, self.config, step, progress, self.random(~step))
 
     def after_step(self, step: int) -> None:
         """Set the next step's number of rays so that they give about `samples_per_step` samples."""
@@ -311,8 +247,3 @@ class InstantNGP(RayMethod):
 
     def refined(self, cameras: Camera) -> Camera:
         return self.poses.refined(cameras) if self.poses else cameras
-
-    def _set_steps(self, share: float) -> None:
-        """Set a step's length and its growth with distance: with a share below 1 both are coarser by as much."""
-        self.steps_per_diagonal = int(self.config.steps_per_diagonal * share)
-        self.cone_angle = self.config.cone_angle / share if self.frame.reach > 1 else 0.0
