@@ -23,6 +23,7 @@ from ..metrics.lpips import DEFINITION, Lpips
 from ..progress import counting, track
 from ..rays import Rendering
 from ..scene import Scene
+from .held_out_poses import PROTOCOL, held_out_poses, pose_scores
 
 SHOWN = 8  # views of the contact sheet, evenly spread; the worst one joins them
 WARM_UP_SIZE = 32  # pixels; the first rendering compiles kernels, which is not the view's fault
@@ -48,6 +49,7 @@ class Evaluation:
     protocol: dict[str, Any]
     compile_seconds: float
     shown: dict[str, tuple[Tensor, Rendering]]  # some views' photograph and rendering
+    poses: tuple[Score, ...] = ()  # how far refined poses are from true ones, where these are known
 
     @property
     def psnr(self) -> float:
@@ -78,7 +80,7 @@ class Evaluation:
 
     @property
     def scores(self) -> list[Score]:
-        return scores_of(self.means())
+        return [*scores_of(self.means()), *self.poses]
 
     @property
     def compared(self) -> str:
@@ -123,8 +125,8 @@ def evaluate(
 
     keep:  told each view's name and rendering
     views: so many of them at most, evenly spread over the split; None means all
-    Cameras are those that the method refined, which moves none but those of photographs it was trained on. Pixels that
-    the photograph's mask rules out do not count. Raises LumigraphError if the split has no view.
+    Cameras are those that the method refined; held-out ones are then found as `held_out_poses` says. Pixels that the
+    photograph's mask rules out do not count. Raises LumigraphError if the split has no view.
     """
     chosen = scene.splits.get(split)
     if chosen is None or not len(chosen):
@@ -136,13 +138,13 @@ def evaluate(
     method.eval()
     with counting("Preparing to render"):
         compile_seconds = warm_up(method, scene.cameras[compared[0]])
-    spread = set(evenly(compared, SHOWN))
+    spread, found = set(evenly(compared, SHOWN)), held_out_poses(method, scene)
     scores: list[ViewScore] = []
     shown: dict[str, tuple[Tensor, Rendering]] = {}
     worst: dict[str, tuple[Tensor, Rendering]] = {}
     for index in track(compared, "Comparing views", len(compared)):
         shot = scene.photograph(index)
-        camera = method.refined(shot.camera)
+        camera = found.camera(index) if found else method.refined(shot.camera)
         photograph = shot.before(scene.frame.background)
         begin = time.perf_counter()
         seen = method.render(camera).cpu()
@@ -154,7 +156,9 @@ def evaluate(
         if all(score.psnr < other.psnr for other in scores):
             worst = {score.name: (photograph, seen)}
         scores.append(score)
-    return Evaluation(scores, protocol(scene, split, compared, lpips, method), compile_seconds, shown | worst)
+    told = protocol(scene, split, compared, lpips, method) | ({"poses": PROTOCOL} if found else {})
+    poses = tuple(pose_scores(method, scene))
+    return Evaluation(scores, told, compile_seconds, shown | worst, poses)
 
 
 def compare(

@@ -18,9 +18,10 @@ from ..components.sampling.carving import visual_hull
 from ..components.sampling.importance import importance
 from ..components.sampling.marching import FIRST_RAYS, rays_for, reached
 from ..components.sampling.occupancy import OccupancyGrid
-from ..components.training.corrections import Exposure, PoseRefinement
+from ..components.training.corrections import Exposure
 from ..components.training.lazy_adam import LazyAdam
 from ..components.training.photometric import backdrop, residuals
+from ..components.training.pose_refinement import PoseRefinement
 from ..components.training.schedules import falling
 from ..controls import Control
 from ..errors import LumigraphError
@@ -60,7 +61,8 @@ class Config:
     hash_weight_decay: NonNegative = 0.0  # of the table, decoupled; of objects only, for it pulls density towards 1
     huber_delta: PositiveShare = 0.1  # residual at which the loss turns from square to linear
     exposure_correction: bool = False  # learn a gain per photograph
-    refine_cameras: bool = False  # learn a correction of each photograph's pose
+    refine_cameras: bool = False  # learn where each photograph was taken from, coarse to fine (Lin 2021, BARF)
+    pose_learning_rate: LearningRate = 2e-3  # radians by which a step moves a picture, with refine_cameras
     seed: Seed = 0
 
     def check(self) -> None:
@@ -100,8 +102,12 @@ class Field(nn.Module):
         hidden = [config.hidden_width] * config.colour_layers
         self.colour_network = MLP(config.geometry_features + self.bands**2, *hidden, 3)
 
-    def encode(self, points: Float[Tensor, "sample 3"]) -> Float[Tensor, "sample width"]:
-        return kernels.hash_encode(points * (0.5 / self.reach) + 0.5, self.table, self.levels)
+    def encode(
+        self, points: Float[Tensor, "sample 3"], weights: Float[Tensor, " level"] | None = None
+    ) -> Float[Tensor, "sample width"]:
+        """Features of all levels, the coarsest first. weights: of the levels, where not all count fully"""
+        encoded = kernels.hash_encode(points * (0.5 / self.reach) + 0.5, self.table, self.levels)
+        return encoded if weights is None else encoded * weights.repeat_interleave(self.levels.features)
 
     def density(
         self, encoded: Float[Tensor, "sample width"]
@@ -152,7 +158,8 @@ class InstantNGP(RayMethod):
             torch.manual_seed(config.seed)
             self.network = Field(config, frame.reach)
         self.exposure = Exposure(frame.image_count) if config.exposure_correction else None
-        self.poses = PoseRefinement(frame.image_count) if config.refine_cameras else None
+        refining, rate = config.refine_cameras, config.pose_learning_rate
+        self.poses = PoseRefinement(frame.image_count, rate) if refining else None
         self.occupancy = OccupancyGrid(frame.reach, max(4, int(config.occupancy_resolution * STAGES[0][1])))
         self._set_steps(1.0)
         self.register_buffer("rays_per_step", torch.tensor(FIRST_RAYS))
@@ -208,7 +215,9 @@ class InstantNGP(RayMethod):
         return self.config.samples_per_step / SAMPLES_OF_A_RAY
 
     def begin(self, scene: Scene, seconds: float = math.inf) -> None:
-        if scene.images.has_alpha and self.frame.reach == 1:
+        if self.poses:  # silhouettes seen from wrong poses would carve what is there
+            self.poses.begin(scene.cameras, scene.frame)
+        elif scene.images.has_alpha and self.frame.reach == 1:
             self.occupancy.rule_out(visual_hull(scene, self.config.occupancy_resolution)[None])
 
     def batch(self, data: Scene, generator: torch.Generator) -> Batch:
@@ -243,19 +252,25 @@ class InstantNGP(RayMethod):
     def optimizers(self) -> list[torch.optim.Optimizer]:
         networks = [*self.network.density_network.parameters(), *self.network.colour_network.parameters()]
         groups: list[dict[str, Any]] = [{"params": networks, "scale": 1.0}]
-        groups += [{"params": [*x.parameters()], "scale": 0.05} for x in (self.exposure, self.poses) if x]
+        if self.exposure:
+            groups.append({"params": [self.exposure.log_gain], "scale": 0.05})
+        if self.poses:
+            groups.append(self.poses.group())
         common = {"lr": self.config.learning_rate, "betas": (0.9, 0.99), "eps": 1e-15}
         decay = self.config.hash_weight_decay if self.frame.reach == 1 else 0.0
         table = LazyAdam([self.network.table], weight_decay=decay, **common)
         return [table, torch.optim.Adam(groups, foreach=True, **common)]
 
-    def learning_rate(self, step: int, progress: float) -> float:
+    def learning_rate(self, step: int, progress: float) -> float | dict[str, float]:
         """Twenty steps of warm-up, then constant, then exponential decay (section 4 decays likewise)."""
         c = self.config
         fall = max(0.0, progress - c.decay_start) / (1 - c.decay_start)
-        return falling(c.learning_rate, c.final_learning_rate, fall) * min(1.0, (step + 1) / 20)
+        rate = falling(c.learning_rate, c.final_learning_rate, fall) * min(1.0, (step + 1) / 20)
+        return {"": rate, "poses": self.poses.rate(progress)} if self.poses else rate
 
     def before_step(self, step: int, progress: float) -> None:
+        if self.poses:
+            self.poses.progress.fill_(progress)
         _, cells, steps = max(stage for stage in STAGES if stage[0] <= progress)
         self._set_steps(steps)
         finer = False
@@ -276,13 +291,17 @@ class InstantNGP(RayMethod):
         self, points: Float[Tensor, "point 3"], directions: Float[Tensor, "point 3"]
     ) -> tuple[Float[Tensor, " point"], Float[Tensor, "point 3"]]:
         """Density per scene unit, and sRGB-encoded colour seen along unit directions."""
-        density, geometry = self.network.density(self.network.encode(points))
+        density, geometry = self.network.density(self._encoded(points))
         rgb = self.network.colour(geometry, directions)
         return density, rgb * self.exposure.gain(self.told) if self.told and self.exposure else rgb
 
     def density(self, points: Float[Tensor, "sample 3"]) -> Float[Tensor, " sample"]:
         """Density per scene unit."""
-        return self.network.density(self.network.encode(points))[0]
+        return self.network.density(self._encoded(points))[0]
+
+    def _encoded(self, points: Float[Tensor, "sample 3"]) -> Float[Tensor, "sample width"]:
+        """The network's input; while poses are refined, of as many levels as have joined."""
+        return self.network.encode(points, self.poses.weights(self.config.levels) if self.poses else None)
 
     def storage(self) -> dict[str, Stored]:
         """The table as whole numbers, the networks as halves; of the grid, marks alone are needed for pictures."""
