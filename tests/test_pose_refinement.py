@@ -14,7 +14,7 @@ from lumigraph import methods
 from lumigraph.alignment import aligning, moves
 from lumigraph.camera import Camera
 from lumigraph.capture import open_scene
-from lumigraph.capture.folds import about_fold
+from lumigraph.capture.folds import about_fold, jumps
 from lumigraph.components.clouds.initial_cloud import random_cloud
 from lumigraph.components.clouds.seen_from import seen_from
 from lumigraph.components.fields.encodings import FrequencyEncoding
@@ -241,13 +241,18 @@ def test_a_held_out_photograph_is_found_on_itself():
 # Captures
 
 
-def test_a_capture_that_leaps_is_said_to_be_folded():
-    poses = tiny.poses(40).numpy()
-    poses[:, :, 3] *= 2
-    names = [f"{i}.jpg" for i in range(40)]
-    assert about_fold(names, poses) is None
-    assert about_fold(names, poses[torch.randperm(40, generator=torch.Generator().manual_seed(0))]) is None
-    folded = poses.copy()
-    folded[20:, :, 3] += 20 * poses[20, :, 2]
-    said = about_fold(names, folded)
-    assert said is not None and "19.jpg and 20.jpg" in said
+def test_a_capture_that_leaps_to_a_second_copy_of_its_place_is_said_to_be_folded():
+    """And no other: not one whose photographs leap and still see the same, nor one in no order."""
+    poses, chance = tiny.poses(40).numpy(), np.random.default_rng(0)
+    names, points = [f"{i}.jpg" for i in range(40)], chance.normal(0, 0.3, (200, 3))
+    assert about_fold(names, poses, points) is None
+    copied, away = poses.copy(), 8 * poses[20, :, 0]
+    copied[20:, :, 3] += away
+    twice = np.concatenate([points, points + away])
+    said = about_fold(names, copied, twice)
+    assert said is not None and "19.jpg and 20.jpg" in said and "folded" in said
+    shuffled = chance.permutation(40)
+    assert about_fold(names, copied[shuffled], twice) is None
+    nearer = poses.copy()
+    nearer[20:, :, 3] *= 3  # a second round, from farther off
+    assert jumps(nearer) and about_fold(names, nearer, points) is None and about_fold(names, nearer, None) is None

@@ -25,8 +25,8 @@ STEPS = 100  # down the photograph's own loss, the scene frozen
 RATE = 2e-3  # radians by which the first step moves the picture
 TRUE_POSE = "true_pose"  # of `Scene.about`: camera-to-world in the source's frame
 PROTOCOL = (
-    "as the method refined them; held-out ones moved along by a similarity that aligns training poses before and after, "
-    f"then refined on their own photographs, {STEPS} steps with the scene frozen (Lin 2021, section 5.1)"
+    "as the method refined them; held-out ones moved along by the similarity that aligns training poses before and "
+    f"after, then refined on their own photographs, {STEPS} steps with the scene frozen (Lin 2021, section 5.1)"
 )
 
 
@@ -53,7 +53,7 @@ class HeldOutPoses:
         poses = PoseRefinement(len(self.scene), RATE).to(self.method.device)
         poses.begin(self.scene.cameras[index : index + 1], self.scene.frame, first=index)
         self.copy.poses = poses
-        optimizer, generator = torch.optim.Adam([poses.group()]), torch.Generator().manual_seed(index)
+        optimizer, generator = poses.optimizer(), torch.Generator().manual_seed(index)
         with torch.enable_grad():
             for step in range(STEPS):
                 optimizer.param_groups[0]["lr"] = poses.rate(step / STEPS)
@@ -71,7 +71,7 @@ def held_out_poses(method: Method, scene: Scene) -> HeldOutPoses | None:
 
 
 def against_truth(method: Method, scene: Scene) -> Moves | None:
-    """How far training poses, as the method has them, are from the true ones, aligned; None where nobody knows these."""
+    """How far training poses, as the method has them, are from true ones, aligned; None where nobody knows these."""
     if TRUE_POSE not in scene.about:
         return None
     learnt = scene.splits["train"]

@@ -20,7 +20,6 @@ from ..components.clouds.density_control import AdaptiveDensity, MarkovChain
 from ..components.clouds.initial_cloud import Initialization, initial_cloud, random_cloud
 from ..components.clouds.seen_from import seen_from
 from ..components.clouds.smoothing import sampling_interval, smoothed
-from ..components.training.lazy_adam import LazyAdam
 from ..components.training.pose_refinement import PoseRefinement
 from ..components.training.rhythm import Rhythm, haste, intervals
 from ..components.training.schedules import falling
@@ -85,6 +84,7 @@ STORAGE = {  # of tensors, where a run is compressed; positions need the most bi
 }
 SWEEPING = 0.08  # of the budget: the share that looking for points to begin at may take
 NEAR = 0.1  # times the scene's near distance: the near plane of splats
+COARSE = 0.5  # of the budget, at half size where poses are refined and nothing else is said
 SMALLEST = 64  # pixels of a photograph's shorter side that are kept when it is reduced
 ENOUGH = 2400  # steps, with which sizes and colours need not hurry
 RECOVERY = 3  # opacity_reset_intervals that must be left after opacities are reset, or the pictures stay dim
@@ -214,7 +214,7 @@ class GaussianSplatting(Method):
 
     def _reduction(self, shorter: int) -> int:
         """How many times smaller photographs are at this share of the budget; no side gets below SMALLEST pixels."""
-        half = self.config.half_resolution_until
+        half = self.config.half_resolution_until or (COARSE if self.poses else 0.0)
         wanted = 4 if self._progress < half / 4 else 2 if self._progress < half else 1
         return max(1, min(wanted, shorter // SMALLEST))
 
@@ -256,7 +256,7 @@ class GaussianSplatting(Method):
             {"name": "harmonics", "params": [cloud.harmonics], "lr": c.sh_lr, "columns": columns},
         ]
         self._optimizer = CloudAdam(groups)
-        return [self._optimizer, *([LazyAdam([self.poses.group()])] if self.poses else [])]
+        return [self._optimizer, self.poses.optimizer()] if self.poses else [self._optimizer]
 
     def learning_rate(self, step: int, progress: float) -> dict[str, float]:
         """Exponential decay of the means' rate (section 7.1), in extents of the cameras; the others stay. Sizes and

@@ -252,14 +252,13 @@ class InstantNGP(RayMethod):
     def optimizers(self) -> list[torch.optim.Optimizer]:
         networks = [*self.network.density_network.parameters(), *self.network.colour_network.parameters()]
         groups: list[dict[str, Any]] = [{"params": networks, "scale": 1.0}]
-        if self.exposure:
-            groups.append({"params": [self.exposure.log_gain], "scale": 0.05})
-        if self.poses:
-            groups.append(self.poses.group())
+        older = self.poses if self.poses and not self.poses.whitened else None
+        groups += [{"params": [*x.parameters()], "scale": 0.05} for x in (self.exposure, older) if x]
         common = {"lr": self.config.learning_rate, "betas": (0.9, 0.99), "eps": 1e-15}
         decay = self.config.hash_weight_decay if self.frame.reach == 1 else 0.0
         table = LazyAdam([self.network.table], weight_decay=decay, **common)
-        return [table, torch.optim.Adam(groups, foreach=True, **common)]
+        optimizers = [table, torch.optim.Adam(groups, foreach=True, **common)]
+        return [*optimizers, self.poses.optimizer()] if self.poses and not older else optimizers
 
     def learning_rate(self, step: int, progress: float) -> float | dict[str, float]:
         """Twenty steps of warm-up, then constant, then exponential decay (section 4 decays likewise)."""

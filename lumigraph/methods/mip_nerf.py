@@ -218,8 +218,8 @@ class MipNeRF(RayMethod):
         return self.encode_frustum(means, variances, weights)
 
     def optimizers(self) -> list[torch.optim.Optimizer]:
-        groups = [{"params": [*self.network.parameters()]}, *([self.poses.group()] if self.poses else [])]
-        return [torch.optim.Adam(groups, self.config.learning_rate)]
+        of_network = torch.optim.Adam(self.network.parameters(), self.config.learning_rate)
+        return [of_network, self.poses.optimizer()] if self.poses else [of_network]
 
     def learning_rate(self, step: int, progress: float) -> float | dict[str, float]:
         """Exponential decay after a warm-up (section 4)."""

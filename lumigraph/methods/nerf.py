@@ -250,8 +250,8 @@ class NeRF(RayMethod):
 
     def optimizers(self) -> list[torch.optim.Optimizer]:
         networks = [p for name, p in self.named_parameters() if not name.startswith("poses.")]
-        groups = [{"params": networks}, *([self.poses.group()] if self.poses else [])]
-        return [torch.optim.Adam(groups, self.config.learning_rate, eps=1e-7)]
+        of_networks = torch.optim.Adam(networks, self.config.learning_rate, eps=1e-7)
+        return [of_networks, self.poses.optimizer()] if self.poses else [of_networks]
 
     def learning_rate(self, step: int, progress: float) -> float | dict[str, float]:
         """Exponential decay (section 5.3)."""

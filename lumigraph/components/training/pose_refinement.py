@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -13,12 +12,13 @@ from ...camera import Camera
 from ...rays import Rays
 from ...scene import Frame
 from .coarse_to_fine import ENDS, band_weights
+from .pose_adam import PoseAdam
 from .schedules import falling
 
 PLACES = 16  # along each side of a picture, and as many depths: where its motion is measured
 DAMPING, LEAST = 0.1, 1e-8  # of the whitening, lambda and mu of Park 2023, section 4.2
-WARMUP = 0.05  # share of the budget in which poses' rate grows: at first nothing is there to be aligned with
-FALL = 0.01  # of the rate, that is left of it at the end of the budget (Lin 2021, section 5.1)
+WARMUP = 0.1  # share of the budget in which poses' rate grows: at first nothing is there to be aligned with
+FALL = 0.02  # of the rate, that is left of it at the end of the budget
 
 
 class PoseRefinement(nn.Module):
@@ -28,8 +28,9 @@ class PoseRefinement(nn.Module):
     section 3.3). What is learnt, `twist`, are coordinates in which a step of any direction moves the picture equally
     far, by radians (Park 2023, CamP): `axes` leads from these to rotation and shift. Without `begin` they are the same.
 
-    learning_rate: radians that a step moves a picture by, about
+    learning_rate: radians that a step moves a picture by, at most
     progress:      share of the budget spent, by which `weights` lets bands of an encoding join
+    whitened:      whether `axes` are there; runs of version 0.1 learnt rotation and shift themselves
     """
 
     axes: Tensor
@@ -37,7 +38,7 @@ class PoseRefinement(nn.Module):
 
     def __init__(self, image_count: int, learning_rate: float = 1e-3):
         super().__init__()
-        self.learning_rate = learning_rate
+        self.learning_rate, self.whitened = learning_rate, True
         self.twist = nn.Parameter(torch.zeros(image_count, 6))
         self.register_buffer("axes", torch.eye(6).repeat(image_count, 1, 1))
         self.register_buffer("progress", torch.tensor(1.0))
@@ -72,15 +73,16 @@ class PoseRefinement(nn.Module):
         progress = float(self.progress)
         return None if progress >= ENDS else band_weights(bands, progress).to(self.twist)
 
-    def group(self) -> dict[str, Any]:
-        """The parameters as an optimizer takes them; its rate is that of `rate`."""
-        return {"name": "poses", "params": [self.twist]}
+    def optimizer(self) -> PoseAdam:
+        """Fresh; its group is called "poses", and its rate is that of `rate`."""
+        return PoseAdam([{"name": "poses", "params": [self.twist]}], self.learning_rate)
 
     def rate(self, progress: float) -> float:
         """The learning rate at a share of the budget: it grows, then falls exponentially."""
         return falling(self.learning_rate, FALL * self.learning_rate, progress, WARMUP)
 
     def _load_from_state_dict(self, state_dict, prefix, *others) -> None:
+        self.whitened = f"{prefix}axes" in state_dict
         for name in ("axes", "progress"):  # which older runs lack: rotation and shift as they are, all bands
             state_dict.setdefault(prefix + name, getattr(self, name))
         super()._load_from_state_dict(state_dict, prefix, *others)
