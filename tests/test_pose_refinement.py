@@ -9,12 +9,14 @@ import numpy as np
 import pytest
 import tiny
 import torch
+from PIL import Image
 
 from lumigraph import methods
 from lumigraph.alignment import aligning, moves
 from lumigraph.camera import Camera
 from lumigraph.capture import open_scene
-from lumigraph.capture.folds import about_fold, jumps
+from lumigraph.capture.capture import Shot
+from lumigraph.capture.folds import about_fold
 from lumigraph.components.clouds.initial_cloud import random_cloud
 from lumigraph.components.clouds.seen_from import seen_from
 from lumigraph.components.fields.encodings import FrequencyEncoding
@@ -24,6 +26,7 @@ from lumigraph.evaluate.held_out_poses import HeldOutPoses, held_out_poses, pose
 from lumigraph.gaussians.splatting import splat, view_of
 from lumigraph.geometry import Similarity
 from lumigraph.images import ImageStore
+from lumigraph.lens import Pinhole
 from lumigraph.run import build
 from lumigraph.verdict import cameras_moved
 
@@ -241,18 +244,26 @@ def test_a_held_out_photograph_is_found_on_itself():
 # Captures
 
 
-def test_a_capture_that_leaps_to_a_second_copy_of_its_place_is_said_to_be_folded():
-    """And no other: not one whose photographs leap and still see the same, nor one in no order."""
-    poses, chance = tiny.poses(40).numpy(), np.random.default_rng(0)
-    names, points = [f"{i}.jpg" for i in range(40)], chance.normal(0, 0.3, (200, 3))
-    assert about_fold(names, poses, points) is None
-    copied, away = poses.copy(), 8 * poses[20, :, 0]
-    copied[20:, :, 3] += away
-    twice = np.concatenate([points, points + away])
-    said = about_fold(names, copied, twice)
-    assert said is not None and "19.jpg and 20.jpg" in said and "folded" in said
-    shuffled = chance.permutation(40)
-    assert about_fold(names, copied[shuffled], twice) is None
-    nearer = poses.copy()
-    nearer[20:, :, 3] *= 3  # a second round, from farther off
-    assert jumps(nearer) and about_fold(names, nearer, points) is None and about_fold(names, nearer, None) is None
+def photographed(folder, poses: np.ndarray, seen: np.ndarray) -> list[Shot]:
+    """Photographs of a panorama: each shows the part that its number in `seen` says."""
+    chance = np.random.default_rng(0)
+    panorama = np.kron(chance.integers(0, 255, (2, 30)), np.ones((12, 12))).astype(np.uint8)
+    shots = []
+    for i, place in enumerate(seen):
+        Image.fromarray(panorama[:, 4 * place : 4 * place + 24]).save(folder / f"{i}.png")
+        lens = Pinhole(torch.tensor([[30.0, 30.0]]), torch.tensor([[12.0, 12.0]]))
+        shots.append(Shot(f"{i}.png", poses[i], lens, (24, 24), {1: folder / f"{i}.png"}))
+    return shots
+
+
+def test_a_capture_is_said_to_be_folded_where_it_leaps_and_its_photographs_do_not(tmp_path):
+    walk = tiny.poses(40).numpy()
+    folded = walk.copy()
+    folded[20:, :, 3] += 8 * walk[20, :, 0]
+    steady, leaping = np.arange(40), np.arange(40) + 30 * (np.arange(40) >= 20)
+    assert about_fold(photographed(tmp_path, walk, steady), walk) is None
+    said = about_fold(photographed(tmp_path, folded, steady), folded)
+    assert said is not None and "19.png and 20.png" in said and "folded" in said
+    assert about_fold(photographed(tmp_path, folded, leaping), folded) is None  # somebody walked there
+    shuffled = folded[np.random.default_rng(0).permutation(40)]
+    assert about_fold(photographed(tmp_path, shuffled, steady), shuffled) is None  # in no order

@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
+from itertools import pairwise
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
+from PIL import Image
 
-from .normalise import SAMPLED_POINTS, where_axes_meet
+from .capture import Shot
 
 JUMP = 10.0  # times the usual distance between neighbours
 SAME_WAY = 45.0  # degrees between views; who walks far off seldom looks the same way there
 PAIRED = 200  # photographs, every two of which are compared
-SHARED = 0.1  # share of what they see, below which two cameras see different places
-VIEW = 30.0  # degrees from a camera's axis, about as far as photographs show
+LOOKED_AT = 4  # leaps, the widest, whose photographs are compared
+ALIKE = 1.25  # times the difference of photographs beside them, up to which two show the same
+THUMBNAIL = 16  # pixels a side
 STEADY = 0.5  # distance of neighbours, as a share of that of any two, up to which names tell the order of exposure
 
 
@@ -44,44 +47,53 @@ def in_steps(positions: Float[np.ndarray, "photo 3"]) -> bool:
     return bool(np.median(steps) < STEADY * np.median(between[np.triu_indices(len(some), 1)]))
 
 
-def about_fold(
-    names: Sequence[str], poses: Float[np.ndarray, "photo 3 4"], points: Float[np.ndarray, "point 3"] | None
-) -> str | None:
-    """A sentence about the widest leap between neighbours that look the same way and yet see nothing of what the other
-    sees, as where a model has a place twice. None where their order tells nothing, or nobody knows what they see.
+def about_fold(shots: Sequence[Shot], poses: Float[np.ndarray, "photo 3 4"]) -> str | None:
+    """A sentence about the widest leap between neighbours whose photographs show the same, if there is one and the
+    order of photographs tells anything.
 
-    points: sparse points of the model; without them, what all cameras look at stands for what they see
+    Those of each published split are a list of their own. Photographs are looked at only where cameras leap.
     """
-    if not in_steps(poses[:, :, 3]):
-        return None
-    leaps = [(i, times) for i, times in jumps(poses) if apart(poses[i], poses[i + 1], places_seen(poses, points))]
+    groups = [[i for i, shot in enumerate(shots) if shot.split == split] for split in {shot.split for shot in shots}]
+    leaps = [
+        (times, group[i : i + 2])
+        for group in groups
+        for i, times in leaps_alike([shots[k] for k in group], poses[group])
+    ]
     if not leaps:
         return None
-    i, times = max(leaps, key=lambda leap: leap[1])
+    times, (before, after) = max(leaps)
     return (
-        f"has {names[i]} and {names[i + 1]} next to each other, looking the same way, but {times:.0f} times as far "
-        "apart as neighbours usually are, where they see nothing of the same: its model may be folded there; look at "
-        "its cameras, and if they are wrong find them anew with `lumigraph capture`"
+        f"has {shots[before].name} and {shots[after].name} next to each other, showing the same, but {times:.0f} times "
+        "as far apart as neighbours usually are: its model may be folded there; look at its cameras, and if they are "
+        "wrong find them anew with `lumigraph capture`"
     )
 
 
-def places_seen(
-    poses: Float[np.ndarray, "photo 3 4"], points: Float[np.ndarray, "point 3"] | None
-) -> Float[np.ndarray, "place 3"]:
-    """Some of the points; without any, where all axes meet, if they do."""
-    if points is not None and len(points):
-        return points[:: -(-len(points) // SAMPLED_POINTS)]
-    subject, converging = where_axes_meet(poses[:, :, 3], poses[:, :, 2])
-    return subject[None] if converging else np.zeros((0, 3))
+def leaps_alike(shots: Sequence[Shot], poses: Float[np.ndarray, "photo 3 4"]) -> list[tuple[int, float]]:
+    """The widest jumps, whichever way cameras look, across which photographs differ no more than beside them."""
+    if not in_steps(poses[:, :, 3]):
+        return []
+    found = sorted(jumps(poses, range(len(poses))), key=lambda jump: -jump[1])[:LOOKED_AT]
+    return [(i, times) for i, times in found if 0 < i < len(poses) - 2 and alike(shots[i - 1 : i + 3])]
 
 
-def apart(a: Float[np.ndarray, "3 4"], b: Float[np.ndarray, "3 4"], places: Float[np.ndarray, "place 3"]) -> bool:
-    """Whether two cameras see different places, though they see some."""
-    seen_a, seen_b = (in_view(pose, places) for pose in (a, b))
-    fewer = min(seen_a.sum(), seen_b.sum())
-    return bool(fewer and (seen_a & seen_b).sum() < SHARED * fewer)
+def alike(four: Sequence[Shot]) -> bool:
+    """Whether the middle two of four photographs in a row differ no more than the outer pairs do."""
+    seen = [thumbnail(shot) for shot in four]
+    if any(picture is None for picture in seen):
+        return False
+    before, between, after = (float(np.abs(b - a).mean()) for a, b in pairwise(seen))
+    return between < ALIKE * max(before, after)
 
 
-def in_view(pose: Float[np.ndarray, "3 4"], places: Float[np.ndarray, "place 3"]) -> Bool[np.ndarray, " place"]:
-    towards = places - pose[:, 3]
-    return towards @ pose[:, 2] > np.cos(np.radians(VIEW)) * np.linalg.norm(towards, axis=-1)
+def thumbnail(shot: Shot) -> Float[np.ndarray, "row column"] | None:
+    """A photograph in a few grey pixels, whatever its exposure; None where no file holds it."""
+    if not isinstance(shot.image, dict):
+        return None
+    try:
+        with Image.open(shot.image[max(shot.image)]) as image:
+            image.draft("L", (4 * THUMBNAIL, 4 * THUMBNAIL))
+            grey = np.asarray(image.convert("L").resize((THUMBNAIL, THUMBNAIL), Image.Resampling.BOX), np.float64)
+    except OSError:  # said where it is read
+        return None
+    return (grey - grey.mean()) / max(float(grey.std()), 1.0)

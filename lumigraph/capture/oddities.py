@@ -26,7 +26,7 @@ def oddities(capture: Capture, shots: list[Shot], poses: Float[np.ndarray, "came
         return []
     found = [about_double(shots), about_places(poses), about_gaze(capture, poses), about_angles(shots)]
     if not any("folded" in sentence for sentence in capture.told):  # the reader may know more
-        found.append(about_fold([shot.name for shot in shots], poses, capture.points))
+        found.append(about_fold(shots, poses))
     return [f"{capture.source} {sentence}" for sentence in found if sentence]
 
 

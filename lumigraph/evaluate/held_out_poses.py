@@ -50,8 +50,8 @@ class HeldOutPoses:
         if index in self.trained:
             return self.method.refined(self.photographs[index])
         alone = replace(self.scene, splits={"train": torch.tensor([index])})
-        poses = PoseRefinement(len(self.scene), RATE).to(self.method.device)
-        poses.begin(self.scene.cameras[index : index + 1], self.scene.frame, first=index)
+        poses = PoseRefinement(self.scene.frame.image_count, RATE).to(self.method.device)
+        poses.begin(self.scene.cameras[index], self.scene.frame)
         self.copy.poses = poses
         optimizer, generator = poses.optimizer(), torch.Generator().manual_seed(index)
         with torch.enable_grad():

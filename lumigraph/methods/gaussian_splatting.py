@@ -179,6 +179,7 @@ class GaussianSplatting(Method):
             refine_until=0.8,
             densify_grad_threshold=1e-6,
             opacity_reset_interval=5,
+            refine_cameras=True,
         )
 
     def rehearse_begin(self) -> None:

@@ -43,10 +43,11 @@ class PoseRefinement(nn.Module):
         self.register_buffer("axes", torch.eye(6).repeat(image_count, 1, 1))
         self.register_buffer("progress", torch.tensor(1.0))
 
-    def begin(self, cameras: Camera, frame: Frame, first: int = 0) -> None:
-        """Choose the coordinates by what each camera sees. cameras: of photographs in their order, from the first on"""
-        for i in range(len(cameras)):
-            self.axes[first + i] = whitening(cameras[i], frame)
+    def begin(self, cameras: Camera, frame: Frame) -> None:
+        """Choose the coordinates by what each camera sees. cameras: of photographs, by their `image_index`"""
+        if cameras.image_index is not None:
+            for i, image in enumerate(cameras.image_index.tolist()):
+                self.axes[image] = whitening(cameras[i], frame)
 
     @property
     def moves(self) -> Float[Tensor, "image 6"]:
