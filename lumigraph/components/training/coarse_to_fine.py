@@ -9,7 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 FIRST = 1 / 4  # share of the bands that are there from the beginning
-BEGINS, ENDS = 0.05, 0.5  # shares of the budget between which the others join
+BEGINS, ENDS = 0.05, 0.4  # shares of the budget between which the others join
 
 
 def band_weights(count: int, progress: float) -> Float[Tensor, " band"]:
