@@ -22,7 +22,7 @@ from ..metrics import Score
 from ..scene import Scene
 
 STEPS = 100  # down the photograph's own loss, the scene frozen
-RATE = 2e-3  # radians by which the first step moves the picture
+RATE = 5e-3  # radians by which the first step moves the picture
 TRUE_POSE = "true_pose"  # of `Scene.about`: camera-to-world in the source's frame
 PROTOCOL = (
     "as the method refined them; held-out ones moved along by the similarity that aligns training poses before and "

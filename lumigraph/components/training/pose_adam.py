@@ -13,7 +13,7 @@ class PoseAdam(torch.optim.Optimizer):
     all zero was not looked at: it stays, and its moments are those of the steps that did.
     """
 
-    def __init__(self, params, lr: float = 1e-3, betas: tuple[float, float] = (0.9, 0.99)):
+    def __init__(self, params, lr: float = 1e-3, betas: tuple[float, float] = (0.9, 0.95)):
         super().__init__(params, {"lr": lr, "betas": betas})
 
     @torch.no_grad()
