@@ -7,6 +7,7 @@ from typing import Any
 
 from rich.tree import Tree
 
+from ..alignment import Moves
 from ..budget import Budget
 from ..choice import evenly
 from ..console import bold, dim
@@ -19,6 +20,7 @@ from ..run import Run
 from ..run.compressed import Compressed
 from ..scene import Frame, Scene
 from ..shapes import Shapes
+from ..verdict import cameras_moved
 
 MEMBERS = 12  # of many shapes, that are told of one by one
 
@@ -39,6 +41,8 @@ def run_tree(run: Run) -> Tree:
             "trained",
             rows | {"budget": said.budget and str(Budget.from_json(said.budget)), "seed": said.seed, "on": said.device},
         )
+    if moved := moves_of(run):
+        branch(tree, "cameras", {"moved by": str(moved)})
     if made := Compressed.read(run.folder):
         smaller = f"{made.times:.1f} times smaller, {made.bytes_after / 1e6:.3g} MB of {made.bytes_before / 1e6:.3g} MB"
         branch(tree, "compressed", {"from": made.source, "model": smaller, "dB": f"{made.psnr_after:.2f}"})
@@ -53,6 +57,13 @@ def run_tree(run: Run) -> Tree:
     if pages:
         branch(tree, "files", {str(path.relative_to(run.folder)): size(path) for path in pages})
     return tree
+
+
+def moves_of(run: Run) -> Moves | None:
+    """How far the method has moved cameras; None where it refines none, or has not begun."""
+    if not (run.has_state and run.settings.config.get("refine_cameras")):
+        return None
+    return cameras_moved(run.method("cpu"), run.cameras()["train"])
 
 
 def control_rows(run: Run) -> dict[str, str]:

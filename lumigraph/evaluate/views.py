@@ -24,6 +24,7 @@ from ..progress import counting, track
 from ..rays import Rendering
 from ..scene import Photograph, Scene
 from . import halves
+from .held_out_poses import PROTOCOL, held_out_poses, pose_scores
 
 SHOWN = 8  # views of the contact sheet, evenly spread; the worst one joins them
 CLEAN = "clean"  # the layer of photographs in their own light without whoever passes by
@@ -52,6 +53,7 @@ class Evaluation:
     protocol: dict[str, Any]
     compile_seconds: float
     shown: dict[str, tuple[Tensor, Rendering]]  # some views' photograph and rendering
+    poses: tuple[Score, ...] = ()  # how far refined poses are from true ones, where these are known
 
     @property
     def psnr(self) -> float:
@@ -83,7 +85,7 @@ class Evaluation:
 
     @property
     def scores(self) -> list[Score]:
-        return scores_of(self.means())
+        return [*scores_of(self.means()), *self.poses]
 
     @property
     def compared(self) -> str:
@@ -129,8 +131,8 @@ def evaluate(
 
     keep:  told each view's name and rendering
     views: so many of them at most, evenly spread over the split; None means all
-    Cameras are those that the method refined, which moves none but those of photographs it was trained on. Pixels that
-    the photograph's mask rules out do not count. A method that photographs can be given to is judged by halves (see
+    Cameras are those that the method refined; held-out ones are then found as `held_out_poses` says. Pixels that the
+    photograph's mask rules out do not count. A method that photographs can be given to is judged by halves (see
     `evaluate.halves`). Raises LumigraphError if the split has no view.
     """
     chosen = scene.splits.get(split)
@@ -144,12 +146,13 @@ def evaluate(
     with counting("Preparing to render"):
         compile_seconds = warm_up(method, scene.cameras[compared[0]])
     spread, by_halves = set(evenly(compared, SHOWN)), halves.judged_by_halves(method)
+    found = held_out_poses(method, scene)
     scores: list[ViewScore] = []
     shown: dict[str, tuple[Tensor, Rendering]] = {}
     worst: dict[str, tuple[Tensor, Rendering]] = {}
     for index in track(compared, "Comparing views", len(compared)):
         shot = scene.photograph(index, [CLEAN] if CLEAN in scene.layers else [])
-        camera = method.refined(shot.camera)
+        camera = found.camera(index) if found else method.refined(shot.camera)
         photograph = shot.before(scene.frame.background)
         told = method.given(halves.left_half(shot)) if by_halves else method
         begin = time.perf_counter()
@@ -163,7 +166,9 @@ def evaluate(
         if all(score.psnr < other.psnr for other in scores):
             worst = {score.name: (photograph, seen)}
         scores.append(score)
-    return Evaluation(scores, protocol(scene, split, compared, lpips, method), compile_seconds, shown | worst)
+    told = protocol(scene, split, compared, lpips, method) | ({"poses": PROTOCOL} if found else {})
+    poses = tuple(pose_scores(method, scene))
+    return Evaluation(scores, told, compile_seconds, shown | worst, poses)
 
 
 def compare(

@@ -17,9 +17,10 @@ from ..components.sampling.coarse_to_fine import SAMPLES_OF_A_RAY, first_grid, k
 from ..components.sampling.importance import importance
 from ..components.sampling.marching import FIRST_RAYS, rays_for, reached
 from ..components.sampling.occupancy import OccupancyGrid
-from ..components.training.corrections import Exposure, PoseRefinement
+from ..components.training.corrections import Exposure
 from ..components.training.lazy_adam import LazyAdam
 from ..components.training.photometric import backdrop, residuals
+from ..components.training.pose_refinement import PoseRefinement
 from ..components.training.schedules import held
 from ..controls import Control
 from ..method import RayMethod
@@ -58,7 +59,8 @@ class Config:
     hash_weight_decay: NonNegative = 0.0  # of the table, decoupled; of objects only, for it pulls density towards 1
     huber_delta: PositiveShare = 0.1  # residual at which the loss turns from square to linear
     exposure_correction: bool = False  # learn a gain per photograph
-    refine_cameras: bool = False  # learn a correction of each photograph's pose
+    refine_cameras: bool = False  # learn where each photograph was taken from, coarse to fine (Lin 2021, BARF)
+    pose_learning_rate: LearningRate = 2e-3  # radians by which a step moves a picture, with refine_cameras
     seed: Seed = 0
 
     def check(self) -> None:
@@ -100,7 +102,8 @@ class InstantNGP(RayMethod):
             torch.manual_seed(config.seed)
             self.network = HashField(config, frame.reach)
         self.exposure = Exposure(frame.image_count) if config.exposure_correction else None
-        self.poses = PoseRefinement(frame.image_count) if config.refine_cameras else None
+        refining, rate = config.refine_cameras, config.pose_learning_rate
+        self.poses = PoseRefinement(frame.image_count, rate) if refining else None
         self.occupancy = first_grid(config, frame.reach)
         self.lattice = lattice(config, frame.reach)
         self.register_buffer("rays_per_step", torch.tensor(FIRST_RAYS))
@@ -154,7 +157,9 @@ class InstantNGP(RayMethod):
         return self.config.samples_per_step / SAMPLES_OF_A_RAY
 
     def begin(self, scene: Scene, seconds: float = math.inf) -> None:
-        if scene.images.has_alpha and self.frame.reach == 1:
+        if self.poses:  # silhouettes seen from wrong poses would carve what is there
+            self.poses.begin(scene.cameras, scene.frame)
+        elif scene.images.has_alpha and self.frame.reach == 1:
             self.occupancy.rule_out(visual_hull(scene, self.config.occupancy_resolution)[None])
 
     def batch(self, data: Scene, generator: torch.Generator) -> Batch:
@@ -188,18 +193,23 @@ class InstantNGP(RayMethod):
     def optimizers(self) -> list[torch.optim.Optimizer]:
         networks = [*self.network.density_network.parameters(), *self.network.colour_network.parameters()]
         groups: list[dict[str, Any]] = [{"params": networks, "scale": 1.0}]
-        groups += [{"params": [*x.parameters()], "scale": 0.05} for x in (self.exposure, self.poses) if x]
+        older = self.poses if self.poses and not self.poses.whitened else None
+        groups += [{"params": [*x.parameters()], "scale": 0.05} for x in (self.exposure, older) if x]
         common = {"lr": self.config.learning_rate, "betas": (0.9, 0.99), "eps": 1e-15}
         decay = self.config.hash_weight_decay if self.frame.reach == 1 else 0.0
         table = LazyAdam([self.network.table], weight_decay=decay, **common)
-        return [table, torch.optim.Adam(groups, foreach=True, **common)]
+        optimizers = [table, torch.optim.Adam(groups, foreach=True, **common)]
+        return [*optimizers, self.poses.optimizer()] if self.poses and not older else optimizers
 
-    def learning_rate(self, step: int, progress: float) -> float:
+    def learning_rate(self, step: int, progress: float) -> float | dict[str, float]:
         """Twenty steps of warm-up, then constant, then exponential decay (section 4 decays likewise)."""
         c = self.config
-        return held(c.learning_rate, c.final_learning_rate, step, progress, c.decay_start)
+        rate = held(c.learning_rate, c.final_learning_rate, step, progress, c.decay_start)
+        return {"": rate, "poses": self.poses.rate(progress)} if self.poses else rate
 
     def before_step(self, step: int, progress: float) -> None:
+        if self.poses:
+            self.poses.progress.fill_(progress)
         self.lattice = lattice(self.config, self.frame.reach, stage(progress).steps)
         keep_looking(self.occupancy, self.density, self.config, step, progress, self.random(~step))
 
@@ -212,13 +222,17 @@ class InstantNGP(RayMethod):
         self, points: Float[Tensor, "point 3"], directions: Float[Tensor, "point 3"]
     ) -> tuple[Float[Tensor, " point"], Float[Tensor, "point 3"]]:
         """Density per scene unit, and sRGB-encoded colour seen along unit directions."""
-        density, geometry = self.network.density(self.network.encode(points))
+        density, geometry = self.network.density(self._encoded(points))
         rgb = self.network.colour(geometry, directions)
         return density, rgb * self.exposure.gain(self.told) if self.told and self.exposure else rgb
 
     def density(self, points: Float[Tensor, "sample 3"]) -> Float[Tensor, " sample"]:
         """Density per scene unit."""
-        return self.network.density(self.network.encode(points))[0]
+        return self.network.density(self._encoded(points))[0]
+
+    def _encoded(self, points: Float[Tensor, "sample 3"]) -> Float[Tensor, "sample width"]:
+        """The network's input; while poses are refined, of as many levels as have joined."""
+        return self.network.encode(points, self.poses.weights(self.config.levels) if self.poses else None)
 
     def storage(self) -> dict[str, Stored]:
         """The table as whole numbers, the networks as halves; of the grid, marks alone are needed for pictures."""

@@ -40,6 +40,7 @@ from .world import Sky as Sky
 from .world import Sun as Sun
 from .world import World as World
 
+TRUE_POSE = "true_pose"  # of `Scene.about`: camera-to-world in the source's frame
 DIGITS = 20  # of a number, at most
 
 
@@ -62,7 +63,8 @@ def read(request: str) -> Capture:
     name, *rest = request.split(",")
     options = typed(Options, dict(parse(request, text) for text in rest), f"procedural:{request}")
     stage = scenes.stage(name, options.size, options.views, options.seed)
-    return capture(stage, f"procedural:{request}", jittered(stage, options.jitter_poses, options.seed))
+    off = jittered(stage, options.jitter_poses, options.seed) if options.jitter_poses else None
+    return capture(stage, f"procedural:{request}", off)
 
 
 def parse(request: str, text: str) -> tuple[str, int]:
@@ -77,7 +79,10 @@ def parse(request: str, text: str) -> tuple[str, int]:
 
 
 def capture(stage: Stage, source: str, found: dict[str, Camera] | None = None) -> Capture:
-    """A stage as photographs with known poses. found: the cameras as they are said to be, where that differs."""
+    """A stage as photographs with known poses.
+
+    found: the cameras as they are said to be, where that differs; `about` has each `true_pose` then
+    """
     visible = stage.world.sky.visible
     said = found or stage.cameras
     shots = [
@@ -90,6 +95,7 @@ def capture(stage: Stage, source: str, found: dict[str, Camera] | None = None) -
             split=split,
             planes=known_planes(stage, cameras[i]),
             time=None if cameras.time is None else float(cameras.time[i]),
+            about={} if found is None else {TRUE_POSE: cameras.pose[i].double().numpy()},
         )
         for split, cameras in stage.cameras.items()
         for i in range(len(cameras))

@@ -35,8 +35,12 @@ class HashField(nn.Module):
         hidden = [config.hidden_width] * config.colour_layers
         self.colour_network = MLP(config.geometry_features + self.bands**2 + code, *hidden, 3)
 
-    def encode(self, points: Float[Tensor, "sample 3"]) -> Float[Tensor, "sample width"]:
-        return kernels.hash_encode(points * (0.5 / self.reach) + 0.5, self.table, self.levels)
+    def encode(
+        self, points: Float[Tensor, "sample 3"], weights: Float[Tensor, " level"] | None = None
+    ) -> Float[Tensor, "sample width"]:
+        """Features of all levels, the coarsest first. weights: of the levels, where not all count fully"""
+        encoded = kernels.hash_encode(points * (0.5 / self.reach) + 0.5, self.table, self.levels)
+        return encoded if weights is None else encoded * weights.repeat_interleave(self.levels.features)
 
     def density(
         self, encoded: Float[Tensor, "sample width"]
