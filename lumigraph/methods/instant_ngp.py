@@ -11,12 +11,15 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from ..camera import Camera
+from ..components.clouds.dense_points import compile_sweep
 from ..components.fields.hash_field import HashField, bytes_kept, check_levels
 from ..components.sampling.carving import visual_hull
 from ..components.sampling.coarse_to_fine import SAMPLES_OF_A_RAY, first_grid, keep_looking, lattice, stage
 from ..components.sampling.importance import importance
 from ..components.sampling.marching import FIRST_RAYS, rays_for, reached
 from ..components.sampling.occupancy import OccupancyGrid
+from ..components.sampling.spaces import Box, space_of
+from ..components.sampling.unbounded import RAYS, OpenNumbers, Unbounded, rays_of, unbounded
 from ..components.training.corrections import Exposure
 from ..components.training.lazy_adam import LazyAdam
 from ..components.training.photometric import backdrop, residuals
@@ -32,7 +35,7 @@ from ..volume import composite
 
 
 @dataclass(frozen=True)
-class Config:
+class Config(OpenNumbers):
     """The paper's numbers, with where it gives them; `InstantNGP.preset` says what a plain CPU does otherwise."""
 
     levels: Annotated[int, between(1, 32)] = 16  # L, table 1
@@ -58,6 +61,7 @@ class Config:
     decay_start: Annotated[float, between(0, 0.99)] = 0.3  # share of the budget before the learning rate falls
     hash_weight_decay: NonNegative = 0.0  # of the table, decoupled; of objects only, for it pulls density towards 1
     huber_delta: PositiveShare = 0.1  # residual at which the loss turns from square to linear
+    contraction: bool = True  # of open captures (Barron 2022), with proposals; or section 5.4's cascades around them
     exposure_correction: bool = False  # learn a gain per photograph
     refine_cameras: bool = False  # learn where each photograph was taken from, coarse to fine (Lin 2021, BARF)
     pose_learning_rate: LearningRate = 2e-3  # radians by which a step moves a picture, with refine_cameras
@@ -69,7 +73,10 @@ class Config:
 
 
 class InstantNGP(RayMethod):
-    """Rays are sampled in occupied cells; a first pass without gradients drops hidden samples, a second one learns."""
+    """Rays are sampled in occupied cells; a first pass without gradients drops hidden samples, a second one learns.
+
+    Open captures are contracted, and sampled where a grid proposes; see `components.sampling.unbounded`.
+    """
 
     Config = Config
     formerly_weights: ClassVar[dict[str, str]] = {"field.": "network."}
@@ -93,20 +100,26 @@ class InstantNGP(RayMethod):
         "huber": "huber_delta",
         "exposure": "exposure_correction",
     }
+    before: ClassVar[dict[str, Any]] = {"contraction": False}
     rays_per_step: Tensor
 
     def __init__(self, frame: Frame, config: Any = None):
         config = config or Config()
         super().__init__(frame, config)
+        self.space = space_of(frame) if config.contraction else Box(frame.bounds, frame.near)
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(config.seed)
-            self.network = HashField(config, frame.reach)
+            self.network = HashField(config, self.space, frame.reach)
+        self.unbounded = unbounded(frame, self.space, config) if config.contraction else None
+        if self.unbounded:
+            self.rays_per_chunk = RAYS
         self.exposure = Exposure(frame.image_count) if config.exposure_correction else None
         refining, rate = config.refine_cameras, config.pose_learning_rate
         self.poses = PoseRefinement(frame.image_count, rate) if refining else None
         self.occupancy = first_grid(config, frame.reach)
         self.lattice = lattice(config, frame.reach)
-        self.register_buffer("rays_per_step", torch.tensor(FIRST_RAYS))
+        first = rays_of(config.samples_per_step, config) if self.unbounded else FIRST_RAYS
+        self.register_buffer("rays_per_step", torch.tensor(first))
 
     @classmethod
     def preset(cls, device: torch.device) -> Any:
@@ -151,44 +164,60 @@ class InstantNGP(RayMethod):
 
     @classmethod
     def further_bytes(cls, frame: Frame, config: Any, learning: bool) -> int:
-        return OccupancyGrid.bytes_of(frame.reach, config.occupancy_resolution) + bytes_kept(config) * learning
+        grids = OccupancyGrid.bytes_of(frame.reach, config.occupancy_resolution) + Unbounded.bytes_of(frame, learning)
+        return grids + bytes_kept(config) * learning
 
     def rays_in_a_step(self, data: Scene) -> float:
-        return self.config.samples_per_step / SAMPLES_OF_A_RAY
+        c = self.config
+        return c.samples_per_step / (c.samples_per_ray if self.unbounded else SAMPLES_OF_A_RAY)
 
     def begin(self, scene: Scene, seconds: float = math.inf) -> None:
         if self.poses:  # silhouettes seen from wrong poses would carve what is there
             self.poses.begin(scene.cameras, scene.frame)
         elif scene.images.has_alpha and self.frame.reach == 1:
             self.occupancy.rule_out(visual_hull(scene, self.config.occupancy_resolution)[None])
+        if self.unbounded and not self.poses:
+            self.unbounded.begin(scene, seconds, self.random(1))
+
+    def rehearse_begin(self) -> None:
+        if self.unbounded:
+            compile_sweep()
 
     def batch(self, data: Scene, generator: torch.Generator) -> Batch:
         return data.sample_rays(int(self.rays_per_step), generator).to(self.device)
 
-    def render_rays(
-        self, rays: Rays, background: Float[Tensor, "#ray 3"], jitter: Float[Tensor, " ray"] | None = None
-    ) -> Rendering:
-        (look,) = self.looks(rays, jitter)
+    def render_rays(self, rays: Rays, background: Float[Tensor, "#ray 3"]) -> Rendering:
+        (look,) = self.looks(rays)
         return composite(look.samples, look.density, look.rgb, background)
 
-    def looks(self, rays: Rays, jitter: Float[Tensor, " ray"] | None = None) -> list[Look]:
+    def looks(self, rays: Rays) -> list[Look]:
+        return [self.unbounded.look(self.field, rays)[0] if self.unbounded else self._march(rays)]
+
+    def _march(self, rays: Rays, jitter: Float[Tensor, " ray"] | None = None) -> Look:
         found = self.occupancy.sample(rays, self.frame.near, *self.lattice, jitter=jitter)
         samples, asked = reached(rays, found, self.density, self.config.transmittance_threshold)
         points, directions = samples.along(rays)
         density, rgb = self.field(points, directions)
         self.figures |= {"rays": len(rays), "samples": asked, "visible_samples": len(samples)}
-        return [Look("samples", samples, density, rgb)]
+        return Look("samples", samples, density, rgb)
 
     def loss(self, batch: Batch, step: int) -> dict[str, Tensor]:
-        generator = self.random(step)
-        jitter = torch.rand(len(batch), generator=generator).to(self.device)
-        background = backdrop(batch, self.background, generator)
+        generator, terms = self.random(step), dict[str, Tensor]()
+        jitter = torch.rand(len(batch), 2 if self.unbounded else 1, generator=generator).to(self.device)
+        background = backdrop(batch, self.background, generator, opaque=self.unbounded is not None)
         rays = self.poses(batch.rays) if self.poses else batch.rays
-        rendering = self.render_rays(rays, background, jitter)
+        if self.unbounded:
+            look, proposed = self.unbounded.look(self.field, rays, jitter)
+            terms = self.unbounded.terms(self.field, look, proposed, generator)
+            self.figures |= {"rays": len(rays), "samples": len(look.samples)}
+        else:
+            look = self._march(rays, jitter[:, 0])
+        rendering = composite(look.samples, look.density, look.rgb, background)
         residual, self.figures["mse"] = residuals(rendering, batch, background, self.exposure)
         # Divided by delta, so that the linear part has slope 1.
         delta = self.config.huber_delta
-        return {"huber": nn.functional.huber_loss(residual, torch.zeros_like(residual), delta=delta) / delta}
+        huber = nn.functional.huber_loss(residual, torch.zeros_like(residual), delta=delta) / delta
+        return {"huber": huber, **terms}
 
     def optimizers(self) -> list[torch.optim.Optimizer]:
         networks = [*self.network.density_network.parameters(), *self.network.colour_network.parameters()]
@@ -199,22 +228,30 @@ class InstantNGP(RayMethod):
         decay = self.config.hash_weight_decay if self.frame.reach == 1 else 0.0
         table = LazyAdam([self.network.table], weight_decay=decay, **common)
         optimizers = [table, torch.optim.Adam(groups, foreach=True, **common)]
+        if self.unbounded:
+            optimizers.append(self.unbounded.optimizer())
         return [*optimizers, self.poses.optimizer()] if self.poses and not older else optimizers
 
-    def learning_rate(self, step: int, progress: float) -> float | dict[str, float]:
+    def learning_rate(self, step: int, progress: float) -> dict[str, float]:
         """Twenty steps of warm-up, then constant, then exponential decay (section 4 decays likewise)."""
         c = self.config
         rate = held(c.learning_rate, c.final_learning_rate, step, progress, c.decay_start)
-        return {"": rate, "poses": self.poses.rate(progress)} if self.poses else rate
+        rates = {"": rate, "proposal": Unbounded.rate(progress)}
+        return rates | {"poses": self.poses.rate(progress)} if self.poses else rates
 
     def before_step(self, step: int, progress: float) -> None:
         if self.poses:
             self.poses.progress.fill_(progress)
+        if self.unbounded:
+            self.unbounded.before_step(progress)
+            return
         self.lattice = lattice(self.config, self.frame.reach, stage(progress).steps)
         keep_looking(self.occupancy, self.density, self.config, step, progress, self.random(~step))
 
     def after_step(self, step: int) -> None:
         """Set the next step's number of rays so that they give about `samples_per_step` samples."""
+        if self.unbounded:
+            return
         rays = rays_for(self.config.samples_per_step, int(self.rays_per_step), self.figures["samples"])
         self.rays_per_step.fill_(rays)
 
@@ -223,16 +260,19 @@ class InstantNGP(RayMethod):
     ) -> tuple[Float[Tensor, " point"], Float[Tensor, "point 3"]]:
         """Density per scene unit, and sRGB-encoded colour seen along unit directions."""
         density, geometry = self.network.density(self._encoded(points))
+        density = density * self.space.stretch(points)
         rgb = self.network.colour(geometry, directions)
         return density, rgb * self.exposure.gain(self.told) if self.told and self.exposure else rgb
 
     def density(self, points: Float[Tensor, "sample 3"]) -> Float[Tensor, " sample"]:
         """Density per scene unit."""
-        return self.network.density(self._encoded(points))[0]
+        return self.network.density(self._encoded(points))[0] * self.space.stretch(points)
 
     def _encoded(self, points: Float[Tensor, "sample 3"]) -> Float[Tensor, "sample width"]:
         """The network's input; while poses are refined, of as many levels as have joined."""
-        return self.network.encode(points, self.poses.weights(self.config.levels) if self.poses else None)
+        return self.network.encode(
+            self.space.warp(points), self.poses.weights(self.config.levels) if self.poses else None
+        )
 
     def storage(self) -> dict[str, Stored]:
         """The table as whole numbers, the networks as halves; of the grid, marks alone are needed for pictures."""
@@ -242,11 +282,12 @@ class InstantNGP(RayMethod):
             **dict.fromkeys(networks, Stored("half")),
             "occupancy.density": Stored("nothing"),
             "occupancy.possible": Stored("nothing", fill=1.0),
+            **(self.unbounded.storage() if self.unbounded else {}),
         }
 
     def importance(self, camera: Camera) -> dict[str, Float[Tensor, " row"]]:
         """How much each entry of the table adds to one picture; see `components.sampling.importance`."""
-        (shares,) = importance(self, camera, self.network.encode, [self.network.table])
+        (shares,) = importance(self, camera, self._encoded, [self.network.table])
         return {"network.table": shares.mean(-1)}
 
     @torch.no_grad()

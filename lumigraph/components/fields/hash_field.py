@@ -10,22 +10,26 @@ from torch import Tensor, nn
 
 from ... import kernels
 from ...errors import LumigraphError
+from ..sampling.spaces import Box, Space
 from .activations import truncated_exp
 from .mlp import MLP
+
+WITHIN = 2  # times as fine as asked for, where coordinates are contracted: the box of interest is half as wide in them
 
 
 class HashField(nn.Module):
     """Density from position, colour from position, direction and a code (Müller 2022, figure 3 and section 5.4).
 
     config: names the numbers of levels, table and networks as `methods.instant_ngp.Config` does
-    reach:  half-size of the cube that the table covers, in scene units
+    space:  whose coordinates the table covers
+    reach:  half-size of the cube that a scene lies in as it is, where the space leaves it so
     code:   numbers beside the direction that colour depends on, such as a photograph's appearance
     """
 
-    def __init__(self, config: Any, reach: float, code: int = 0):
+    def __init__(self, config: Any, space: Space, reach: float, code: int = 0):
         super().__init__()
-        self.reach, self.bands = reach, config.sh_bands
-        finest = int(config.max_resolution * reach)
+        self.extent, finer = (reach, reach) if isinstance(space, Box) else (1.0, WITHIN)
+        self.bands, finest = config.sh_bands, int(config.max_resolution * finer)
         self.levels = kernels.HashLevels(
             config.levels, config.features_per_level, config.log2_hashmap_size, config.base_resolution, finest
         )
@@ -36,16 +40,16 @@ class HashField(nn.Module):
         self.colour_network = MLP(config.geometry_features + self.bands**2 + code, *hidden, 3)
 
     def encode(
-        self, points: Float[Tensor, "sample 3"], weights: Float[Tensor, " level"] | None = None
+        self, coordinates: Float[Tensor, "sample 3"], weights: Float[Tensor, " level"] | None = None
     ) -> Float[Tensor, "sample width"]:
         """Features of all levels, the coarsest first. weights: of the levels, where not all count fully"""
-        encoded = kernels.hash_encode(points * (0.5 / self.reach) + 0.5, self.table, self.levels)
+        encoded = kernels.hash_encode(coordinates * (0.5 / self.extent) + 0.5, self.table, self.levels)
         return encoded if weights is None else encoded * weights.repeat_interleave(self.levels.features)
 
     def density(
         self, encoded: Float[Tensor, "sample width"]
     ) -> tuple[Float[Tensor, " sample"], Float[Tensor, "sample geometry"]]:
-        """Density per scene unit, and the features of each place that the colour network takes."""
+        """Density per unit of the coordinates, and the features of each place that the colour network takes."""
         geometry = self.density_network(encoded)
         return truncated_exp(geometry[:, 0]), geometry
 

@@ -13,6 +13,7 @@ from ...rays import Rays
 from ...scene import Frame
 from ..sampling.coarse_to_fine import first_grid, keep_looking, lattice, stage
 from ..sampling.marching import FIRST_RAYS, rays_for, reached
+from ..sampling.spaces import Box
 from ..training.lazy_adam import LazyAdam
 from .activations import truncated_exp
 from .hash_field import HashField, side_by_side
@@ -36,7 +37,7 @@ class WildHash(WildField):
     def __init__(self, frame: Frame, config: Any):
         super().__init__()
         self.config, self.frame = config, frame
-        self.scene = HashField(config, frame.reach, config.appearance_code)
+        self.scene = HashField(config, Box(frame.bounds, frame.near), frame.reach, config.appearance_code)
         inputs = config.levels * config.features_per_level + config.transient_code
         self.transient = MLP(inputs, *[config.transient_width] * config.transient_layers, 5)
         self.occupancy = first_grid(config, frame.reach)

@@ -1,8 +1,8 @@
-"""Proposals: a coarse grid of density that says where along a ray a field is worth asking (Barron 2022, section 3.1)."""
+"""Proposals: a coarse grid of density says where along a ray a field is worth asking (Barron 2022, section 3.1)."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Float
@@ -18,8 +18,8 @@ from .spaces import NDC, Space
 FLAT = (1.5, 1.5, 0.5)  # a forward-facing capture has few depths and many pixels
 LITTLE = 1e-5  # weight that counts as none in the loss
 SLOPE = 10.0  # of annealing (Barron 2022, appendix)
-import os
-DENSE, THIN = float(os.environ.get("PDENSE", 3)), float(os.environ.get("PTHIN", -3))  # log density per unit of the coordinates, where points are known and elsewhere
+SHARP = 0.3  # share of the budget after which samples lie where the grid says
+DENSE, THIN = 3.0, -3.0  # log density per unit of the coordinates, where places on surfaces are known and elsewhere
 SPARE = 0.01  # share of samples that lie anywhere, however little was found there
 
 
@@ -54,16 +54,16 @@ class Proposal(nn.Module):
         self.sharpness = 1.0
 
     def anneal(self, progress: float) -> None:
-        """Begin with samples nearly everywhere, for nothing is known yet. progress: share of the budget spent"""
-        if getattr(self, 'known', False):
-            progress = 1.0
-        self.sharpness = SLOPE * progress / ((SLOPE - 1) * progress + 1)
+        """Begin with samples nearly everywhere, where nothing is known yet. progress: share of the budget spent"""
+        share = min(1.0, progress / SHARP)
+        self.sharpness = SLOPE * share / ((SLOPE - 1) * share + 1)
 
     def sample(self, rays: Rays, jitter: Float[Tensor, "ray 2"] | None = None) -> Proposed:
         """Intervals for a field, with gradients to the grid in the weights alone.
 
         jitter: in [0, 1), moves each ray's intervals, the grid's and the field's, by that share of one
         """
+        rays = replace(rays, origins=rays.origins.detach(), directions=rays.directions.detach())
         near, far = self.space.interval(rays)
         if jitter is None:
             jitter = rays.origins.new_full((len(rays), 2), 0.5)
@@ -89,7 +89,6 @@ class Proposal(nn.Module):
         found[(index[:, 0] * y + index[:, 1]) * z + index[:, 2]] = 1
         found = nn.functional.max_pool3d(found.view(1, x, y, z), 3, 1, 1)
         grid.values.copy_(torch.where(found.view(-1, 1) > 0, DENSE, THIN))
-        self.known = True
 
     def _density(self, points: Float[Tensor, "sample 3"]) -> Float[Tensor, " sample"]:
         return truncated_exp(self.grid(self.space.warp(points))[:, 0]) * self.space.stretch(points)
@@ -99,7 +98,7 @@ class Proposal(nn.Module):
         return Samples.rows(t[:, :-1], t[:, -1])
 
     def _distance(self, shares: Tensor, rays: Rays, near: Tensor, far: Tensor) -> Tensor:
-        """Even in normalised device coordinates; elsewhere even within a unit of the camera, and in disparity beyond."""
+        """Even in normalised device coordinates; elsewhere within a unit of the camera, and in disparity beyond."""
         if isinstance(self.space, NDC):
             return self.space.distance(shares, rays, near, far)
         first, last = (torch.where(t < 1, t, 2 - 1 / t.clamp_min(1))[:, None] for t in (near, far))

@@ -234,8 +234,10 @@ class Contraction(Space):
 
 def looped(points: Tensor) -> bool:
     """Whether a loop of `loops.py` may do: float32 on a CPU, where no gradient is asked for."""
-    return points.device.type == "cpu" and points.dtype == torch.float32 and not (
-        torch.is_grad_enabled() and points.requires_grad
+    return (
+        points.device.type == "cpu"
+        and points.dtype == torch.float32
+        and not (torch.is_grad_enabled() and points.requires_grad)
     )
 
 

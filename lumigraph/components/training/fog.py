@@ -7,18 +7,35 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ...kernels import distortion
-from ...rays import Samples
-from ...volume import weights_of
+from ...rays import Look, Samples
 
 
-def spread(samples: Samples, density: Float[Tensor, " sample"]) -> Float[Tensor, ""]:
-    """How far apart along its ray the weight of what a ray sees lies, mean of all rays (Barron 2022, eq. 15).
+def evened(t: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
+    """Distances t as t / (1 + t): what is near counts for more than what is far, and the horizon is at 1."""
+    return t / (1 + t)
 
-    Distances t count as t / (1 + t), so that a metre near the camera counts for more than one on the horizon.
-    """
-    start, end = (t / (1 + t) for t in (samples.t_start, samples.t_end))
-    weights = weights_of(samples, density)
+
+def spread(samples: Samples, weights: Float[Tensor, " sample"]) -> Float[Tensor, ""]:
+    """How far apart along its ray the weight of what a ray sees lies, mean of all rays (Barron 2022, eq. 15)."""
+    start, end = evened(samples.t_start), evened(samples.t_end)
     return distortion(weights, 0.5 * (start + end), end - start, samples.ray_starts).mean()
+
+
+def elsewhere(
+    samples: Samples,
+    weights: Float[Tensor, " sample"],
+    distance: Float[Tensor, " ray"],
+    margin: float,
+) -> Float[Tensor, ""]:
+    """The share of rays that does not end where something is known to be, mean of all rays: light that is stopped too
+    early or too late, or not at all (as Deng 2022 supervises depth; linear, for what is known may be wrong).
+
+    distance: along each ray to what is known to be there
+    margin:   how far off counts as there, in evened distances, beside half a sample's own length
+    """
+    start, end, known = evened(samples.t_start), evened(samples.t_end), evened(distance)[samples.ray_index]
+    there = (start - margin < known) & (known < end + margin)
+    return 1 - (weights * there).sum() / len(distance)
 
 
 class _Scaled(torch.autograd.Function):
@@ -33,12 +50,11 @@ class _Scaled(torch.autograd.Function):
         return None, *(g * scale.view(-1, *[1] * (g.ndim - 1)) for g in grads)
 
 
-def scaled_by_distance(
-    density: Float[Tensor, " sample"], rgb: Float[Tensor, "sample 3"], t: Float[Tensor, " sample"]
-) -> tuple[Float[Tensor, " sample"], Float[Tensor, "sample 3"]]:
-    """The same values, whose gradients count min(1, t^2) (Philip 2023, eq. 7).
+def scaled_by_distance(look: Look) -> Look:
+    """The same look, whose gradients count min(1, t^2) (Philip 2023, eq. 7).
 
-    As many samples of as many rays lie in a place near a camera as the inverse square of the distance says, and all of
-    one photograph: learning would be fastest where least is known.
+    As many rays pass a place near a camera as the inverse square of its distance says, and all of one photograph:
+    without this, learning would be fastest where least is known.
     """
-    return _Scaled.apply(t.square().clamp(max=1), density, rgb)
+    density, rgb = _Scaled.apply(look.samples.t.square().clamp(max=1), look.density, look.rgb)
+    return Look(look.name, look.samples, density, rgb)
