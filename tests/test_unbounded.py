@@ -23,7 +23,7 @@ def rays(count: int = 5) -> Rays:
 
 @pytest.fixture(params=SPACES)
 def proposal(request):
-    return Proposal(SPACES[request.param], 16, 32, 8)
+    return Proposal(SPACES[request.param], 48, 32, 8)
 
 
 def test_intervals_join_from_near_to_far(proposal):
@@ -45,7 +45,7 @@ def test_samples_lie_where_places_are_known(proposal):
     def nearest(samples: Samples) -> torch.Tensor:
         return (samples.t.view(5, 8) - 2.5).abs().sort(-1).values[:, :4].mean()
 
-    assert nearest(after) < 0.4 * nearest(before)
+    assert nearest(after) < 0.3 < nearest(before)
 
 
 def test_a_new_grid_looks_everywhere_whatever_it_holds(proposal):
@@ -69,7 +69,7 @@ def test_the_grid_learns_what_it_overlooked(proposal):
         adam.zero_grad()
         loss.backward()
         adam.step()
-        losses.append(float(loss))
+        losses.append(float(loss.detach()))
     assert losses[-1] < 0.2 * losses[0]
     assert ((proposal.sample(rays()).samples.t - 2.5).abs().view(5, 8).median(-1).values < 1.0).all()
 
@@ -109,21 +109,21 @@ def test_what_is_near_is_learnt_slowly():
 
 def test_places_found_by_sweeps_are_remembered_and_end_rays():
     scene = tiny.scene()
-    unbounded = Unbounded(SPACES["contracted"], OpenNumbers(proposal_samples=16, samples_per_ray=8))
+    unbounded = Unbounded(SPACES["contracted"], OpenNumbers(proposal_samples=32, samples_per_ray=16))
     generator = torch.Generator().manual_seed(0)
     unbounded.begin(scene, 1.0, generator)
     unbounded.seen, unbounded.seen_from = torch.tensor([[0.0, 0.0, 2.0]]), torch.zeros(1, 3)
     unbounded.before_step(0.1)
 
     def field(points, directions):
-        return 30 * torch.exp(-50 * (points.norm(dim=-1) - place).square()), points.new_ones(len(points), 3)
+        return 30.0 * (points.norm(dim=-1) > place), points.new_ones(len(points), 3)
 
     errors = []
     for place in (2.0, 1.0):
         look, proposed = unbounded.look(field, rays(), torch.rand(5, 2, generator=generator))
         terms = unbounded.terms(field, look, proposed, generator)
         errors.append(float(terms["depth"]))
-    assert errors[0] < errors[1]
+    assert errors[0] < 0.8 * errors[1]
     unbounded.before_step(0.9)
     assert "depth" not in unbounded.terms(field, look, proposed, generator)
 
