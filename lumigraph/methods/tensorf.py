@@ -60,6 +60,7 @@ class Config(OpenNumbers):
     step_ratio: Annotated[float, between(0.05, 8)] = 0.5  # of a sample to the distance of nodes, the code's
     rays_per_step: BatchSize = 4096  # section 5; at most
     samples_per_step: Annotated[int, between(64, 1 << 24)] = 1 << 20  # that these rays may meet in occupied cells
+    open_samples_per_step: Annotated[int, between(64, 1 << 24)] = 1 << 17  # the same where there is no bound
     transmittance_threshold: Share = 1e-4  # at which a ray is spent
     weight_threshold: Share = 1e-4  # weight of a sample below which it gets no colour, the code's
     l1_weight: NonNegative = 8e-5  # of objects, of density's factors, the code's
@@ -185,6 +186,7 @@ class TensoRF(RayMethod):
             feature_frequencies=0,
             rays_per_step=4096,
             samples_per_step=1 << 17,
+            open_samples_per_step=1 << 15,
             step_ratio=1.0,
             density_shift=-8.0,
             l1_weight=0.0,
@@ -233,7 +235,12 @@ class TensoRF(RayMethod):
     def rays_in_a_step(self, data: Scene) -> float:
         c = self.config
         samples = c.samples_per_ray if self.unbounded else SAMPLES_OF_A_RAY
-        return min(c.rays_per_step, c.samples_per_step / samples)
+        return min(c.rays_per_step, self._samples / samples)
+
+    @property
+    def _samples(self) -> int:
+        """That a step asks about, at most."""
+        return self.config.open_samples_per_step if self.unbounded else self.config.samples_per_step
 
     def begin(self, scene: Scene, seconds: float = math.inf) -> None:
         """Where photographs say what is transparent, the grid's box is that of the visual hull from the beginning."""
@@ -332,7 +339,7 @@ class TensoRF(RayMethod):
 
     def after_step(self, step: int) -> None:
         """Set the next step's number of rays so that they meet at most about `samples_per_step` samples."""
-        rays = rays_for(self.config.samples_per_step, int(self.rays_per_step), self.figures["samples"])
+        rays = rays_for(self._samples, int(self.rays_per_step), self.figures["samples"])
         self.rays_per_step.fill_(min(rays, self.config.rays_per_step))
 
     def field(
