@@ -23,6 +23,8 @@ from ..metrics.lpips import DEFINITION, Lpips
 from ..progress import counting, track
 from ..rays import Rendering
 from ..scene import Scene
+from .light import LIGHT, in_light
+from .light import PROTOCOL as LIGHT_PROTOCOL
 
 SHOWN = 8  # views of the contact sheet, evenly spread; the worst one joins them
 WARM_UP_SIZE = 32  # pixels; the first rendering compiles kernels, which is not the view's fault
@@ -137,17 +139,22 @@ def evaluate(
     with counting("Preparing to render"):
         compile_seconds = warm_up(method, scene.cameras[compared[0]])
     spread = set(evenly(compared, SHOWN))
+    light = (LIGHT,) if LIGHT in scene.layers else ()
     scores: list[ViewScore] = []
     shown: dict[str, tuple[Tensor, Rendering]] = {}
     worst: dict[str, tuple[Tensor, Rendering]] = {}
     for index in track(compared, "Comparing views", len(compared)):
-        shot = scene.photograph(index)
+        shot = scene.photograph(index, light)
         camera = method.refined(shot.camera)
         photograph = shot.before(scene.frame.background)
         begin = time.perf_counter()
         seen = method.render(camera).cpu()
         seconds = time.perf_counter() - begin
-        score = compare(scene.names[index], seen.rgb.clamp(0, 1), photograph, shot.mask, seconds, lpips)
+        rgb = seen.rgb.clamp(0, 1)
+        if light:
+            rgb, photograph = in_light(seen, shot.extra[LIGHT])
+            seen = replace(seen, rgb=rgb)
+        score = compare(scene.names[index], rgb, photograph, shot.mask, seconds, lpips)
         keep(score.name, seen)
         if index in spread:
             shown[score.name] = photograph, seen
@@ -197,7 +204,7 @@ def protocol(scene: Scene, split: str, compared: list[int], lpips: Lpips | None,
         "poses": "as the method refined them" if refined else "as captured",
         "controls": dict(method.told),
         "masked": any(scene.images.mask(i) is not None for i in compared),
-        "colours": "sRGB in [0, 1]; renderings clipped, not rounded",
+        "colours": LIGHT_PROTOCOL if LIGHT in scene.layers else "sRGB in [0, 1]; renderings clipped, not rounded",
         "psnr": "per view, then averaged",
         "ssim": "Wang 2004: Gaussian window 11x11, deviation 1.5, K1 0.01, K2 0.03, windows inside the image",
         "lpips": DEFINITION if lpips else None,

@@ -18,8 +18,9 @@ def resized(
     """Values (height, width) or (height, width, channels) at a size (width, height), in their own type.
 
     Light is averaged over each new pixel's area, over known values alone, and as much as they cover where a fourth
-    channel says so. A mosaic stays one (`in_phase`). All else is picked, never mixed: the value at the new pixel's centre, or if that is not known,
-    the known one nearest to it within the new pixel. Offsets in pixels follow the size.
+    channel says so. A mosaic stays one (`in_phase`). All else is picked, never mixed: the value at the new
+    pixel's centre, or if that is not known, the known one nearest to it within the new pixel. Offsets in pixels follow
+    the size.
     """
     height, width = values.shape[:2]
     if (width, height) == size:

@@ -48,7 +48,9 @@ def develop(files: Mapping[str, Path], folder: Path, track: Track) -> dict[str, 
 
     with ThreadPoolExecutor(AT_ONCE) as pool:
         try:
-            made = dict(zip(photos, track(pool.map(make, photos), "Developing raw photographs", len(photos)), strict=True))
+            made = dict(
+                zip(photos, track(pool.map(make, photos), "Developing raw photographs", len(photos)), strict=True)
+            )
         except BaseException:
             pool.shutdown(wait=False, cancel_futures=True)
             raise

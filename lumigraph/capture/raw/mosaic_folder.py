@@ -1,7 +1,7 @@
-"""A folder of mosaics: 16-bit grey PNG, or bare little-endian numbers (.raw), and mosaics.json, which says what they are.
+"""A folder of mosaics: 16-bit grey PNG, or bare little-endian numbers (.raw), and what mosaics.json says of them.
 
-    {"all": {"pattern": "RGGB", "black": 600, "white": 15520, "gains": [1.95, 1, 1.34], "width": 768, "height": 512},
-     "photographs": {"a.raw": {"exposure": 0.1}, "b.raw": {"exposure": 0.025}}}
+{"all": {"pattern": "RGGB", "black": 600, "white": 15520, "gains": [1.95, 1, 1.34], "width": 768, "height": 512},
+ "photographs": {"a.raw": {"exposure": 0.1}, "b.raw": {"exposure": 0.025}}}
 """
 
 from __future__ import annotations
@@ -76,7 +76,9 @@ def open_mosaic(path: Path) -> RawPhoto:
     size = size_of(path, about)
     black, white, pattern = (needed(about, name, path) for name in ("black", "white", "pattern"))
     if white <= black:
-        raise LumigraphError(f"{listing}: {path.name} has its white level {white:g} at or below black {black:g}; correct it")
+        raise LumigraphError(
+            f"{listing}: {path.name} has its white level {white:g} at or below black {black:g}; correct it"
+        )
     a, b, c, d = ("RGB".index(colour) for colour in pattern)
     return RawPhoto(
         path,
@@ -98,7 +100,9 @@ def needed(about: About, name: str, path: Path):
     """What has to be said of a mosaic."""
     value = getattr(about, name)
     if value is None:
-        raise LumigraphError(f"{path.parent / LISTING} does not say the {name} of {path.name}; add it there, or to \"all\"")
+        raise LumigraphError(
+            f'{path.parent / LISTING} does not say the {name} of {path.name}; add it there, or to "all"'
+        )
     return value
 
 
@@ -116,8 +120,8 @@ def size_of(path: Path, about: About) -> tuple[int, int]:
         there = path.stat().st_size
     if there != 2 * width * height:
         raise LumigraphError(
-            f"{path} has {there:,} bytes, and {width}x{height} pixels of 16 bits are {2 * width * height:,}; restore it, "
-            f"or correct {path.parent / LISTING}"
+            f"{path} has {there:,} bytes, and {width}x{height} pixels of 16 bits are {2 * width * height:,}; "
+            f"restore it, or correct {path.parent / LISTING}"
         )
     return width, height
 

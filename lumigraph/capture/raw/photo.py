@@ -12,7 +12,9 @@ from jaxtyping import Float, UInt8
 from ...srgb import srgb_from_linear
 from .demosaic import GREEN, Pattern, demosaiced, repeated
 
-XYZ_FROM_SRGB = np.array([[0.412453, 0.357580, 0.180423], [0.212671, 0.715160, 0.072169], [0.019334, 0.119193, 0.950227]])
+XYZ_FROM_SRGB = np.array(
+    [[0.412453, 0.357580, 0.180423], [0.212671, 0.715160, 0.072169], [0.019334, 0.119193, 0.950227]]
+)
 WHITE = 97  # percentile of the light that becomes white in a developed picture (Mildenhall 2022, supplement)
 
 
@@ -65,7 +67,9 @@ class RawPhoto:
 
 def srgb_from_camera(camera_from_xyz: Float[np.ndarray, "3 3"] | None) -> Float[np.ndarray, "3 3"]:
     """From white-balanced camera colours to linear sRGB, as DNG's specification and dcraw have it: rows of the way
-    there sum to 1, so that white stays white. camera_from_xyz: the file's colour matrix; None leaves colours as they are.
+    there sum to 1, so that white stays white.
+
+    camera_from_xyz: the file's colour matrix; None leaves colours as they are
     """
     if camera_from_xyz is None:
         return np.eye(3)

@@ -60,8 +60,8 @@ def with_raw(capture: Capture, folder: Path) -> Capture:
     told = list(capture.told)
     if lacking := [shot.name for shot in shots if shot.name in known and "exposure" not in shot.about]:
         told.append(
-            f"{len(lacking)} of {len(known)} raw files do not say how long they were exposed, such as that of {lacking[0]}; "
-            f"a method of raw photographs learns their brightness instead"
+            f"{len(lacking)} of {len(known)} raw files do not say how long they were exposed, such as that of "
+            f"{lacking[0]}; a method of raw photographs learns their brightness instead"
         )
     return replace(capture, shots=shots, told=told)
 
@@ -72,7 +72,9 @@ def raw_files(capture: Capture, folder: Path) -> dict[str, Developed]:
         files = read_json(folder / REMEMBERED, Remembered).photographs
     elif (folder / FOLDER).is_dir():
         by_stem = {path.stem: path for path in sorted((folder / FOLDER).iterdir()) if is_raw(path)}
-        return {s.name: Developed(str(by_stem[k])) for s in capture.shots if (k := PurePosixPath(s.name).stem) in by_stem}
+        return {
+            s.name: Developed(str(by_stem[k])) for s in capture.shots if (k := PurePosixPath(s.name).stem) in by_stem
+        }
     else:
         return {}
     found = {shot.name: [files[name] for name in inner_names(shot.name) if name in files] for shot in capture.shots}
@@ -83,14 +85,14 @@ def with_its_raw(shot: Shot, developed: Developed) -> Shot:
     path = Path(developed.file)
     if not exists(path):
         raise LumigraphError(
-            f"{path}, from which {shot.name} was developed, does not exist; bring it back, or delete {REMEMBERED} to do "
-            f"without raw light"
+            f"{path}, from which {shot.name} was developed, does not exist; bring it back, or delete {REMEMBERED} "
+            f"to do without raw light"
         )
     photo = open_raw(path)
     if shot.size is not None and not same_shape(photo.size, shot.size):
         raise LumigraphError(
-            f"{path} has {photo.size[0]}x{photo.size[1]} pixels, and {shot.name} {shot.size[0]}x{shot.size[1]}, which is "
-            f"another shape; restore what was developed from it"
+            f"{path} has {photo.size[0]}x{photo.size[1]} pixels, and {shot.name} {shot.size[0]}x{shot.size[1]}, "
+            f"which is another shape; restore what was developed from it"
         )
     about = facts(photo, developed.brightness)
     return replace(shot, planes=shot.planes | planes(photo, f"{path} {stat(path)}"), about=shot.about | about)

@@ -1,5 +1,5 @@
-"""The study at night: two lamps and the moon through the window, photographed raw by a hand-held camera at three shutter
-times, most of it in the dark. What is known besides is the light itself, without noise.
+"""The study at night: two lamps and the moon through the window, photographed raw by a hand-held camera at three
+shutter times, most of it in the dark. What is known besides is the light itself, without noise.
 """
 
 from __future__ import annotations
@@ -20,11 +20,11 @@ FIELD_OF_VIEW = 68.0  # degrees
 
 def world() -> World:
     lights = (
-        Lamp((-0.70, 0.30, 0.24), radius=0.03, power=0.12, colour=(1.0, 0.80, 0.56)),  # above the shade
-        Lamp((0.22, 0.62, -0.20), radius=0.02, power=0.02, colour=(1.0, 0.62, 0.34)),  # a candle on the sofa's arm
-        Lamp((0.80, 0.08, 0.10), radius=0.05, power=0.012, colour=(0.62, 0.76, 1.0)),  # the moon, through the window
+        Lamp((-0.70, 0.30, 0.24), radius=0.03, power=0.25, colour=(1.0, 0.80, 0.56)),  # above the shade
+        Lamp((0.10, 0.30, -0.10), radius=0.02, power=0.012, colour=(1.0, 0.62, 0.34)),  # a candle before the sofa
+        Lamp((0.80, 0.08, 0.10), radius=0.05, power=0.05, colour=(0.62, 0.76, 1.0)),  # the moon, through the window
     )
-    sky = Sky((0.60, 0.70, 0.95), (0.70, 0.70, 0.80), (0.55, 0.45, 0.38), light=0.015, visible=True, reach=0.15)
+    sky = Sky((0.60, 0.70, 0.95), (0.70, 0.70, 0.80), (0.55, 0.45, 0.38), light=0.03, visible=True, reach=0.15)
     return replace(room.world(), lights=lights, sky=sky)
 
 
