@@ -19,7 +19,6 @@ from ..camera import Camera
 from ..components.fields.activations import truncated_exp
 from ..components.fields.development import CONTROLS, decoded, exposed, toned
 from ..components.sampling.thin_lens import through_lens
-from ..components.training.photometric import backdrop
 from ..controls import Control
 from ..errors import LumigraphWarning
 from ..method import RayMethod
@@ -81,6 +80,7 @@ OF_THE_FIELD = {x.name for x in fields(NgpConfig)} & {x.name for x in fields(Con
 LENS_PLACES = 24  # through which a picture with a shallow focus is seen
 OPENED = 0.06  # diameter of the lens, as a share of the distance, where a focus is told and no aperture
 WIDEST, FARTHEST = 0.5, 8.0  # aperture in scene units; focus in reaches
+GROSS = 1.0  # relative error from which on the loss is linear
 WHITE = 0.97  # quantile of the light that is shown as white, where nobody said how bright to develop it
 GLANCE = 1 << 14  # pixels that tell how much light there is
 
@@ -91,6 +91,8 @@ class LightField(Field):
 
     level: log of the light that the scene has on average, where the network begins
     """
+
+    level: Tensor
 
     def __init__(self, config: NgpConfig, reach: float):
         super().__init__(config, reach)
@@ -174,7 +176,9 @@ class RawNeRF(RayMethod):
         light, measured = self.measured(
             scene.sample_rays(GLANCE, self.random(0), layers=layers_of(scene)).to(self.device)
         )
-        self.marcher.network.level.copy_(light[measured].mean().clamp_min(1e-6).log())
+        network = self.marcher.network
+        assert isinstance(network, LightField)
+        network.level.copy_(light[measured].mean().clamp_min(1e-6).log())
         self.brightness.copy_(self.brightness_of(scene, light, measured))
 
     def brightness_of(
@@ -196,13 +200,8 @@ class RawNeRF(RayMethod):
     def rays_in_a_step(self, data: Scene) -> float:
         return self.marcher.rays_in_a_step(data)
 
-    def measured(
-        self, batch: Batch, background: Float[Tensor, "#ray 3"] | None = None
-    ) -> tuple[Float[Tensor, "ray 3"], Bool[Tensor, "ray 3"]]:
-        """The light of a batch's pixels as it was exposed, and which of its colours were measured.
-
-        background: linear, behind photographs that have alpha
-        """
+    def measured(self, batch: Batch) -> tuple[Float[Tensor, "ray 3"], Bool[Tensor, "ray 3"]]:
+        """The light of a batch's pixels as it was exposed, and which of its colours were measured."""
         if "mosaic" in batch.extra:
             light = batch.extra["mosaic"][:, None].expand(-1, 3)
             behind = batch.extra["filter"][:, None] == torch.arange(3, device=light.device)
@@ -210,10 +209,7 @@ class RawNeRF(RayMethod):
         if "raw" in batch.extra:
             light = batch.extra["raw"][:, :3]
             return light, light.isfinite()
-        light = decoded(batch.rgb)
-        if batch.alpha is not None:
-            behind = self.background if background is None else background
-            light = torch.lerp(behind.expand_as(light), light, batch.alpha[:, None])
+        light = decoded(batch.before(self.background))
         return light, torch.ones_like(light, dtype=torch.bool)
 
     # Learning
@@ -236,19 +232,19 @@ class RawNeRF(RayMethod):
 
     def loss(self, batch: Batch, step: int) -> dict[str, Tensor]:
         """The squared error relative to what is shown (eq. 4): that of a tone curve with slope 1 / (y + epsilon)."""
-        generator = self.random(step)
-        jitter = torch.rand(len(batch), generator=generator).to(self.device)
-        behind = decoded(backdrop(batch, self.background, generator))
-        measured, known = self.measured(batch, behind)
+        jitter = torch.rand(len(batch), generator=self.random(step)).to(self.device)
+        measured, known = self.measured(batch)
         rays = self.marcher.poses(batch.rays) if self.marcher.poses else batch.rays
         seen = self.light(rays, jitter, spread=True)
-        shown = seen.rgb * self.scale(batch.rays) + (1 - seen.opacity)[:, None] * behind
+        shown = seen.rgb * self.scale(batch.rays) + (1 - seen.opacity)[:, None] * decoded(self.background)
         shown = torch.where(measured >= 1, shown.clamp(max=1), shown)  # a full sensor says: at least so much
         error = (shown - measured) / (shown.detach() + self.config.epsilon)
         self.figures |= self.marcher.figures
         first, second = seen.extra["moments"].unbind(-1)
         variance = (second - first.square() / seen.opacity.clamp_min(1e-3)).mean()
-        return {"relative": error[known].square().mean(), "variance": self.config.variance_weight * variance}
+        # Gross errors count linearly: noise is far below, and what is dark by mistake does not outweigh all else.
+        relative = 2 * nn.functional.huber_loss(error[known], torch.zeros_like(error[known]), delta=GROSS)
+        return {"relative": relative, "variance": self.config.variance_weight * variance}
 
     def optimizers(self) -> list[torch.optim.Optimizer]:
         optimizers = self.marcher.optimizers()

@@ -55,7 +55,7 @@ def develop(files: Mapping[str, Path], folder: Path, track: Track) -> dict[str, 
             pool.shutdown(wait=False, cancel_futures=True)
             raise
     write_json(record, Remembered({k: v for k, v in made.items() if isinstance(v, Developed)}).to_json(), ours=True)
-    return {name: made.get(name, opened[name]) for name in files}  # type: ignore[misc]
+    return {name: made.get(name, opened[name]) for name in files}
 
 
 def open_or_why(path: Path) -> RawPhoto | str:

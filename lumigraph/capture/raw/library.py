@@ -44,16 +44,15 @@ def open_file(path: Path) -> RawPhoto:
         gains = np.array(raw.camera_whitebalance[:3], np.float64)
         if not (gains > 0).all():  # the camera did not judge
             gains = np.array(raw.daylight_whitebalance[:3], np.float64)
-        matrix = np.array(raw.rgb_xyz_matrix[:3], np.float64)
+        matrix = colours_of(raw)
         about, pattern = raw.other, turned_pattern(bayer(raw, path), (width, height), turns)
-        known = bool(np.isfinite(matrix).all() and abs(np.linalg.det(matrix)) > 1e-6)
     light = about.shutter_speed * (about.iso_speed or 100) / 100 / (about.aperture or 1) ** 2
     return RawPhoto(
         path,
         (height, width) if turns % 2 else (width, height),
         pattern,
         tuple((gains / gains[1]).tolist()) if (gains > 0).all() else (1.0, 1.0, 1.0),
-        srgb_from_camera(matrix if known else None),
+        matrix,
         light if np.isfinite(light) and light > 0 else None,
         partial(read_light, path, turns),
     )
@@ -66,6 +65,15 @@ def read_light(path: Path, turns: int) -> np.ndarray:
         black = np.array(raw.black_level_per_channel, np.float32)[raw.raw_colors_visible]
         light = (raw.raw_image_visible - black) / (np.float32(raw.white_level) - black)
     return np.ascontiguousarray(np.rot90(light, turns), np.float32)
+
+
+def colours_of(raw: Any) -> np.ndarray:
+    """The way from white-balanced camera colours to linear sRGB: as the file says, else as LibRaw knows the camera."""
+    own = np.array(raw.color_matrix, np.float64)[:3, :3]
+    if np.allclose(own.sum(-1), 1, atol=0.01):
+        return own
+    known = np.array(raw.rgb_xyz_matrix[:3], np.float64)
+    return srgb_from_camera(known if np.isfinite(known).all() and abs(np.linalg.det(known)) > 1e-6 else None)
 
 
 def bayer(raw: Any, path: Path) -> Pattern:
