@@ -30,7 +30,7 @@ def night():
 
 @pytest.fixture(scope="module")
 def begun(night):
-    method = RawNeRF(night.frame, RawNeRF.smallest())
+    method = RawNeRF(night.frame, replace(RawNeRF.smallest(), epsilon=1e-3))
     method.begin(night)
     return method
 
@@ -96,7 +96,7 @@ def test_it_begins_at_the_light_there_is_and_develops_as_the_camera_did(night, b
 
 
 def test_it_learns_night_from_noise(night):
-    method = RawNeRF(night.frame, replace(RawNeRF.smallest(), refine_cameras=False))
+    method = RawNeRF(night.frame, replace(RawNeRF.smallest(), refine_cameras=False, epsilon=1e-3))
     fresh = evaluate(method, night).psnr
     fit(method, night, steps=60, show=False, rehearsal=False)
     found = evaluate(method, night)

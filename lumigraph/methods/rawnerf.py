@@ -141,7 +141,8 @@ class RawNeRF(RayMethod):
 
     @classmethod
     def smallest(cls) -> Any:
-        return Config.around(InstantNGP.smallest())
+        """Instant-NGP's, with an error that is less relative: in a few steps its gross beginnings fall, and no more."""
+        return Config.around(InstantNGP.smallest(), epsilon=0.1)
 
     @classmethod
     def further_bytes(cls, frame: Frame, config: Any, learning: bool) -> int:
@@ -173,24 +174,24 @@ class RawNeRF(RayMethod):
         if "white_balance" in scene.about:
             self.gains.copy_(scene.about["white_balance"][train].nanmedian(0).values)
             self.srgb_from_camera.copy_(scene.about["srgb_from_camera"][train].nanmedian(0).values)
-        light, measured = self.measured(
-            scene.sample_rays(GLANCE, self.random(0), layers=layers_of(scene)).to(self.device)
-        )
+        glance = scene.sample_rays(GLANCE, self.random(0), layers=layers_of(scene)).to(self.device)
+        light, measured = self.measured(glance)
+        taken = self.exposure[glance.rays.image_index]
         network = self.marcher.network
         assert isinstance(network, LightField)
-        network.level.copy_(light[measured].mean().clamp_min(1e-6).log())
-        self.brightness.copy_(self.brightness_of(scene, light, measured))
+        network.level.copy_((light[measured].mean() / taken.mean()).clamp_min(1e-6).log())
+        self.brightness.copy_(self.brightness_of(scene, light[measured[:, 1] & (taken == 1), 1]))
 
-    def brightness_of(
-        self, scene: Scene, light: Float[Tensor, "ray 3"], measured: Bool[Tensor, "ray 3"]
-    ) -> Float[Tensor, ""]:
+    def brightness_of(self, scene: Scene, green: Float[Tensor, " pixel"]) -> Float[Tensor, ""]:
         """What linear light is multiplied by when it is developed: as the photographs were, else so that little of it
-        is beyond white."""
+        is beyond white.
+
+        green: light of some pixels in the longest exposure
+        """
         exposure = self.exposure.cpu()[scene.splits["train"]]
         if "brightness" in scene.about:
             return (scene.about["brightness"][scene.splits["train"]] * exposure).nanmedian()
         if "mosaic" in scene.layers:
-            green = light[:, 1][measured[:, 1]]
             return 1 / (green.quantile(WHITE) * self.gains[1]).clamp_min(1e-6)
         return exposure.median()
 
