@@ -8,14 +8,10 @@ import torch
 
 from lumigraph import kernels
 from lumigraph.components.fields.sparse_voxels import SparseVoxels
-from lumigraph.components.sampling.occupancy import OccupancyGrid
-from lumigraph.components.sampling.spaces import NDC
 from lumigraph.components.training.lazy_rmsprop import LazyRMSprop
 from lumigraph.errors import LumigraphError
 from lumigraph.kernels import Nodes
 from lumigraph.methods.plenoxels import Config, Plenoxels, cauchy, undecided
-from lumigraph.rays import Rays
-from lumigraph.scene import Forward
 
 
 def random(*shape: int, seed: int = 0) -> torch.Tensor:

@@ -25,6 +25,8 @@ from ..rays import Rendering
 from ..scene import Photograph, Scene
 from . import halves
 from .held_out_poses import PROTOCOL, held_out_poses, pose_scores
+from .light import LIGHT, in_light
+from .light import PROTOCOL as LIGHT_PROTOCOL
 
 SHOWN = 8  # views of the contact sheet, evenly spread; the worst one joins them
 CLEAN = "clean"  # the layer of photographs in their own light without whoever passes by
@@ -151,7 +153,7 @@ def evaluate(
     shown: dict[str, tuple[Tensor, Rendering]] = {}
     worst: dict[str, tuple[Tensor, Rendering]] = {}
     for index in track(compared, "Comparing views", len(compared)):
-        shot = scene.photograph(index, [CLEAN] if CLEAN in scene.layers else [])
+        shot = scene.photograph(index, [name for name in (CLEAN, LIGHT) if name in scene.layers])
         camera = found.camera(index) if found else method.refined(shot.camera)
         photograph = shot.before(scene.frame.background)
         told = method.given(halves.left_half(shot)) if by_halves else method
@@ -159,7 +161,11 @@ def evaluate(
         seen = told.render(camera).cpu()
         seconds = time.perf_counter() - begin
         columns = halves.right_half(shot) if by_halves else slice(None)
-        score = compare(scene.names[index], seen.rgb.clamp(0, 1), shot, photograph, columns, seconds, lpips)
+        rgb = seen.rgb.clamp(0, 1)
+        if LIGHT in shot.extra:
+            rgb, photograph = in_light(seen, shot.extra[LIGHT])
+            seen = replace(seen, rgb=rgb)
+        score = compare(scene.names[index], rgb, shot, photograph, columns, seconds, lpips)
         keep(score.name, seen)
         if index in spread:
             shown[score.name] = photograph, seen
@@ -224,7 +230,7 @@ def protocol(scene: Scene, split: str, compared: list[int], lpips: Lpips | None,
         "controls": dict(method.told),
         "halves": halves.DEFINITION if halves.judged_by_halves(method) else None,
         "masked": any(scene.images.mask(i) is not None for i in compared),
-        "colours": "sRGB in [0, 1]; renderings clipped, not rounded",
+        "colours": LIGHT_PROTOCOL if LIGHT in scene.layers else "sRGB in [0, 1]; renderings clipped, not rounded",
         "psnr": "per view, then averaged",
         "ssim": "Wang 2004: Gaussian window 11x11, deviation 1.5, K1 0.01, K2 0.03, windows inside the image",
         "lpips": DEFINITION if lpips else None,

@@ -201,17 +201,20 @@ class InstantNGP(RayMethod):
         self.figures |= {"rays": len(rays), "samples": asked, "visible_samples": len(samples)}
         return Look("samples", samples, density, rgb)
 
+    def look_to_learn(self, rays: Rays, generator: torch.Generator) -> tuple[Look, dict[str, Tensor]]:
+        """A step's look along rays, at random places, and what it costs beside colours, by name."""
+        jitter = torch.rand(len(rays), 2 if self.unbounded else 1, generator=generator).to(self.device)
+        if not self.unbounded:
+            return self._march(rays, jitter[:, 0]), {}
+        look, proposed = self.unbounded.look(self.field, rays, jitter)
+        self.figures |= {"rays": len(rays), "samples": len(look.samples)}
+        return look, self.unbounded.terms(self.field, look, proposed, generator)
+
     def loss(self, batch: Batch, step: int) -> dict[str, Tensor]:
-        generator, terms = self.random(step), dict[str, Tensor]()
-        jitter = torch.rand(len(batch), 2 if self.unbounded else 1, generator=generator).to(self.device)
-        background = backdrop(batch, self.background, generator, opaque=self.unbounded is not None)
+        generator = self.random(step)
         rays = self.poses(batch.rays) if self.poses else batch.rays
-        if self.unbounded:
-            look, proposed = self.unbounded.look(self.field, rays, jitter)
-            terms = self.unbounded.terms(self.field, look, proposed, generator)
-            self.figures |= {"rays": len(rays), "samples": len(look.samples)}
-        else:
-            look = self._march(rays, jitter[:, 0])
+        look, terms = self.look_to_learn(rays, generator)
+        background = backdrop(batch, self.background, generator, opaque=self.unbounded is not None)
         rendering = composite(look.samples, look.density, look.rgb, background)
         residual, self.figures["mse"] = residuals(rendering, batch, background, self.exposure)
         # Divided by delta, so that the linear part has slope 1.
