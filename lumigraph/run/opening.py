@@ -14,8 +14,7 @@ from .splat_file import SplatFile
 
 
 def open_any(path: Path | str, within: tuple[Path, ...] = ()) -> Opened:
-    """What lies at a path: a run's folder, a splat file, one of `exchange.SUFFIXES` or a folder of SOG, or a composition
-    (.json).
+    """What lies at a path: a run's folder, a splat file (`exchange.SUFFIXES`, a folder of SOG), a composition (.json).
 
     within: compositions that it is opened as a part of
     Raises LumigraphError, in one sentence, for anything else.
