@@ -21,6 +21,7 @@ from jaxtyping import Float
 from ..errors import LumigraphError
 from ..files import write_bytes
 from ..gaussians import Gaussians
+from ..geometry import to_matrix
 from ..kernels.spherical_harmonics import K00
 from ..srgb import linear_from_srgb
 from . import gltf
@@ -98,14 +99,10 @@ def _matrix(file: gltf.File, node: gltf.Node) -> Float[np.ndarray, "4 4"]:
         raise LumigraphError(f"{file.path} has a node whose place is no place; export it again")
     if node.matrix is not None:
         return np.array(node.matrix).reshape(4, 4).T
-    x, y, z, w = unit(np.array([node.rotation]))[0] if any(node.rotation) else (0.0, 0.0, 0.0, 1.0)
-    turn = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
+    x, y, z, w = node.rotation
+    turn = to_matrix(torch.tensor([[w, x, y, z]], dtype=torch.float64))[0].numpy()
     matrix = np.eye(4)
-    matrix[:3, :3] = np.array(turn) * np.array(node.scale)
+    matrix[:3, :3] = turn * np.array(node.scale)
     matrix[:3, 3] = node.translation
     return matrix
 

@@ -165,8 +165,8 @@ class File:
         start = at + CHUNK.size
         if found != name or start + size > len(data):
             raise LumigraphError(
-                f"{self.path} is damaged, for its {name[:4].strip(bytes(1)).decode()} is cut or not where it should be; "
-                "copy or download it again"
+                f"{self.path} is damaged, for its {name[:4].strip(bytes(1)).decode()} is cut or not where "
+                "it should be; copy or download it again"
             )
         return data[start : start + size], start + size
 

@@ -27,7 +27,7 @@ import msgspec
 import numpy as np
 import torch
 from jaxtyping import Float, UInt8
-from PIL import Image
+from PIL import Image, UnidentifiedImageError
 
 from ..errors import LumigraphError
 from ..files import from_json, replacing_folder, write_bytes
@@ -232,9 +232,8 @@ class _Pictures:
                 check_room(path, self.count, self.harmonics, self.bundle.size, 4 * pixels)
                 return np.asarray(image.convert("RGBA"))
         except (OSError, ValueError, SyntaxError, EOFError, Image.DecompressionBombError) as fault:
-            raise LumigraphError(
-                f"{path}: {name} cannot be read as a picture ({fault}); copy or download it again"
-            ) from fault
+            why = "it does not begin like one" if isinstance(fault, UnidentifiedImageError) else fault
+            raise LumigraphError(f"{path}: {name} cannot be read as a picture ({why}); get it again") from fault
 
     def means(self, about: Means | OldMeans) -> Float[np.ndarray, "gaussian 3"]:
         low, high = (self.of(name)[:, :3].astype(np.int64) for name in about.files)
