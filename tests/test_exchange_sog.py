@@ -40,11 +40,11 @@ def test_it_keeps_what_it_promises(tmp_path, degree, count):
     assert ((found.means - cloud.means).abs() <= 1.01 * step * (1 + cloud.means.abs()) + 1e-6).all()
     assert components_apart(found, cloud) <= 3 * 0.0028  # the largest is worked out from the others
     assert opacity_apart(found, cloud) <= 1 / 510 + 1e-6
-    assert apart(found.log_scales, cloud.log_scales) <= 6 / 256
-    assert C0 * apart(found.harmonics[:, 0], cloud.harmonics[:, 0]) <= 1 / 256
+    assert apart(found.log_scales, cloud.log_scales) <= 6 / 150  # they lie between 6 apart
+    assert C0 * apart(found.harmonics[:, 0], cloud.harmonics[:, 0]) <= 1 / 150
     if degree:
         off = (found.harmonics[:, 1:] - cloud.harmonics[:, 1:]).square().mean().sqrt()
-        assert off < (0.004 if count <= 1024 else 0.5 * 1.8 / math.sqrt(12))  # noise is what a palette holds worst
+        assert off < (0.004 if count <= 1024 else 0.7 * 1.8 / math.sqrt(12))  # noise is what a palette holds worst
 
 
 def test_it_looks_the_same(tmp_path):
@@ -139,8 +139,8 @@ def test_a_folder_says_the_same(tmp_path, capsys, monkeypatch):
     assert (Path("new") / "holiday.jpg").exists() and "holiday.jpg" in capsys.readouterr().err
 
 
-def bent(tmp_path: Path, **changes: object) -> str:
-    """What is said of a file whose meta.json differs: names of values, as a path with underscores for dots."""
+def bent(path: Path, **changes: object) -> Path:
+    """A file whose meta.json says other values; shN_count is that of the palette."""
     files = by_hand()
     meta = json.loads(files["meta.json"])
     for name, value in changes.items():
@@ -149,35 +149,39 @@ def bent(tmp_path: Path, **changes: object) -> str:
         for part in above:
             place = place[part]
         place[last] = value
-    files["meta.json"] = json.dumps(meta).encode()
-    (tmp_path / "a.sog").write_bytes(zipped(files))
-    return refusal(tmp_path / "a.sog")
+    path.write_bytes(zipped(files | {"meta.json": json.dumps(meta).encode()}))
+    return path
 
 
-def test_what_meta_says_is_held_against_what_is_there(tmp_path):
-    assert "3 are needed" in bent(tmp_path, count=3)
-    assert "promises 100,000,000 Gaussians" in bent(tmp_path, count=10**8)
-    assert "no Gaussians" in bent(tmp_path, count=0)
-    assert "count" in with_typed(tmp_path, count=-1) and "count" in with_typed(tmp_path, count=10**30)
-    assert "version 3" in bent(tmp_path, version=3)
-    assert "entries that l.webp names" in bent(tmp_path, shN_count=63)
-    assert "entries that l.webp names" in bent(tmp_path, shN_bands=2)
-    assert "lacks the file elsewhere.webp" in bent(tmp_path, scales_files=["elsewhere.webp"])
-    assert "lacks the file ../a.webp" in bent(tmp_path, quats_files=["../a.webp"])
-    assert "no rotations" in bent(tmp_path, quats_files=["c.webp"])
-    for wrong in ({"scales_codebook": [0.0] * 255}, {"means_mins": [0, 0]}, {"means_files": ["a"]}, {"means": 3}):
-        with_typed(tmp_path, **wrong)
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"count": 3}, "has 2 pixels where 3 are needed"),
+        ({"count": 10**8}, "promises 100,000,000 Gaussians"),
+        ({"count": 0}, "holds no Gaussians"),
+        ({"version": 3}, "version 3"),
+        ({"shN_count": 63}, "entries that l.webp names"),
+        ({"shN_bands": 2}, "entries that l.webp names"),
+        ({"scales_files": ["elsewhere.webp"]}, "lacks the file elsewhere.webp"),
+        ({"quats_files": ["../a.webp"]}, "lacks the file ../a.webp"),
+        ({"quats_files": ["c.webp"]}, "no rotations"),
+    ],
+    ids=str,
+)
+def test_what_meta_says_is_held_against_what_is_there(tmp_path, change, said):
+    assert said in refusal(bent(tmp_path / "a.sog", **change))
 
 
-def with_typed(tmp_path: Path, **changes: object) -> str:
-    """`bent`, where what is said names the value that is wrong."""
-    try:
-        return bent(tmp_path, **changes)
-    except AssertionError:
-        with pytest.raises(LumigraphError) as caught:
-            read_gaussians(tmp_path / "a.sog")
-        assert "meta.json" in str(caught.value) and "\n" not in str(caught.value)
-        return str(caught.value)
+@pytest.mark.parametrize(
+    "change",
+    [{"count": -1}, {"count": 10**30}, {"scales_codebook": [0.0] * 255}, {"means_mins": [0, 0]}, {"means_files": ["a"]}]
+    + [{"means": 3}, {"quats": None}, {"means_maxs": ["a", 0, 0]}],
+    ids=lambda change: next(iter(change)),
+)
+def test_what_meta_says_is_of_the_right_kind(tmp_path, change):
+    with pytest.raises(LumigraphError, match=r"meta\.json .* does not hold what it should") as caught:
+        read_gaussians(bent(tmp_path / "a.sog", **change))
+    assert next(iter(change)).replace("_", ".") in str(caught.value)
 
 
 @pytest.mark.parametrize("name", [name for name in by_hand()])

@@ -11,6 +11,7 @@ word, is in the primitive's extras. A Gaussian takes 64 + 12 (K - 1) bytes.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -21,7 +22,7 @@ from jaxtyping import Float
 from ..errors import LumigraphError
 from ..files import write_bytes
 from ..gaussians import Gaussians
-from ..geometry import to_matrix
+from ..geometry import is_similarity, to_matrix
 from ..kernels.spherical_harmonics import K00
 from ..srgb import linear_from_srgb
 from . import gltf
@@ -37,7 +38,6 @@ KNOWN = {EXTENSION, "KHR_mesh_quantization"}
 POINTS = 0
 ANTIALIASED = "antialiased"
 LONGEST = 1 << 24  # bytes of JSON
-SKEW = 1e-3  # by which a node's matrix may differ from a similarity
 
 
 def recognises(path: Path) -> bool:
@@ -119,13 +119,10 @@ def _bands(file: gltf.File, primitive: gltf.Primitive) -> int:
         )
     if inner := said.get("extensions"):
         raise LumigraphError(f"{file.path} packs its Gaussians by {', '.join(inner)}; export it without compression")
-    missing = [x for x in ("POSITION", ROTATION, SCALE, OPACITY, HARMONICS[0]) if x not in primitive.attributes]
-    here = sum(name in primitive.attributes for name in HARMONICS)
-    bands = next((bands for bands in range(1, 5) if here == bands**2), 0)
-    missing += [name for name in HARMONICS[: max(bands**2, 1)] if name not in primitive.attributes]
-    if missing or not bands:
-        what = ", ".join(dict.fromkeys(missing)) or "some of a degree's harmonics"
-        raise LumigraphError(f"{file.path} lacks {what}; export it again")
+    bands = 1 + math.isqrt(max((i for i, name in enumerate(HARMONICS) if name in primitive.attributes), default=0))
+    wanted = ["POSITION", ROTATION, SCALE, OPACITY, *HARMONICS[: bands**2]]
+    if missing := [name for name in wanted if name not in primitive.attributes]:
+        raise LumigraphError(f"{file.path} lacks {', '.join(missing)}; export it again")
     return bands
 
 
@@ -157,8 +154,10 @@ def _cloud(file: gltf.File, primitive: gltf.Primitive, most: int, matrix: Float[
         isinstance(primitive.extras, dict) and primitive.extras.get(ANTIALIASED) is True,
     )
     if not np.array_equal(matrix, np.eye(4)):
-        _check_similarity(file.path, matrix)
-        found = found.transformed(torch.from_numpy(matrix))
+        place = torch.from_numpy(matrix)
+        if not is_similarity(place):
+            raise LumigraphError(f"{file.path} stretches or mirrors its Gaussians by a node; apply its place to them")
+        found = found.transformed(place)
     return cloud(
         array(found.means) * TURN_MEAN,
         array(found.quaternions) * TURN_ROTATION,
@@ -167,17 +166,6 @@ def _cloud(file: gltf.File, primitive: gltf.Primitive, most: int, matrix: Float[
         array(found.harmonics) * TURN_HARMONICS[: most**2],
         found.antialiased,
     )
-
-
-def _check_similarity(path: Path, matrix: Float[np.ndarray, "4 4"]) -> None:
-    with np.errstate(over="ignore", invalid="ignore"):
-        square = matrix[:3, :3].T @ matrix[:3, :3]
-        size = np.trace(square) / 3
-        even = np.abs(square - size * np.eye(3)).max() <= SKEW * size
-    if not (even and size > 0 and np.linalg.det(matrix[:3, :3]) > 0 and np.array_equal(matrix[3], [0, 0, 0, 1])):
-        raise LumigraphError(
-            f"{path} stretches or mirrors its Gaussians by a node, which they cannot be; apply the node's place to them"
-        )
 
 
 def _joined(parts: list[Gaussians]) -> Gaussians:
