@@ -179,13 +179,13 @@ def test_what_is_short_or_not_known_is_said_in_a_sentence(tmp_path):
     assert "promises 6 rows" in said('"count": 5', '"count": 6')
     assert "lacks KHR_gaussian_splatting:SCALE" in said(":SCALE", ":SIZE")
     assert "lacks KHR_gaussian_splatting:SH_DEGREE_1_COEF_1" in said("SH_DEGREE_1_COEF_1", "SH_DEGREE_9_COEF_1")
-    assert "kernel box" in said('"ellipse"', '"box"')
-    assert "colours lin_rec709_display" in said("srgb_rec709_display", "lin_rec709_display")
+    assert "kernel 'box'" in said('"ellipse"', '"box"')
+    assert "colours 'lin_rec709_display'" in said("srgb_rec709_display", "lin_rec709_display")
     assert "mode 4" in said('"mode": 0', '"mode": 4')
-    assert "needs EXT_meshopt_compression" in said(
+    assert "needs 'EXT_meshopt_compression'" in said(
         '"asset"', '"extensionsRequired": ["EXT_meshopt_compression"], "asset"'
     )
-    assert "packs its Gaussians by KHR_x" in said('"kernel"', '"extensions": {"KHR_x": {}}, "kernel"')
+    assert "packs its Gaussians by 'KHR_x'" in said('"kernel"', '"extensions": {"KHR_x": {}}, "kernel"')
     assert "leads to other files" in said('"buffers": [{', '"buffers": [{"uri": "b.bin", ')
     assert "is of a kind" in said('"VEC4"', '"MAT4"')
     assert "names mesh 7" in said('"nodes": [{"mesh": 0}]', '"nodes": [{"mesh": 7}]')

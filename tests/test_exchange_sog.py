@@ -160,10 +160,10 @@ def bent(path: Path, **changes: object) -> Path:
         ({"count": 10**8}, "promises 100,000,000 Gaussians"),
         ({"count": 0}, "holds no Gaussians"),
         ({"version": 3}, "version 3"),
-        ({"shN_count": 63}, "entries that l.webp names"),
-        ({"shN_bands": 2}, "entries that l.webp names"),
-        ({"scales_files": ["elsewhere.webp"]}, "lacks the file elsewhere.webp"),
-        ({"quats_files": ["../a.webp"]}, "lacks the file ../a.webp"),
+        ({"shN_count": 63}, "entries that 'l.webp' names"),
+        ({"shN_bands": 2}, "entries that 'l.webp' names"),
+        ({"scales_files": ["elsewhere.webp"]}, "lacks the file 'elsewhere.webp'"),
+        ({"quats_files": ["../a.webp"]}, "lacks the file '../a.webp'"),
         ({"quats_files": ["c.webp"]}, "no rotations"),
     ],
     ids=str,
@@ -188,7 +188,7 @@ def test_what_meta_says_is_of_the_right_kind(tmp_path, change):
 def test_a_picture_that_is_missing_or_cut(tmp_path, name):
     files = by_hand()
     (tmp_path / "a.sog").write_bytes(zipped({key: data for key, data in files.items() if key != name}))
-    assert f"lacks the file {name}" in refusal(tmp_path / "a.sog")
+    assert f"lacks the file {name!r}" in refusal(tmp_path / "a.sog")
     folder = tmp_path / "scene"
     folder.mkdir()
     for key, data in files.items():
@@ -196,9 +196,9 @@ def test_a_picture_that_is_missing_or_cut(tmp_path, name):
     assert same(read_gaussians(folder), read_gaussians_of(tmp_path, files))
     if name != "meta.json":
         (folder / name).write_bytes(files[name][:-3])
-        assert f"{name} cannot be read as a picture" in refusal(folder)
+        assert f"{name!r} cannot be read as a picture" in refusal(folder)
         (folder / name).unlink()
-        assert f"lacks the file {name}" in refusal(folder)
+        assert f"lacks the file {name!r}" in refusal(folder)
 
 
 def read_gaussians_of(tmp_path: Path, files: dict[str, bytes]):

@@ -8,6 +8,7 @@ import zlib
 from pathlib import Path
 
 from ..errors import LumigraphError
+from ..ranges import shown
 from .checks import PLAUSIBLE, SMALL
 
 DATE = (1980, 1, 1, 0, 0, 0)  # the earliest that an archive can say, so that like files have like bytes
@@ -33,18 +34,22 @@ class Bundle:
         if self._archive is None:
             file = self.path / name
             if Path(name).name != name or file.is_symlink() or not file.is_file():
-                raise LumigraphError(f"{self.path} lacks the file {name}; copy the whole folder again")
+                raise LumigraphError(f"{self.path} lacks the file {shown(name)}; copy the whole folder again")
             return file.read_bytes()
         try:
             about = self._archive.getinfo(name)
             if about.file_size > max(SMALL, PLAUSIBLE * self.size):
-                raise LumigraphError(f"{self.path}: {name} would unpack to {about.file_size:,} bytes; get it anew")
+                raise LumigraphError(
+                    f"{self.path}: {shown(name)} would unpack to {about.file_size:,} bytes; get it anew"
+                )
             with self._archive.open(about) as file:
                 return file.read(about.file_size)  # no more, whatever is there
         except KeyError as fault:
-            raise LumigraphError(f"{self.path} lacks the file {name}; copy or download it again") from fault
+            raise LumigraphError(f"{self.path} lacks the file {shown(name)}; copy or download it again") from fault
         except (zipfile.BadZipFile, zlib.error, EOFError, ValueError, NotImplementedError, RuntimeError) as fault:
-            raise LumigraphError(f"{self.path}: {name} is damaged ({fault}); copy or download it again") from fault
+            raise LumigraphError(
+                f"{self.path}: {shown(name)} is damaged ({fault}); copy or download it again"
+            ) from fault
 
 
 def zipped(files: dict[str, bytes]) -> bytes:

@@ -24,6 +24,7 @@ from ..files import write_bytes
 from ..gaussians import Gaussians
 from ..geometry import is_similarity, to_matrix
 from ..kernels.spherical_harmonics import K00
+from ..ranges import shown
 from ..srgb import linear_from_srgb
 from . import gltf
 from .axes import TURN_HARMONICS, TURN_MEAN, TURN_ROTATION
@@ -58,7 +59,7 @@ def read(path: Path) -> Gaussians:
     """
     file = gltf.File(path)
     if unknown := sorted({*file.about.extensions_required} - KNOWN):
-        raise LumigraphError(f"{path} needs {', '.join(unknown)}, which is not read here; export it without")
+        raise LumigraphError(f"{path} needs {shown(', '.join(unknown))}, which is not read here; export it without")
     placed = [
         (primitive, matrix)
         for mesh, matrix in _placed(file)
@@ -114,11 +115,12 @@ def _bands(file: gltf.File, primitive: gltf.Primitive) -> int:
     said = said if isinstance(said, dict) else {}
     if primitive.mode != POINTS or any(said.get(name) != value for name, value in SHAPED.items()):
         raise LumigraphError(
-            f"{file.path} has Gaussians of another kind (mode {primitive.mode}, kernel {said.get('kernel')}, colours "
-            f"{said.get('colorSpace')}), where points, ellipse and srgb_rec709_display are read; export it as those"
+            f"{file.path} has Gaussians of another kind (mode {primitive.mode}, kernel {shown(said.get('kernel'))}, colours "
+            f"{shown(said.get('colorSpace'))}), where points, ellipse and srgb_rec709_display are read; export it as those"
         )
     if inner := said.get("extensions"):
-        raise LumigraphError(f"{file.path} packs its Gaussians by {', '.join(inner)}; export it without compression")
+        by = ", ".join(inner) if isinstance(inner, dict) else inner
+        raise LumigraphError(f"{file.path} packs its Gaussians by {shown(by)}; export it without compression")
     bands = 1 + math.isqrt(max((i for i, name in enumerate(HARMONICS) if name in primitive.attributes), default=0))
     wanted = ["POSITION", ROTATION, SCALE, OPACITY, *HARMONICS[: bands**2]]
     if missing := [name for name in wanted if name not in primitive.attributes]:

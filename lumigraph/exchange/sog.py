@@ -33,7 +33,7 @@ from ..errors import LumigraphError
 from ..files import from_json, replacing_folder, write_bytes
 from ..gaussians import Gaussians
 from ..packing.clusters import clustered
-from ..ranges import Coordinate, Name, Tally, between, typed
+from ..ranges import Coordinate, Name, Tally, between, shown, typed
 from .bundle import Bundle, zipped
 from .checks import check_room
 from .codes import LOGITS, alpha_to_byte, array, cloud, to_byte, with_largest, without_largest
@@ -157,7 +157,7 @@ def read(path: Path) -> Gaussians:
     version = said.get("version", 1) if isinstance(said, dict) else None
     if version not in (1, VERSION):
         raise LumigraphError(
-            f"{path} is of version {version} of SOG, of which 1 and {VERSION} are read; save it as {VERSION}"
+            f"{path} is of version {shown(version)} of SOG, of which 1 and {VERSION} are read; save it as {VERSION}"
         )
     return _read(bundle, said) if version == VERSION else _read_old(bundle, said)
 
@@ -227,13 +227,13 @@ class _Pictures:
                 pixels = image.width * image.height
                 if pixels < least:
                     raise LumigraphError(
-                        f"{path}: {name} has {pixels:,} pixels where {least:,} are needed; copy or download it again"
+                        f"{path}: {shown(name)} has {pixels:,} pixels where {least:,} are needed; copy or download it again"
                     )
                 check_room(path, self.count, self.harmonics, self.bundle.size, 4 * pixels)
                 return np.asarray(image.convert("RGBA"))
         except (OSError, ValueError, SyntaxError, EOFError, Image.DecompressionBombError) as fault:
             why = "it does not begin like one" if isinstance(fault, UnidentifiedImageError) else fault
-            raise LumigraphError(f"{path}: {name} cannot be read as a picture ({why}); get it again") from fault
+            raise LumigraphError(f"{path}: {shown(name)} cannot be read as a picture ({why}); get it again") from fault
 
     def means(self, about: Means | OldMeans) -> Float[np.ndarray, "gaussian 3"]:
         low, high = (self.of(name)[:, :3].astype(np.int64) for name in about.files)
@@ -243,7 +243,7 @@ class _Pictures:
     def rotations(self, name: str) -> Float[np.ndarray, "gaussian 4"]:
         pixels = self.of(name)
         if (pixels[:, 3] < LARGEST).any():
-            raise LumigraphError(f"{self.bundle.path}: {name} has pixels that are no rotations; export it again")
+            raise LumigraphError(f"{self.bundle.path}: {shown(name)} has pixels that are no rotations; export it again")
         return with_largest(pixels[:, 3].astype(np.int64) - LARGEST, (pixels[:, :3] / 255 - 0.5) * math.sqrt(2))
 
     def palette(
@@ -256,8 +256,8 @@ class _Pictures:
         fits = image.shape[1] in widths and labels.max() < min(count or MOST, ROW * image.shape[0])
         if not fits:
             raise LumigraphError(
-                f"{self.bundle.path}: {files[0]} of {image.shape[1]} x {image.shape[0]} pixels does not hold the "
-                f"{labels.max() + 1:,} entries that {files[1]} names; export it again"
+                f"{self.bundle.path}: {shown(files[0])} of {image.shape[1]} x {image.shape[0]} pixels does not hold the "
+                f"{labels.max() + 1:,} entries that {shown(files[1])} names; export it again"
             )
         return image[..., :3].reshape(ROW * image.shape[0], -1, 3)[:count], labels
 
