@@ -227,7 +227,7 @@ class _Pictures:
                 pixels = image.width * image.height
                 if pixels < least:
                     raise LumigraphError(
-                        f"{path}: {shown(name)} has {pixels:,} pixels where {least:,} are needed; copy or download it again"
+                        f"{path}: {shown(name)} has {pixels:,} pixels where {least:,} are needed; get it again"
                     )
                 check_room(path, self.count, self.harmonics, self.bundle.size, 4 * pixels)
                 return np.asarray(image.convert("RGBA"))
@@ -256,8 +256,8 @@ class _Pictures:
         fits = image.shape[1] in widths and labels.max() < min(count or MOST, ROW * image.shape[0])
         if not fits:
             raise LumigraphError(
-                f"{self.bundle.path}: {shown(files[0])} of {image.shape[1]} x {image.shape[0]} pixels does not hold the "
-                f"{labels.max() + 1:,} entries that {shown(files[1])} names; export it again"
+                f"{self.bundle.path}: {shown(files[0])} of {image.shape[1]} x {image.shape[0]} pixels does not hold "
+                f"the {labels.max() + 1:,} entries that {shown(files[1])} names; export it again"
             )
         return image[..., :3].reshape(ROW * image.shape[0], -1, 3)[:count], labels
 
