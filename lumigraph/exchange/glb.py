@@ -116,8 +116,8 @@ def _bands(file: gltf.File, primitive: gltf.Primitive) -> int:
     if primitive.mode != POINTS or any(said.get(name) != value for name, value in SHAPED.items()):
         found = f"mode {primitive.mode}, kernel {shown(said.get('kernel'))}, colours {shown(said.get('colorSpace'))}"
         raise LumigraphError(
-            f"{file.path} has Gaussians of another kind ({found}), where points, ellipse and srgb_rec709_display are read; "
-            "export it as those"
+            f"{file.path} has Gaussians of another kind ({found}), where points, ellipse and srgb_rec709_display are "
+            "read; export it as those"
         )
     if inner := said.get("extensions"):
         by = ", ".join(inner) if isinstance(inner, dict) else inner
