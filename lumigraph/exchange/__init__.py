@@ -91,6 +91,12 @@ def place_of(path: Path) -> Path:
     return path.parent if path.name == sog.META and (sog.recognises(path.parent) or not exists(path)) else path
 
 
+def size_of(path: Path | str) -> int:
+    """Bytes of a file of Gaussians, or of all files of a folder of SOG."""
+    place = place_of(expanded(path))
+    return sum(file.stat().st_size for file in (place.iterdir() if place.is_dir() else [place]))
+
+
 def check_ending(path: Path) -> str:
     """The one of SUFFIXES that a name has. Raises LumigraphError if it has none."""
     if path.name == sog.META:

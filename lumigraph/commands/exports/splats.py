@@ -33,7 +33,7 @@ class ExportSplats:
 
     def run(self) -> int:
         from ...capabilities import HasGaussians, needs
-        from ...exchange import check_ending, claim_splats, is_splat_file, place_of, read_gaussians, write_gaussians
+        from ...exchange import check_ending, claim_splats, is_splat_file, read_gaussians, size_of, write_gaussians
         from ...export.splats import export_splats
         from ...run import open_any
         from ...run.splat_file import frame_of
@@ -55,8 +55,7 @@ class ExportSplats:
             gaussians = needs(method, HasGaussians).gaussians()
             gaussians = self.part.of_gaussians(gaussians, self.part.crop(method.frame))
             written = export_splats(gaussians, method.frame, self.output)
-        place = place_of(self.output)
-        size = sum(file.stat().st_size for file in (place.iterdir() if place.is_dir() else [place]))
+        size = size_of(self.output)
         show(
             {
                 "file": str(self.output),
