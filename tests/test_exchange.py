@@ -158,7 +158,8 @@ def test_what_was_rounded_once_stays(tmp_path, suffix, error):
     assert apart(twice.log_scales, once.log_scales) <= 1e-5
     assert opacity_apart(twice, once) <= 1e-6
     assert apart(twice.harmonics, once.harmonics) <= 1e-5
-    assert components_apart(twice, once) <= (1 / 100 if suffix == ".splat" else 1e-6)
+    # Of two components that are nearly alike, another may be the largest the second time.
+    assert components_apart(twice, once) <= {".splat": 1 / 100, ".sog": 3 * 0.0028}.get(suffix, 1e-6)
 
 
 def test_spz_turns_half_around_x(tmp_path):

@@ -191,7 +191,8 @@ def test_what_is_short_or_not_known_is_said_in_a_sentence(tmp_path):
     assert "in two places" in said('"nodes": [{"mesh": 0}]', '"nodes": [{"mesh": 0, "children": [0]}]')
     assert "stretches or mirrors" in said('"nodes": [{"mesh": 0}]', '"nodes": [{"mesh": 0, "scale": [1, 2, 1]}]')
     assert "is no place" in said('"nodes": [{"mesh": 0}]', '"nodes": [{"mesh": 0, "matrix": [1]}]')
-    assert "bufferView" in said('"bufferView": 0', '"bufferView": -1')
+    with pytest.raises(LumigraphError, match="bufferView is -1"):
+        read_gaussians(put(tmp_path / "b.glb", json.loads(text.replace('"bufferView": 0', '"bufferView": -1')), buffer))
     path = tmp_path / "a.glb"
     data = path.read_bytes()
     path.write_bytes(data[:4] + struct.pack("<I", 1) + data[8:])
