@@ -42,8 +42,8 @@ class Bundle:
                 raise LumigraphError(
                     f"{self.path}: {shown(name)} would unpack to {about.file_size:,} bytes; get it anew"
                 )
-            with self._archive.open(about) as file:
-                return file.read(about.file_size)  # no more, whatever is there
+            with self._archive.open(about) as stream:
+                return stream.read(about.file_size)  # no more, whatever is there
         except KeyError as fault:
             raise LumigraphError(f"{self.path} lacks the file {shown(name)}; copy or download it again") from fault
         except (zipfile.BadZipFile, zlib.error, EOFError, ValueError, NotImplementedError, RuntimeError) as fault:

@@ -14,6 +14,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -172,9 +173,11 @@ def _cloud(file: gltf.File, primitive: gltf.Primitive, most: int, matrix: Float[
 
 
 def _joined(parts: list[Gaussians]) -> Gaussians:
-    names = "means", "quaternions", "log_scales", "opacities", "harmonics"
-    tensors = [torch.cat([getattr(part, name) for part in parts]) for name in names]
-    return Gaussians(*tensors, antialiased=all(part.antialiased for part in parts))
+    def of(name: str) -> Any:
+        return torch.cat([getattr(part, name) for part in parts])
+
+    alike = all(part.antialiased for part in parts)
+    return Gaussians(of("means"), of("quaternions"), of("log_scales"), of("opacities"), of("harmonics"), alike)
 
 
 def write(path: Path, gaussians: Gaussians) -> None:

@@ -53,7 +53,8 @@ FORMATS = ("WEBP", "PNG")
 Ends = tuple[Coordinate, Coordinate, Coordinate]
 FourEnds = tuple[Coordinate, Coordinate, Coordinate, Coordinate]
 Book = Annotated[tuple[Coordinate, ...], msgspec.Meta(min_length=256, max_length=256)]
-One, Two = tuple[Name], tuple[Name, Name]
+One = tuple[Name]
+Two = tuple[Name, Name]
 
 
 @dataclass(frozen=True)
