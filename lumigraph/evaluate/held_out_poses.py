@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import copy
 from dataclasses import replace
+from functools import cached_property
 from typing import Any
 
 import torch
@@ -38,27 +39,28 @@ class HeldOutPoses:
     """
 
     def __init__(self, method: Method, scene: Scene):
-        self.learnt = scene.splits["train"]
-        given = scene.cameras[self.learnt].to("cpu")
-        frame_moved = aligning(given, method.refined(given).to("cpu"))
-        self.method, self.trained = method, set(self.learnt.tolist())
-        self.scene = replace(scene, cameras=scene.cameras.transformed(frame_moved.matrix))
-        self.photographs = scene.cameras
-        self.copy: Any = copy.deepcopy(method).requires_grad_(False)
+        learnt, self.photographs, self.method = scene.splits["train"], scene.cameras, method
+        given = scene.cameras[learnt].to("cpu")
+        moved_along = scene.cameras.transformed(aligning(given, method.refined(given)).matrix)
+        self.scene, self.learnt = replace(scene, cameras=moved_along), set(learnt.tolist())
+
+    @cached_property
+    def frozen(self) -> Any:
+        return copy.deepcopy(self.method).requires_grad_(False)
 
     def camera(self, index: int) -> Camera:
-        if index in self.trained:
+        if index in self.learnt:
             return self.method.refined(self.photographs[index])
         alone = replace(self.scene, splits={"train": torch.tensor([index])})
         poses = PoseRefinement(self.scene.frame.image_count, RATE).to(self.method.device)
         poses.begin(self.scene.cameras[index], self.scene.frame)
-        self.copy.poses = poses
+        self.frozen.poses = poses
         optimizer, generator = poses.optimizer(), torch.Generator().manual_seed(index)
         with torch.enable_grad():
             for step in range(STEPS):
                 optimizer.param_groups[0]["lr"] = poses.rate(step / STEPS)
                 optimizer.zero_grad()
-                terms = self.copy.loss(self.copy.batch(alone, generator), step)
+                terms = self.frozen.loss(self.frozen.batch(alone, generator), step)
                 torch.stack(list(terms.values())).sum().backward()
                 optimizer.step()
         return poses.refined(self.scene.cameras[index])
