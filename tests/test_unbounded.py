@@ -112,17 +112,17 @@ def test_rays_end_at_places_that_are_known_until_half_of_the_budget_is_spent():
     unbounded.seen, unbounded.seen_from = torch.tensor([[0.0, 0.0, 2.0]]), torch.zeros(1, 3)
     unbounded.before_step(0.1)
 
-    def field(points, directions):
-        return 30.0 * (points.norm(dim=-1) > place), points.new_ones(len(points), 3)
+    def wall(place: float):
+        return lambda points, _: (30.0 * (points.norm(dim=-1) > place), points.new_ones(len(points), 3))
 
     errors = []
     for place in (2.0, 1.0):
-        look, proposed = unbounded.look(field, rays(), torch.rand(5, 2, generator=generator))
-        terms = unbounded.terms(field, look, proposed, generator)
+        look, proposed = unbounded.look(wall(place), rays(), torch.rand(5, 2, generator=generator))
+        terms = unbounded.terms(wall(place), look, proposed, generator)
         errors.append(float(terms["depth"]))
     assert errors[0] < 0.8 * errors[1]
     unbounded.before_step(0.9)
-    assert "depth" not in unbounded.terms(field, look, proposed, generator)
+    assert "depth" not in unbounded.terms(wall(1.0), look, proposed, generator)
 
 
 def test_contraction_loops_as_it_is_written():
