@@ -7,7 +7,7 @@ from lumigraph.components.sampling.proposal import Proposal, edges_of, overlooke
 from lumigraph.components.sampling.spaces import NDC, Contraction
 from lumigraph.components.sampling.unbounded import OpenNumbers, Unbounded
 from lumigraph.components.training.fog import elsewhere, scaled_by_distance, spread
-from lumigraph.rays import Look, Rays, Samples
+from lumigraph.rays import Rays, Samples
 from lumigraph.scene import Forward
 
 AHEAD = Forward(((1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0)), (1.0, 1.0), 1.0)
@@ -100,8 +100,7 @@ def test_rays_should_end_where_something_is_known_to_be():
 def test_what_is_near_is_learnt_slowly():
     samples = Samples(torch.tensor([0.0, 1.0, 4.0]), torch.tensor([1.0, 1.5, 5.0]), torch.tensor([0, 3]))
     density, rgb = torch.ones(3, requires_grad=True), torch.ones(3, 3, requires_grad=True)
-    scaled = scaled_by_distance(Look("samples", samples, density, rgb))
-    (scaled.density.sum() + scaled.rgb.sum()).backward()
+    sum(x.sum() for x in scaled_by_distance(samples.t, density, rgb)).backward()
     torch.testing.assert_close(density.grad, torch.tensor([0.25, 1.0, 1.0]))
     torch.testing.assert_close(rgb.grad, torch.tensor([0.25, 1.0, 1.0])[:, None].expand(3, 3))
 
@@ -113,16 +112,17 @@ def test_rays_end_at_places_that_are_known_until_half_of_the_budget_is_spent():
     unbounded.before_step(0.1)
 
     def wall(place: float):
-        return lambda points, _: (30.0 * (points.norm(dim=-1) > place), points.new_ones(len(points), 3))
+        return lambda points: 30.0 * (points.norm(dim=-1) > place)
 
     errors = []
     for place in (2.0, 1.0):
-        look, proposed = unbounded.look(wall(place), rays(), torch.rand(5, 2, generator=generator))
-        terms = unbounded.terms(wall(place), look, proposed, generator)
+        proposed = unbounded.proposal.sample(rays(), torch.rand(5, 2, generator=generator))
+        density = wall(place)(proposed.samples.along(rays())[0])
+        terms = unbounded.terms(wall(place), proposed, density, generator)
         errors.append(float(terms["depth"]))
     assert errors[0] < 0.8 * errors[1]
     unbounded.before_step(0.9)
-    assert "depth" not in unbounded.terms(wall(1.0), look, proposed, generator)
+    assert "depth" not in unbounded.terms(wall(1.0), proposed, density, generator)
 
 
 def test_contraction_loops_as_it_is_written():

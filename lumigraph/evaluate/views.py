@@ -172,9 +172,9 @@ def evaluate(
         if all(score.psnr < other.psnr for other in scores):
             worst = {score.name: (photograph, seen)}
         scores.append(score)
-    told = protocol(scene, split, compared, lpips, method) | ({"poses": PROTOCOL} if found else {})
+    stated = protocol(scene, split, compared, lpips, method) | ({"poses": PROTOCOL} if found else {})
     poses = tuple(pose_scores(method, scene))
-    return Evaluation(scores, told, compile_seconds, shown | worst, poses)
+    return Evaluation(scores, stated, compile_seconds, shown | worst, poses)
 
 
 def compare(

@@ -208,7 +208,7 @@ class InstantNGP(RayMethod):
             return self._march(rays, jitter[:, 0]), {}
         look, proposed = self.unbounded.look(self.field, rays, jitter)
         self.figures |= {"rays": len(rays), "samples": len(look.samples)}
-        return look, self.unbounded.terms(self.field, look, proposed, generator)
+        return look, self.unbounded.terms(self.density, proposed, look.density, generator)
 
     def loss(self, batch: Batch, step: int) -> dict[str, Tensor]:
         generator = self.random(step)

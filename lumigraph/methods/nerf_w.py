@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from typing import Annotated, Any, ClassVar, Literal
 
@@ -9,6 +10,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from ..components.clouds.dense_points import compile_sweep
 from ..components.fields import hash_field
 from ..components.fields.appearance import PhotographCodes, drawn, fitted
 from ..components.fields.wild_field import of_samples, with_passing
@@ -16,6 +18,7 @@ from ..components.fields.wild_hash import WildHash
 from ..components.fields.wild_networks import WildNetworks
 from ..components.sampling.coarse_to_fine import SAMPLES_OF_A_RAY
 from ..components.sampling.occupancy import OccupancyGrid
+from ..components.sampling.unbounded import OpenNumbers, Unbounded
 from ..components.training.corrections import AVERAGE
 from ..components.training.photometric import backdrop
 from ..components.training.schedules import held
@@ -44,7 +47,7 @@ Code = Annotated[int, between(1, 1024)]  # numbers of a photograph's code
 
 
 @dataclass(frozen=True)
-class Config:
+class Config(OpenNumbers):
     """The paper's numbers, with where it gives them; `NeRFW.preset` says what a plain CPU does otherwise."""
 
     field: Literal["hash", "network"] = "network"  # what holds the scene: a hash table, or the paper's networks
@@ -171,13 +174,21 @@ class NeRFW(RayMethod):
             samples = config.rays_per_step * (config.coarse_samples + config.fine_samples)
             return 2 * samples * config.depth * config.hidden_width * learning
         grid = OccupancyGrid.bytes_of(frame.reach, config.occupancy_resolution)
-        return grid + hash_field.bytes_kept(config) * learning
+        return grid + Unbounded.bytes_of(frame, learning) + hash_field.bytes_kept(config) * learning
 
     # Learning
 
+    def begin(self, scene: Scene, seconds: float = math.inf) -> None:
+        self.network.begin(scene, seconds, self.random(1))
+
+    def rehearse_begin(self) -> None:
+        if self.config.field == "hash" and self.frame.reach > 1:
+            compile_sweep()
+
     def rays_in_a_step(self, data: Scene) -> float:
         c = self.config
-        return c.samples_per_step / SAMPLES_OF_A_RAY if c.field == "hash" else c.rays_per_step
+        samples = c.samples_per_ray if self.frame.reach > 1 else SAMPLES_OF_A_RAY
+        return c.samples_per_step / samples if c.field == "hash" else c.rays_per_step
 
     def batch(self, data: Scene, generator: torch.Generator) -> Batch:
         return data.sample_rays(self.network.batch_size, generator).to(self.device)
@@ -209,6 +220,8 @@ class NeRFW(RayMethod):
             terms["transient"] = c.transient_weight * mean_along(last.samples, passing.density)
         error = squared(seen.rgb - target)
         terms["colour"] = (error / (2 * beta.square())).mean()
+        certain = 1 / (2 * c.beta_min**2)  # what an error counts at most, beside which the others have their weights
+        terms |= {name: certain * term for name, term in self.network.further_terms(generator).items()}
         self.figures |= {"mse": float(error.detach().mean()) / 3, "beta": float(beta.detach().mean())}
         self.figures |= {"rays": len(rays), "samples": last.asked}
         return terms
@@ -216,9 +229,10 @@ class NeRFW(RayMethod):
     def optimizers(self) -> list[torch.optim.Optimizer]:
         return self.network.optimizers([self.appearance.codes, self.transient.codes])
 
-    def learning_rate(self, step: int, progress: float) -> float:
+    def learning_rate(self, step: int, progress: float) -> dict[str, float]:
         c = self.config
-        return held(c.learning_rate, c.final_learning_rate, step, progress, c.decay_start)
+        rate = held(c.learning_rate, c.final_learning_rate, step, progress, c.decay_start)
+        return {"": rate, "proposal": Unbounded.rate(progress)}
 
     def before_step(self, step: int, progress: float) -> None:
         self.settling = progress < self.config.transient_start

@@ -286,7 +286,7 @@ class Plenoxels(RayMethod):
         if self.unbounded:
             look, proposed = self.unbounded.look(self._learnt, batch.rays, jitter)
             rows, part = self._touched
-            further = self.unbounded.terms(self._learnt, look, proposed, generator)
+            further = self.unbounded.terms(self.density, proposed, look.density, generator)
             self.figures |= {"rays": len(batch), "samples": len(look.samples)}
         else:
             samples, weights = self._reached(batch.rays, jitter[:, 0])

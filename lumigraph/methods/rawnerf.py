@@ -102,11 +102,14 @@ class LightField(HashField):
         self.register_buffer("level", torch.tensor(-1.0))
 
     def colour(
-        self, geometry: Float[Tensor, "sample geometry"], directions: Float[Tensor, "sample 3"]
+        self,
+        geometry: Float[Tensor, "sample geometry"],
+        directions: Float[Tensor, "sample 3"],
+        *codes: Float[Tensor, "sample code"],
     ) -> Float[Tensor, "sample 3"]:
         """Light in the camera's colours, 1 for what fills the sensor in the longest exposure."""
         harmonics = kernels.spherical_harmonics(directions, self.bands)
-        return truncated_exp(self.colour_network(side_by_side(geometry, harmonics)) + self.level)
+        return truncated_exp(self.colour_network(side_by_side(geometry, harmonics, *codes)) + self.level)
 
 
 class RawNeRF(RayMethod):

@@ -290,7 +290,7 @@ class TensoRF(RayMethod):
         further = dict[str, Tensor]()
         if self.unbounded:
             look, proposed = self.unbounded.look(self.field, batch.rays, jitter)
-            further = self.unbounded.terms(self.field, look, proposed, generator)
+            further = self.unbounded.terms(self.density, proposed, look.density, generator)
             self.figures |= {"rays": len(batch), "samples": len(look.samples)}
         else:
             look = self._march(batch.rays, jitter[:, 0])

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, replace
-from typing import ClassVar
 
 import torch
 from jaxtyping import Bool, Float
@@ -16,6 +15,7 @@ from torch.nn.functional import embedding
 
 from ... import kernels
 from ...rays import Rays, Rendering, Samples
+from ...scene import Scene
 from ...volume import composite
 
 LEAST = 1e-10  # opacity of a sample that is divided by at least
@@ -66,7 +66,7 @@ class WildField(nn.Module, ABC):
     rays_per_chunk: rendered at once
     """
 
-    rays_per_chunk: ClassVar[int]
+    rays_per_chunk: int
 
     @property
     @abstractmethod
@@ -98,6 +98,13 @@ class WildField(nn.Module, ABC):
     @abstractmethod
     def optimizers(self, codes: list[nn.Parameter]) -> list[torch.optim.Optimizer]:
         """Of the field, and of the photographs' codes with it."""
+
+    def begin(self, scene: Scene, seconds: float, generator: torch.Generator) -> None:
+        """Ahead of the first step; see `Method.begin`."""
+
+    def further_terms(self, generator: torch.Generator) -> dict[str, Tensor]:
+        """What the last `passes` cost beside colours, by name."""
+        return {}
 
     def before_step(self, step: int, progress: float, generator: torch.Generator) -> None:
         """Ahead of each step; see `Method.before_step`."""

@@ -37,6 +37,7 @@ MARGIN = 0.005  # of evened distances: how exactly a place is known
 TAUGHT = 0.5  # share of the budget after which photographs alone say where things are
 RAYS = 4096  # rendered at once: their proposals fit into a cache
 
+Density = Callable[[Float[Tensor, "sample 3"]], Float[Tensor, " sample"]]
 Field = Callable[
     [Float[Tensor, "sample 3"], Float[Tensor, "sample 3"]], tuple[Float[Tensor, " sample"], Float[Tensor, "sample 3"]]
 ]
@@ -92,32 +93,42 @@ class Unbounded(nn.Module):
     def look(self, field: Field, rays: Rays, jitter: Float[Tensor, "ray 2"] | None = None) -> tuple[Look, Proposed]:
         """What a field has along rays, and what was proposed. jitter: as for `Proposal.sample`, while learning"""
         proposed = self.proposal.sample(rays, jitter)
-        look = Look("samples", proposed.samples, *field(*proposed.samples.along(rays)))
-        return (look if jitter is None else scaled_by_distance(look)), proposed
+        samples = proposed.samples
+        density, rgb = field(*samples.along(rays))
+        if jitter is not None:
+            density, rgb = scaled_by_distance(samples.t, density, rgb)
+        return Look("samples", samples, density, rgb), proposed
 
-    def terms(self, field: Field, look: Look, proposed: Proposed, generator: torch.Generator) -> dict[str, Tensor]:
-        """What rays cost beside their colours, by name. generator: draws rays whose ends are known"""
-        weights = weights_of(look.samples, look.density)
+    def terms(
+        self, density_at: Density, proposed: Proposed, density: Float[Tensor, " sample"], generator: torch.Generator
+    ) -> dict[str, Tensor]:
+        """What rays cost beside their colours, by name.
+
+        density:    that a field found at what was proposed
+        density_at: the field, for some more rays, whose ends are known; `generator` draws them
+        """
+        weights = weights_of(proposed.samples, density)
         terms = {"proposal": overlooked(proposed, weights)}
         if self.numbers.distortion_weight:
-            terms["distortion"] = self.numbers.distortion_weight * spread(look.samples, weights)
+            terms["distortion"] = self.numbers.distortion_weight * spread(proposed.samples, weights)
         weight = self.numbers.depth_weight * (1 - self.progress / TAUGHT)
         if weight > 0 and len(self.seen):
-            error, missed = self._elsewhere(field, generator)
+            error, missed = self._elsewhere(density_at, generator)
             terms["depth"] = weight * error
             terms["proposal"] = terms["proposal"] + missed * (KNOWN / len(proposed.edges))
         return terms
 
-    def _elsewhere(self, field: Field, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+    def _elsewhere(self, density_at: Density, generator: torch.Generator) -> tuple[Tensor, Tensor]:
         """`elsewhere` of some rays whose ends are known, and what the grid of proposals missed of them."""
         chosen = torch.randint(len(self.seen), (KNOWN,), generator=generator).to(self.seen.device)
         origins, ways = self.seen_from[chosen], self.seen[chosen] - self.seen_from[chosen]
         distance = ways.norm(dim=-1)
         rays = Rays(origins, ways / distance[:, None], torch.zeros_like(distance))
-        jitter = torch.rand(KNOWN, 2, generator=generator).to(distance)
-        look, proposed = self.look(field, rays, jitter)
-        weights = weights_of(look.samples, look.density)
-        return elsewhere(look.samples, weights, distance, MARGIN), overlooked(proposed, weights)
+        proposed = self.proposal.sample(rays, torch.rand(KNOWN, 2, generator=generator).to(distance))
+        samples = proposed.samples
+        (density,) = scaled_by_distance(samples.t, density_at(samples.along(rays)[0]))
+        weights = weights_of(samples, density)
+        return elsewhere(samples, weights, distance, MARGIN), overlooked(proposed, weights)
 
     @staticmethod
     def storage() -> dict[str, Stored]:

@@ -7,7 +7,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ...kernels import distortion
-from ...rays import Look, Samples
+from ...rays import Samples
 
 
 def evened(t: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
@@ -50,11 +50,10 @@ class _Scaled(torch.autograd.Function):
         return None, *(g * scale.view(-1, *[1] * (g.ndim - 1)) for g in grads)
 
 
-def scaled_by_distance(look: Look) -> Look:
-    """The same look, whose gradients count min(1, t^2) (Philip 2023, eq. 7).
+def scaled_by_distance(t: Float[Tensor, " sample"], *values: Float[Tensor, sample * _]) -> tuple[Tensor, ...]:
+    """The same values of samples at distances t, whose gradients count min(1, t^2) (Philip 2023, eq. 7).
 
     As many rays pass a place near a camera as the inverse square of its distance says, and all of one photograph:
     without this, learning would be fastest where least is known.
     """
-    density, rgb = _Scaled.apply(look.samples.t.square().clamp(max=1), look.density, look.rgb)
-    return Look(look.name, look.samples, density, rgb)
+    return _Scaled.apply(t.square().clamp(max=1), *values)

@@ -25,11 +25,12 @@ class PoseAdam(torch.optim.Optimizer):
                     self._update(p, group["lr"], *group["betas"])
 
     def _update(self, p: torch.Tensor, lr: float, b1: float, b2: float) -> None:
+        assert p.grad is not None
         state = self.state[p]
         if not state:
             state["mean"] = torch.zeros_like(p)
             state["square"], state["steps"] = torch.zeros_like(p[:, 0]), torch.zeros_like(p[:, 0])
-        seen = (p.grad != 0).any(-1).nonzero()[:, 0]
+        seen = p.grad.ne(0).any(-1).nonzero()[:, 0]
         grad = p.grad[seen]
         steps = state["steps"][seen] + 1
         mean = torch.lerp(grad, state["mean"][seen], b1)
