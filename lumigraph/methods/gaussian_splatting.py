@@ -69,7 +69,7 @@ class Config:
     antialiased: bool = False  # Mip-Splatting's 2-D filter (Yu 2024, section 5.2)
     filter_3d: bool = False  # Mip-Splatting's 3-D filter (Yu 2024, section 5.1)
     refine_cameras: bool = False  # learn where each photograph was taken from, small pictures first
-    pose_learning_rate: LearningRate = 1e-2  # radians by which a step moves a picture, with refine_cameras
+    pose_learning_rate: LearningRate = 5e-3  # radians by which a step moves a picture, with refine_cameras
     seed: Seed = 0
 
 
