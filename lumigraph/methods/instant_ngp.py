@@ -203,9 +203,9 @@ class InstantNGP(RayMethod):
 
     def look_to_learn(self, rays: Rays, generator: torch.Generator) -> tuple[Look, dict[str, Tensor]]:
         """A step's look along rays, at random places, and what it costs beside colours, by name."""
-        jitter = torch.rand(len(rays), 2 if self.unbounded else 1, generator=generator).to(self.device)
         if not self.unbounded:
-            return self._march(rays, jitter[:, 0]), {}
+            return self._march(rays, torch.rand(len(rays), generator=generator).to(self.device)), {}
+        jitter = torch.rand(len(rays), 2, generator=generator).to(self.device)
         look, proposed = self.unbounded.look(self.field, rays, jitter)
         self.figures |= {"rays": len(rays), "samples": len(look.samples)}
         return look, self.unbounded.terms(self.density, proposed, look.density, generator)

@@ -47,7 +47,7 @@ def nearest(
     """The code of each row, and its squared distance."""
     half = 0.5 * book.square().sum(-1)
     codes, errors = torch.empty(len(rows), dtype=torch.int64), torch.empty(len(rows))
-    chunk = min(CHUNK, max(1, HELD // len(book)))
+    chunk = min(CHUNK, max(1, HELD // max(1, len(book))))
     for i in range(0, len(rows), chunk):
         some = rows[i : i + chunk]
         least, codes[i : i + chunk] = torch.addmm(half, some, book.t(), alpha=-1).min(-1)
