@@ -148,7 +148,7 @@ class RawNeRF(RayMethod):
     @classmethod
     def smallest(cls) -> Any:
         """Instant-NGP's, with an error that is less relative: in a few steps its gross beginnings fall, and no more."""
-        return Config.around(InstantNGP.smallest(), epsilon=0.1)
+        return Config.around(InstantNGP.smallest(), epsilon=1.0)
 
     @classmethod
     def further_bytes(cls, frame: Frame, config: Any, learning: bool) -> int:
