@@ -20,9 +20,12 @@ from ..components.clouds.density_control import AdaptiveDensity, MarkovChain
 from ..components.clouds.initial_cloud import Initialization, initial_cloud, random_cloud
 from ..components.clouds.seen_from import seen_from
 from ..components.clouds.smoothing import sampling_interval, smoothed
+from ..components.fields.affine_colours import NUMBERS, changed, changed_harmonics
+from ..components.fields.appearance import PhotographCodes, fitted
 from ..components.training.pose_refinement import PoseRefinement
 from ..components.training.rhythm import Rhythm, haste, intervals
 from ..components.training.schedules import falling
+from ..controls import Control, Value
 from ..errors import LumigraphWarning
 from ..exchange.morton import morton_order
 from ..gaussians import Gaussians
@@ -70,6 +73,10 @@ class Config:
     filter_3d: bool = False  # Mip-Splatting's 3-D filter (Yu 2024, section 5.1)
     refine_cameras: bool = False  # learn where each photograph was taken from, small pictures first
     pose_learning_rate: LearningRate = 1e-2  # radians by which a step moves a picture, with refine_cameras
+    appearance: bool = False  # learn for each photograph how its colours differ from the scene's
+    appearance_lr: LearningRate = 5e-3  # of those changes of colour
+    final_appearance_lr: LearningRate = 5e-4
+    appearance_regularization: NonNegative = 1e-3  # of a change's squared numbers in the loss
     seed: Seed = 0
 
 
@@ -83,6 +90,7 @@ STORAGE = {  # of tensors, where a run is compressed; positions need the most bi
     "density_control.sightings": Stored("nothing"),
 }
 SWEEPING = 0.08  # of the budget: the share that looking for points to begin at may take
+BLACK = 0.0, 0.0, 0.0
 NEAR = 0.1  # times the scene's near distance: the near plane of splats
 COARSE = 0.5  # of the budget, at half size where poses are refined and nothing else is said
 SMALLEST = 64  # pixels of a photograph's shorter side that are kept when it is reduced
@@ -90,6 +98,7 @@ ENOUGH = 2400  # steps, with which sizes and colours need not hurry
 RECOVERY = 3  # opacity_reset_intervals that must be left after opacities are reset, or the pictures stay dim
 GROWTH = 1.05  # of the number at each change, for mcmc (Kheradmand 2024, section 3.2)
 LAST_MOVE = 0.9  # share of the budget after which mcmc moves and adds no Gaussians, so that those there converge
+FIT_STEPS, FIT_RATE = 200, 0.02  # of Adam, where the light of a given photograph is found
 BYTES = 4096  # that one more Gaussian needs while it learns: itself, its gradient and moments, its share of a picture
 
 
@@ -134,6 +143,8 @@ class GaussianSplatting(Method):
         self.exploration = MarkovChain()
         refining, rate = config.refine_cameras, config.pose_learning_rate
         self.poses = PoseRefinement(frame.image_count, rate) if refining else None
+        self.appearance = PhotographCodes(frame.image_count, NUMBERS) if config.appearance else None
+        self.found: Tensor | None = None  # the light of a photograph that was given
         self.rhythm = Rhythm(config.refine_every, config.refine_every_share)
         self.register_buffer("extent", torch.tensor(1.0))
         self.register_buffer("drawn", torch.tensor(0))
@@ -220,7 +231,7 @@ class GaussianSplatting(Method):
         return max(1, min(wanted, shorter // SMALLEST))
 
     def loss(self, batch: Photograph, step: int) -> dict[str, Tensor]:
-        config, cloud, camera = self.config, self.gaussians(), batch.camera
+        config, cloud, camera = self.config, self._cloud(), batch.camera
         if self.poses:
             cloud, camera = seen_from(self.poses, cloud, camera)
         seen = splat(cloud, view_of(camera, self._near), self._bands, config.transmittance_threshold)
@@ -228,6 +239,10 @@ class GaussianSplatting(Method):
         if batch.alpha is not None:  # a random colour behind everything, so that only opacity can imitate opacity
             background = torch.rand(3, generator=self.random(~step)).to(rgb.device)
         target = batch.before(background)
+        code = None
+        if self.appearance and camera.image_index is not None:
+            code = self.appearance(camera.image_index)[0]
+            rgb = changed(rgb, seen.opacity, code)
         if background.any():
             rgb = over(rgb, seen.opacity, background)
         if batch.mask is not None:
@@ -241,6 +256,8 @@ class GaussianSplatting(Method):
             "l1": (1 - config.ssim_weight) * difference.abs().mean(),
             "ssim": config.ssim_weight * (1 - kernels.ssim(rgb, target)),
         }
+        if code is not None:
+            terms["appearance"] = config.appearance_regularization * code.square().sum()
         if config.strategy == "mcmc":
             terms["opacity"] = config.opacity_regularization * cloud.opacities.sigmoid().mean()
             terms["scale"] = config.scale_regularization / float(self.extent) * cloud.log_scales.exp().mean()
@@ -256,6 +273,8 @@ class GaussianSplatting(Method):
             {"params": [cloud.opacities], "lr": c.opacities_lr},
             {"name": "harmonics", "params": [cloud.harmonics], "lr": c.sh_lr, "columns": columns},
         ]
+        if self.appearance:  # one row a step has a gradient, as with Gaussians
+            groups.append({"name": "appearance", "params": [self.appearance.codes], "lr": c.appearance_lr})
         self._optimizer = CloudAdam(groups)
         return [self._optimizer, self.poses.optimizer()] if self.poses else [self._optimizer]
 
@@ -266,6 +285,8 @@ class GaussianSplatting(Method):
         times = haste(step, progress, ENOUGH, c.most_haste)
         means = float(self.extent) * falling(c.means_lr, c.final_means_lr, progress)
         rates = {"means": means, "scales": times * c.scales_lr, "harmonics": times * c.sh_lr}
+        if self.appearance:
+            rates["appearance"] = falling(c.appearance_lr, c.final_appearance_lr, progress)
         return rates | ({"poses": self.poses.rate(progress)} if self.poses else {})
 
     def before_step(self, step: int, progress: float) -> None:
@@ -375,7 +396,12 @@ class GaussianSplatting(Method):
         return {"cloud.harmonics": weights[kept]}
 
     def gaussians(self) -> Gaussians:
-        """The cloud, in the scene's frame; with the 3-D filter in it, where that is used."""
+        """The cloud, in the scene's frame and the light that was told; with the 3-D filter in it, where that is used."""
+        cloud, code = self._cloud(), self._light
+        return cloud if code is None else replace(cloud, harmonics=changed_harmonics(cloud.harmonics, code))
+
+    def _cloud(self) -> Gaussians:
+        """The cloud as it is learnt, which is in no photograph's light."""
         cloud = self.cloud.gaussians()
         return smoothed(cloud, self.interval) if self.config.filter_3d else cloud
 
@@ -383,7 +409,63 @@ class GaussianSplatting(Method):
         return self.poses.refined(cameras) if self.poses else cameras
 
     def render(self, camera: Camera) -> Rendering:
-        return render(self.gaussians(), camera.to(self.device), self.frame.background, self._near)
+        seen = render(self._cloud(), camera.to(self.device), BLACK, self._near)
+        rgb, code, background = seen.rgb, self._light, self.background[0]
+        if code is not None:
+            rgb = changed(rgb, seen.opacity, code.detach()).clamp(0, 1)
+        return replace(seen, rgb=over(rgb, seen.opacity, background))
+
+    # Being told something
+
+    @property
+    def accepts(self) -> tuple[type, ...]:  # type: ignore[override]  # it depends on the run
+        """Photographs, where their colours were learnt to differ."""
+        return (Photograph,) if self.appearance else ()
+
+    @property
+    def controls(self) -> tuple[Control, ...]:
+        about = "The photograph, by number or name, in whose light and colours the scene is shown; or the average of all."
+        return (self.appearance.control("appearance", about),) if self.appearance else ()
+
+    def given(self, *evidence: Any, **controls: Value) -> Method:
+        """The same cloud, told its controls, or in the light of a photograph, found from the pixels that are to be
+        trusted."""
+        photographs = [piece for piece in evidence if isinstance(piece, self.accepts)]
+        told = super().given(*(piece for piece in evidence if not isinstance(piece, self.accepts)), **controls)
+        assert isinstance(told, GaussianSplatting)
+        for photograph in photographs:
+            told.found = self._found(photograph)
+            told.told.pop("appearance", None)
+        return told
+
+    @property
+    def _light(self) -> Float[Tensor, "12"] | None:
+        """The code that was told, else the one that was found, else the average; None where there are none."""
+        if self.appearance is None:
+            return None
+        if self.found is not None and "appearance" not in self.told:
+            return self.found
+        return self.appearance.told(str(self.control("appearance")))
+
+    @torch.no_grad()
+    def _found(self, photograph: Photograph) -> Float[Tensor, "12"]:
+        """The change of colours that brings the cloud closest to a photograph, by the mean absolute difference, which
+        passers-by sway little; the average, where no pixel tells."""
+        assert self.appearance is not None
+        photograph = photograph.to(self.device)
+        seen = render(self._cloud(), photograph.camera, BLACK, self._near)
+        background, trusted = self.background[0], photograph.mask
+        if trusted is None:
+            trusted = torch.ones_like(seen.opacity, dtype=torch.bool)
+        if not trusted.any():
+            return self.appearance.average
+        rgb, opacity = seen.rgb[trusted], seen.opacity[trusted]
+        target = photograph.before(background)[trusted]
+
+        def error(code: Tensor) -> Tensor:
+            return (over(changed(rgb, opacity, code), opacity, background) - target).abs().mean()
+
+        return fitted(self.appearance.average, error, FIT_STEPS, FIT_RATE)
 
     def statistics(self) -> dict[str, float]:
         return {"mse": float(self._difference.square().mean()), "gaussians": len(self.cloud)}
