@@ -20,6 +20,8 @@ from ..components.clouds.density_control import AdaptiveDensity, MarkovChain
 from ..components.clouds.initial_cloud import Initialization, initial_cloud, random_cloud
 from ..components.clouds.seen_from import seen_from
 from ..components.clouds.smoothing import sampling_interval, smoothed
+from ..components.clouds.tidying import before_a_lens, confined, nearest_camera
+from ..components.clouds.witnesses import hold_back
 from ..components.fields.affine_colours import NUMBERS, changed, changed_harmonics
 from ..components.fields.appearance import PhotographCodes, fitted
 from ..components.training.pose_refinement import PoseRefinement
@@ -86,6 +88,7 @@ STORAGE = {  # of tensors, where a run is compressed; positions need the most bi
     "cloud.log_scales": Stored("scaled"),
     "cloud.opacities": Stored("scaled"),
     "cloud.harmonics": Stored("coded", plain=3),
+    "cloud.marks": Stored("nothing"),
     "density_control.pulls": Stored("nothing"),
     "density_control.sightings": Stored("nothing"),
 }
@@ -156,6 +159,7 @@ class GaussianSplatting(Method):
         self._told_full = False
         self._optimizer: CloudAdam | None = None
         self._seen: Splatted | None = None
+        self._image = 0  # that was learnt from last
         self._difference = torch.zeros(0)
 
     @property
@@ -205,23 +209,24 @@ class GaussianSplatting(Method):
         self.cloud.replace(found, self._optimizer)
         self.density_control.begin(len(found))
         self.began.fill_(len(found))
+        self._cameras = scene.cameras[scene.splits["train"]]
         if config.filter_3d:
-            self._cameras = scene.cameras[scene.splits["train"]]
             self.interval = sampling_interval(self.cloud.means, self._cameras, self._near)
         if self.poses:
             self.poses.begin(scene.cameras, scene.frame)
-        positions = scene.cameras.position[scene.splits["train"]]
+        positions = self._cameras.position
         self.extent.fill_(1.1 * float((positions - positions.mean(0)).norm(dim=-1).max()))
 
     def batch(self, scene: Scene, generator: torch.Generator) -> Photograph:
         """The next photograph: each once in a random order, then in another."""
         train = scene.splits["train"]
-        if self.config.filter_3d and self._cameras is None:  # in a run that was resumed
+        if self._cameras is None:  # in a run that was resumed
             self._cameras = scene.cameras[train]
         turn, place = divmod(int(self.drawn), len(train))
         self.drawn += 1
         order = torch.randperm(len(train), generator=self.random(1_000_000 + turn))
-        photograph = scene.photograph(int(train[order[place]]))
+        self._image = int(train[order[place]])
+        photograph = scene.photograph(self._image)
         return photograph.reduced(self._reduction(min(photograph.rgb.shape[:2]))).to(self.device)
 
     def _reduction(self, shorter: int) -> int:
@@ -302,12 +307,17 @@ class GaussianSplatting(Method):
         assert seen is not None and optimizer is not None
         self._seen, size = None, len(self.cloud)
         due = self.due(step)
+        assert seen.centres.grad is not None and self._cameras is not None
+        self.cloud.see(self._image, seen.centres.grad.ne(0).any(-1))
         if config.strategy == "mcmc":
             self._sample(step, due, optimizer, self.random(step))
         elif self._progress < config.refine_until:
             self._densify(step, due, seen, optimizer)
+        if due:
+            self._tidy(self._cameras)
+        if self._bands > 1:
+            hold_back(self.cloud.harmonics, self.cloud.seen_by)
         if config.filter_3d and (due or len(self.cloud) != size):
-            assert self._cameras is not None
             self.interval = sampling_interval(self.cloud.means, self._cameras, self._near)
 
     def due(self, step: int) -> bool:
@@ -328,6 +338,15 @@ class GaussianSplatting(Method):
         every, whole = self.config.opacity_reset_interval, self._progress >= self.config.half_resolution_until
         if step and step % every == 0 and whole and step / max(self._progress, 1e-6) - step >= RECOVERY * every:
             control.reset_opacity(self.cloud, optimizer)
+
+    def _tidy(self, cameras: Camera) -> None:
+        """Leave nothing before a lens once each photograph was seen twice, and neither giants nor needles anywhere."""
+        distance = nearest_camera(self.cloud.means, self.refined(cameras).position.to(self.device))
+        hanging = before_a_lens(distance, self.cloud.seen_by, self.frame.near)
+        if int(self.drawn) >= 2 * len(cameras) and hanging.any() and not hanging.all():
+            self.prune(~hanging)
+            distance = distance[~hanging]
+        self.cloud.log_scales.copy_(confined(self.cloud.gaussians(), distance, float(self.extent)))
 
     def _sample(self, step: int, due: bool, optimizer: CloudAdam, chance: torch.Generator) -> None:
         if due and self._progress < LAST_MOVE:
