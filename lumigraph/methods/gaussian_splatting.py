@@ -27,6 +27,7 @@ from ..components.fields.appearance import PhotographCodes, fitted
 from ..components.training.pose_refinement import PoseRefinement
 from ..components.training.rhythm import Rhythm, haste, intervals
 from ..components.training.schedules import falling
+from ..components.training.trimming import Trimming
 from ..controls import Control, Value
 from ..errors import LumigraphWarning
 from ..exchange.morton import morton_order
@@ -79,6 +80,8 @@ class Config:
     appearance_lr: LearningRate = 5e-3  # of those changes of colour
     final_appearance_lr: LearningRate = 5e-4
     appearance_regularization: NonNegative = 1e-3  # of a change's squared numbers in the loss
+    robust: Literal["auto", "yes", "no"] = "auto"  # leave out what moved between photographs; auto: with appearance
+    robust_start: Share = 0.1  # share of the budget before which every pixel counts
     seed: Seed = 0
 
 
@@ -148,6 +151,8 @@ class GaussianSplatting(Method):
         self.poses = PoseRefinement(frame.image_count, rate) if refining else None
         self.appearance = PhotographCodes(frame.image_count, NUMBERS) if config.appearance else None
         self.found: Tensor | None = None  # the light of a photograph that was given
+        robust = config.robust == "yes" or (config.robust == "auto" and config.appearance)
+        self.trimming = Trimming() if robust else None
         self.rhythm = Rhythm(config.refine_every, config.refine_every_share)
         self.register_buffer("extent", torch.tensor(1.0))
         self.register_buffer("drawn", torch.tensor(0))
@@ -255,8 +260,11 @@ class GaussianSplatting(Method):
         if seen.centres.requires_grad:
             seen.centres.retain_grad()
         self._seen = seen
+        self._difference = (rgb - target).detach()
+        if self.trimming and self._progress >= config.robust_start:
+            counted = self.trimming(self._difference.abs().mean(-1))
+            target = torch.where(counted[..., None], target, rgb.detach())
         difference = rgb - target
-        self._difference = difference.detach()
         terms = {
             "l1": (1 - config.ssim_weight) * difference.abs().mean(),
             "ssim": config.ssim_weight * (1 - kernels.ssim(rgb, target)),
@@ -309,6 +317,8 @@ class GaussianSplatting(Method):
         due = self.due(step)
         assert seen.centres.grad is not None and self._cameras is not None
         self.cloud.see(self._image, seen.centres.grad.ne(0).any(-1))
+        if self.trimming:
+            self.trimming.note(self._difference.abs().mean(-1))
         if config.strategy == "mcmc":
             self._sample(step, due, optimizer, self.random(step))
         elif self._progress < config.refine_until:

@@ -78,7 +78,7 @@ class Cloud(nn.Module):
         return witnesses(self.marks)
 
     def _load_from_state_dict(self, state: dict[str, Any], prefix: str, *rest: Any) -> None:
-        if f"{prefix}marks" not in state:  # older runs say nothing of it, and what they learnt may stay
+        if f"{prefix}marks" not in state and f"{prefix}means" in state:  # older runs: what they learnt may stay
             self.marks = torch.full((len(state[f"{prefix}means"]),), ALL, device=self.marks.device)
             state[f"{prefix}marks"] = self.marks.clone()
         super()._load_from_state_dict(state, prefix, *rest)
