@@ -112,7 +112,10 @@ def by_definition(error: np.ndarray, threshold: float) -> np.ndarray:
     height, width = error.shape
     small = error <= threshold
     smooth = np.array(
-        [[small[max(y - 1, 0) : y + 2, max(x - 1, 0) : x + 2].mean() >= 0.5 for x in range(width)] for y in range(height)]
+        [
+            [small[max(y - 1, 0) : y + 2, max(x - 1, 0) : x + 2].mean() >= 0.5 for x in range(width)]
+            for y in range(height)
+        ]
     )
     out = small | smooth
     for y in range(0, height, 8):

@@ -425,7 +425,7 @@ class GaussianSplatting(Method):
         return {"cloud.harmonics": weights[kept]}
 
     def gaussians(self) -> Gaussians:
-        """The cloud, in the scene's frame and the light that was told; with the 3-D filter in it, where that is used."""
+        """The cloud, in the scene's frame and the light that was told, with the 3-D filter where that is used."""
         cloud, code = self._cloud(), self._light
         return cloud if code is None else replace(cloud, harmonics=changed_harmonics(cloud.harmonics, code))
 
@@ -453,7 +453,9 @@ class GaussianSplatting(Method):
 
     @property
     def controls(self) -> tuple[Control, ...]:
-        about = "The photograph, by number or name, in whose light and colours the scene is shown; or the average of all."
+        about = (
+            "The photograph, by number or name, in whose light and colours the scene is shown; or the average of all."
+        )
         return (self.appearance.control("appearance", about),) if self.appearance else ()
 
     def given(self, *evidence: Any, **controls: Value) -> Method:
@@ -468,7 +470,7 @@ class GaussianSplatting(Method):
         return told
 
     @property
-    def _light(self) -> Float[Tensor, "12"] | None:
+    def _light(self) -> Float[Tensor, " 12"] | None:
         """The code that was told, else the one that was found, else the average; None where there are none."""
         if self.appearance is None:
             return None
@@ -477,7 +479,7 @@ class GaussianSplatting(Method):
         return self.appearance.told(str(self.control("appearance")))
 
     @torch.no_grad()
-    def _found(self, photograph: Photograph) -> Float[Tensor, "12"]:
+    def _found(self, photograph: Photograph) -> Float[Tensor, " 12"]:
         """The change of colours that brings the cloud closest to a photograph, by the mean absolute difference, which
         passers-by sway little; the average, where no pixel tells."""
         assert self.appearance is not None

@@ -35,9 +35,7 @@ def before_a_lens(
     return (distance < near) | ((distance < CLOSE * near) & (seen_by < WITNESSES))
 
 
-def confined(
-    gaussians: Gaussians, distance: Float[Tensor, " gaussian"], extent: float
-) -> Float[Tensor, "gaussian 3"]:
+def confined(gaussians: Gaussians, distance: Float[Tensor, " gaussian"], extent: float) -> Float[Tensor, "gaussian 3"]:
     """Log scales without giants and needles: the largest deviation is at most GIANT times the distance to the nearest
     camera, and at most NEEDLE times the second, unless it is short.
 

@@ -28,8 +28,8 @@ def witnesses(marks: Int[Tensor, " gaussian"]) -> Int[Tensor, " gaussian"]:
 
 @torch.no_grad()
 def hold_back(harmonics: Float[Tensor, "gaussian coefficient 3"], seen_by: Int[Tensor, " gaussian"]) -> None:
-    """Set to zero, in place, what of the harmonics a Gaussian's witnesses are too few for: a colour that changes with the
-    direction is told by several directions, and of one alone it may be anything everywhere else."""
+    """Set to zero, in place, what of the harmonics a Gaussian's witnesses are too few for: a colour that changes with
+    the direction is told by several directions, and from elsewhere may be anything."""
     for first, fewest in FEWEST.items():
         few = (seen_by < fewest).nonzero()[:, 0]
         harmonics[few, first:] = 0

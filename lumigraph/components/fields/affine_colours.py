@@ -1,7 +1,7 @@
 """Affine colours: a photograph's light as a small change of the scene's colours, c' = (I + A) c + b.
 
-The twelve numbers of A and b are a photograph's code (`PhotographCodes`): zeros change nothing. A camera's white balance,
-exposure and most of a grey day are such a map (Rematas 2022, Urban Radiance Fields, section 4.2).
+The twelve numbers of A and b are a photograph's code (`PhotographCodes`): zeros change nothing. A camera's white
+balance, exposure and most of a grey day are such a map (Rematas 2022, Urban Radiance Fields, section 4.2).
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ MIDDLE = 0.5  # the colour of a Gaussian whose harmonics are zero
 
 
 def changed(
-    rgb: Float[Tensor, "*#row 3"], opacity: Float[Tensor, "*#row"], code: Float[Tensor, "12"]
+    rgb: Float[Tensor, "*#row 3"], opacity: Float[Tensor, "*#row"], code: Float[Tensor, " 12"]
 ) -> Float[Tensor, "*#row 3"]:
     """Colours over black, in a photograph's light: the map is of the scene, and not of what shows behind it.
 
@@ -28,12 +28,12 @@ def changed(
 
 
 def changed_harmonics(
-    harmonics: Float[Tensor, "gaussian coefficient 3"], code: Float[Tensor, "12"]
+    harmonics: Float[Tensor, "gaussian coefficient 3"], code: Float[Tensor, " 12"]
 ) -> Float[Tensor, "gaussian coefficient 3"]:
     """Coefficients whose colours are those of others in a photograph's light, from every side.
 
-    A colour is 1/2 + sum_k Y_k h_k, so that h_k' = (I + A) h_k, and the constant takes up what is left of 1/2 and b. The
-    same but where a colour is cut at 0, which comes after this and before `changed`.
+    A colour is 1/2 + sum_k Y_k h_k, so that h_k' = (I + A) h_k, and the constant takes up what is left of 1/2 and b.
+    The same but where a colour is cut at 0, which comes after this and before `changed`.
     """
     matrix, offset = _map(code)
     out = harmonics @ matrix.T
@@ -41,6 +41,6 @@ def changed_harmonics(
     return torch.cat([constant, out[:, 1:]], 1)
 
 
-def _map(code: Float[Tensor, "12"]) -> tuple[Float[Tensor, "3 3"], Float[Tensor, "3"]]:
+def _map(code: Float[Tensor, " 12"]) -> tuple[Float[Tensor, "3 3"], Float[Tensor, " 3"]]:
     """I + A, and b."""
     return torch.eye(3, device=code.device) + code[:9].view(3, 3), code[9:]

@@ -1,7 +1,8 @@
 """Trimming: pixels whose error is among the largest teach nothing, for something passed before them.
 
-Trimmed least squares with smooth masks (Sabour et al. 2023, RobustNeRF, arXiv 2302.00833, section 4.2, eqs. 6 to 9). What
-passes covers patches of some photographs; fine detail that is not learnt yet errs at scattered pixels, and goes on counting.
+Trimmed least squares with smooth masks (Sabour et al. 2023, RobustNeRF, arXiv 2302.00833, section 4.2, eqs. 6 to 9).
+What passes covers patches of some photographs; fine detail that is not learnt yet errs at scattered pixels, and goes on
+counting.
 """
 
 from __future__ import annotations
@@ -41,8 +42,8 @@ class Trimming(nn.Module):
 
     @torch.no_grad()
     def note(self, error: Float[Tensor, "height width"]) -> None:
-        """Add a photograph's errors to the counts. Where there is none at all, nothing was photographed nor is it rendered,
-        and such pixels say nothing of how well others are learnt."""
+        """Add a photograph's errors to the counts. Where there is none at all, nothing was photographed nor is
+        it rendered, and such pixels say nothing of how well others are learnt."""
         some = error[error > 0]
         self.counts.mul_(DECAY).add_(torch.histc(some, BINS, 0, 1) / max(len(some), 1))
 
@@ -57,8 +58,8 @@ class Trimming(nn.Module):
 
 @torch.no_grad()
 def inliers(error: Float[Tensor, "height width"], threshold: float) -> Bool[Tensor, "height width"]:
-    """Pixels that err by no more than a threshold (eq. 6), or whose 3 x 3 neighbours do so for the most part (eq. 7), or
-    that lie in a patch of 8 x 8 whose neighbourhood of 16 x 16 does (eqs. 8 and 9), as the authors' release joins them.
+    """Pixels that err by no more than a threshold (eq. 6), or whose 3 x 3 neighbours do so for the most part (eq. 7),
+    or that lie in a patch of 8 x 8 whose neighbourhood of 16 x 16 does (eqs. 8 and 9); the authors' release joins them so.
 
     What lies beyond the picture is in no neighbourhood.
     """
