@@ -354,7 +354,7 @@ class GaussianSplatting(Method):
         distance = nearest_camera(self.cloud.means, self.refined(cameras).position.to(self.device))
         hanging = before_a_lens(distance, self.cloud.seen_by, self.frame.near)
         if int(self.drawn) >= 2 * len(cameras) and hanging.any() and not hanging.all():
-            self.prune(~hanging)
+            self._leave(~hanging)
             distance = distance[~hanging]
         self.cloud.log_scales.copy_(confined(self.cloud.gaussians(), distance, float(self.extent)))
 
@@ -390,12 +390,16 @@ class GaussianSplatting(Method):
     @torch.no_grad()
     def prune(self, keep: Bool[Tensor, " gaussian"]) -> None:
         """Leave those Gaussians that a mask picks, with their moments in the optimizer."""
+        self._leave(keep)
+        if self.config.filter_3d:
+            self.interval = self.interval[keep]
+
+    def _leave(self, keep: Bool[Tensor, " gaussian"]) -> None:
         assert self._optimizer is not None
         source = keep.nonzero()[:, 0]
         self.cloud.rebuild(self._optimizer, source, torch.zeros_like(source, dtype=torch.bool))
-        self.density_control.prune(keep)
-        if self.config.filter_3d:
-            self.interval = self.interval[keep]
+        if self.config.strategy == "adaptive":  # the chain counts no gradients
+            self.density_control.prune(keep)
 
     def storage(self) -> dict[str, Stored]:
         """Harmonics beyond the plain colour by a codebook; of what density control counts, nothing."""

@@ -59,7 +59,7 @@ class Trimming(nn.Module):
 @torch.no_grad()
 def inliers(error: Float[Tensor, "height width"], threshold: float) -> Bool[Tensor, "height width"]:
     """Pixels that err by no more than a threshold (eq. 6), or whose 3 x 3 neighbours do so for the most part (eq. 7),
-    or that lie in a patch of 8 x 8 whose neighbourhood of 16 x 16 does (eqs. 8 and 9); the authors' release joins them so.
+    or that lie in a patch of 8 x 8 whose neighbourhood of 16 x 16 does (eqs. 8 and 9), joined as in the authors' code.
 
     What lies beyond the picture is in no neighbourhood.
     """
