@@ -22,8 +22,8 @@ from ..components.clouds.seen_from import seen_from
 from ..components.clouds.smoothing import sampling_interval, smoothed
 from ..components.clouds.tidying import before_a_lens, confined, nearest_camera
 from ..components.clouds.witnesses import hold_back
-from ..components.fields.affine_colours import NUMBERS, changed, changed_harmonics
-from ..components.fields.appearance import PhotographCodes, fitted
+from ..components.fields.affine_colours import NUMBERS, changed, changed_harmonics, found
+from ..components.fields.appearance import PhotographCodes
 from ..components.training.pose_refinement import PoseRefinement
 from ..components.training.rhythm import Rhythm, haste, intervals
 from ..components.training.schedules import falling
@@ -104,7 +104,6 @@ ENOUGH = 2400  # steps, with which sizes and colours need not hurry
 RECOVERY = 3  # opacity_reset_intervals that must be left after opacities are reset, or the pictures stay dim
 GROWTH = 1.05  # of the number at each change, for mcmc (Kheradmand 2024, section 3.2)
 LAST_MOVE = 0.9  # share of the budget after which mcmc moves and adds no Gaussians, so that those there converge
-FIT_STEPS, FIT_RATE = 200, 0.02  # of Adam, where the light of a given photograph is found
 BYTES = 4096  # that one more Gaussian needs while it learns: itself, its gradient and moments, its share of a picture
 
 
@@ -484,23 +483,15 @@ class GaussianSplatting(Method):
 
     @torch.no_grad()
     def _found(self, photograph: Photograph) -> Float[Tensor, " 12"]:
-        """The change of colours that brings the cloud closest to a photograph, by the mean absolute difference, which
-        passers-by sway little; the average, where no pixel tells."""
+        """The light in which the cloud looks most like a photograph; the average, where no pixel tells."""
         assert self.appearance is not None
-        photograph = photograph.to(self.device)
+        photograph, background = photograph.to(self.device), self.background[0]
         seen = render(self._cloud(), photograph.camera, BLACK, self._near)
-        background, trusted = self.background[0], photograph.mask
+        target, trusted = photograph.before(background), photograph.mask
         if trusted is None:
             trusted = torch.ones_like(seen.opacity, dtype=torch.bool)
-        if not trusted.any():
-            return self.appearance.average
-        rgb, opacity = seen.rgb[trusted], seen.opacity[trusted]
-        target = photograph.before(background)[trusted]
-
-        def error(code: Tensor) -> Tensor:
-            return (over(changed(rgb, opacity, code), opacity, background) - target).abs().mean()
-
-        return fitted(self.appearance.average, error, FIT_STEPS, FIT_RATE)
+        rgb, opacity = seen.rgb.detach()[trusted], seen.opacity.detach()[trusted]
+        return found(self.appearance.average.detach(), rgb, opacity, background, target[trusted])
 
     def statistics(self) -> dict[str, float]:
         return {"mse": float(self._difference.square().mean()), "gaussians": len(self.cloud)}
