@@ -62,7 +62,6 @@ def test_a_field_tells_where_rays_should_go(name):
     method = refining(name, **SMALL[name])
     if name == "instant-ngp":
         method.network.table.data.uniform_(-1, 1)
-    method.poses.begin(tiny.scene().cameras, method.frame)
     camera, t = tiny.scene().cameras[1], torch.linspace(2.5, 3.5, 8)
     rays = camera.rays(camera.pixels()[::7])
 
@@ -77,17 +76,16 @@ def test_a_field_tells_where_rays_should_go(name):
     (found,) = torch.autograd.grad(value(), method.poses.twist)
     expected = slopes(value, method.poses.twist, 1, 1e-4)
     assert found[0].abs().max() == 0 and expected.norm() > 1
-    assert (found[1] - expected).norm() < 0.1 * expected.norm()  # across kinks of ReLUs and cells
+    assert (found[1] - expected).norm() < 0.06 * expected.norm()  # across kinks of ReLUs and cells
 
 
 def test_a_cloud_tells_where_its_camera_should_go():
     """A picture through the refined camera, by central differences in its pose."""
     scene = tiny.scene()
-    cloud = random_cloud(scene.frame, 150, 0, torch.Generator().manual_seed(0))
+    cloud = random_cloud(scene.frame, 30, 0, torch.Generator().manual_seed(0))
     scales = cloud.log_scales + torch.tensor([0.5, -0.5, 0.0])
-    cloud = replace(cloud, log_scales=scales, opacities=cloud.opacities + 3)  # whose cut edges are faint beside them
+    cloud = replace(cloud, log_scales=scales, opacities=cloud.opacities + 2)  # whose cut edges are faint beside them
     poses = PoseRefinement(len(scene))
-    poses.begin(scene.cameras, scene.frame)
     weights = torch.rand(tiny.SIZE, tiny.SIZE, 3, generator=torch.Generator().manual_seed(1))
 
     def value() -> torch.Tensor:
@@ -97,7 +95,7 @@ def test_a_cloud_tells_where_its_camera_should_go():
     with torch.no_grad():
         poses.twist[2] = torch.tensor([0.02, -0.01, 0.03, 0.01, 0.02, -0.02])
     (found,) = torch.autograd.grad(value(), poses.twist)
-    expected = slopes(value, poses.twist, 2, 1e-3)
+    expected = slopes(value, poses.twist, 2, 2e-4)
     assert expected.norm() > 1 and (found[2] - expected).norm() < 0.05 * expected.norm()
 
 
@@ -157,8 +155,8 @@ def test_waves_and_levels_are_weighted_in_their_order():
 def test_a_method_that_refines_nothing_has_no_weights_and_one_rate():
     plain = build(methods.find("nerf"), tiny.scene().frame, methods.find("nerf").smallest(), CPU, 0)
     assert plain.poses is None and isinstance(plain.learning_rate(0, 0.5), float)
-    rates = [refining("nerf").learning_rate(0, progress)["poses"] for progress in (0.0, 0.1, 1.0)]
-    assert rates[0] < 0.02 * rates[1] and rates[2] < 0.02 * rates[1]
+    rates = [refining("nerf").learning_rate(0, progress)["poses"] for progress in (0.0, 0.2, 1.0)]
+    assert rates[0] < 0.05 * rates[1] and rates[2] < 0.1 * rates[1]
 
 
 # Frames

@@ -79,7 +79,7 @@ def leaps_alike(shots: Sequence[Shot], poses: Float[np.ndarray, "photo 3 4"]) ->
 
 def alike(four: Sequence[Shot]) -> bool:
     """Whether the middle two of four photographs in a row differ no more than the outer pairs do."""
-    seen = [picture for picture in map(thumbnail, four) if picture is not None]
+    seen = [picture for shot in four if (picture := thumbnail(shot)) is not None]
     if len(seen) < len(four):
         return False
     before, between, after = (float(np.abs(b - a).mean()) for a, b in pairwise(seen))

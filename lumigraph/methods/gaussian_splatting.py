@@ -75,7 +75,7 @@ class Config:
     antialiased: bool = False  # Mip-Splatting's 2-D filter (Yu 2024, section 5.2)
     filter_3d: bool = False  # Mip-Splatting's 3-D filter (Yu 2024, section 5.1)
     refine_cameras: bool = False  # learn where each photograph was taken from, small pictures first
-    pose_learning_rate: LearningRate = 1e-2  # radians by which a step moves a picture, with refine_cameras
+    pose_learning_rate: LearningRate = 5e-3  # radians by which a step moves a picture, with refine_cameras
     appearance: bool = False  # learn for each photograph how its colours differ from the scene's
     appearance_lr: LearningRate = 5e-3  # of those changes of colour
     final_appearance_lr: LearningRate = 5e-4
@@ -98,7 +98,7 @@ STORAGE = {  # of tensors, where a run is compressed; positions need the most bi
 SWEEPING = 0.08  # of the budget: the share that looking for points to begin at may take
 BLACK = 0.0, 0.0, 0.0
 NEAR = 0.1  # times the scene's near distance: the near plane of splats
-COARSE = 0.5  # of the budget, at half size where poses are refined and nothing else is said
+COARSE = 0.5  # of the budget: where poses are refined, plain colours, and half size if nothing else is said
 SMALLEST = 64  # pixels of a photograph's shorter side that are kept when it is reduced
 ENOUGH = 2400  # steps, with which sizes and colours need not hurry
 RECOVERY = 3  # opacity_reset_intervals that must be left after opacities are reset, or the pictures stay dim
@@ -306,7 +306,8 @@ class GaussianSplatting(Method):
         if self.poses:
             self.poses.progress.fill_(progress)
         raised = intervals(step, progress, config.sh_degree_interval, config.sh_degree_interval_share)
-        self._bands = 1 + min(int(raised), config.sh_degree)
+        flat = self.poses is not None and progress < COARSE  # colours by direction would explain wrong poses away
+        self._bands = 1 if flat else 1 + min(int(raised), config.sh_degree)
 
     @torch.no_grad()
     def after_step(self, step: int) -> None:

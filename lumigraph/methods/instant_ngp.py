@@ -64,7 +64,7 @@ class Config(OpenNumbers):
     contraction: bool = True  # of open captures (Barron 2022), with proposals; or section 5.4's cascades around them
     exposure_correction: bool = False  # learn a gain per photograph
     refine_cameras: bool = False  # learn where each photograph was taken from, coarse to fine (Lin 2021, BARF)
-    pose_learning_rate: LearningRate = 2e-3  # radians by which a step moves a picture, with refine_cameras
+    pose_learning_rate: LearningRate = 5e-4  # radians by which a step moves a picture, with refine_cameras
     seed: Seed = 0
 
     def check(self) -> None:

@@ -48,7 +48,7 @@ class Config:
     occupancy_resolution: Cells = 0  # cells per axis of a grid that tells where to sample; 0 samples everywhere
     occupancy_threshold: NonNegative = 0.01  # optical thickness across a cell below which it is empty
     refine_cameras: bool = False  # learn where each photograph was taken from, coarse to fine (Lin 2021, BARF)
-    pose_learning_rate: LearningRate = 2e-3  # radians by which a step moves a picture, with refine_cameras
+    pose_learning_rate: LearningRate = 5e-4  # radians by which a step moves a picture, with refine_cameras
     bfloat16: bool = True  # multiply in bfloat16 where the machine is fast at it
     seed: Seed = 0
 

@@ -62,7 +62,7 @@ class Config:
     transmittance_threshold: Share = 0.0  # at which a ray is spent
     warmup: Share = 0.0  # share of the budget in which the learning rate grows
     refine_cameras: bool = False  # learn where each photograph was taken from, coarse to fine (Lin 2021, BARF)
-    pose_learning_rate: LearningRate = 2e-3  # radians by which a step moves a picture, with refine_cameras
+    pose_learning_rate: LearningRate = 5e-4  # radians by which a step moves a picture, with refine_cameras
     bfloat16: bool = True  # multiply in bfloat16 where the machine is fast at it
     seed: Seed = 0
 

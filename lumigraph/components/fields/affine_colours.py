@@ -53,7 +53,7 @@ def found(
     background: Float[Tensor, " 3"],
     target: Float[Tensor, "pixel 3"],
 ) -> Float[Tensor, " 12"]:
-    """The code that brings a picture closest to a photograph, by mean absolute difference, which passers-by hardly sway.
+    """What brings a picture closest to a photograph by mean absolute difference, which passers-by hardly sway.
 
     start:   where the search begins, and what comes back where there is no pixel
     rgb:     of the picture, over black; with its opacity and what shows behind it

@@ -22,16 +22,15 @@ class PoseAdam(torch.optim.Optimizer):
         for group in self.param_groups:
             for p in group["params"]:
                 if p.grad is not None:
-                    self._update(p, group["lr"], *group["betas"])
+                    self._update(p, p.grad, group["lr"], *group["betas"])
 
-    def _update(self, p: torch.Tensor, lr: float, b1: float, b2: float) -> None:
-        assert p.grad is not None
+    def _update(self, p: torch.Tensor, grads: torch.Tensor, lr: float, b1: float, b2: float) -> None:
         state = self.state[p]
         if not state:
             state["mean"] = torch.zeros_like(p)
             state["square"], state["steps"] = torch.zeros_like(p[:, 0]), torch.zeros_like(p[:, 0])
-        seen = p.grad.ne(0).any(-1).nonzero()[:, 0]
-        grad = p.grad[seen]
+        seen = grads.ne(0).any(-1).nonzero()[:, 0]
+        grad = grads[seen]
         steps = state["steps"][seen] + 1
         mean = torch.lerp(grad, state["mean"][seen], b1)
         square = torch.lerp(grad.square().sum(-1), state["square"][seen], b2)

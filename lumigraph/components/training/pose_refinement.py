@@ -16,10 +16,8 @@ from .pose_adam import PoseAdam
 from .schedules import falling
 
 PLACES = 16  # along each side of a picture, and as many depths: where its motion is measured
-# Lambda and mu of the whitening. Park 2023 damps ten times as much, for an Adam with a rate for each number; with one
-# for a whole pose, turning about the scene would then come ten times slower than turning on the spot.
-DAMPING, LEAST = 0.01, 1e-8
-WARMUP = 0.1  # share of the budget in which poses' rate grows: at first nothing is there to be aligned with
+DAMPING, LEAST = 0.1, 1e-8  # of the whitening, lambda and mu of Park 2023
+WARMUP = 0.2  # share of the budget in which poses' rate grows: at first nothing is there to be aligned with
 FALL = 0.02  # of the rate, that is left of it at the end of the budget
 
 
