@@ -61,6 +61,7 @@ SHARES: dict[str, tuple[str, float]] = {
     "test_tensorf": ("methods", 5),
     "test_instant_ngp": ("methods", 10),
     "test_gaussian_splatting": ("methods", 10),
+    "test_wild_splats": ("methods", 10),
     "test_dvgo": ("methods", 8),
     "test_fourier_features": ("methods", 12),
 }

@@ -20,9 +20,15 @@ from ..components.clouds.density_control import AdaptiveDensity, MarkovChain
 from ..components.clouds.initial_cloud import Initialization, initial_cloud, random_cloud
 from ..components.clouds.seen_from import seen_from
 from ..components.clouds.smoothing import sampling_interval, smoothed
+from ..components.clouds.tidying import before_a_lens, confined, nearest_camera
+from ..components.clouds.witnesses import hold_back
+from ..components.fields.affine_colours import NUMBERS, changed, changed_harmonics, found
+from ..components.fields.appearance import PhotographCodes
 from ..components.training.pose_refinement import PoseRefinement
 from ..components.training.rhythm import Rhythm, haste, intervals
 from ..components.training.schedules import falling
+from ..components.training.trimming import Trimming
+from ..controls import Control, Value
 from ..errors import LumigraphWarning
 from ..exchange.morton import morton_order
 from ..gaussians import Gaussians
@@ -70,6 +76,12 @@ class Config:
     filter_3d: bool = False  # Mip-Splatting's 3-D filter (Yu 2024, section 5.1)
     refine_cameras: bool = False  # learn where each photograph was taken from, small pictures first
     pose_learning_rate: LearningRate = 5e-3  # radians by which a step moves a picture, with refine_cameras
+    appearance: bool = False  # learn for each photograph how its colours differ from the scene's
+    appearance_lr: LearningRate = 5e-3  # of those changes of colour
+    final_appearance_lr: LearningRate = 5e-4
+    appearance_regularization: NonNegative = 1e-3  # of a change's squared numbers in the loss
+    robust: Literal["auto", "yes", "no"] = "auto"  # leave out what moved between photographs; auto: with appearance
+    robust_start: Share = 0.1  # share of the budget before which every pixel counts
     seed: Seed = 0
 
 
@@ -79,10 +91,12 @@ STORAGE = {  # of tensors, where a run is compressed; positions need the most bi
     "cloud.log_scales": Stored("scaled"),
     "cloud.opacities": Stored("scaled"),
     "cloud.harmonics": Stored("coded", plain=3),
+    "cloud.marks": Stored("nothing"),
     "density_control.pulls": Stored("nothing"),
     "density_control.sightings": Stored("nothing"),
 }
 SWEEPING = 0.08  # of the budget: the share that looking for points to begin at may take
+BLACK = 0.0, 0.0, 0.0
 NEAR = 0.1  # times the scene's near distance: the near plane of splats
 COARSE = 0.5  # of the budget: where poses are refined, plain colours, and half size if nothing else is said
 SMALLEST = 64  # pixels of a photograph's shorter side that are kept when it is reduced
@@ -134,6 +148,10 @@ class GaussianSplatting(Method):
         self.exploration = MarkovChain()
         refining, rate = config.refine_cameras, config.pose_learning_rate
         self.poses = PoseRefinement(frame.image_count, rate) if refining else None
+        self.appearance = PhotographCodes(frame.image_count, NUMBERS) if config.appearance else None
+        self.found: Tensor | None = None  # the light of a photograph that was given
+        robust = config.robust == "yes" or (config.robust == "auto" and config.appearance)
+        self.trimming = Trimming() if robust else None
         self.rhythm = Rhythm(config.refine_every, config.refine_every_share)
         self.register_buffer("extent", torch.tensor(1.0))
         self.register_buffer("drawn", torch.tensor(0))
@@ -145,6 +163,7 @@ class GaussianSplatting(Method):
         self._told_full = False
         self._optimizer: CloudAdam | None = None
         self._seen: Splatted | None = None
+        self._image = 0  # that was learnt from last
         self._difference = torch.zeros(0)
 
     @property
@@ -194,23 +213,24 @@ class GaussianSplatting(Method):
         self.cloud.replace(found, self._optimizer)
         self.density_control.begin(len(found))
         self.began.fill_(len(found))
+        self._cameras = scene.cameras[scene.splits["train"]]
         if config.filter_3d:
-            self._cameras = scene.cameras[scene.splits["train"]]
             self.interval = sampling_interval(self.cloud.means, self._cameras, self._near)
         if self.poses:
             self.poses.begin(scene.cameras, scene.frame)
-        positions = scene.cameras.position[scene.splits["train"]]
+        positions = self._cameras.position
         self.extent.fill_(1.1 * float((positions - positions.mean(0)).norm(dim=-1).max()))
 
     def batch(self, scene: Scene, generator: torch.Generator) -> Photograph:
         """The next photograph: each once in a random order, then in another."""
         train = scene.splits["train"]
-        if self.config.filter_3d and self._cameras is None:  # in a run that was resumed
+        if self._cameras is None:  # in a run that was resumed
             self._cameras = scene.cameras[train]
         turn, place = divmod(int(self.drawn), len(train))
         self.drawn += 1
         order = torch.randperm(len(train), generator=self.random(1_000_000 + turn))
-        photograph = scene.photograph(int(train[order[place]]))
+        self._image = int(train[order[place]])
+        photograph = scene.photograph(self._image)
         return photograph.reduced(self._reduction(min(photograph.rgb.shape[:2]))).to(self.device)
 
     def _reduction(self, shorter: int) -> int:
@@ -220,7 +240,7 @@ class GaussianSplatting(Method):
         return max(1, min(wanted, shorter // SMALLEST))
 
     def loss(self, batch: Photograph, step: int) -> dict[str, Tensor]:
-        config, cloud, camera = self.config, self.gaussians(), batch.camera
+        config, cloud, camera = self.config, self._cloud(), batch.camera
         if self.poses:
             cloud, camera = seen_from(self.poses, cloud, camera)
         seen = splat(cloud, view_of(camera, self._near), self._bands, config.transmittance_threshold)
@@ -228,6 +248,10 @@ class GaussianSplatting(Method):
         if batch.alpha is not None:  # a random colour behind everything, so that only opacity can imitate opacity
             background = torch.rand(3, generator=self.random(~step)).to(rgb.device)
         target = batch.before(background)
+        code = None
+        if self.appearance and camera.image_index is not None:
+            code = self.appearance(camera.image_index)[0]
+            rgb = changed(rgb, seen.opacity, code)
         if background.any():
             rgb = over(rgb, seen.opacity, background)
         if batch.mask is not None:
@@ -235,12 +259,17 @@ class GaussianSplatting(Method):
         if seen.centres.requires_grad:
             seen.centres.retain_grad()
         self._seen = seen
+        self._difference = (rgb - target).detach()
+        if self.trimming and self._progress >= config.robust_start:
+            counted = self.trimming(self._difference.abs().mean(-1))
+            target = torch.where(counted[..., None], target, rgb.detach())
         difference = rgb - target
-        self._difference = difference.detach()
         terms = {
             "l1": (1 - config.ssim_weight) * difference.abs().mean(),
             "ssim": config.ssim_weight * (1 - kernels.ssim(rgb, target)),
         }
+        if code is not None:
+            terms["appearance"] = config.appearance_regularization * code.square().sum()
         if config.strategy == "mcmc":
             terms["opacity"] = config.opacity_regularization * cloud.opacities.sigmoid().mean()
             terms["scale"] = config.scale_regularization / float(self.extent) * cloud.log_scales.exp().mean()
@@ -256,6 +285,8 @@ class GaussianSplatting(Method):
             {"params": [cloud.opacities], "lr": c.opacities_lr},
             {"name": "harmonics", "params": [cloud.harmonics], "lr": c.sh_lr, "columns": columns},
         ]
+        if self.appearance:  # one row a step has a gradient, as with Gaussians
+            groups.append({"name": "appearance", "params": [self.appearance.codes], "lr": c.appearance_lr})
         self._optimizer = CloudAdam(groups)
         return [self._optimizer, self.poses.optimizer()] if self.poses else [self._optimizer]
 
@@ -266,6 +297,8 @@ class GaussianSplatting(Method):
         times = haste(step, progress, ENOUGH, c.most_haste)
         means = float(self.extent) * falling(c.means_lr, c.final_means_lr, progress)
         rates = {"means": means, "scales": times * c.scales_lr, "harmonics": times * c.sh_lr}
+        if self.appearance:
+            rates["appearance"] = falling(c.appearance_lr, c.final_appearance_lr, progress)
         return rates | ({"poses": self.poses.rate(progress)} if self.poses else {})
 
     def before_step(self, step: int, progress: float) -> None:
@@ -282,12 +315,19 @@ class GaussianSplatting(Method):
         assert seen is not None and optimizer is not None
         self._seen, size = None, len(self.cloud)
         due = self.due(step)
+        assert seen.centres.grad is not None and self._cameras is not None
+        self.cloud.see(self._image, seen.centres.grad.ne(0).any(-1))
+        if self.trimming:
+            self.trimming.note(self._difference.abs().mean(-1))
         if config.strategy == "mcmc":
             self._sample(step, due, optimizer, self.random(step))
         elif self._progress < config.refine_until:
             self._densify(step, due, seen, optimizer)
+        if due:
+            self._tidy(self._cameras)
+        if self._bands > 1:
+            hold_back(self.cloud.harmonics, self.cloud.seen_by)
         if config.filter_3d and (due or len(self.cloud) != size):
-            assert self._cameras is not None
             self.interval = sampling_interval(self.cloud.means, self._cameras, self._near)
 
     def due(self, step: int) -> bool:
@@ -308,6 +348,15 @@ class GaussianSplatting(Method):
         every, whole = self.config.opacity_reset_interval, self._progress >= self.config.half_resolution_until
         if step and step % every == 0 and whole and step / max(self._progress, 1e-6) - step >= RECOVERY * every:
             control.reset_opacity(self.cloud, optimizer)
+
+    def _tidy(self, cameras: Camera) -> None:
+        """Leave nothing before a lens once each photograph was seen twice, and neither giants nor needles anywhere."""
+        distance = nearest_camera(self.cloud.means, self.refined(cameras).position.to(self.device))
+        hanging = before_a_lens(distance, self.cloud.seen_by, self.frame.near)
+        if int(self.drawn) >= 2 * len(cameras) and hanging.any() and not hanging.all():
+            self._leave(~hanging)
+            distance = distance[~hanging]
+        self.cloud.log_scales.copy_(confined(self.cloud.gaussians(), distance, float(self.extent)))
 
     def _sample(self, step: int, due: bool, optimizer: CloudAdam, chance: torch.Generator) -> None:
         if due and self._progress < LAST_MOVE:
@@ -341,12 +390,16 @@ class GaussianSplatting(Method):
     @torch.no_grad()
     def prune(self, keep: Bool[Tensor, " gaussian"]) -> None:
         """Leave those Gaussians that a mask picks, with their moments in the optimizer."""
+        self._leave(keep)
+        if self.config.filter_3d:
+            self.interval = self.interval[keep]
+
+    def _leave(self, keep: Bool[Tensor, " gaussian"]) -> None:
         assert self._optimizer is not None
         source = keep.nonzero()[:, 0]
         self.cloud.rebuild(self._optimizer, source, torch.zeros_like(source, dtype=torch.bool))
-        self.density_control.prune(keep)
-        if self.config.filter_3d:
-            self.interval = self.interval[keep]
+        if self.config.strategy == "adaptive":  # the chain counts no gradients
+            self.density_control.prune(keep)
 
     def storage(self) -> dict[str, Stored]:
         """Harmonics beyond the plain colour by a codebook; of what density control counts, nothing."""
@@ -376,7 +429,12 @@ class GaussianSplatting(Method):
         return {"cloud.harmonics": weights[kept]}
 
     def gaussians(self) -> Gaussians:
-        """The cloud, in the scene's frame; with the 3-D filter in it, where that is used."""
+        """The cloud, in the scene's frame and the light that was told, with the 3-D filter where that is used."""
+        cloud, code = self._cloud(), self._light
+        return cloud if code is None else replace(cloud, harmonics=changed_harmonics(cloud.harmonics, code))
+
+    def _cloud(self) -> Gaussians:
+        """The cloud as it is learnt, which is in no photograph's light."""
         cloud = self.cloud.gaussians()
         return smoothed(cloud, self.interval) if self.config.filter_3d else cloud
 
@@ -384,7 +442,57 @@ class GaussianSplatting(Method):
         return self.poses.refined(cameras) if self.poses else cameras
 
     def render(self, camera: Camera) -> Rendering:
-        return render(self.gaussians(), camera.to(self.device), self.frame.background, self._near)
+        seen = render(self._cloud(), camera.to(self.device), BLACK, self._near)
+        rgb, code, background = seen.rgb, self._light, self.background[0]
+        if code is not None:
+            rgb = changed(rgb, seen.opacity, code.detach()).clamp(0, 1)
+        return replace(seen, rgb=over(rgb, seen.opacity, background))
+
+    # Being told something
+
+    @property
+    def accepts(self) -> tuple[type, ...]:  # type: ignore[override]  # it depends on the run
+        """Photographs, where their colours were learnt to differ."""
+        return (Photograph,) if self.appearance else ()
+
+    @property
+    def controls(self) -> tuple[Control, ...]:
+        about = (
+            "The photograph, by number or name, in whose light and colours the scene is shown; or the average of all."
+        )
+        return (self.appearance.control("appearance", about),) if self.appearance else ()
+
+    def given(self, *evidence: Any, **controls: Value) -> Method:
+        """The same cloud, told its controls, or in the light of a photograph, found from the pixels that are to be
+        trusted."""
+        photographs = [piece for piece in evidence if isinstance(piece, self.accepts)]
+        told = super().given(*(piece for piece in evidence if not isinstance(piece, self.accepts)), **controls)
+        assert isinstance(told, GaussianSplatting)
+        for photograph in photographs:
+            told.found = self._found(photograph)
+            told.told.pop("appearance", None)
+        return told
+
+    @property
+    def _light(self) -> Float[Tensor, " 12"] | None:
+        """The code that was told, else the one that was found, else the average; None where there are none."""
+        if self.appearance is None:
+            return None
+        if self.found is not None and "appearance" not in self.told:
+            return self.found
+        return self.appearance.told(str(self.control("appearance")))
+
+    @torch.no_grad()
+    def _found(self, photograph: Photograph) -> Float[Tensor, " 12"]:
+        """The light in which the cloud looks most like a photograph; the average, where no pixel tells."""
+        assert self.appearance is not None
+        photograph, background = photograph.to(self.device), self.background[0]
+        seen = render(self._cloud(), photograph.camera, BLACK, self._near)
+        target, trusted = photograph.before(background), photograph.mask
+        if trusted is None:
+            trusted = torch.ones_like(seen.opacity, dtype=torch.bool)
+        rgb, opacity = seen.rgb.detach()[trusted], seen.opacity.detach()[trusted]
+        return found(self.appearance.average.detach(), rgb, opacity, background, target[trusted])
 
     def statistics(self) -> dict[str, float]:
         return {"mse": float(self._difference.square().mean()), "gaussians": len(self.cloud)}

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from functools import lru_cache
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -14,26 +14,29 @@ from torch import Tensor, nn
 
 from ...gaussians import Gaussians
 from ..training.exchange import exchange
+from .witnesses import ALL, marked, witnesses
 
 NAMES = ("means", "quaternions", "log_scales", "opacities", "harmonics")
 
 
 class Cloud(nn.Module):
-    """The tensors of `Gaussians` as parameters."""
+    """The tensors of `Gaussians` as parameters, and the photographs that saw each: a bit for each, see `witnesses`."""
 
-    grows: ClassVar[tuple[str, ...]] = NAMES  # with training, so that a saved one may be of another size
+    grows: ClassVar[tuple[str, ...]] = (*NAMES, "marks")  # with training, so that a saved one may be of another size
 
     means: nn.Parameter
     quaternions: nn.Parameter
     log_scales: nn.Parameter
     opacities: nn.Parameter
     harmonics: nn.Parameter
+    marks: Tensor
 
     def __init__(self, gaussians: Gaussians):
         super().__init__()
         self.antialiased = gaussians.antialiased
         for name in NAMES:
             setattr(self, name, nn.Parameter(getattr(gaussians, name).clone()))
+        self.register_buffer("marks", torch.zeros(len(gaussians), dtype=torch.int64))
 
     def __len__(self) -> int:
         return len(self.means)
@@ -47,6 +50,7 @@ class Cloud(nn.Module):
         """Put another cloud in this one's place; the optimizer updates it from now on, with fresh moments."""
         for name in NAMES:
             exchange(self, name, getattr(gaussians, name).detach().clone(), optimizer)
+        self.marks = self.marks.new_zeros(len(gaussians))
 
     @torch.no_grad()
     def rebuild(self, optimizer: CloudAdam, source: Int[Tensor, " new"], fresh: Bool[Tensor, " new"]) -> None:
@@ -62,6 +66,22 @@ class Cloud(nn.Module):
                     state[moment] = state[moment][source]
                     state[moment][fresh] = state["step"] if moment == "last" else 0
             exchange(self, name, old.data[source], optimizer, state)
+        self.marks = self.marks[source]
+
+    def see(self, image_index: int, seen: Bool[Tensor, " gaussian"]) -> None:
+        """Remember which Gaussians a photograph saw something of."""
+        self.marks = marked(self.marks, image_index, seen)
+
+    @property
+    def seen_by(self) -> Int[Tensor, " gaussian"]:
+        """How many photographs saw each Gaussian."""
+        return witnesses(self.marks)
+
+    def _load_from_state_dict(self, state: dict[str, Any], prefix: str, *rest: Any) -> None:
+        if f"{prefix}marks" not in state and f"{prefix}means" in state:  # older runs: what they learnt may stay
+            self.marks = torch.full((len(state[f"{prefix}means"]),), ALL, device=self.marks.device)
+            state[f"{prefix}marks"] = self.marks.clone()
+        super()._load_from_state_dict(state, prefix, *rest)
 
 
 class CloudAdam(torch.optim.Optimizer):

@@ -1,0 +1,232 @@
+"""Splats from photographs that differ, and from few: light of each, what moves, what nobody saw well."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import tiny
+import torch
+from test_gaussian_splatting import new
+from test_gaussians import cloud
+from test_nerf_w import two_lights
+
+from lumigraph import kernels
+from lumigraph.components.clouds.tidying import CLOSE, GIANT, NEEDLE, before_a_lens, confined, nearest_camera
+from lumigraph.components.clouds.witnesses import FEWEST, MARKS, hold_back, marked, witnesses
+from lumigraph.components.fields.affine_colours import changed, changed_harmonics, found
+from lumigraph.components.training.trimming import BINS, KEPT, Trimming, inliers
+from lumigraph.errors import LumigraphError
+from lumigraph.evaluate import evaluate
+from lumigraph.evaluate.halves import judged_by_halves, left_half
+from lumigraph.images import ImageStore
+from lumigraph.run import Run
+from lumigraph.scene import Photograph
+from lumigraph.train import fit
+
+pytestmark = pytest.mark.filterwarnings("ignore:The cloud stops growing")
+
+
+def code(seed: int = 0) -> torch.Tensor:
+    return 0.1 * torch.randn(12, generator=torch.Generator().manual_seed(seed))
+
+
+# The light of each photograph
+
+
+def test_harmonics_change_as_their_colours_do(generator):
+    """From every side: 1/2 + Y h' = (I + A)(1/2 + Y h) + b."""
+    harmonics, directions = torch.randn(5, 16, 3, generator=generator), torch.randn(5, 3, generator=generator)
+    basis = kernels.spherical_harmonics(torch.nn.functional.normalize(directions, dim=-1), 4)
+
+    def colours(h):
+        return 0.5 + torch.einsum("nk,nkc->nc", basis, h)
+
+    one, other = colours(harmonics), colours(changed_harmonics(harmonics, code()))
+    matrix, offset = torch.eye(3) + code()[:9].view(3, 3), code()[9:]
+    torch.testing.assert_close(other, one @ matrix.T + offset, atol=1e-5, rtol=1e-5)
+    torch.testing.assert_close(changed(one, torch.ones(5), code()), other, atol=1e-5, rtol=1e-5)
+    assert torch.equal(changed_harmonics(harmonics, torch.zeros(12))[:, 1:], harmonics[:, 1:])
+
+
+@pytest.fixture(scope="module")
+def taught():
+    scene, (method, _) = two_lights(), new(appearance=True, appearance_lr=0.03, robust="no")
+    fit(method, scene, steps=150, show=False, rehearsal=False)
+    return method.eval(), scene
+
+
+def test_the_light_is_learnt_and_found_on_left_halves(taught):
+    """Held-out photographs, some of them a third as bright, come out in their own light."""
+    method, scene = taught
+    assert judged_by_halves(method) and not judged_by_halves(method.given(appearance="average"))
+    average, halves = (evaluate(x, scene) for x in (method.given(appearance="average"), method))
+    assert halves.psnr > average.psnr + 2, (halves.psnr, average.psnr)
+    assert not method.appearance.codes[scene.splits["test"]].any()
+    shot = scene.photograph(0)
+    blank = replace(shot, rgb=torch.where(left_half(shot).mask[..., None], shot.rgb, 0.5))
+    found = method.given(left_half(shot)).render(shot.camera).rgb
+    assert torch.equal(found, method.given(left_half(blank)).render(shot.camera).rgb)
+
+
+def test_a_told_light_shows_in_pictures_and_in_the_cloud(taught):
+    method, scene = taught
+    dim, bright = (method.given(appearance=i) for i in (1, 2))
+    camera, average = scene.cameras[2], method.render(scene.cameras[2])
+    dark, light = (x.render(camera) for x in (dim, bright))
+    there = average.opacity > 0.9
+    assert dark.rgb[there].mean() < 0.6 * light.rgb[there].mean()
+    assert torch.equal(dark.opacity, light.opacity)
+    assert torch.equal(method.given(dim_shot := scene.photograph(1)).given(appearance=1).render(camera).rgb, dark.rgb)
+    assert torch.allclose(method.given(dim_shot).render(camera).rgb, dark.rgb, atol=0.15)
+    plain = new()[0]
+    plain.cloud.replace(dim.gaussians())
+    torch.testing.assert_close(plain.render(camera).rgb[there], dark.rgb[there], atol=0.06, rtol=0)
+
+
+def test_the_light_of_a_picture_is_found(generator):
+    """Where the photograph is the picture in some light, it is that light, although a tenth is hidden."""
+    rgb, opacity = torch.rand(500, 3, generator=generator), torch.ones(500)
+    target, background = changed(rgb, opacity, code()), torch.ones(3)
+    target[:50] = 0.5
+    torch.testing.assert_close(found(torch.zeros(12), rgb, opacity, background, target), code(), atol=0.02, rtol=0)
+    assert torch.equal(found(code(), rgb[:0], opacity[:0], background, target[:0]), code())
+
+
+def test_without_it_nothing_is_told():
+    method, _ = new()
+    assert method.controls == () and Photograph not in method.accepts and not judged_by_halves(method)
+    with pytest.raises(LumigraphError, match="cannot be given a Photograph"):
+        method.given(tiny.scene().photograph(0))
+
+
+def test_resuming_is_exact(tmp_path):
+    config = {"appearance": True, "robust": "yes", "robust_start": 0.2}
+    (a, straight), (b, broken) = new(tmp_path / "a", **config), new(tmp_path / "b", **config)
+    fit(a, tiny.scene(), straight, steps=40, show=False, rehearsal=False)
+    fit(b, tiny.scene(), broken, steps=40, pause_at=25, show=False, rehearsal=False)
+    fit(broken.new_method(), tiny.scene(), Run(broken.folder), steps=40, show=False, rehearsal=False)
+    expected, actual = straight.method().state_dict(), Run(broken.folder).method().state_dict()
+    assert expected["appearance.codes"].any() and expected["trimming.counts"].any() and expected["cloud.marks"].any()
+    for name in expected:
+        assert torch.equal(expected[name], actual[name]), name
+
+
+# What moves
+
+
+def by_definition(error: np.ndarray, threshold: float) -> np.ndarray:
+    """Equations 6 to 9 of Sabour 2023, pixel by pixel."""
+    height, width = error.shape
+    small = error <= threshold
+    smooth = np.array(
+        [
+            [small[max(y - 1, 0) : y + 2, max(x - 1, 0) : x + 2].mean() >= 0.5 for x in range(width)]
+            for y in range(height)
+        ]
+    )
+    out = small | smooth
+    for y in range(0, height, 8):
+        for x in range(0, width, 8):
+            if smooth[max(y - 4, 0) : y + 12, max(x - 4, 0) : x + 12].mean() >= 0.6:
+                out[y : y + 8, x : x + 8] = True
+    return out
+
+
+@pytest.mark.parametrize("size", [(24, 40), (21, 30), (5, 7)])
+def test_inliers_are_those_of_the_paper(size, generator):
+    error = torch.rand(*size, generator=generator)
+    error[: size[0] // 2, : size[1] // 2] += 0.6
+    expected = by_definition(error.numpy(), 0.7)
+    assert np.array_equal(inliers(error, 0.7).numpy(), expected)
+    assert size == (5, 7) or 0 < expected.mean() < 1
+
+
+def test_the_threshold_follows_the_errors(generator):
+    trimming, error = Trimming(), torch.rand(40, 50, generator=generator)
+    assert trimming(error).all()
+    trimming.note(error)
+    assert trimming.threshold == pytest.approx(float(error.quantile(KEPT)), abs=2 / BINS)
+    for _ in range(200):
+        trimming.note(0.1 * error)
+    assert trimming.threshold == pytest.approx(float(0.1 * error.quantile(KEPT)), abs=2 / BINS)
+    empty = torch.cat([0.1 * error, torch.zeros(400, 50)])  # pixels without an error say nothing
+    trimming.note(empty)
+    assert trimming.threshold == pytest.approx(float(0.1 * error.quantile(KEPT)), abs=2 / BINS)
+
+
+def test_what_passed_before_one_photograph_is_left_out():
+    """A dark sheet before the ball, on a photograph of nine: the cloud does not take it up."""
+    scene = tiny.scene()
+    pictures = [tiny.picture(pose) for pose in scene.cameras.pose]
+    pictures[6] = pictures[6].copy()
+    pictures[6][4:20, 6:18] = (0, 30, 0, 255)
+    spoilt = replace(scene, images=ImageStore.from_arrays(pictures))
+    scores = {}
+    for robust in ("no", "yes"):
+        method, _ = new(robust=robust, robust_start=0.3, opacity_reset_interval=1000)
+        fit(method, spoilt, steps=150, show=False, rehearsal=False)
+        scores[robust] = evaluate(method, scene).psnr
+    assert scores["yes"] > scores["no"], scores
+    photograph = spoilt.photograph(6).before(scene.frame.background)
+    counts = method.trimming((method.render(scene.cameras[6]).rgb - photograph).abs().mean(-1))
+    sheet = torch.zeros_like(counts)
+    sheet[4:20, 6:18] = True
+    assert counts[sheet].float().mean() < 0.4 and counts[~sheet].float().mean() > 0.8
+
+
+# What few photographs see
+
+
+def test_witnesses_are_counted_as_sets(generator):
+    marks = torch.zeros(6, dtype=torch.int64)
+    sets = [set() for _ in range(6)]
+    for image in (0, 3, 3, 40, 61, 62, 100):
+        seen = torch.rand(6, generator=generator) < 0.5
+        marks = marked(marks, image, seen)
+        for i in seen.nonzero()[:, 0].tolist():
+            sets[i].add(image % MARKS)
+    assert witnesses(marks).tolist() == [len(x) for x in sets]
+    assert witnesses(torch.tensor([(1 << MARKS) - 1])).tolist() == [MARKS]
+
+
+def test_few_witnesses_hold_harmonics_back(generator):
+    harmonics = torch.randn(4, 16, 3, generator=generator)
+    before = harmonics.clone()
+    hold_back(harmonics, torch.tensor([0, FEWEST[1], FEWEST[4], 20]))
+    kept = [1, 4, 16, 16]
+    for row, count in enumerate(kept):
+        assert torch.equal(harmonics[row, :count], before[row, :count]) and not harmonics[row, count:].any()
+
+
+def test_giants_and_needles_are_confined():
+    some = cloud(4)
+    sizes = torch.tensor([[5.0, 4.0, 0.1], [0.9, 0.01, 0.001], [0.008, 1e-5, 1e-5], [0.2, 0.1, 0.05]])
+    found = confined(replace(some, log_scales=sizes.log()), torch.full((4,), 2.0), 1.0).exp()
+    expected = sizes.clone()
+    expected[0, :2] = 2 * GIANT
+    expected[1, 0] = NEEDLE * 0.01
+    torch.testing.assert_close(found, expected)
+
+
+def test_nothing_hangs_before_a_lens():
+    distance = torch.tensor([0.5, 1.5, 1.5, CLOSE + 0.1])
+    assert before_a_lens(distance, torch.tensor([9, 2, 3, 0]), 1.0).tolist() == [True, True, False, False]
+    positions, means = torch.randn(7, 3), torch.randn(5, 3)
+    expected = (means[:, None] - positions).norm(dim=-1).amin(-1)
+    torch.testing.assert_close(nearest_camera(means, positions), expected)
+
+
+def test_a_sheet_before_a_training_camera_goes():
+    method, _ = new()
+    scene = tiny.scene()
+    camera = scene.cameras[1]
+    fit(method, scene, steps=1, show=False, rehearsal=False)
+    method.drawn.fill_(2 * len(scene.splits["train"]))
+    with torch.no_grad():
+        method.cloud.means[0] = camera.position[0] + 0.5 * scene.frame.near * camera.forward[0]
+        before = len(method.cloud)
+        method._tidy(scene.cameras[scene.splits["train"]])
+    assert len(method.cloud) == before - 1 == len(method.cloud.marks) == len(method.density_control.pulls)
+    assert float(nearest_camera(method.cloud.means, scene.cameras.position).min()) > scene.frame.near
