@@ -33,6 +33,7 @@ from lumigraph.metrics import psnr, ssim_map
 from lumigraph.rays import Rendering
 from lumigraph.run import build
 from lumigraph.scene import Scene
+from lumigraph.signals import go_on_unless
 from lumigraph.train import fit
 
 STRENGTHS = 0.6, 1.0, 1.5, 2.2  # of a filter, about its noise
@@ -58,7 +59,7 @@ def main(options: Options) -> None:
     seen: dict[str, list[Rendering]] = {}
     for name, kind in methods.items():
         method = build(find(kind), scene.frame, find(kind).preset(device), device, 0)
-        fit(method, scene, seconds=options.seconds, steps=options.steps, show=False)
+        go_on_unless(fit(method, scene, seconds=options.seconds, steps=options.steps, show=False).signal)
         method.eval()
         seen[name] = [method.render(scene.cameras[index]).cpu() for index in chosen]
     truths = [scene.photograph(index, (LIGHT,)).extra[LIGHT] for index in chosen]

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any, Protocol, runtime_checkable
 
 from jaxtyping import Bool, Float
-from torch import Tensor
+from torch import Tensor, nn
 
 from .camera import Camera
 from .errors import LumigraphError
@@ -47,6 +47,13 @@ class HasGaussians(Protocol):
 
     def gaussians(self) -> Gaussians:
         """The scene as a cloud, in the scene's frame."""
+
+
+@runtime_checkable
+class RefinesPoses(Protocol):
+    """Can learn where photographs were taken from, besides the scene."""
+
+    poses: nn.Module | None  # a `PoseRefinement`; None where it was not asked to
 
 
 @runtime_checkable

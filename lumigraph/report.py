@@ -22,6 +22,7 @@ from .files import claim, write_bytes
 from .metrics import scores_of
 from .progress import clock, short
 from .run import Run
+from .verdict import cameras_moved
 
 LARGEST_FILM = 12 << 20  # bytes; larger ones are named instead of embedded
 STYLE = CHARTS + (Path(__file__).parent / "report.css").read_text("utf-8")
@@ -38,6 +39,7 @@ def write_report(run: Run) -> Path:
         previews(run),
         curves(run),
         views(run, evaluation),
+        cameras(run),
         contact_sheet(run),
         settings(run, evaluation),
     ]
@@ -171,6 +173,22 @@ def views(run: Run, evaluation: dict[str, Any] | None) -> str:
         f"the line is the mean. Single values are in <code>eval.json</code>."
     )
     return section("View by view", f"<figure>{chart}</figure>", note)
+
+
+def cameras(run: Run) -> str:
+    """How far each camera was moved, where the method refines poses."""
+    if not (run.has_state and run.settings.config.get("refine_cameras")):
+        return ""
+    moved = cameras_moved(run.method("cpu"), run.cameras()["train"])
+    if moved is None or len(names := run.view_names()["train"]) < 2:
+        return ""
+    own = methods.colour(run.method_name)
+    charts = (
+        bar_chart(names, moved.turned.tolist(), "turned, degrees", own, "degrees"),
+        bar_chart(names, moved.shifted.tolist(), "shifted, % of the extent", own, "%"),
+    )
+    body = f"<div class='charts'>{''.join(f'<figure>{chart}</figure>' for chart in charts)}</div>"
+    return section("How far cameras moved", body, f"Against all of them together: {moved}. The lines are means.")
 
 
 def contact_sheet(run: Run) -> str:

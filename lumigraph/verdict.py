@@ -9,8 +9,10 @@ from typing import Any
 
 import numpy as np
 
+from .alignment import Moves, moves
+from .camera import Camera
 from .dataset import Dataset
-from .method import Lesson
+from .method import Lesson, Method
 from .scene import Photograph, Scene
 
 STRETCHES = 4, 30  # at least and at most, that the second half of training is divided into; fewer tell nothing
@@ -64,6 +66,13 @@ def loss_trend(rows: Sequence[dict[str, Any]], by_photograph: bool) -> Trend | N
     scatter = log - log.mean() - slope * offset
     deviation = math.sqrt((scatter @ scatter) / (stretches - 2) / (offset @ offset))
     return Trend(1 - math.exp(slope * length), deviation * length)
+
+
+def cameras_moved(method: Method, cameras: Camera) -> Moves | None:
+    """How far a method has moved the cameras that it learnt from, each against all of them; None where it learns no
+    poses. cameras: those of training photographs as they were given"""
+    refined = method.refined(cameras)
+    return None if refined is cameras else moves(cameras, refined, method.frame)
 
 
 def last_psnr(rows: Sequence[dict[str, Any]]) -> float | None:

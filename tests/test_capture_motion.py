@@ -21,8 +21,9 @@ from views import draw, look_at, pattern, spoil, write_views
 from lumigraph import cli
 from lumigraph.capture import open_scene
 from lumigraph.capture.colmap import read as read_colmap
+from lumigraph.capture.folds import jumps
 from lumigraph.capture.motion import Options, diagnosis, reconstruct, reconstruction
-from lumigraph.capture.motion.diagnosis import Matches, coverage, folds, jumps, read_matches, why_not
+from lumigraph.capture.motion.diagnosis import Matches, coverage, folds, read_matches, why_not
 from lumigraph.capture.motion.georeference import georeference, upright
 from lumigraph.capture.motion.lenses import group_by_lens, prior
 from lumigraph.capture.motion.pairs import alike, choose_matching, exhaustive, likeness, sequential

@@ -142,8 +142,9 @@ def test_a_cleaned_run_opens_renders_and_goes_on(cloud_run, tmp_path, capsys):
 
 def test_the_moments_of_those_left_stay_with_them(cloud_run):
     method, generator = cloud_run.method(), torch.Generator()
-    (optimizer,) = method.optimizers()
-    cloud_run.restore_training([optimizer], generator)
+    optimizers = method.optimizers()
+    cloud_run.restore_training(optimizers, generator)
+    optimizer = optimizers[0]
     moments = optimizer.state[method.cloud.means]["mean"].clone()
     assert moments.abs().max() > 0
     keep = torch.rand(len(method.cloud), generator=generator) < 0.5

@@ -45,7 +45,7 @@ def test_the_loss_is_the_papers_on_the_colour_that_was_measured(night, begun, mo
     light = torch.tensor([[0.2, 0.3, 0.4], [0.5, 0.02, 0.1], [3.0, 3.0, 3.0], [3.0, 3.0, 3.0]], requires_grad=True)
     opacity, moments = torch.ones(4), torch.zeros(4, 2)
     seen = Rendering(light, torch.ones(4), opacity, {"moments": moments})
-    monkeypatch.setattr(begun, "light", lambda *given, **more: seen)
+    monkeypatch.setattr(begun, "light_and_spread", lambda look: seen)
     longest = int(night.splits["train"][night.about["exposure"][night.splits["train"]].argmax()])
     batch = batch_of(night, [0.1, -0.001, 1.2, 0.9], [0, 1, 2, 2], [longest] * 4)
     found = begun.loss(batch, 0)["relative"]

@@ -10,6 +10,7 @@ from jaxtyping import Float
 
 from ..errors import LumigraphError
 from .capture import Capture, Shot
+from .folds import about_fold
 from .normalise import CONVERGING, SAMPLED_POINTS
 
 ONE_PLACE = 1e-9  # spread of cameras, as a share of their distance from the origin, that tells nothing
@@ -24,6 +25,8 @@ def oddities(capture: Capture, shots: list[Shot], poses: Float[np.ndarray, "came
     if capture.bounds is not None:
         return []
     found = [about_double(shots), about_places(poses), about_gaze(capture, poses), about_angles(shots)]
+    if not any("folded" in sentence for sentence in capture.told):  # the reader may know more
+        found.append(about_fold(shots, poses))
     return [f"{capture.source} {sentence}" for sentence in found if sentence]
 
 

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 from rich.tree import Tree
 
+from ..alignment import Moves
 from ..budget import Budget
 from ..choice import evenly
 from ..console import bold, dim
 from ..dataset import Dataset
 from ..errors import LumigraphError
+from ..exchange import size_of
 from ..gaussians import Gaussians
 from ..metrics import scores_of
 from ..names import natural
@@ -19,6 +20,7 @@ from ..run import Run
 from ..run.compressed import Compressed
 from ..scene import Frame, Scene
 from ..shapes import Shapes
+from ..verdict import cameras_moved
 
 MEMBERS = 12  # of many shapes, that are told of one by one
 
@@ -39,6 +41,8 @@ def run_tree(run: Run) -> Tree:
             "trained",
             rows | {"budget": said.budget and str(Budget.from_json(said.budget)), "seed": said.seed, "on": said.device},
         )
+    if moved := moves_of(run):
+        branch(tree, "cameras", {"moved by": str(moved)})
     if made := Compressed.read(run.folder):
         smaller = f"{made.times:.1f} times smaller, {made.bytes_after / 1e6:.3g} MB of {made.bytes_before / 1e6:.3g} MB"
         branch(tree, "compressed", {"from": made.source, "model": smaller, "dB": f"{made.psnr_after:.2f}"})
@@ -51,8 +55,15 @@ def run_tree(run: Run) -> Tree:
     pages = [path for path in places if path.is_file() and path.suffix in (".mp4", ".html", ".png")]
     pages.sort(key=lambda path: natural(path.as_posix()))
     if pages:
-        branch(tree, "files", {str(path.relative_to(run.folder)): size(path) for path in pages})
+        branch(tree, "files", {str(path.relative_to(run.folder)): size(path.stat().st_size) for path in pages})
     return tree
+
+
+def moves_of(run: Run) -> Moves | None:
+    """How far the method has moved cameras; None where it refines none, or has not begun."""
+    if not (run.has_state and run.settings.config.get("refine_cameras")):
+        return None
+    return cameras_moved(run.method("cpu"), run.cameras()["train"])
 
 
 def control_rows(run: Run) -> dict[str, str]:
@@ -107,7 +118,7 @@ def scene_tree(scene: Scene) -> Tree:
 
 def cloud_tree(name: str, cloud: Gaussians) -> Tree:
     tree = Tree(bold(name) + f"  a cloud of {len(cloud):,} Gaussians")
-    rows: dict[str, Any] = {"file": size(Path(name)), "harmonics": f"degree {cloud.degree}"}
+    rows: dict[str, Any] = {"file": size(size_of(name)), "harmonics": f"degree {cloud.degree}"}
     rows["opacities"] = "antialiased (Mip-Splatting's 2-D filter)" if cloud.antialiased else "as in the first release"
     if len(cloud):
         low, high = cloud.means.amin(0), cloud.means.amax(0)
@@ -155,6 +166,5 @@ def vector(numbers: tuple[float, ...]) -> str:
     return "(" + ", ".join(f"{x:.3g}" for x in numbers) + ")"
 
 
-def size(path: Path) -> str:
-    count = path.stat().st_size
+def size(count: int) -> str:
     return f"{count / 1e6:.1f} MB" if count >= 1e5 else f"{count / 1e3:.0f} kB"

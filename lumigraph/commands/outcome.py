@@ -8,6 +8,7 @@ from typing import Any
 from ..budget import Budget
 from ..method import Method, RayMethod
 from ..quality import QUALITIES
+from ..scene import Scene
 from .common import say, show, typed
 
 TOTALS = (10.0, 30.0, 60.0, 180.0, 600.0, 1800.0, 3600.0, 7200.0)  # seconds that are suggested
@@ -21,7 +22,7 @@ NEXT = {
 
 def tell_outcome(run: Any, outcome: Any, method: Method, data: Any) -> None:
     """Where a Run is after an Outcome, and how to go on."""
-    from ..verdict import last_psnr, loss_trend
+    from ..verdict import cameras_moved, last_psnr, loss_trend
 
     state, budget = outcome.state, Budget.from_json(run.settings.budget)
     besides = f"{state.compile_seconds:.1f} s compiling, {outcome.saving_seconds:.1f} s saving"
@@ -40,6 +41,8 @@ def tell_outcome(run: Any, outcome: Any, method: Method, data: Any) -> None:
     if trend:
         how = f"fell by {100 * trend.fall:.0f} %" if trend.falling else "did not fall any more"
         rows["loss"] = f"{how} over the second half of training"
+    if isinstance(data, Scene) and (moved := cameras_moved(method, data.cameras[data.splits["train"]])):
+        rows["cameras moved by"] = str(moved)
     enough = state.step >= method.steps_for("draft", data)
     more = more_time(run.folder, budget) if enough else typed("resume", run.folder, "--quality", "draft")
     rows["advice"] = advice(trend, enough, more, photographed(run, data))

@@ -28,7 +28,7 @@ class Render:
     """
 
     source: Annotated[Positional[Path], needed("RUN_OR_FILE")]
-    """Folder of the run, a splat file (.ply, .compressed.ply, .spz, .splat), or a composition (.json)."""
+    """Folder of the run, a splat file (.ply, .spz, .sog, .glb, .splat), or a composition (.json)."""
     path: Annotated[str, option("{" + ",".join(PATHS) + ",FILE.json}")] = "orbit"
     """Where the camera goes."""
     frames: Annotated[Count | None, option("N", "120; every held-out view; as long as keyframes say")] = None

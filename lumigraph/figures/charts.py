@@ -91,7 +91,7 @@ def standalone(chart: str) -> bytes:
     return f"{opening}><style>\n{STYLE}</style>{body}\n".encode()
 
 
-def bar_chart(names: Sequence[str], values: Sequence[float], label: str, colour: int = 0) -> str:
+def bar_chart(names: Sequence[str], values: Sequence[float], label: str, colour: int = 0, unit: str = "dB") -> str:
     """One bar for each value, its name on hovering, and a line at their mean."""
     low, high = min(values), max(values)
     width = 2 * WIDTH
@@ -101,7 +101,7 @@ def bar_chart(names: Sequence[str], values: Sequence[float], label: str, colour:
     bars = "".join(
         f"<rect class='bar c{colour % COLOURS}' x='{LEFT + (i + 0.5) * step - bar / 2:.1f}' y='{y_axis(value):.1f}' "
         f"width='{bar:.1f}' height='{y_axis.start - y_axis(value):.1f}' rx='1.5'>"
-        f"<title>{escape(name)}: {value:.2f} dB</title></rect>"
+        f"<title>{escape(name)}: {value:.2f} {escape(unit)}</title></rect>"
         for i, (name, value) in enumerate(zip(names, values, strict=True))
     )
     mean = y_axis(sum(values) / len(values))

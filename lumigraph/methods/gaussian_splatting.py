@@ -18,7 +18,9 @@ from ..components.clouds.cloud import Cloud, CloudAdam
 from ..components.clouds.dense_points import compile_sweep
 from ..components.clouds.density_control import AdaptiveDensity, MarkovChain
 from ..components.clouds.initial_cloud import Initialization, initial_cloud, random_cloud
+from ..components.clouds.seen_from import seen_from
 from ..components.clouds.smoothing import sampling_interval, smoothed
+from ..components.training.pose_refinement import PoseRefinement
 from ..components.training.rhythm import Rhythm, haste, intervals
 from ..components.training.schedules import falling
 from ..errors import LumigraphWarning
@@ -66,6 +68,8 @@ class Config:
     transmittance_threshold: Share = 1e-4  # at which a pixel is finished, appendix C
     antialiased: bool = False  # Mip-Splatting's 2-D filter (Yu 2024, section 5.2)
     filter_3d: bool = False  # Mip-Splatting's 3-D filter (Yu 2024, section 5.1)
+    refine_cameras: bool = False  # learn where each photograph was taken from, small pictures first
+    pose_learning_rate: LearningRate = 5e-3  # radians by which a step moves a picture, with refine_cameras
     seed: Seed = 0
 
 
@@ -80,6 +84,7 @@ STORAGE = {  # of tensors, where a run is compressed; positions need the most bi
 }
 SWEEPING = 0.08  # of the budget: the share that looking for points to begin at may take
 NEAR = 0.1  # times the scene's near distance: the near plane of splats
+COARSE = 0.5  # of the budget: where poses are refined, plain colours, and half size if nothing else is said
 SMALLEST = 64  # pixels of a photograph's shorter side that are kept when it is reduced
 ENOUGH = 2400  # steps, with which sizes and colours need not hurry
 RECOVERY = 3  # opacity_reset_intervals that must be left after opacities are reset, or the pictures stay dim
@@ -127,13 +132,15 @@ class GaussianSplatting(Method):
         self.cloud.antialiased = config.antialiased
         self.density_control = AdaptiveDensity(len(self.cloud), config.densify_grad_threshold)
         self.exploration = MarkovChain()
+        refining, rate = config.refine_cameras, config.pose_learning_rate
+        self.poses = PoseRefinement(frame.image_count, rate) if refining else None
         self.rhythm = Rhythm(config.refine_every, config.refine_every_share)
         self.register_buffer("extent", torch.tensor(1.0))
         self.register_buffer("drawn", torch.tensor(0))
         self.register_buffer("began", torch.tensor(len(self.cloud)))
         self.register_buffer("interval", torch.zeros(len(self.cloud) if config.filter_3d else 0))
         self._bands = config.sh_degree + 1
-        self._progress = 0.0
+        self._progress = 1.0  # as trained; `before_step` says how far training is
         self._cameras: Camera | None = None
         self._told_full = False
         self._optimizer: CloudAdam | None = None
@@ -172,6 +179,7 @@ class GaussianSplatting(Method):
             refine_until=0.8,
             densify_grad_threshold=1e-6,
             opacity_reset_interval=5,
+            refine_cameras=True,
         )
 
     def rehearse_begin(self) -> None:
@@ -189,6 +197,8 @@ class GaussianSplatting(Method):
         if config.filter_3d:
             self._cameras = scene.cameras[scene.splits["train"]]
             self.interval = sampling_interval(self.cloud.means, self._cameras, self._near)
+        if self.poses:
+            self.poses.begin(scene.cameras, scene.frame)
         positions = scene.cameras.position[scene.splits["train"]]
         self.extent.fill_(1.1 * float((positions - positions.mean(0)).norm(dim=-1).max()))
 
@@ -205,13 +215,15 @@ class GaussianSplatting(Method):
 
     def _reduction(self, shorter: int) -> int:
         """How many times smaller photographs are at this share of the budget; no side gets below SMALLEST pixels."""
-        half = self.config.half_resolution_until
+        half = self.config.half_resolution_until or (COARSE if self.poses else 0.0)
         wanted = 4 if self._progress < half / 4 else 2 if self._progress < half else 1
         return max(1, min(wanted, shorter // SMALLEST))
 
     def loss(self, batch: Photograph, step: int) -> dict[str, Tensor]:
-        config, cloud = self.config, self.gaussians()
-        seen = splat(cloud, view_of(batch.camera, self._near), self._bands, config.transmittance_threshold)
+        config, cloud, camera = self.config, self.gaussians(), batch.camera
+        if self.poses:
+            cloud, camera = seen_from(self.poses, cloud, camera)
+        seen = splat(cloud, view_of(camera, self._near), self._bands, config.transmittance_threshold)
         rgb, background = seen.rgb, torch.tensor(self.frame.background, device=seen.rgb.device)
         if batch.alpha is not None:  # a random colour behind everything, so that only opacity can imitate opacity
             background = torch.rand(3, generator=self.random(~step)).to(rgb.device)
@@ -245,7 +257,7 @@ class GaussianSplatting(Method):
             {"name": "harmonics", "params": [cloud.harmonics], "lr": c.sh_lr, "columns": columns},
         ]
         self._optimizer = CloudAdam(groups)
-        return [self._optimizer]
+        return [self._optimizer, self.poses.optimizer()] if self.poses else [self._optimizer]
 
     def learning_rate(self, step: int, progress: float) -> dict[str, float]:
         """Exponential decay of the means' rate (section 7.1), in extents of the cameras; the others stay. Sizes and
@@ -253,12 +265,16 @@ class GaussianSplatting(Method):
         c = self.config
         times = haste(step, progress, ENOUGH, c.most_haste)
         means = float(self.extent) * falling(c.means_lr, c.final_means_lr, progress)
-        return {"means": means, "scales": times * c.scales_lr, "harmonics": times * c.sh_lr}
+        rates = {"means": means, "scales": times * c.scales_lr, "harmonics": times * c.sh_lr}
+        return rates | ({"poses": self.poses.rate(progress)} if self.poses else {})
 
     def before_step(self, step: int, progress: float) -> None:
         config, self._progress = self.config, progress
+        if self.poses:
+            self.poses.progress.fill_(progress)
         raised = intervals(step, progress, config.sh_degree_interval, config.sh_degree_interval_share)
-        self._bands = 1 + min(int(raised), config.sh_degree)
+        flat = self.poses is not None and progress < COARSE  # colours by direction would explain wrong poses away
+        self._bands = 1 if flat else 1 + min(int(raised), config.sh_degree)
 
     @torch.no_grad()
     def after_step(self, step: int) -> None:
@@ -363,6 +379,9 @@ class GaussianSplatting(Method):
         """The cloud, in the scene's frame; with the 3-D filter in it, where that is used."""
         cloud = self.cloud.gaussians()
         return smoothed(cloud, self.interval) if self.config.filter_3d else cloud
+
+    def refined(self, cameras: Camera) -> Camera:
+        return self.poses.refined(cameras) if self.poses else cameras
 
     def render(self, camera: Camera) -> Rendering:
         return render(self.gaussians(), camera.to(self.device), self.frame.background, self._near)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
 import torch
@@ -11,6 +11,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import max_pool1d, pad, softplus
 
+from ..camera import Camera
 from ..components.fields.coordinate_network import CoordinateNetwork, bytes_kept
 from ..components.fields.dense import in_chunks
 from ..components.fields.encodings import FrequencyEncoding, IntegratedEncoding
@@ -18,11 +19,12 @@ from ..components.sampling.frustums import frustum_moments
 from ..components.sampling.occupancy_mask import OccupancyMask
 from ..components.sampling.sampling import inverse_transform, stratified
 from ..components.sampling.spaces import space_of
+from ..components.training.pose_refinement import PoseRefinement
 from ..components.training.schedules import falling
 from ..method import RayMethod
 from ..ranges import BatchSize, Cells, Depth, Layers, LearningRate, NonNegative, Octaves, RaySamples, Seed, Share, Width
 from ..rays import Look, Rays, Rendering, Samples
-from ..scene import Frame, Scene
+from ..scene import Batch, Frame, Scene
 from ..volume import composite, weights_of
 
 
@@ -45,6 +47,8 @@ class Config:
     warmup: Share = 0.0025  # share of the budget in which the learning rate grows, section 4
     occupancy_resolution: Cells = 0  # cells per axis of a grid that tells where to sample; 0 samples everywhere
     occupancy_threshold: NonNegative = 0.01  # optical thickness across a cell below which it is empty
+    refine_cameras: bool = False  # learn where each photograph was taken from, coarse to fine (Lin 2021, BARF)
+    pose_learning_rate: LearningRate = 5e-4  # radians by which a step moves a picture, with refine_cameras
     bfloat16: bool = True  # multiply in bfloat16 where the machine is fast at it
     seed: Seed = 0
 
@@ -79,6 +83,8 @@ class MipNeRF(RayMethod):
         shape = config.depth, config.hidden_width, config.skip_layer
         self.network = CoordinateNetwork(*inputs, *shape, exact=not config.bfloat16)
         self.empty = OccupancyMask(config.occupancy_resolution, config.occupancy_threshold)
+        refining, rate = config.refine_cameras, config.pose_learning_rate
+        self.poses = PoseRefinement(frame.image_count, rate) if refining else None
 
     @classmethod
     def preset(cls, device: torch.device) -> Any:
@@ -121,7 +127,13 @@ class MipNeRF(RayMethod):
         return bytes_kept(config) if learning else 0
 
     def begin(self, scene: Scene, seconds: float = math.inf) -> None:
-        self.empty.begin(scene)
+        if self.poses:
+            self.poses.begin(scene.cameras, scene.frame)
+        else:  # silhouettes seen from wrong poses would carve what is there
+            self.empty.begin(scene)
+
+    def loss(self, batch: Batch, step: int) -> dict[str, Tensor]:
+        return super().loss(replace(batch, rays=self.poses(batch.rays)) if self.poses else batch, step)
 
     @property
     def pass_weights(self) -> dict[str, float]:
@@ -153,8 +165,9 @@ class MipNeRF(RayMethod):
 
     def _look(self, name: str, rays: Rays, edges: Float[Tensor, "ray edge"], colours: bool = True) -> Look:
         """The network's outputs for the frustums between edges, which are shares of the way along each ray."""
-        near, far = self.space.interval(rays)
-        t = self.space.distance(edges, rays, near, far)
+        with torch.no_grad():  # where samples lie tells nothing of a pose
+            near, far = self.space.interval(rays)
+            t = self.space.distance(edges, rays, near, far)
         samples = Samples.rows(t[:, :-1], t[:, -1])
         ray = samples.ray_index
         distance, along, across = frustum_moments(samples.t_start, samples.t_end, rays.radius[ray])
@@ -164,7 +177,7 @@ class MipNeRF(RayMethod):
         seen = self.encode_direction(rays.directions)
 
         def answer(mean: Tensor, variance: Tensor, ray: Tensor) -> tuple[Tensor, Tensor]:
-            encoded = self.encode_frustum(mean, variance)
+            encoded = self._frustums(mean, variance)
             raw, rgb = self.network(encoded, seen[ray]) if colours else (self.network.density(encoded), mean)
             return softplus(raw - 1), padded(rgb)
 
@@ -195,18 +208,32 @@ class MipNeRF(RayMethod):
 
     def _encoded(self, coordinates: Float[Tensor, "point 3"]) -> Float[Tensor, "point width"]:
         """Points, encoded over as much space as a cell of a grid of 128 takes: photographs show nothing smaller."""
-        return self.encode_frustum(coordinates, torch.full_like(coordinates, (2 / 128) ** 2 / 12))
+        return self._frustums(coordinates, torch.full_like(coordinates, (2 / 128) ** 2 / 12))
+
+    def _frustums(
+        self, means: Float[Tensor, "point 3"], variances: Float[Tensor, "point 3"]
+    ) -> Float[Tensor, "point width"]:
+        """Frustums as waves; while poses are refined, of as many octaves as have joined."""
+        weights = self.poses.weights(self.config.position_frequencies) if self.poses else None
+        return self.encode_frustum(means, variances, weights)
 
     def optimizers(self) -> list[torch.optim.Optimizer]:
-        return [torch.optim.Adam(self.network.parameters(), self.config.learning_rate)]
+        of_network = torch.optim.Adam(self.network.parameters(), self.config.learning_rate)
+        return [of_network, self.poses.optimizer()] if self.poses else [of_network]
 
-    def learning_rate(self, step: int, progress: float) -> float:
+    def learning_rate(self, step: int, progress: float) -> float | dict[str, float]:
         """Exponential decay after a warm-up (section 4)."""
         c = self.config
-        return falling(c.learning_rate, c.final_learning_rate, progress, c.warmup)
+        rate = falling(c.learning_rate, c.final_learning_rate, progress, c.warmup)
+        return {"": rate, "poses": self.poses.rate(progress)} if self.poses else rate
 
     def before_step(self, step: int, progress: float) -> None:
+        if self.poses:
+            self.poses.progress.fill_(progress)
         self.empty.look(step, progress, self._density_at, self.random(~step))
+
+    def refined(self, cameras: Camera) -> Camera:
+        return self.poses.refined(cameras) if self.poses else cameras
 
 
 def padded(raw: Float[Tensor, "sample 3"]) -> Float[Tensor, "sample 3"]:

@@ -3,19 +3,21 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated, Any, ClassVar
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from ..camera import Camera
 from ..components.fields.coordinate_network import CoordinateNetwork, bytes_kept
 from ..components.fields.dense import in_chunks
 from ..components.fields.encodings import FrequencyEncoding
 from ..components.sampling.occupancy_mask import OccupancyMask
 from ..components.sampling.sampling import inverse_transform, midpoints, stratified
 from ..components.sampling.spaces import space_of
+from ..components.training.pose_refinement import PoseRefinement
 from ..components.training.schedules import falling
 from ..errors import LumigraphError
 from ..method import RayMethod
@@ -34,7 +36,7 @@ from ..ranges import (
     between,
 )
 from ..rays import Look, Rays, Rendering, Samples
-from ..scene import Frame, Scene
+from ..scene import Batch, Frame, Scene
 from ..volume import composite, weights_of
 
 
@@ -59,6 +61,8 @@ class Config:
     occupancy_threshold: NonNegative = 0.01  # optical thickness across a cell below which it is empty
     transmittance_threshold: Share = 0.0  # at which a ray is spent
     warmup: Share = 0.0  # share of the budget in which the learning rate grows
+    refine_cameras: bool = False  # learn where each photograph was taken from, coarse to fine (Lin 2021, BARF)
+    pose_learning_rate: LearningRate = 5e-4  # radians by which a step moves a picture, with refine_cameras
     bfloat16: bool = True  # multiply in bfloat16 where the machine is fast at it
     seed: Seed = 0
 
@@ -99,6 +103,8 @@ class NeRF(RayMethod):
         self.fine = CoordinateNetwork(*inputs, *shape, exact=exact)
         self.coarse = CoordinateNetwork(*inputs, *shape, exact=exact) if config.networks == 2 else None
         self.empty = OccupancyMask(config.occupancy_resolution, config.occupancy_threshold)
+        refining, rate = config.refine_cameras, config.pose_learning_rate
+        self.poses = PoseRefinement(frame.image_count, rate) if refining else None
 
     @classmethod
     def preset(cls, device: torch.device) -> Any:
@@ -144,7 +150,13 @@ class NeRF(RayMethod):
         return bytes_kept(config) if learning else 0
 
     def begin(self, scene: Scene, seconds: float = math.inf) -> None:
-        self.empty.begin(scene)
+        if self.poses:
+            self.poses.begin(scene.cameras, scene.frame)
+        else:  # silhouettes seen from wrong poses would carve what is there
+            self.empty.begin(scene)
+
+    def loss(self, batch: Batch, step: int) -> dict[str, Tensor]:
+        return super().loss(replace(batch, rays=self.poses(batch.rays)) if self.poses else batch, step)
 
     @property
     def pass_weights(self) -> dict[str, float]:
@@ -189,8 +201,9 @@ class NeRF(RayMethod):
         colours: bool = True,
     ) -> Look:
         """A network's outputs at places along rays; each holds as far as the next place (eq. 3)."""
-        near, far = self.space.interval(rays)
-        t = self.space.distance(shares, rays, near, far)
+        with torch.no_grad():  # where samples lie tells nothing of a pose
+            near, far = self.space.interval(rays)
+            t = self.space.distance(shares, rays, near, far)
         samples, ray = Samples.rows(t, far), torch.arange(t.numel(), device=t.device) // t.shape[1]
         points = rays.origins[:, None] + t[..., None] * rays.directions[:, None]
         coordinates = self.space.warp(points.flatten(0, 1))
@@ -198,7 +211,7 @@ class NeRF(RayMethod):
         noise = self.config.density_noise if generator and self.frame.reach > 1 else 0.0
 
         def answer(x: Tensor, ray: Tensor) -> tuple[Tensor, Tensor]:
-            position = self.encode_position(x)
+            position = self._encoded(x)
             raw, rgb = network(position, directions[ray]) if colours else (network.density(position), x)
             if noise:
                 raw = raw + noise * torch.randn(len(raw), generator=generator).to(raw.device)
@@ -216,7 +229,7 @@ class NeRF(RayMethod):
         """Density per scene unit, and sRGB-encoded colour seen along unit directions."""
 
         def answer(x: Tensor, direction: Tensor) -> tuple[Tensor, Tensor]:
-            raw, rgb = self.fine(self.encode_position(x), self.encode_direction(direction))
+            raw, rgb = self.fine(self._encoded(x), self.encode_direction(direction))
             return raw.relu(), rgb.sigmoid()
 
         density, rgb = in_chunks(answer, self.space.warp(points), directions)
@@ -228,15 +241,28 @@ class NeRF(RayMethod):
 
     def _density_at(self, coordinates: Float[Tensor, "point 3"]) -> Float[Tensor, " point"]:
         """Density per unit of the coordinates."""
-        return in_chunks(lambda x: (self.fine.density(self.encode_position(x)).relu(),), coordinates)[0]
+        return in_chunks(lambda x: (self.fine.density(self._encoded(x)).relu(),), coordinates)[0]
+
+    def _encoded(self, coordinates: Float[Tensor, "point 3"]) -> Float[Tensor, "point width"]:
+        """Coordinates as waves; while poses are refined, of as many octaves as have joined."""
+        weights = self.poses.weights(self.config.position_frequencies) if self.poses else None
+        return self.encode_position(coordinates, weights)
 
     def optimizers(self) -> list[torch.optim.Optimizer]:
-        return [torch.optim.Adam(self.parameters(), self.config.learning_rate, eps=1e-7)]
+        networks = [p for name, p in self.named_parameters() if not name.startswith("poses.")]
+        of_networks = torch.optim.Adam(networks, self.config.learning_rate, eps=1e-7)
+        return [of_networks, self.poses.optimizer()] if self.poses else [of_networks]
 
-    def learning_rate(self, step: int, progress: float) -> float:
+    def learning_rate(self, step: int, progress: float) -> float | dict[str, float]:
         """Exponential decay (section 5.3)."""
         c = self.config
-        return falling(c.learning_rate, c.final_learning_rate, progress, c.warmup)
+        rate = falling(c.learning_rate, c.final_learning_rate, progress, c.warmup)
+        return {"": rate, "poses": self.poses.rate(progress)} if self.poses else rate
 
     def before_step(self, step: int, progress: float) -> None:
+        if self.poses:
+            self.poses.progress.fill_(progress)
         self.empty.look(step, progress, self._density_at, self.random(~step))
+
+    def refined(self, cameras: Camera) -> Camera:
+        return self.poses.refined(cameras) if self.poses else cameras

@@ -18,16 +18,19 @@ from .. import kernels
 from ..camera import Camera
 from ..components.fields.activations import truncated_exp
 from ..components.fields.development import CONTROLS, decoded, exposed, toned
+from ..components.fields.hash_field import HashField, side_by_side
+from ..components.sampling.spaces import Space
 from ..components.sampling.thin_lens import through_lens
+from ..components.training.fog import evened
 from ..controls import Control
 from ..errors import LumigraphWarning
 from ..method import RayMethod
 from ..ranges import Layers, LearningRate, NonNegative, Positive, Seed, Share, Steps, Width, between
-from ..rays import Rays, Rendering
+from ..rays import Look, Rays, Rendering
 from ..scene import Batch, Frame, Scene
 from ..volume import composite
 from .instant_ngp import Config as NgpConfig
-from .instant_ngp import Field, InstantNGP
+from .instant_ngp import InstantNGP
 
 
 @dataclass(frozen=True)
@@ -85,7 +88,7 @@ WHITE = 0.97  # quantile of the light that is shown as white, where nobody said 
 GLANCE = 1 << 14  # pixels that tell how much light there is
 
 
-class LightField(Field):
+class LightField(HashField):
     """Instant-NGP's field with linear radiance instead of encoded colour: an exponential keeps it above zero and
     spans the range of light (section 4.1).
 
@@ -94,16 +97,19 @@ class LightField(Field):
 
     level: Tensor
 
-    def __init__(self, config: NgpConfig, reach: float):
-        super().__init__(config, reach)
+    def __init__(self, config: NgpConfig, space: Space, reach: float):
+        super().__init__(config, space, reach)
         self.register_buffer("level", torch.tensor(-1.0))
 
     def colour(
-        self, geometry: Float[Tensor, "sample geometry"], directions: Float[Tensor, "sample 3"]
+        self,
+        geometry: Float[Tensor, "sample geometry"],
+        directions: Float[Tensor, "sample 3"],
+        *codes: Float[Tensor, "sample code"],
     ) -> Float[Tensor, "sample 3"]:
         """Light in the camera's colours, 1 for what fills the sensor in the longest exposure."""
         harmonics = kernels.spherical_harmonics(directions, self.bands)
-        return truncated_exp(self.colour_network(torch.cat([geometry.t(), harmonics.t()]).t()) + self.level)
+        return truncated_exp(self.colour_network(side_by_side(geometry, harmonics, *codes)) + self.level)
 
 
 class RawNeRF(RayMethod):
@@ -124,7 +130,7 @@ class RawNeRF(RayMethod):
         self.marcher = InstantNGP(frame, config.field)
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(config.seed)
-            self.marcher.network = LightField(config.field, frame.reach)
+            self.marcher.network = LightField(config.field, self.marcher.space, frame.reach)
         photographs = frame.image_count
         self.log_scale = nn.Parameter(torch.zeros(photographs, 3), requires_grad=config.exposure_scales)
         self.register_buffer("exposure", torch.ones(photographs))  # of each photograph, of the longest
@@ -147,6 +153,9 @@ class RawNeRF(RayMethod):
     @classmethod
     def further_bytes(cls, frame: Frame, config: Any, learning: bool) -> int:
         return InstantNGP.further_bytes(frame, config.field, learning)
+
+    def rehearse_begin(self) -> None:
+        self.marcher.rehearse_begin()
 
     # What there is to learn from
 
@@ -215,13 +224,15 @@ class RawNeRF(RayMethod):
 
     # Learning
 
-    def light(self, rays: Rays, jitter: Float[Tensor, " ray"] | None = None, spread: bool = False) -> Rendering:
-        """Linear light along rays in the camera's colours, before nothing. spread: tell also how far from one another
-        the weights lie that make each ray's colour (`variance`)."""
-        (look,) = self.marcher.looks(rays, jitter)
-        if not spread:
-            return composite(look.samples, look.density, look.rgb)
-        s = look.samples.t / (1 + look.samples.t)  # far away little counts as little
+    def light(self, rays: Rays) -> Rendering:
+        """Linear light along rays in the camera's colours, before nothing."""
+        (look,) = self.marcher.looks(rays)
+        return composite(look.samples, look.density, look.rgb)
+
+    def light_and_spread(self, look: Look) -> Rendering:
+        """The light of a look, and how far from one another the weights lie that make each ray's colour: the extra
+        `moments` is the mean and the mean square of their places."""
+        s = evened(look.samples.t)
         return composite(look.samples, look.density, look.rgb, moments=torch.stack([s, s * s], -1))
 
     def scale(self, rays: Rays) -> Float[Tensor, "ray 3"]:
@@ -233,10 +244,10 @@ class RawNeRF(RayMethod):
 
     def loss(self, batch: Batch, step: int) -> dict[str, Tensor]:
         """The squared error relative to what is shown (eq. 4): that of a tone curve with slope 1 / (y + epsilon)."""
-        jitter = torch.rand(len(batch), generator=self.random(step)).to(self.device)
         measured, known = self.measured(batch)
         rays = self.marcher.poses(batch.rays) if self.marcher.poses else batch.rays
-        seen = self.light(rays, jitter, spread=True)
+        look, terms = self.marcher.look_to_learn(rays, self.random(step))
+        seen = self.light_and_spread(look)
         shown = seen.rgb * self.scale(batch.rays) + (1 - seen.opacity)[:, None] * decoded(self.background)
         shown = torch.where(measured >= 1, shown.clamp(max=1), shown)  # a full sensor says: at least so much
         error = (shown - measured) / (shown.detach() + self.config.epsilon)
@@ -245,7 +256,7 @@ class RawNeRF(RayMethod):
         variance = (second - first.square() / seen.opacity.clamp_min(1e-3)).mean()
         # Gross errors count linearly: noise is far below, and what is dark by mistake does not outweigh all else.
         relative = 2 * nn.functional.huber_loss(error[known], torch.zeros_like(error[known]), delta=GROSS)
-        return {"relative": relative, "variance": self.config.variance_weight * variance}
+        return {"relative": relative, "variance": self.config.variance_weight * variance, **terms}
 
     def optimizers(self) -> list[torch.optim.Optimizer]:
         optimizers = self.marcher.optimizers()
@@ -254,7 +265,7 @@ class RawNeRF(RayMethod):
             optimizers.append(torch.optim.Adam([group], lr=self.config.learning_rate, betas=(0.9, 0.99), eps=1e-15))
         return optimizers
 
-    def learning_rate(self, step: int, progress: float) -> float:
+    def learning_rate(self, step: int, progress: float) -> dict[str, float]:
         return self.marcher.learning_rate(step, progress)
 
     def before_step(self, step: int, progress: float) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import statistics
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -12,6 +12,7 @@ from jaxtyping import Float
 from scipy.spatial import ConvexHull, QhullError
 
 from ...names import natural
+from ..folds import in_steps, jumps
 from ..library import pycolmap
 from ..normalise import where_axes_meet
 from ..photos import Intake, Photo
@@ -22,10 +23,7 @@ STOPS = 1.5  # of exposure that a photograph may differ from others
 WINDOW = 5  # neighbours on each side that a frame's exposure is compared with
 SMALL_ANGLE = 2.0  # degrees between the rays that meet at a point, in the middle: less says little of depth
 ROTATIONS = 0.6  # share of the pairs that a turn of the camera explains alone
-JUMP = 10.0  # times the usual distance between neighbours
-SAME_WAY = 45.0  # degrees between views; who walks far off seldom looks the same way there
 OVERLAPPING = 30  # details that neighbours share, from which on they cannot be far apart
-STEADY = 0.5  # distance of neighbours, as a share of that of any two, up to which names tell the order of exposure
 GAP = 30.0  # degrees between neighbouring directions from which on nobody looked from between
 INACCURATE = 2.0  # pixels of reprojection error
 SEEN_ANGLES = 2000  # points whose angles are measured
@@ -246,23 +244,6 @@ def coverage(names: Sequence[str], poses: Float[np.ndarray, "photo 3 4"]) -> Cov
     return Coverage(degrees, sorted(gaps, key=lambda gap: -gap.degrees) if degrees > 180 else [])
 
 
-def jumps(poses: Float[np.ndarray, "photo 3 4"], overlapping: Collection[int] = ()) -> list[tuple[int, float]]:
-    """Where cameras in order leap, though they see the same: the one before, and how many times the usual step it is.
-
-    A model that is folded, with parts of the place in it twice or two parts in one place, leaps where the fold is.
-    poses:       camera-to-world
-    overlapping: photographs that are known to share details with the next; others count where both look the same way
-    """
-    steps = np.linalg.norm(np.diff(poses[:, :, 3], axis=0), axis=-1)
-    same_way = (poses[1:, :, 2] * poses[:-1, :, 2]).sum(-1) > np.cos(np.radians(SAME_WAY))
-    usual = float(np.median(steps)) if len(steps) else 0.0
-    return [
-        (i, float(step / usual))
-        for i, step in enumerate(steps)
-        if step > JUMP * usual > 0 and (same_way[i] or i in overlapping)
-    ]
-
-
 def folds(
     names: Sequence[str], poses: Float[np.ndarray, "photo 3 4"], matches: Matches, in_order: bool
 ) -> list[tuple[int, float]]:
@@ -270,15 +251,6 @@ def folds(
     if not (in_order or in_steps(poses[:, :, 3])):
         return []
     return jumps(poses, [i for i in range(len(names) - 1) if matches.between(names[i], names[i + 1]) >= OVERLAPPING])
-
-
-def in_steps(positions: Float[np.ndarray, "photo 3"]) -> bool:
-    """Whether neighbours in the list were taken near each other, as one walks."""
-    if len(positions) < 8:
-        return False
-    steps = np.linalg.norm(np.diff(positions, axis=0), axis=-1)
-    apart = np.linalg.norm(positions[:, None] - positions, axis=-1)
-    return bool(np.median(steps) < STEADY * np.median(apart[np.triu_indices(len(positions), 1)]))
 
 
 def about_left_out(left_out: Mapping[str, str], used: int) -> list[str]:

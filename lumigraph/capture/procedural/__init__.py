@@ -41,6 +41,7 @@ from .world import Sky as Sky
 from .world import Sun as Sun
 from .world import World as World
 
+TRUE_POSE = "true_pose"  # of `Scene.about`: camera-to-world in the source's frame
 DIGITS = 20  # of a number, at most
 
 
@@ -63,7 +64,8 @@ def read(request: str) -> Capture:
     name, *rest = request.split(",")
     options = typed(Options, dict(parse(request, text) for text in rest), f"procedural:{request}")
     stage = scenes.stage(name, options.size, options.views, options.seed)
-    return capture(stage, f"procedural:{request}", jittered(stage, options.jitter_poses, options.seed))
+    off = jittered(stage, options.jitter_poses, options.seed) if options.jitter_poses else None
+    return capture(stage, f"procedural:{request}", off)
 
 
 def parse(request: str, text: str) -> tuple[str, int]:
@@ -78,7 +80,10 @@ def parse(request: str, text: str) -> tuple[str, int]:
 
 
 def capture(stage: Stage, source: str, found: dict[str, Camera] | None = None) -> Capture:
-    """A stage as photographs with known poses. found: the cameras as they are said to be, where that differs."""
+    """A stage as photographs with known poses.
+
+    found: the cameras as they are said to be, where that differs; `about` has each `true_pose` then
+    """
     visible = stage.world.sky.visible
     said = found or stage.cameras
     shots = [
@@ -91,7 +96,7 @@ def capture(stage: Stage, source: str, found: dict[str, Camera] | None = None) -
             split=split,
             planes=known_planes(stage, cameras[i]),
             time=None if cameras.time is None else float(cameras.time[i]),
-            about=known_facts(stage, cameras[i]),
+            about=known_facts(stage, cameras[i], jittered=found is not None),
         )
         for split, cameras in stage.cameras.items()
         for i in range(len(cameras))
@@ -123,11 +128,12 @@ def known_planes(stage: Stage, camera: Camera) -> dict[str, Plane]:
     }
 
 
-def known_facts(stage: Stage, camera: Camera) -> dict[str, Any]:
-    """What one photograph says of itself."""
+def known_facts(stage: Stage, camera: Camera, jittered: bool) -> dict[str, Any]:
+    """What one photograph says of itself. jittered: whether its pose is not the true one, which is told then"""
+    known = {TRUE_POSE: camera.pose[0].double().numpy()} if jittered else {}
     if stage.sensor is None or camera.image_index is None:
-        return {}
-    return facts(taken_raw(stage, camera), stage.sensor.brightness(int(camera.image_index)))
+        return known
+    return known | facts(taken_raw(stage, camera), stage.sensor.brightness(int(camera.image_index)))
 
 
 def taken_raw(stage: Stage, camera: Camera) -> RawPhoto:

@@ -31,9 +31,12 @@ class FrequencyEncoding(nn.Module):
         octaves = base * 2.0 ** torch.arange(bands, dtype=torch.float64)
         self.register_buffer("octaves", octaves.float(), persistent=False)
 
-    def forward(self, points: Float[Tensor, "sample input"]) -> Float[Tensor, "sample feature"]:
+    def forward(
+        self, points: Float[Tensor, "sample input"], weights: Float[Tensor, " octave"] | None = None
+    ) -> Float[Tensor, "sample feature"]:
+        """weights: of the octaves, where not all count fully; see `training.coarse_to_fine`"""
         angles = self.octaves[:, None] * points[:, None]  # (sample, octave, input)
-        waves = torch.stack([angles.sin(), angles.cos()], 2).flatten(1)
+        waves = weighted(torch.stack([angles.sin(), angles.cos()], 2), weights).flatten(1)
         return torch.cat([points, waves], 1) if self.keep_input else waves
 
 
@@ -55,11 +58,21 @@ class IntegratedEncoding(nn.Module):
         self.register_buffer("octaves", 2.0 ** torch.arange(bands), persistent=False)
 
     def forward(
-        self, means: Float[Tensor, "sample input"], variances: Float[Tensor, "sample input"]
+        self,
+        means: Float[Tensor, "sample input"],
+        variances: Float[Tensor, "sample input"],
+        weights: Float[Tensor, " octave"] | None = None,
     ) -> Float[Tensor, "sample feature"]:
+        """weights: of the octaves, where not all count fully; see `training.coarse_to_fine`"""
         angles = self.octaves[:, None] * means[:, None]  # (sample, octave, input)
         left = torch.exp(-0.5 * self.octaves.square()[:, None] * variances[:, None])
-        return torch.stack([angles.sin() * left, angles.cos() * left], 2).flatten(1)
+        return weighted(torch.stack([angles.sin() * left, angles.cos() * left], 2), weights).flatten(1)
+
+
+def weighted(
+    waves: Float[Tensor, "sample octave wave input"], weights: Float[Tensor, " octave"] | None
+) -> Float[Tensor, "sample octave wave input"]:
+    return waves if weights is None else waves * weights[:, None, None]
 
 
 class FourierFeatures(nn.Module):

@@ -1,16 +1,12 @@
-"""What differs from photograph to photograph: exposure, and small errors of pose."""
+"""What differs from photograph to photograph: exposure."""
 
 from __future__ import annotations
-
-from dataclasses import replace
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
-from ...camera import Camera
 from ...controls import Control, Value
-from ...rays import Rays
 
 STOPS = 4.0  # that exposure can be turned up or down
 SCENE, AVERAGE = "scene", "average"  # beside the photographs: a gain of 1, and the mean of those that were learnt
@@ -57,38 +53,3 @@ class Exposure(nn.Module):
         else:
             log_gain = self.log_gain[int(whose)]
         return log_gain.exp() * 2 ** float(told.get("exposure", 0.0))
-
-
-class PoseRefinement(nn.Module):
-    """A small rotation (radians) and shift (scene units) of each photograph's rays, in the world's frame, 0 at first.
-
-    The exponential map of so(3) by Rodrigues' formula, as in BARF (Lin 2021, section 3).
-    """
-
-    def __init__(self, image_count: int):
-        super().__init__()
-        self.twist = nn.Parameter(torch.zeros(image_count, 6))
-
-    def forward(self, rays: Rays) -> Rays:
-        if rays.image_index is None:
-            return rays
-        omega, shift = self.twist[rays.image_index].split(3, -1)
-        return replace(rays, origins=rays.origins + shift, directions=rotated(rays.directions, omega))
-
-    @torch.no_grad()
-    def refined(self, cameras: Camera) -> Camera:
-        """Cameras with the corrections of the photographs that they took; those that were not trained on have none."""
-        if cameras.image_index is None:
-            return cameras
-        omega, shift = self.twist[cameras.image_index.to(self.twist.device)].to(cameras.pose).split(3, -1)
-        axes = [rotated(cameras.pose[:, :, i], omega) for i in range(3)]
-        return replace(cameras, pose=torch.stack([*axes, cameras.position + shift], -1))
-
-
-def rotated(vectors: Float[Tensor, "row 3"], omega: Float[Tensor, "row 3"]) -> Float[Tensor, "row 3"]:
-    """Each vector turned about an axis by its length in radians (Rodrigues); differentiable at zero as well."""
-    squared = omega.square().sum(-1, keepdim=True)
-    angle = squared.clamp_min(1e-12).sqrt()
-    once = torch.linalg.cross(omega, vectors)
-    twice = torch.linalg.cross(omega, once)
-    return vectors + angle.sin() / angle * once + (1 - angle.cos()) / angle.square() * twice

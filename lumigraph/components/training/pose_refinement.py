@@ -1,0 +1,137 @@
+"""Poses that are learnt beside the scene: a small turn and shift of each photograph's camera."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from ...camera import Camera
+from ...rays import Rays
+from ...scene import Frame
+from .coarse_to_fine import ENDS, band_weights
+from .pose_adam import PoseAdam
+from .schedules import falling
+
+PLACES = 16  # along each side of a picture, and as many depths: where its motion is measured
+DAMPING, LEAST = 0.1, 1e-8  # of the whitening, lambda and mu of Park 2023
+WARMUP = 0.2  # share of the budget in which poses' rate grows: at first nothing is there to be aligned with
+FALL = 0.02  # of the rate, that is left of it at the end of the budget
+
+
+class PoseRefinement(nn.Module):
+    """A small rotation (radians) and shift (scene units) of each photograph's camera, in the world's frame, 0 at first.
+
+    The rotation is about the camera's own place: the exponential map of so(3) by Rodrigues' formula (Lin 2021, BARF,
+    section 3.3). What is learnt, `twist`, are coordinates in which a step of any direction moves the picture equally
+    far, by radians (Park 2023, CamP): `axes` leads from these to rotation and shift. Without `begin` they are the same.
+
+    learning_rate: radians that a step moves a picture by, at most
+    progress:      share of the budget spent, by which `weights` lets bands of an encoding join
+    whitened:      whether `axes` are there; runs of version 0.1 learnt rotation and shift themselves
+    """
+
+    axes: Tensor
+    progress: Tensor
+
+    def __init__(self, image_count: int, learning_rate: float = 1e-3):
+        super().__init__()
+        self.learning_rate, self.whitened = learning_rate, True
+        self.twist = nn.Parameter(torch.zeros(image_count, 6))
+        self.register_buffer("axes", torch.eye(6).repeat(image_count, 1, 1))
+        self.register_buffer("progress", torch.tensor(1.0))
+
+    def begin(self, cameras: Camera, frame: Frame) -> None:
+        """Choose the coordinates by what each camera sees. cameras: of photographs, by their `image_index`"""
+        if cameras.image_index is not None:
+            for i, image in enumerate(cameras.image_index.tolist()):
+                self.axes[image] = whitening(cameras[i], frame)
+
+    @property
+    def moves(self) -> Float[Tensor, "image 6"]:
+        """Rotation and shift of each photograph's camera."""
+        return torch.einsum("ni,nij->nj", self.twist, self.axes)
+
+    def forward(self, rays: Rays) -> Rays:
+        if rays.image_index is None:
+            return rays
+        omega, shift = self.moves[rays.image_index].split(3, -1)
+        return replace(rays, origins=rays.origins + shift, directions=rotated(rays.directions, omega))
+
+    @torch.no_grad()
+    def refined(self, cameras: Camera) -> Camera:
+        """Cameras with the corrections of the photographs that they took; those that were not trained on have none."""
+        if cameras.image_index is None:
+            return cameras
+        omega, shift = self.moves[cameras.image_index.to(self.twist.device)].to(cameras.pose).split(3, -1)
+        axes = [rotated(cameras.pose[:, :, i], omega) for i in range(3)]
+        return replace(cameras, pose=torch.stack([*axes, cameras.position + shift], -1))
+
+    def weights(self, bands: int) -> Float[Tensor, " band"] | None:
+        """Of an encoding's bands at this share of the budget; None once all count fully."""
+        progress = float(self.progress)
+        return None if progress >= ENDS else band_weights(bands, progress).to(self.twist)
+
+    def optimizer(self) -> PoseAdam:
+        """Fresh; its group is called "poses", and its rate is that of `rate`."""
+        return PoseAdam([{"name": "poses", "params": [self.twist]}], self.learning_rate)
+
+    def rate(self, progress: float) -> float:
+        """The learning rate at a share of the budget: it grows, then falls exponentially."""
+        return falling(self.learning_rate, FALL * self.learning_rate, progress, WARMUP)
+
+    def _load_from_state_dict(self, state_dict, prefix, *others) -> None:
+        self.whitened = f"{prefix}axes" in state_dict
+        for name in ("axes", "progress"):  # which older runs lack: rotation and shift as they are, all bands
+            state_dict.setdefault(prefix + name, getattr(self, name))
+        super()._load_from_state_dict(state_dict, prefix, *others)
+
+
+def rotated(vectors: Float[Tensor, "row 3"], omega: Float[Tensor, "row 3"]) -> Float[Tensor, "row 3"]:
+    """Each vector turned about an axis by its length in radians (Rodrigues); differentiable at zero as well."""
+    squared = omega.square().sum(-1, keepdim=True)
+    angle = squared.clamp_min(1e-12).sqrt()
+    once = torch.linalg.cross(omega, vectors)
+    twice = torch.linalg.cross(omega, once)
+    return vectors + angle.sin() / angle * once + (1 - angle.cos()) / angle.square() * twice
+
+
+def whitening(camera: Camera, frame: Frame) -> Float[Tensor, "6 6"]:
+    """(Sigma + lambda diag(Sigma) + mu I)^(-1/2), Sigma the mean of J^T J over what one camera sees (Park 2023, eq. 9).
+
+    J is how the direction towards a point of the scene, seen from the camera, follows rotation and shift: omega x d and
+    the part of the shift across d over the distance. In whitened coordinates a step along any axis moves the picture
+    equally far, so that turning and shifting, which look nearly the same, are told apart.
+    """
+    rays, t = seen_places(camera, frame)
+    d, eye = rays.directions.double(), torch.eye(3, dtype=torch.float64, device=t.device)
+    turns = torch.linalg.cross(eye.expand(len(d), 3, 3), d[:, None].expand(-1, 3, -1)).mT  # (ray, direction, omega)
+    shifts = (d[:, :, None] * d[:, None] - eye)[:, None] / t.double()[:, :, None, None]
+    jacobian = torch.cat([-turns[:, None].expand_as(shifts), shifts], -1).flatten(0, 2)
+    sigma = jacobian.T @ jacobian / t.numel()
+    values, vectors = torch.linalg.eigh(sigma + DAMPING * sigma.diagonal().diag() + LEAST * torch.eye(6).to(sigma))
+    found = vectors * values.rsqrt() @ vectors.T
+    return found.round(decimals=6).float()  # to the same bits, however threads share out the sums
+
+
+def seen_places(camera: Camera, frame: Frame) -> tuple[Rays, Float[Tensor, "ray depth"]]:
+    """Rays over a camera's picture and distances along them: evenly through the box of interest where that holds all,
+    else evenly by their logarithm as far as the scene reaches."""
+    width, height = camera.size[0].tolist()
+    x, y = ((torch.arange(PLACES, device=camera.pose.device) + 0.5) * n / PLACES for n in (width, height))
+    rays = camera.rays(torch.cartesian_prod(x, y).to(camera.pose))
+    share = ((torch.arange(PLACES, device=camera.pose.device) + 0.5) / PLACES).to(camera.pose)
+    if frame.reach > 1:
+        t = frame.near * (2 * frame.reach / frame.near) ** share
+        return rays, t.expand(len(rays), -1)
+    enter, leave = rays.through_box(rays.origins.new_tensor(frame.bounds))
+    through = leave > enter.clamp_min(frame.near)
+    if not through.any():  # it looks past the box
+        away = max(frame.near, float(camera.position[0].norm()))
+        return rays, torch.full((len(rays), PLACES), away, device=camera.pose.device)
+    inside = through.nonzero()[:, 0]
+    first, last = enter[inside].clamp_min(frame.near), leave[inside]
+    kept = Rays(rays.origins[inside], rays.directions[inside], rays.radius[inside])
+    return kept, torch.lerp(first[:, None], last[:, None], share)

@@ -1,0 +1,268 @@
+"""Poses that are learnt: their gradients, the order in which details join, frames that agree, held-out photographs."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import tiny
+import torch
+from PIL import Image
+
+from lumigraph import methods
+from lumigraph.alignment import aligning, moves
+from lumigraph.camera import Camera
+from lumigraph.capture import open_scene
+from lumigraph.capture.capture import Shot
+from lumigraph.capture.folds import about_fold
+from lumigraph.components.clouds.initial_cloud import random_cloud
+from lumigraph.components.clouds.seen_from import seen_from
+from lumigraph.components.fields.encodings import FrequencyEncoding
+from lumigraph.components.training.coarse_to_fine import BEGINS, ENDS, FIRST, band_weights
+from lumigraph.components.training.pose_refinement import PoseRefinement, seen_places
+from lumigraph.evaluate.held_out_poses import HeldOutPoses, held_out_poses, pose_scores
+from lumigraph.gaussians.splatting import splat, view_of
+from lumigraph.geometry import Similarity
+from lumigraph.images import ImageStore
+from lumigraph.lens import Pinhole
+from lumigraph.run import build
+from lumigraph.verdict import cameras_moved
+
+CPU = torch.device("cpu")
+SMALL = {"nerf": {"position_frequencies": 3, "bfloat16": False}, "mip-nerf": {"bfloat16": False}, "instant-ngp": {}}
+
+
+def refining(name: str, **config):
+    kind = methods.find(name)
+    return build(kind, tiny.scene().frame, replace(kind.smallest(), refine_cameras=True, **config), CPU, 0)
+
+
+def slopes(value, twist: torch.nn.Parameter, image: int, step: float) -> torch.Tensor:
+    """Central differences of a function of what is learnt of one photograph's pose."""
+    found = []
+    for i in range(6):
+        ends = []
+        for way in (1, -1):
+            with torch.no_grad():
+                twist[image, i] += way * step
+                ends.append(float(value()))
+                twist[image, i] -= way * step
+        found.append((ends[0] - ends[1]) / (2 * step))
+    return torch.tensor(found)
+
+
+# Gradients
+
+
+@pytest.mark.parametrize("name", SMALL)
+def test_a_field_tells_where_rays_should_go(name):
+    """What the network says along a photograph's rays, by central differences in its pose."""
+    method = refining(name, **SMALL[name])
+    if name == "instant-ngp":
+        method.network.table.data.uniform_(-1, 1, generator=torch.Generator().manual_seed(2))
+    camera, t = tiny.scene().cameras[1], torch.linspace(2.5, 3.5, 8)
+    rays = camera.rays(camera.pixels()[::7])
+
+    def value() -> torch.Tensor:
+        seen = method.poses(rays)
+        points = seen.origins[:, None] + t[:, None] * seen.directions[:, None]
+        _, rgb = method.field(points.reshape(-1, 3), seen.directions.repeat_interleave(len(t), 0))
+        return (rgb.double() * torch.arange(1, 4)).sum()
+
+    with torch.no_grad():
+        method.poses.twist[1] = torch.tensor([0.01, -0.02, 0.015, 0.02, 0.01, -0.01])
+    (found,) = torch.autograd.grad(value(), method.poses.twist)
+    expected = slopes(value, method.poses.twist, 1, 1e-5)
+    assert found[0].abs().max() == 0 and expected.norm() > 1
+    assert (found[1] - expected).norm() < 0.1 * expected.norm()  # across kinks of ReLUs and cells
+
+
+def test_a_cloud_tells_where_its_camera_should_go():
+    """A picture through the refined camera, by central differences in its pose."""
+    scene = tiny.scene()
+    cloud = random_cloud(scene.frame, 30, 0, torch.Generator().manual_seed(0))
+    scales = cloud.log_scales + torch.tensor([0.5, -0.5, 0.0])
+    cloud = replace(cloud, log_scales=scales, opacities=cloud.opacities + 2)  # whose cut edges are faint beside them
+    poses = PoseRefinement(len(scene))
+    weights = torch.rand(tiny.SIZE, tiny.SIZE, 3, generator=torch.Generator().manual_seed(1))
+
+    def value() -> torch.Tensor:
+        moved, camera = seen_from(poses, cloud, scene.cameras[2])
+        return (splat(moved, view_of(camera), 1).rgb * weights).double().sum()
+
+    with torch.no_grad():
+        poses.twist[2] = torch.tensor([0.02, -0.01, 0.03, 0.01, 0.02, -0.02])
+    (found,) = torch.autograd.grad(value(), poses.twist)
+    expected = slopes(value, poses.twist, 2, 2e-4)
+    assert expected.norm() > 1 and (found[2] - expected).norm() < 0.05 * expected.norm()
+
+
+def test_a_step_moves_the_picture_equally_far_whichever_way():
+    """In the coordinates that are learnt, and not in radians and scene units."""
+    scene = tiny.scene()
+    poses = PoseRefinement(len(scene))
+
+    def motion(axis: int) -> float:
+        """How far, in radians, the directions towards places of the scene move, root mean square."""
+        camera = scene.cameras[0]
+        rays, t = seen_places(camera, scene.frame)
+        places = (rays.origins[:, None] + t[..., None] * rays.directions[:, None]).reshape(-1, 3)
+        with torch.no_grad():
+            poses.twist.zero_()
+            poses.twist[0, axis] = 1e-3
+        there = poses.refined(camera)
+        before, after = (
+            torch.nn.functional.normalize((places - c.position) @ c.pose[0, :, :3], dim=-1) for c in (camera, there)
+        )
+        return float((after - before).square().sum(-1).mean().sqrt()) / 1e-3
+
+    raw = [motion(i) for i in range(6)]
+    poses.begin(scene.cameras, scene.frame)
+    even = [motion(i) for i in range(6)]
+    assert max(raw) / min(raw) > 2 and max(even) / min(even) < 1.6 and 0.3 < min(even) and max(even) < 1.1
+
+
+# Coarse to fine
+
+
+def test_bands_join_one_after_another():
+    first, middle, last = (band_weights(8, progress) for progress in (0.0, (BEGINS + ENDS) / 2, 1.0))
+    assert first.tolist() == [1.0] * int(8 * FIRST) + [0.0] * int(8 - 8 * FIRST)
+    assert (middle.diff() <= 0).all() and middle[4] == 1 and middle[5:].tolist() == [0.0] * 3
+    assert last.tolist() == [1.0] * 8
+    alpha = 2.5  # from 1 to 4 of 4 bands
+    progress = BEGINS + (alpha - 1) / 3 * (ENDS - BEGINS)
+    torch.testing.assert_close(band_weights(4, progress), torch.tensor([1.0, 1.0, 0.5, 0.0]), atol=1e-6, rtol=0)
+
+
+def test_waves_and_levels_are_weighted_in_their_order():
+    encoding, points = FrequencyEncoding(3, 4), torch.rand(5, 3)
+    plain, weighted = encoding(points), encoding(points, torch.tensor([1.0, 0.5, 0.0, 0.0]))
+    assert torch.equal(weighted[:, :9], plain[:, :9]) and torch.equal(weighted[:, 9:15], 0.5 * plain[:, 9:15])
+    assert (weighted[:, 15:] == 0).all()
+    method = refining("instant-ngp")
+    method.network.table.data.uniform_(-1, 1)
+    width = method.config.features_per_level
+    method.before_step(0, 0.0)
+    coarse = method._encoded(points - 0.5)
+    assert (coarse[:, :width] != 0).all() and (coarse[:, width:] == 0).all()
+    method.poses.progress.fill_(1.0)
+    assert (method._encoded(points - 0.5) != 0).all() and method.poses.weights(4) is None
+
+
+def test_a_method_that_refines_nothing_has_no_weights_and_one_rate():
+    plain = build(methods.find("nerf"), tiny.scene().frame, methods.find("nerf").smallest(), CPU, 0)
+    assert plain.poses is None and isinstance(plain.learning_rate(0, 0.5), float)
+    rates = [refining("nerf").learning_rate(0, progress)["poses"] for progress in (0.0, 0.2, 1.0)]
+    assert rates[0] < 0.05 * rates[1] and rates[2] < 0.1 * rates[1]
+
+
+# Frames
+
+
+def some_cameras() -> Camera:
+    return tiny.scene().cameras
+
+
+def test_alignment_finds_a_known_similarity():
+    turn = torch.linalg.matrix_exp(torch.tensor([[0.0, -0.3, 0.2], [0.3, 0.0, -0.5], [-0.2, 0.5, 0.0]]))
+    known = Similarity.make(1.3, turn, torch.tensor([0.4, -0.2, 0.1]))
+    there = some_cameras().transformed(known.matrix)
+    found = aligning(some_cameras(), there)
+    torch.testing.assert_close(found.matrix, known.matrix, atol=1e-5, rtol=0)
+    apart = moves(some_cameras(), there, tiny.scene().frame)
+    assert apart.largest[0] < 1e-2 and apart.largest[1] < 1e-3
+
+
+def test_alignment_of_cameras_on_a_line_is_told_by_their_directions():
+    line = some_cameras()[:4]
+    pose = line.pose[:1].repeat(4, 1, 1)
+    pose[:, :, 3] = torch.linspace(0, 1, 4)[:, None] * torch.tensor([1.0, 0.5, 0.0])
+    line = replace(line, pose=pose)
+    turn = torch.linalg.matrix_exp(torch.tensor([[0.0, -1.0, 0.0], [1.0, 0.0, -2.0], [0.0, 2.0, 0.0]]))
+    known = Similarity.make(0.5, turn, torch.ones(3))
+    torch.testing.assert_close(aligning(line, line.transformed(known.matrix)).matrix, known.matrix, atol=1e-5, rtol=0)
+
+
+def test_moves_are_those_of_single_cameras():
+    method, cameras = refining("instant-ngp"), some_cameras()
+    with torch.no_grad():
+        method.poses.twist[5] = torch.tensor([0.0, math.radians(3), 0.0, 0.0, 0.0, 0.04])
+    moved = cameras_moved(method, cameras)
+    assert moved.turned.argmax() == 5 and 2.4 < moved.largest[0] < 3.01 and moved.median[0] < 0.5
+    assert moved.shifted.argmax() == 5 and 1.2 < moved.largest[1] < 2.05
+    plain = build(methods.find("instant-ngp"), method.frame, methods.find("instant-ngp").Config(levels=2), CPU, 0)
+    assert cameras_moved(plain, cameras) is None and held_out_poses(plain, tiny.scene()) is None
+
+
+def test_true_poses_of_a_jittered_scene_are_known():
+    off = open_scene("procedural:still-life,size=16,views=12,jitter_poses=2")
+    method = refining("instant-ngp")
+    method.poses = PoseRefinement(len(off))
+    rotation, position = pose_scores(method, off)
+    assert 1.5 < rotation.value < 2.2 and 1.3 < position.value < 2.2 and pose_scores(method, tiny.scene()) == []
+    given, true = off.cameras.pose, off.about["true_pose"]  # the scene's frame is the source's
+    omega = torch.stack([axis_angle(b @ a.T) for a, b in zip(given[:, :, :3], true[:, :, :3], strict=True)])
+    with torch.no_grad():
+        method.poses.twist.copy_(torch.cat([omega, true[:, :, 3] - given[:, :, 3]], -1))
+    assert max(score.value for score in pose_scores(method, off)) < 0.02
+
+
+def axis_angle(rotation: torch.Tensor) -> torch.Tensor:
+    skew = (rotation - rotation.T) / 2
+    axis = torch.stack([skew[2, 1], skew[0, 2], skew[1, 0]])
+    return axis * (axis.norm().clamp_min(1e-9).asin() / axis.norm().clamp_min(1e-9))
+
+
+def test_a_held_out_photograph_is_found_on_itself():
+    """A cloud's own pictures, one of them said to be taken from 1.5 degrees and 1 % away; the cloud stays as it is."""
+    scene = tiny.made(8, 32, 40.0)
+    kind = methods.find("gaussian-splatting")
+    config = replace(kind.smallest(), refine_cameras=True, sh_degree=0)
+    method = build(kind, scene.frame, config, CPU, 0).eval()
+    cloud = random_cloud(scene.frame, 100, 0, torch.Generator().manual_seed(0))
+    method.cloud.replace(replace(cloud, means=0.6 * cloud.means, opacities=cloud.opacities + 4))
+    pictures = [method.render(scene.cameras[i]).rgb for i in range(len(scene))]
+    images = ImageStore.from_arrays([np.uint8(255 * x.clamp(0, 1).numpy() + 0.5) for x in pictures])
+    poses = PoseRefinement(len(scene))
+    with torch.no_grad():
+        poses.twist[4] = torch.tensor([0.015, -0.02, 0.005, 0.01, -0.01, 0.015])
+    frame = replace(scene.frame, has_alpha=False)
+    said = replace(scene, cameras=poses.refined(scene.cameras), images=images, frame=frame)
+    before = {name: x.clone() for name, x in method.state_dict().items()}
+    found = HeldOutPoses(method, said)
+    true = scene.cameras[4].pose
+    off, left = ((c.pose - true).norm() for c in (said.cameras[4], found.camera(4)))
+    assert left < 0.15 * off
+    assert all(torch.equal(x, before[name]) for name, x in method.state_dict().items())
+    assert torch.equal(found.camera(1).pose, said.cameras[1].pose)
+
+
+# Captures
+
+
+def photographed(folder, poses: np.ndarray, seen: np.ndarray) -> list[Shot]:
+    """Photographs of a panorama: each shows the part that its number in `seen` says."""
+    chance = np.random.default_rng(0)
+    panorama = np.kron(chance.integers(0, 255, (2, 30)), np.ones((12, 12))).astype(np.uint8)
+    shots = []
+    for i, place in enumerate(seen):
+        Image.fromarray(panorama[:, 4 * place : 4 * place + 24]).save(folder / f"{i}.png")
+        lens = Pinhole(torch.tensor([[30.0, 30.0]]), torch.tensor([[12.0, 12.0]]))
+        shots.append(Shot(f"{i}.png", poses[i], lens, (24, 24), {1: folder / f"{i}.png"}))
+    return shots
+
+
+def test_a_capture_is_said_to_be_folded_where_it_leaps_and_its_photographs_do_not(tmp_path):
+    walk = tiny.poses(40).numpy()
+    folded = walk.copy()
+    folded[20:, :, 3] += 8 * walk[20, :, 0]
+    steady, leaping = np.arange(40), np.arange(40) + 30 * (np.arange(40) >= 20)
+    assert about_fold(photographed(tmp_path, walk, steady), walk) is None
+    said = about_fold(photographed(tmp_path, folded, steady), folded)
+    assert said is not None and "19.png and 20.png" in said and "folded" in said
+    assert about_fold(photographed(tmp_path, folded, leaping), folded) is None  # somebody walked there
+    shuffled = folded[np.random.default_rng(0).permutation(40)]
+    assert about_fold(photographed(tmp_path, shuffled, steady), shuffled) is None  # in no order
