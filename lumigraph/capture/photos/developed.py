@@ -43,7 +43,7 @@ def develop(files: Mapping[str, Path], folder: Path, track: Track) -> dict[str, 
             brightness = 1 / photo.highlight() if wanted is None else wanted
             write(photo, brightness, target)
         except LumigraphError as fault:
-            return str(fault)
+            return reason(photo.path, fault)
         return Developed(str(photo.path.resolve()), brightness)
 
     with ThreadPoolExecutor(AT_ONCE) as pool:
@@ -62,7 +62,13 @@ def open_or_why(path: Path) -> RawPhoto | str:
     try:
         return open_raw(path)
     except LumigraphError as fault:
-        return str(fault)
+        return reason(path, fault)
+
+
+def reason(path: Path, fault: LumigraphError) -> str:
+    """Why a file cannot be used, in a few words: what is said beside its name."""
+    what, *_ = str(fault).split("; ")
+    return f"it {what.removeprefix(f'{path} ')}" if what.startswith(f"{path} ") else what
 
 
 def brightness_of_all(photos: list[RawPhoto]) -> float | None:
