@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
 from numba import njit, prange
 
 
@@ -62,6 +63,19 @@ def along(origins, directions, t_start, t_end, ray_starts, positions, seen_along
             for axis in range(3):
                 positions[i, axis] = origins[ray, axis] + t * directions[ray, axis]
                 seen_along[i, axis] = directions[ray, axis]
+
+
+@njit(parallel=True, cache=True, error_model="numpy")
+def contract(points, coordinates, stretch):
+    """Contraction.warp and Contraction.stretch."""
+    one, half = points.dtype.type(1), points.dtype.type(0.5)
+    for i in prange(len(points)):
+        x, y, z = points[i]
+        inverse = one / max(math.sqrt(x * x + y * y + z * z), one)
+        across = half * (one + one - inverse) * inverse
+        coordinates[i, 0], coordinates[i, 1], coordinates[i, 2] = across * x, across * y, across * z
+        if len(stretch):
+            stretch[i] = np.cbrt(half * inverse * inverse * across * across)
 
 
 @njit(inline="always")

@@ -59,6 +59,7 @@ class Method(nn.Module, ABC):
     any_lens: ClassVar[bool] = False  # whether `render` follows every lens, or flat pictures alone
     formerly_weights: ClassVar[dict[str, str]] = {}  # beginnings of their names in older runs, and those they have now
     formerly: ClassVar[dict[str, str]] = {}  # names that Config's fields had in older runs, and those they have now
+    before: ClassVar[dict[str, Any]] = {}  # what fields of Config are in runs from before there were any such
     efforts: ClassVar[Efforts] = BY_PHOTOGRAPH  # what each --quality asks for
     _place: Tensor
 

@@ -33,7 +33,8 @@ def meant(name: str, known: Sequence[str]) -> str | None:
     ):
         if found := sorted(filter(fits, known), key=len):
             return found[0]
-    parts = {part: other for other in known for part in (*other.split("-"), letters(other))}
+    whole = {letters(other): other for other in known}
+    parts = {part: other for other in known for part in other.split("-")} | whole  # a whole name before another's part
     near = difflib.get_close_matches(said, parts, n=1)
     return parts[near[0]] if near else None
 

@@ -23,7 +23,15 @@ from .ranges import Coordinate, Point, Row, Share, between, typed
 from .rays import Rays
 
 # How values of a layer are reduced, by its name (see `resized`); all others are picked, not averaged.
-AVERAGED = {"colours": "sRGB", "raw": "linear", "albedo": "linear", "flow": "pixels"}
+AVERAGED = {
+    "colours": "sRGB",
+    "raw": "linear",
+    "albedo": "linear",
+    "radiance": "linear",
+    "mosaic": "mosaic",
+    "filter": "filter",
+    "flow": "pixels",
+}
 
 
 Size = Annotated[float, between(1e-9, 1e9)]  # scene units

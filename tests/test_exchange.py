@@ -18,8 +18,9 @@ import zstandard
 from listing import names
 
 from lumigraph.errors import LumigraphError
-from lumigraph.exchange import SUFFIXES, is_splat_file, read_gaussians, write_gaussians
+from lumigraph.exchange import REORDERED, SUFFIXES, is_splat_file, read_gaussians, write_gaussians
 from lumigraph.exchange.morton import morton_order
+from lumigraph.exchange.spz import gzipped
 from lumigraph.gaussians import Gaussians, turned
 
 C0 = math.sqrt(1 / (4 * math.pi))
@@ -51,10 +52,10 @@ def same(a: Gaussians, b: Gaussians) -> bool:
 
 
 def round_trip(gaussians: Gaussians, path: Path) -> Gaussians:
-    """Through a file and back; the compressed layout's order undone."""
+    """Through a file and back; Morton's order undone where a format has it."""
     write_gaussians(path, gaussians)
     found = read_gaussians(path)
-    if path.name.endswith(".compressed.ply"):
+    if path.name.endswith(REORDERED):
         order = torch.from_numpy(morton_order(gaussians.means.numpy()))
         found = found[order.argsort()]
     return found
@@ -142,7 +143,10 @@ def test_splat_keeps_what_it_promises(tmp_path, degree, count):
     assert C0 * apart(found.harmonics, cloud.harmonics[:, :1]) <= 1 / 510 + 1e-6
 
 
-@pytest.mark.parametrize(("suffix", "error"), [(".splat", 0), (".spz", 2**-17 + 1e-6), (".compressed.ply", 4e-3)])
+@pytest.mark.parametrize(
+    ("suffix", "error"),
+    [(".splat", 0), (".spz", 2**-17 + 1e-6), (".compressed.ply", 4e-3), (".sog", 2e-4), (".glb", 0)],
+)
 def test_what_was_rounded_once_stays(tmp_path, suffix, error):
     """ply -> format -> ply: the second time through a format changes (almost) nothing, and .ply nothing at all."""
     original = round_trip(make(300), tmp_path / "a.ply")
@@ -154,14 +158,14 @@ def test_what_was_rounded_once_stays(tmp_path, suffix, error):
     assert apart(twice.log_scales, once.log_scales) <= 1e-5
     assert opacity_apart(twice, once) <= 1e-6
     assert apart(twice.harmonics, once.harmonics) <= 1e-5
-    assert components_apart(twice, once) <= (1 / 100 if suffix == ".splat" else 1e-6)
+    # Of two components that are nearly alike, another may be the largest the second time.
+    assert components_apart(twice, once) <= {".splat": 1 / 100, ".sog": 3 * 0.0028}.get(suffix, 1e-6)
 
 
 def test_spz_turns_half_around_x(tmp_path):
     """Written numbers are those of the cloud in the other axes, whose harmonics need no table of signs."""
     cloud = make(50)
-    write_gaussians(tmp_path / "a.spz", cloud)
-    data = gzip.decompress((tmp_path / "a.spz").read_bytes())
+    data = gzip.decompress(gzipped(cloud))
     turned_by = torch.eye(4)
     turned_by[:3, :3] = HALF_TURN
     there = cloud.transformed(turned_by)
@@ -172,6 +176,7 @@ def test_spz_turns_half_around_x(tmp_path):
     fixed = np.frombuffer(data[16 : 16 + 450], np.uint8).reshape(50, 3, 3) @ (1 << np.array([0, 8, 16]))
     fixed = torch.from_numpy((fixed - (fixed > 2**23 - 1) * 2**24) / 2.0 ** data[13])
     assert apart(fixed.float(), there.means) <= 2**-17 + 1e-6
+    write_gaussians(tmp_path / "a.spz", cloud)
     found = read_gaussians(tmp_path / "a.spz")
     assert components_apart(found.transformed(turned_by), there) <= 0.0021
 
@@ -181,7 +186,7 @@ def test_spz_spends_its_bits_on_what_is_there(tmp_path, reach, bits):
     cloud = make(9, 0)
     means = cloud.means / cloud.means.abs().max() * reach
     found = round_trip(replace(cloud, means=means), tmp_path / "a.spz")
-    assert gzip.decompress((tmp_path / "a.spz").read_bytes())[13] == bits
+    assert (tmp_path / "a.spz").read_bytes()[13] == bits
     assert apart(found.means, means) <= 2.0 ** -(bits + 1) + 1e-6 * reach
     with pytest.raises(LumigraphError, match="scale the cloud down"):
         write_gaussians(tmp_path / "b.spz", replace(cloud, means=means * 1e7 / reach))
@@ -222,7 +227,7 @@ def test_extremes_are_cut_and_nothing_else(tmp_path, suffix):
         torch.testing.assert_close(found.log_scales[:, :2], torch.tensor([[-20.0, 20.0]]).repeat(4, 1))
     rotations = found.quaternions.double().abs()
     rotations = rotations / rotations.norm(dim=-1, keepdim=True)
-    torch.testing.assert_close(rotations, torch.eye(4)[[0, 0, 1, 3]].double(), atol=2e-3, rtol=0)
+    torch.testing.assert_close(rotations, torch.eye(4)[[0, 0, 1, 3]].double(), atol=3e-3, rtol=0)
 
 
 def test_compressed_chunks_hold_neighbours(tmp_path):
@@ -432,7 +437,7 @@ def test_truncated_anywhere(tmp_path, suffix, degree):
     write_gaussians(tmp_path / f"a{suffix}", make(9, degree))
     data = (tmp_path / f"a{suffix}").read_bytes()
     path = tmp_path / f"b{suffix}"
-    for length in [*range(0, len(data), 7), len(data) - 1]:
+    for length in [*range(0, len(data), max(7, len(data) // 300)), len(data) - 1]:
         path.write_bytes(data[:length])
         if suffix == ".splat" and length and length % 32 == 0:  # no header says how many there should be
             assert len(read_gaussians(path)) == length // 32
@@ -447,7 +452,7 @@ def test_damaged_anywhere(tmp_path, suffix):
     data = (tmp_path / f"a{suffix}").read_bytes()
     generator = np.random.default_rng(0)
     path = tmp_path / f"b{suffix}"
-    for position in range(0, len(data), 5):
+    for position in range(0, len(data), max(5, len(data) // 300)):
         changed = bytearray(data)
         changed[position] ^= int(generator.integers(1, 256))
         path.write_bytes(changed)
@@ -653,12 +658,16 @@ def tabled(data: bytes) -> bytes:
 
 @pytest.mark.parametrize("degree", [0, 2])
 def test_spz_version_4_says_the_same(tmp_path, degree):
-    write_gaussians(tmp_path / "three.spz", make(70, degree, antialiased=True))
-    data = tabled((tmp_path / "three.spz").read_bytes())
+    """Put together by hand from version 3, and as it is written."""
+    cloud = make(70, degree, antialiased=True)
+    (tmp_path / "three.spz").write_bytes(gzipped(cloud))
+    data = tabled(gzipped(cloud))
     (tmp_path / "four.spz").write_bytes(data)
-    three, four = (read_gaussians(tmp_path / f"{name}.spz") for name in ("three", "four"))
+    write_gaussians(tmp_path / "written.spz", cloud)
+    assert (tmp_path / "written.spz").read_bytes()[:32] == data[:32]
+    three, *others = (read_gaussians(tmp_path / f"{name}.spz") for name in ("three", "four", "written"))
     for name in ("means", "quaternions", "log_scales", "opacities", "harmonics", "antialiased"):
-        assert np.array_equal(getattr(three, name), getattr(four, name)), name
+        assert all(np.array_equal(getattr(three, name), getattr(other, name)) for other in others), name
     for end in range(1, len(data) - 1, 7):
         (tmp_path / "cut.spz").write_bytes(data[:end])
         refusal(tmp_path / "cut.spz")

@@ -24,7 +24,7 @@ from lumigraph.capture import open_dataset
 from lumigraph.cli import main
 from lumigraph.commands.info_tree import run_tree
 from lumigraph.errors import LumigraphError
-from lumigraph.exchange import write_gaussians
+from lumigraph.exchange import SUFFIXES, write_gaussians
 from lumigraph.gaussians import Gaussians
 from lumigraph.geometry import Similarity
 from lumigraph.paths.keyframes import CameraPath
@@ -84,7 +84,7 @@ def test_pictures(tmp_path):
         opened_or_told(path.name, tmp_path, (path.name,), 8, lambda _, path=path: open_dataset(path))
 
 
-@pytest.mark.parametrize("suffix", [".ply", ".compressed.ply", ".splat", ".spz"])
+@pytest.mark.parametrize("suffix", SUFFIXES)
 def test_clouds(suffix, tmp_path):
     chance = torch.Generator().manual_seed(SEED)
     write_gaussians(tmp_path / f"cloud{suffix}", cloud(chance))

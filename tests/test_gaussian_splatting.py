@@ -121,7 +121,7 @@ def test_a_run_becomes_a_file_that_opens_as_a_run(tmp_path, monkeypatch, capsys)
     assert cli.main(["train", "gaussian-splatting", str(scene), *options]) == 0
     count = len(Run(tmp_path / "run").method().cloud)
     assert count > 200
-    for name in ("a.ply", "a.spz", "a.splat", "a.compressed.ply"):
+    for name in ("a.ply", "a.spz", "a.splat", "a.compressed.ply", "a.sog", "a.glb"):
         assert cli.main(["export", "splats", str(tmp_path / "run"), name]) == 0
         assert cli.main(["info", name]) == 0
         assert f"{count:,} Gaussians" in capsys.readouterr().out

@@ -6,11 +6,13 @@ import os
 
 import pytest
 import safetensors.torch
+import tiny
 import torch
 
 from lumigraph.errors import LumigraphError
 from lumigraph.evaluate import compare
 from lumigraph.metrics.lpips import SHAPES, Lpips, load_lpips, named_files
+from lumigraph.scene import Photograph
 
 
 @pytest.fixture(scope="module")
@@ -145,6 +147,8 @@ def test_what_a_mask_rules_out_does_not_count(weights):
     mask[:, 16:] = False
     distance = Lpips(weights)
     spoilt = torch.where(mask[..., None], b, 1 - b)
-    scores = [compare("one", rgb, a, mask, 0.0, distance) for rgb in (b, spoilt)]
+    camera = tiny.scene().cameras[0]
+    masked, whole = Photograph(camera, a, mask=mask), Photograph(camera, a)
+    scores = [compare("one", rgb, masked, a, slice(None), 0.0, distance) for rgb in (b, spoilt)]
     assert scores[0].lpips == scores[1].lpips
-    assert 0 < scores[0].lpips < compare("one", b, a, None, 0.0, distance).lpips
+    assert 0 < scores[0].lpips < compare("one", b, whole, a, slice(None), 0.0, distance).lpips

@@ -110,7 +110,7 @@ def test_it_is_told_how_large_a_grid_would_fit(monkeypatch):
     assert bytes_of(kind, frame, kind.Config(voxels=fitting, coarse_voxels=4096), learning=True) <= 400_000_000
 
 
-ESTIMATED = ["instant-ngp", "nerf", "mip-nerf", "dvgo", "fourier-features", "tensorf", "voxel-grid"]
+ESTIMATED = ["instant-ngp", "nerf", "mip-nerf", "dvgo", "fourier-features", "tensorf", "nerf-w", "voxel-grid"]
 
 
 @pytest.mark.parametrize("name", ESTIMATED)

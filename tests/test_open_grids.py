@@ -1,12 +1,9 @@
-"""What grids without a bound share: steps that suit voxels, smoothness, thin beginnings."""
+"""What grids without a bound share: smoothness, thin beginnings."""
 
 import tiny
 import torch
 
 from lumigraph.components.fields.voxels import VoxelGrid, corners
-from lumigraph.components.sampling.grid_march import march, reach_of
-from lumigraph.components.sampling.occupancy import OccupancyGrid
-from lumigraph.components.sampling.spaces import space_of
 from lumigraph.components.training.smoothness import variation
 from lumigraph.methods.dvgo import DVGO
 from lumigraph.rays import Rays
@@ -22,16 +19,6 @@ def straight_ahead(count: int = 3) -> Rays:
     across = torch.linspace(-0.2, 0.2, count)
     directions = torch.stack([across, across / 2, torch.ones(count)], -1)
     return Rays(torch.zeros(count, 3), torch.nn.functional.normalize(directions, dim=-1), torch.full((count,), 1e-3))
-
-
-def test_steps_are_even_where_the_grid_sees_them():
-    """In the cube of device coordinates; in the middle of contracted space, which has half the scene's scale."""
-    rays = straight_ahead()
-    for frame in (FORWARD, Frame(reach=8.0, near=0.05), Frame()):
-        space = space_of(frame)
-        found = march(space, OccupancyGrid(reach_of(frame), 4), rays, frame.near, 0.02, 0.0)
-        first, last = (space.warp(rays.origins[:1] + t * rays.directions[:1]) for t in found.t_start[[0, 20]])
-        torch.testing.assert_close((last - first).norm(), torch.tensor(0.4), atol=2e-3, rtol=0)
 
 
 def test_only_what_samples_touch_is_smoothed(generator):

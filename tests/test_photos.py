@@ -138,7 +138,7 @@ def test_folders_with_poses_are_not_bare(tmp_path):
         (lambda p: p / "nowhere", "does not exist"),
         (lambda p: (p / "empty").mkdir() or p / "empty", "holds no photographs"),
         (lambda p: [(p / "bad.jpg").write_bytes(b"nonsense"), p / "bad.jpg"][1], "unknown format"),
-        (lambda p: [(p / "raw.cr2").write_bytes(b"II*\0"), p / "raw.cr2"][1], "format is not read"),
+        (lambda p: [(p / "raw.cr2").write_bytes(b"II*\0"), p / "raw.cr2"][1], "raw.cr2"),
     ],
 )
 def test_nothing_to_see_is_said_in_one_sentence(tmp_path, make, says):

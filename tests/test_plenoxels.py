@@ -8,15 +8,10 @@ import torch
 
 from lumigraph import kernels
 from lumigraph.components.fields.sparse_voxels import SparseVoxels
-from lumigraph.components.sampling.forward_march import march_forward
-from lumigraph.components.sampling.occupancy import OccupancyGrid
-from lumigraph.components.sampling.spaces import NDC
 from lumigraph.components.training.lazy_rmsprop import LazyRMSprop
 from lumigraph.errors import LumigraphError
 from lumigraph.kernels import Nodes
 from lumigraph.methods.plenoxels import Config, Plenoxels, cauchy, undecided
-from lumigraph.rays import Rays
-from lumigraph.scene import Forward
 
 
 def random(*shape: int, seed: int = 0) -> torch.Tensor:
@@ -137,20 +132,3 @@ def test_the_density_learns_slowly_at_first():
 def test_a_grid_that_begins_too_fine_is_refused():
     with pytest.raises(LumigraphError, match="--base-resolution 64 is above --max-resolution 32"):
         Config(base_resolution=64, max_resolution=32).check()
-
-
-def test_a_march_in_device_coordinates_is_even_there_and_reaches_far():
-    pose = ((1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0))
-    space = NDC(Forward(pose=pose, near=1.0, scale=(1.0, 1.0)), near=0.05)
-    directions = torch.nn.functional.normalize(
-        torch.tensor([[0.1, 0.0, 1.0], [0.0, -0.2, 1.0], [0.0, 0.0, -1.0]]), dim=-1
-    )
-    rays = Rays(torch.zeros(3, 3), directions, torch.full((3,), 1e-3))
-    samples = march_forward(space, OccupancyGrid(1.0, 4), rays, 0.1)
-    counts = samples.ray_starts.diff()
-    assert (counts[:2] >= 19).all() and counts[2] == 0  # which looks away
-    ends = space.warp(rays.origins[samples.ray_index] + samples.t_end[:, None] * rays.directions[samples.ray_index])
-    steps = ends[: counts[0]].diff(dim=0).norm(dim=-1)
-    torch.testing.assert_close(steps[:-1], torch.full_like(steps[:-1], 0.1), atol=1e-4, rtol=0)
-    assert float(samples.t_end.max()) > 100
-    torch.testing.assert_close(samples.t_end[: counts[0] - 1], samples.t_start[1 : counts[0]])

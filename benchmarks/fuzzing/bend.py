@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import copy
 import gzip
+import io
 import json
 import random
 import re
 import struct
+import zipfile
 import zlib
 from collections.abc import Callable
 from functools import cache
@@ -174,8 +176,6 @@ def ply(data: bytes, chance: random.Random) -> bytes:
 
 def npy(data: bytes, chance: random.Random) -> bytes:
     """An array of other numbers, of another shape or kind than there is, or that promises what is not there."""
-    import io
-
     import numpy as np
 
     way = chance.randrange(4)
@@ -261,12 +261,92 @@ def zipped(data: bytes, chance: random.Random) -> bytes:
     return gzip.compress(raw(inside, chance), 1)
 
 
+def older(data: bytes, chance: random.Random) -> bytes:
+    """A .spz file of version 4 as one of version 3 or before, something inside changed."""
+    try:
+        version, count, degree, bits, flags, streams, table = struct.unpack_from("<IIBBBBI", data, 4)
+        at, inside = table + 16 * streams, struct.pack("<4sIIBBBB", b"NGSP", 3, count, degree, bits, flags, 0)
+        for i in range(streams):
+            (size,) = struct.unpack_from("<Q", data, table + 16 * i)
+            inside += zstandard.ZstdDecompressor().stream_reader(data[at : at + size]).read(1 << 22)
+            at += size
+    except (struct.error, zstandard.ZstdError):
+        return zipped(data, chance)
+    inside = inside[:4] + struct.pack("<I", chance.choice((1, 2, 3, 3, version))) + inside[8:]
+    return gzip.compress(raw(inside, chance), 1)
+
+
+def stream(data: bytes, chance: random.Random) -> bytes:
+    """A .spz file of version 4 whose header or table is another, or one of whose streams is a bomb."""
+    if len(data) < 64:
+        return raw(data, chance)
+    changed, at = bytearray(data), chance.choice((4, 8, 12, 14, 16, 32 + 8 * chance.randrange(4)))
+    extreme = chance.choice(EXTREMES)[: chance.choice((1, 2, 4, 8))]
+    changed[at : at + len(extreme)] = extreme
+    return bytes(changed) + (zstandard.compress(bytes(BOMB)) if chance.random() < 0.3 else b"")
+
+
 def bomb(data: bytes, chance: random.Random) -> bytes:
-    """A small stream that unpacks to gigabytes, behind a header that says so or does not."""
-    header = bytearray(zlib.decompressobj(31).decompress(data, 16) if data[:2] == b"\x1f\x8b" else 16)
+    """A small stream of gzip that unpacks to gigabytes, behind a header that says so or does not."""
+    header = bytearray(struct.pack("<4sIIBBBB", b"NGSP", 3, 60, 1, 12, 0, 0))
     if chance.random() < 0.7:
         header[8:12] = struct.pack("<I", chance.choice((10**8, 10**7, 2**31, 2**32 - 1)))
     return gzip.compress(bytes(header), 1) + zeros() * 100
+
+
+def archive(data: bytes, chance: random.Random) -> bytes:
+    """An archive of pictures and JSON one of whose entries is another, is gone, or is a bomb."""
+    try:
+        with zipfile.ZipFile(io.BytesIO(data)) as held:
+            files = {name: held.read(name) for name in held.namelist()}
+        name = chance.choice([*files, "meta.json"])
+        way = chance.randrange(6)
+        if way == 0:
+            del files[name]
+        elif way == 1:
+            files[name] = bytes(BOMB)
+        elif way == 2:
+            other = chance.choice([*files])
+            files[name], files[other] = files[other], files[name]
+        elif name.endswith(".json"):
+            files[name] = values(files[name], chance)
+        elif way == 3:
+            files[name] = picture(chance)
+        else:
+            files[name] = raw(files[name], chance)
+    except (ValueError, LookupError, OSError, EOFError, NotImplementedError, RuntimeError, zipfile.BadZipFile):
+        return raw(data, chance)
+    made = io.BytesIO()
+    with zipfile.ZipFile(made, "w", zipfile.ZIP_DEFLATED) as new:
+        for name, inside in files.items():
+            new.writestr(name, inside)
+    return made.getvalue()
+
+
+def picture(chance: random.Random) -> bytes:
+    """A picture of one colour, often a very large one."""
+    from PIL import Image
+
+    made, size = io.BytesIO(), chance.choice(((1, 1), (8, 8), (4000, 4000), (16383, 30)))
+    Image.new("RGBA", size, tuple(chance.randrange(256) for _ in range(4))).save(
+        made, chance.choice(("WEBP", "PNG")), lossless=True
+    )
+    return made.getvalue()
+
+
+def glb(data: bytes, chance: random.Random) -> bytes:
+    """Binary glTF whose JSON is not what it was, or whose buffer is short."""
+    if len(data) < 28:
+        return raw(data, chance)
+    (size,) = struct.unpack_from("<I", data, 12)
+    text, buffer = data[20 : 20 + size], data[28 + size :]
+    if chance.random() < 0.2:
+        buffer = buffer[: chance.randrange(len(buffer) or 1)]
+    else:
+        text = values(text, chance)
+    text += b" " * (-len(text) % 4)
+    body = struct.pack("<I4s", len(text), b"JSON") + text + struct.pack("<I4s", len(buffer), b"BIN\0") + buffer
+    return struct.pack("<4sII", b"glTF", 2, 12 + len(body)) + body
 
 
 @cache
@@ -292,6 +372,8 @@ WAYS: dict[str, tuple[Bend, ...]] = {
     ".npy": (npy,),
     ".safetensors": (safetensors, numbers),
     ".packed": (packed, packed),
-    ".spz": (zipped, zipped, bomb),
+    ".spz": (older, stream, stream, bomb),
+    ".sog": (archive, archive),
+    ".glb": (glb, glb),
     ".bin": (counts,),
 }

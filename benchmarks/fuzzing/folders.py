@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import struct
+import zipfile
 import zlib
 from collections.abc import Iterable
 from fnmatch import fnmatch
@@ -84,8 +85,15 @@ def is_whole(path: Path) -> bool:
             return film_is_whole(path)
         elif suffix == ".ply":
             return ply_is_whole(path)
-        elif suffix in (".spz", ".gz"):
+        elif suffix == ".gz":
             return gzip_is_whole(path.read_bytes())
+        elif suffix == ".spz":
+            return spz_is_whole(path.read_bytes())
+        elif suffix == ".glb":
+            return struct.unpack_from("<4sII", path.read_bytes()) == (b"glTF", 2, path.stat().st_size)
+        elif suffix == ".sog":
+            with zipfile.ZipFile(path) as archive:
+                return archive.testzip() is None
         elif suffix == ".splat":
             return path.stat().st_size % 32 == 0 and path.stat().st_size > 0
     except Exception:
@@ -111,6 +119,13 @@ def ply_is_whole(path: Path) -> bool:
     import plyfile
 
     return len(plyfile.PlyData.read(str(path)).elements) > 0
+
+
+def spz_is_whole(data: bytes) -> bool:
+    """Whether the streams of version 4, of which a table tells, fill the file."""
+    count, table = struct.unpack_from("<BI", data, 15)
+    streams = [struct.unpack_from("<QQ", data, table + 16 * i)[0] for i in range(count)]
+    return table + 16 * count + sum(streams) == len(data)
 
 
 def gzip_is_whole(data: bytes) -> bool:

@@ -94,6 +94,8 @@ KINDS: dict[str, Kind] = {
     ".compressed.ply": cloud(".compressed.ply"),
     ".splat": cloud(".splat"),
     ".spz": cloud(".spz"),
+    ".sog": cloud(".sog"),
+    ".glb": cloud(".glb"),
     "config.json": run(CLOUD, 1.5, "config.json"),
     "config.json of a grid": run(GRID, 1.5, "config.json"),
     "cameras.json": run(CLOUD, 1.0, "cameras.json"),

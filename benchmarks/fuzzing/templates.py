@@ -163,6 +163,8 @@ def write_video(folder: Path) -> None:
 
 def write_runs(root: Path) -> None:
     """Runs of two methods with all that commands leave in them, and what is made of them."""
+    from lumigraph.exchange import SUFFIXES
+
     made, photographs = root / "made", root / "blender" / "given"
     made.mkdir()
     for method in ("gaussian-splatting", "instant-ngp"):
@@ -173,7 +175,7 @@ def write_runs(root: Path) -> None:
         config.write_text(config.read_text().replace(str(photographs.resolve()), SCENE))
     cloud = made / "gaussian-splatting"
     must("compress", cloud, "--output", made / "small", "--steps", "2", "--views", "1", "--scene", photographs)
-    for suffix in (".ply", ".compressed.ply", ".splat", ".spz"):
+    for suffix in SUFFIXES:
         must("export", "splats", cloud, made / f"cloud{suffix}")
         shutil.copy(made / f"cloud{suffix}", home(root, f"cloud{suffix}") / "given")
     must("compose", cloud, made / "cloud.ply", "--output", made / "both.json", "--at", "0", "0", "0")

@@ -26,6 +26,7 @@ from .fewer import with_fewer_views
 from .masks import with_masks
 from .multiscale import multiscale as multiscale
 from .pictures import list_images
+from .raw import with_raw
 
 READERS: dict[str, ModuleType] = {n: import_module(f".{n.replace('-', '_')}", __package__) for n in NAMES}
 PROCEDURAL = "procedural:"
@@ -116,7 +117,7 @@ def open_scene(
     elif single_image.recognises(path := expanded(source)):
         capture, downscale = single_image.read(path, downscale), 1  # it is reduced by now
     else:
-        capture = with_masks(choose_reader(path, reader).read(path), path)
+        capture = with_raw(with_masks(choose_reader(path, reader).read(path), path), path)
     scene = assemble(capture, downscale, memory, cache, before)
     if views is not None:
         scene = with_fewer_views(scene, views)

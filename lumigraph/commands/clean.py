@@ -27,7 +27,7 @@ class Clean:
     source: Annotated[Positional[Path], needed("RUN_OR_FILE")]
     """Folder of a run, a splat file, or a composition."""
     output: Annotated[Path, arg(metavar="NEW", help_behavior_hint="")]
-    """New folder for a run, or new file: .ply, .compressed.ply, .spz, .splat."""
+    """New folder for a run, or new file: .ply, .compressed.ply, .spz, .splat, .sog, .glb."""
     overwrite: Overwrite = False
     part: OmitArgPrefixes[Keeping] = Keeping(clean=True)
     device: Annotated[str, option("NAME")] = "auto"
@@ -35,7 +35,7 @@ class Clean:
 
     def run(self) -> int:
         from ..capabilities import HasGaussians, needs
-        from ..exchange import is_splat_file
+        from ..exchange import names_splats, place_of
         from ..figures import save_picture
         from ..gaussians.cleaning import gone
         from ..run import open_any
@@ -43,8 +43,9 @@ class Clean:
 
         opened, device = open_any(self.source), choose_device(self.device)
         check_output(opened, self.output, self.overwrite, [self.source])
-        beside = self.output.with_name(f"{self.output.name}.png")
-        picture = beside if is_splat_file(self.output) else self.output / "clean.png"
+        place = place_of(self.output)
+        beside = place.with_name(f"{place.name}.png")
+        picture = beside if names_splats(self.output) else self.output / "clean.png"
         claim(picture, "comparison", self.overwrite, [self.source])
         gaussians = needs(opened.method(device), HasGaussians).gaussians()
         reasons = self.part.unwanted(gaussians, self.part.crop(opened.frame))

@@ -73,9 +73,15 @@ def parted(option: str, form: str, text: str) -> tuple[str, str]:
 
 
 def by_number(opened: Any, method: Any, name: str, value: str) -> str:
-    """The value, or the number of the photograph that it names where the control wants one."""
-    wants = any(control.name == name and control.of_photographs for control in method.controls)
-    return numbers(opened).get(value, value) if wants else value
+    """The value, or the number of the photograph that it names where the control wants one; in a blend, A:B:0.5, the
+    numbers of both."""
+    control = next((control for control in method.controls if control.name == name), None)
+    if control is None or not control.of_photographs:
+        return value
+    known = numbers(opened)
+    if value in known or not control.blends:
+        return known.get(value, value)
+    return ":".join(known.get(part, part) for part in value.split(":"))
 
 
 def numbers(opened: Any) -> dict[str, str]:

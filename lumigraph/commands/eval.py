@@ -96,4 +96,6 @@ def compared(result: dict[str, Any]) -> dict[str, str]:
         return {what: f"{some}{members}"}
     sizes = protocol["resolution"]
     shown = sizes if isinstance(sizes, str) else ", ".join(sizes)
-    return {what: f"{some}{members}, {shown}", "rendering": f"{result['seconds_per_view']:.3f} s per view"}
+    halves = {"protocol": protocol["halves"]} if protocol.get("halves") else {}
+    rendering = {"rendering": f"{result['seconds_per_view']:.3f} s per view"}
+    return {what: f"{some}{members}, {shown}"} | halves | rendering

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 from rich.tree import Tree
@@ -13,6 +12,7 @@ from ..choice import evenly
 from ..console import bold, dim
 from ..dataset import Dataset
 from ..errors import LumigraphError
+from ..exchange import size_of
 from ..gaussians import Gaussians
 from ..metrics import scores_of
 from ..names import natural
@@ -55,7 +55,7 @@ def run_tree(run: Run) -> Tree:
     pages = [path for path in places if path.is_file() and path.suffix in (".mp4", ".html", ".png")]
     pages.sort(key=lambda path: natural(path.as_posix()))
     if pages:
-        branch(tree, "files", {str(path.relative_to(run.folder)): size(path) for path in pages})
+        branch(tree, "files", {str(path.relative_to(run.folder)): size(path.stat().st_size) for path in pages})
     return tree
 
 
@@ -118,7 +118,7 @@ def scene_tree(scene: Scene) -> Tree:
 
 def cloud_tree(name: str, cloud: Gaussians) -> Tree:
     tree = Tree(bold(name) + f"  a cloud of {len(cloud):,} Gaussians")
-    rows: dict[str, Any] = {"file": size(Path(name)), "harmonics": f"degree {cloud.degree}"}
+    rows: dict[str, Any] = {"file": size(size_of(name)), "harmonics": f"degree {cloud.degree}"}
     rows["opacities"] = "antialiased (Mip-Splatting's 2-D filter)" if cloud.antialiased else "as in the first release"
     if len(cloud):
         low, high = cloud.means.amin(0), cloud.means.amax(0)
@@ -166,6 +166,5 @@ def vector(numbers: tuple[float, ...]) -> str:
     return "(" + ", ".join(f"{x:.3g}" for x in numbers) + ")"
 
 
-def size(path: Path) -> str:
-    count = path.stat().st_size
+def size(count: int) -> str:
     return f"{count / 1e6:.1f} MB" if count >= 1e5 else f"{count / 1e3:.0f} kB"

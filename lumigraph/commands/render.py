@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 from tyro.conf import Positional
 
@@ -28,7 +28,7 @@ class Render:
     """
 
     source: Annotated[Positional[Path], needed("RUN_OR_FILE")]
-    """Folder of the run, a splat file (.ply, .compressed.ply, .spz, .splat), or a composition (.json)."""
+    """Folder of the run, a splat file (.ply, .spz, .sog, .glb, .splat), or a composition (.json)."""
     path: Annotated[str, option("{" + ",".join(PATHS) + ",FILE.json}")] = "orbit"
     """Where the camera goes."""
     frames: Annotated[Count | None, option("N", "120; every held-out view; as long as keyframes say")] = None
@@ -39,6 +39,8 @@ class Render:
     """Longer side of the picture."""
     output: Annotated[Path | None, option("FILE", "RUN/renders/PATH.mp4, or renders/FILE/PATH.mp4")] = None
     """The film: .mp4, .gif or .webp. Depth (FILE-depth), FILE.json and the folder FILE of pictures go beside it."""
+    format: Annotated[Literal["png", "exr"], option("{png,exr}")] = "png"
+    """Of the pictures beside the film. exr: their linear light too, FILE/0000.exr, with all its range."""
     overwrite: Overwrite = False
     told: Set = ()
     animated: Animate = ()
@@ -61,13 +63,14 @@ class Render:
         kind_of(output, fps)
         claim_film(output, self.overwrite, reads)
         cameras = film_cameras(views, opened.frame, flight or self.path, self.frames, self.size)
-        about = film(animate(opened, method, self.animated, len(cameras)), cameras, output, fps)
+        shown = animate(opened, method, self.animated, len(cameras))
+        about = film(shown, cameras, output, fps, light=self.format == "exr")
         width, height = about["size"]
         show(
             {
                 "film": str(output),
                 "depth": str(output.with_stem(f"{output.stem}-depth")),
-                "pictures": f"{output.with_suffix('')}/0000.png …",
+                "pictures": f"{output.with_suffix('')}/0000.{self.format} …",
                 "frames": f"{about['frames']} of {width}x{height}, {about['seconds_per_frame']:.3f} s each",
             }
         )

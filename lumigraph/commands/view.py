@@ -27,7 +27,7 @@ class ViewCommand:
     """
 
     source: Annotated[Positional[Path], needed("RUN_OR_FILE")]
-    """Folder of the run, a splat file (.ply, .compressed.ply, .spz, .splat), or a composition (.json)."""
+    """Folder of the run, a splat file (.ply, .spz, .sog, .glb, .splat), or a composition (.json)."""
     host: Annotated[str, option("ADDRESS", "127.0.0.1, this machine alone")] = "127.0.0.1"
     """Where to listen; 0.0.0.0 lets other machines look too."""
     port: Annotated[Port | None, option("N", "8080, or the next that is free")] = None

@@ -22,6 +22,7 @@ LADDER: tuple[Rung, ...] = (
     Rung(0.003, Recipe(apart=0.3, coarser=1)),
     Rung(0.01, Recipe(apart=0.1, coarser=2)),
     Rung(0.02, Recipe(apart=0.02, coarser=2)),
+    Rung(0.03, Recipe(apart=0.005, coarser=2)),
     Rung(0.04, Recipe(2048, apart=0.0, coarser=3)),
     Rung(0.08, Recipe(1024, apart=0.0, coarser=3)),
     Rung(0.15, Recipe(256, apart=0.0, coarser=4)),

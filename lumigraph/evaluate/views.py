@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from PIL import Image
 from torch import Tensor
 
@@ -22,16 +22,21 @@ from ..metrics import WINDOW, Score, psnr, scores_of, ssim_map
 from ..metrics.lpips import DEFINITION, Lpips
 from ..progress import counting, track
 from ..rays import Rendering
-from ..scene import Scene
+from ..scene import Photograph, Scene
+from . import halves
 from .held_out_poses import PROTOCOL, held_out_poses, pose_scores
+from .light import LIGHT, in_light
+from .light import PROTOCOL as LIGHT_PROTOCOL
 
 SHOWN = 8  # views of the contact sheet, evenly spread; the worst one joins them
+CLEAN = "clean"  # the layer of photographs in their own light without whoever passes by
 WARM_UP_SIZE = 32  # pixels; the first rendering compiles kernels, which is not the view's fault
 
 
 @dataclass(frozen=True)
 class ViewScore:
-    """One view: PSNR in dB, SSIM, the seconds that rendering it took, and LPIPS where its weights are at hand."""
+    """One view: PSNR in dB, SSIM, the seconds that rendering it took, LPIPS where its weights are at hand, and PSNR
+    against the photograph without passers-by where that is known."""
 
     name: str
     resolution: str
@@ -39,6 +44,7 @@ class ViewScore:
     ssim: float
     seconds: float
     lpips: float | None = None
+    clean_psnr: float | None = None
 
 
 @dataclass(frozen=True)
@@ -62,8 +68,7 @@ class Evaluation:
     @property
     def lpips(self) -> float | None:
         """Mean LPIPS over the views; None if it was not measured."""
-        found = [view.lpips for view in self.views if view.lpips is not None]
-        return mean(found) if found else None
+        return mean_known(view.lpips for view in self.views)
 
     @property
     def seconds_per_view(self) -> float:
@@ -76,7 +81,9 @@ class Evaluation:
         return {size: replace(self, views=[view for view in self.views if view.resolution == size]) for size in sizes}
 
     def means(self) -> dict[str, Any]:
-        return {"psnr": self.psnr, "ssim": self.ssim, "lpips": self.lpips}
+        clean = mean_known(view.clean_psnr for view in self.views)
+        known = {} if clean is None else {"clean_psnr": clean}
+        return {"psnr": self.psnr, "ssim": self.ssim, "lpips": self.lpips} | known
 
     @property
     def scores(self) -> list[Score]:
@@ -85,7 +92,8 @@ class Evaluation:
     @property
     def compared(self) -> str:
         """What was compared, in a title."""
-        return f"{len(self.views)} {self.protocol['split']} views"
+        parts = "right halves of " if self.protocol["halves"] else ""
+        return f"{parts}{len(self.views)} {self.protocol['split']} views"
 
     def to_json(self) -> dict[str, Any]:
         parts = {size: part.means() | {"views": len(part.views)} for size, part in self.by_resolution.items()}
@@ -126,7 +134,8 @@ def evaluate(
     keep:  told each view's name and rendering
     views: so many of them at most, evenly spread over the split; None means all
     Cameras are those that the method refined; held-out ones are then found as `held_out_poses` says. Pixels that the
-    photograph's mask rules out do not count. Raises LumigraphError if the split has no view.
+    photograph's mask rules out do not count. A method that photographs can be given to is judged by halves (see
+    `evaluate.halves`). Raises LumigraphError if the split has no view.
     """
     chosen = scene.splits.get(split)
     if chosen is None or not len(chosen):
@@ -138,46 +147,65 @@ def evaluate(
     method.eval()
     with counting("Preparing to render"):
         compile_seconds = warm_up(method, scene.cameras[compared[0]])
-    spread, found = set(evenly(compared, SHOWN)), held_out_poses(method, scene)
+    spread, by_halves = set(evenly(compared, SHOWN)), halves.judged_by_halves(method)
+    found = held_out_poses(method, scene)
     scores: list[ViewScore] = []
     shown: dict[str, tuple[Tensor, Rendering]] = {}
     worst: dict[str, tuple[Tensor, Rendering]] = {}
     for index in track(compared, "Comparing views", len(compared)):
-        shot = scene.photograph(index)
+        shot = scene.photograph(index, [name for name in (CLEAN, LIGHT) if name in scene.layers])
         camera = found.camera(index) if found else method.refined(shot.camera)
         photograph = shot.before(scene.frame.background)
+        told = method.given(halves.left_half(shot)) if by_halves else method
         begin = time.perf_counter()
-        seen = method.render(camera).cpu()
+        seen = told.render(camera).cpu()
         seconds = time.perf_counter() - begin
-        score = compare(scene.names[index], seen.rgb.clamp(0, 1), photograph, shot.mask, seconds, lpips)
+        columns = halves.right_half(shot) if by_halves else slice(None)
+        rgb = seen.rgb.clamp(0, 1)
+        if LIGHT in shot.extra:
+            rgb, photograph = in_light(seen, shot.extra[LIGHT])
+            seen = replace(seen, rgb=rgb)
+        score = compare(scene.names[index], rgb, shot, photograph, columns, seconds, lpips)
         keep(score.name, seen)
         if index in spread:
             shown[score.name] = photograph, seen
         if all(score.psnr < other.psnr for other in scores):
             worst = {score.name: (photograph, seen)}
         scores.append(score)
-    told = protocol(scene, split, compared, lpips, method) | ({"poses": PROTOCOL} if found else {})
+    stated = protocol(scene, split, compared, lpips, method) | ({"poses": PROTOCOL} if found else {})
     poses = tuple(pose_scores(method, scene))
-    return Evaluation(scores, told, compile_seconds, shown | worst, poses)
+    return Evaluation(scores, stated, compile_seconds, shown | worst, poses)
 
 
 def compare(
     name: str,
     rgb: Float[Tensor, "height width 3"],
+    shot: Photograph,
     photograph: Float[Tensor, "height width 3"],
-    mask: Bool[Tensor, "height width"] | None,
+    columns: slice,
     seconds: float,
     lpips: Lpips | None = None,
 ) -> ViewScore:
-    likeness, size = ssim_map(rgb, photograph), resolution(photograph.shape[1], photograph.shape[0])
+    """A view's scores, by some of its columns.
+
+    photograph: of the shot, before the scene's background
+    """
+    size = resolution(photograph.shape[1], photograph.shape[0])
+    mask = None if shot.mask is None else shot.mask[:, columns]
+    rgb, photograph = rgb[:, columns], photograph[:, columns]
+    clean = None
+    if CLEAN in shot.extra:
+        truth = shot.extra[CLEAN][:, columns]
+        clean = psnr(rgb, truth) if mask is None else psnr(rgb[mask], truth[mask])
+    likeness = ssim_map(rgb, photograph)
     if mask is None:
         perceived = lpips(rgb, photograph) if lpips else None
-        return ViewScore(name, size, psnr(rgb, photograph), float(likeness.mean()), seconds, perceived)
+        return ViewScore(name, size, psnr(rgb, photograph), float(likeness.mean()), seconds, perceived, clean)
     edge = WINDOW // 2
     inner = likeness[mask[edge:-edge, edge:-edge]]
     perceived = lpips(torch.where(mask[..., None], rgb, photograph), photograph) if lpips else None
     closeness = float(inner.mean()) if len(inner) else 0.0
-    return ViewScore(name, size, psnr(rgb[mask], photograph[mask]), closeness, seconds, perceived)
+    return ViewScore(name, size, psnr(rgb[mask], photograph[mask]), closeness, seconds, perceived, clean)
 
 
 def warm_up(method: Method, camera: Camera) -> float:
@@ -200,8 +228,9 @@ def protocol(scene: Scene, split: str, compared: list[int], lpips: Lpips | None,
         "background": list(scene.frame.background) if scene.frame.has_alpha else None,
         "poses": "as the method refined them" if refined else "as captured",
         "controls": dict(method.told),
+        "halves": halves.DEFINITION if halves.judged_by_halves(method) else None,
         "masked": any(scene.images.mask(i) is not None for i in compared),
-        "colours": "sRGB in [0, 1]; renderings clipped, not rounded",
+        "colours": LIGHT_PROTOCOL if LIGHT in scene.layers else "sRGB in [0, 1]; renderings clipped, not rounded",
         "psnr": "per view, then averaged",
         "ssim": "Wang 2004: Gaussian window 11x11, deviation 1.5, K1 0.01, K2 0.03, windows inside the image",
         "lpips": DEFINITION if lpips else None,
@@ -220,3 +249,9 @@ def file_name(name: str) -> str:
 def mean(values) -> float:
     found = list(values)
     return sum(found) / len(found)
+
+
+def mean_known(values: Iterable[float | None]) -> float | None:
+    """The mean of those that are known; None if none is."""
+    found = [value for value in values if value is not None]
+    return mean(found) if found else None

@@ -1,79 +1,124 @@
-"""Clouds of Gaussians as files that other programs know: one format, one file; the suffix says which."""
+"""Clouds of Gaussians as files that other programs know: one format, one file; the ending says which."""
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from pathlib import Path
 
 from ..errors import LumigraphError
-from ..files import claim, exists, expanded, explained
+from ..files import claim, claim_folder, exists, expanded, explained
 from ..gaussians import Gaussians
 from ..memory import free_memory
 from ..progress import counting
-from . import compressed_ply, ply, splat, spz
+from . import compressed_ply, glb, ply, sog, splat, spz
 from .checks import checked
 from .ply_header import read_header
 
-WRITERS = {".compressed.ply": compressed_ply.write, ".ply": ply.write, ".splat": splat.write, ".spz": spz.write}
+WRITERS = {
+    ".compressed.ply": compressed_ply.write,
+    ".ply": ply.write,
+    ".splat": splat.write,
+    ".spz": spz.write,
+    ".sog": sog.write,
+    ".glb": glb.write,
+}
+READERS = {".splat": splat.read, ".spz": spz.read, ".sog": sog.read, ".glb": glb.read}  # and two kinds of .ply
 SUFFIXES = tuple(WRITERS)
+REORDERED = ".compressed.ply", ".sog"  # formats that keep the set of Gaussians and not their order
 
 
 def read_gaussians(path: Path | str) -> Gaussians:
-    """The Gaussians in a .ply, .compressed.ply, .splat or .spz file, on the CPU, in the axes that PLY files keep.
+    """The Gaussians in a file of one of SUFFIXES, or in a folder of SOG, on the CPU, in the axes that PLY files keep.
 
     Which of its two layouts a PLY file has, its header says. Infinite logits of opacity become ±20, rotations of
     length zero none at all. Raises LumigraphError for anything else that keeps the file from being a sound cloud.
     """
-    path = expanded(path)
-    suffix = check_ending(path)
+    path = place_of(expanded(path))
+    is_folder = path.is_dir() and sog.recognises(path)
+    suffix = ".sog" if is_folder else check_ending(path)
     with explained(path):
-        _refuse_folder(path)
-        if path.stat().st_size == 0:
-            raise LumigraphError(f"{path} is empty; copy or download it again")
-        if path.stat().st_size > free_memory():
-            raise LumigraphError(f"{path} is larger than the memory that is free; take a larger machine")
+        if not is_folder:
+            _check_file(path)
         with counting(f"Reading {path.name}"):
             gaussians = _read(path, suffix)
     return checked(gaussians, str(path), "restore it from a copy, or remove them with an editor of splats")
 
 
 def write_gaussians(path: Path | str, gaussians: Gaussians) -> None:
-    """Write a cloud in the format that the suffix names, whole or not at all.
+    """Write a cloud in the format that the ending names, whole or not at all; to FOLDER/meta.json, a folder of SOG.
 
-    `.ply` keeps every number as it is; what the others round is said in their files. `.compressed.ply` keeps the set of
+    `.ply` keeps every number as it is; what the others round is said in their files. Those of REORDERED keep the set of
     Gaussians and not their order, `.splat` neither harmonics beyond the plain colour nor `antialiased`. Raises
-    LumigraphError where the suffix is none of SUFFIXES, the cloud is not sound or the disk refuses.
+    LumigraphError where the ending is none of SUFFIXES, the cloud is not sound or the disk refuses.
     """
     path = expanded(path)
     write = WRITERS[check_ending(path)]
-    claim(path, "splats")
+    claim_splats(path)
     with counting(f"Writing {path.name}"):
         write(path, checked(gaussians, f"what is to be written to {path}", "remove them first"))
 
 
+def claim_splats(path: Path, overwrite: bool | None = None, reads: Iterable[Path] = ()) -> None:
+    """`files.claim` for a file of Gaussians, or for the whole folder that a path to meta.json lies in."""
+    if path.name != sog.META:
+        claim(path, "splats", overwrite, reads)
+    elif any(exists(one) and exists(path) and place_of(one).samefile(path.parent) for one in reads):
+        raise LumigraphError(f"{path.parent} would be replaced, and is what the command reads; choose another name")
+    else:
+        claim_folder(path.parent, "splats")
+
+
 def is_splat_file(path: Path | str) -> bool:
-    """Whether a name is one that `read_gaussians` takes: known by its suffix, whether there or not, but no folder."""
+    """Whether `read_gaussians` takes what lies there, or would if something did: known by its name, but for a .glb that
+    is of meshes, and for folders, of which those of SOG are."""
+    path = place_of(expanded(path))
+    if path.is_dir():
+        return sog.recognises(path)
+    if path.name.lower().endswith(".glb") and path.is_file():
+        with explained(path):
+            return glb.recognises(path)
+    return path.name.lower().endswith(SUFFIXES)
+
+
+def names_splats(path: Path | str) -> bool:
+    """Whether `write_gaussians` takes a name, whatever lies there."""
     path = expanded(path)
-    return path.name.lower().endswith(SUFFIXES) and not path.is_dir()
+    return path.name == sog.META or (path.name.lower().endswith(SUFFIXES) and not path.is_dir())
 
 
-def _read(path: Path, suffix: str) -> Gaussians:
-    if suffix == ".splat":
-        return splat.read(path)
-    if suffix == ".spz":
-        return spz.read(path)
-    header = read_header(path)
-    return (compressed_ply if compressed_ply.recognises(header) else ply).read(path, header)
+def place_of(path: Path) -> Path:
+    """The folder of SOG where its meta.json is named, or a new one; otherwise the path itself."""
+    return path.parent if path.name == sog.META and (sog.recognises(path.parent) or not exists(path)) else path
+
+
+def size_of(path: Path | str) -> int:
+    """Bytes of a file of Gaussians, or of all files of a folder of SOG."""
+    place = place_of(expanded(path))
+    return sum(file.stat().st_size for file in (place.iterdir() if place.is_dir() else [place]))
 
 
 def check_ending(path: Path) -> str:
     """The one of SUFFIXES that a name has. Raises LumigraphError if it has none."""
+    if path.name == sog.META:
+        return ".sog"
     for suffix in SUFFIXES:
         if path.name.lower().endswith(suffix):
             return suffix
     raise LumigraphError(f"{path} does not end like a file of Gaussians; name one that ends in {', '.join(SUFFIXES)}")
 
 
-def _refuse_folder(path: Path) -> None:
+def _read(path: Path, suffix: str) -> Gaussians:
+    if suffix in READERS:
+        return READERS[suffix](path)
+    header = read_header(path)
+    return (compressed_ply if compressed_ply.recognises(header) else ply).read(path, header)
+
+
+def _check_file(path: Path) -> None:
     if exists(path) and not path.is_file():
         what = "a folder" if path.is_dir() else "no ordinary file"
         raise LumigraphError(f"{path} is {what}; name a file that ends in {', '.join(SUFFIXES)}")
+    if path.stat().st_size == 0:
+        raise LumigraphError(f"{path} is empty; copy or download it again")
+    if path.stat().st_size > free_memory():
+        raise LumigraphError(f"{path} is larger than the memory that is free; take a larger machine")

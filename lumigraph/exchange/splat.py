@@ -19,12 +19,11 @@ from ..files import write_bytes
 from ..gaussians import Gaussians
 from ..kernels.spherical_harmonics import K00
 from .checks import check_room
-from .codes import LOGITS, alpha_to_byte, array, cloud, to_byte, unit
+from .codes import LOGITS, alpha_to_byte, array, cloud, from_scales, to_byte, to_scales, unit
 
 RECORD = np.dtype(
     [("mean", "<f4", 3), ("scale", "<f4", 3), ("colour", "u1", 3), ("alpha", "u1"), ("rotation", "u1", 4)]
 )
-THIN, WIDE = np.finfo(np.float32).tiny, np.finfo(np.float32).max  # what a scale can be and have a logarithm
 
 
 def read(path: Path) -> Gaussians:
@@ -39,13 +38,10 @@ def read(path: Path) -> Gaussians:
             "copy or download it again"
         )
     records = np.frombuffer(data, RECORD)
-    with np.errstate(invalid="ignore"):  # a negative scale has no logarithm, and is found later
-        scales = records["scale"].astype(np.float64)
-        log_scales = np.log(np.where(scales == 0, THIN, scales))
     return cloud(
         records["mean"],
         records["rotation"] / 128 - 1,
-        log_scales,
+        from_scales(records["scale"]),
         LOGITS[records["alpha"]],
         (records["colour"][:, None] / 255 - 0.5) / K00,
     )
@@ -57,8 +53,7 @@ def write(path: Path, gaussians: Gaussians) -> None:
         raise LumigraphError(f"{path} cannot hold a cloud of no Gaussians; write it as .ply")
     records = np.empty(len(gaussians), RECORD)
     records["mean"] = array(gaussians.means)
-    with np.errstate(over="ignore"):
-        records["scale"] = np.exp(array(gaussians.log_scales).astype(np.float64)).clip(THIN, WIDE)
+    records["scale"] = to_scales(array(gaussians.log_scales))
     records["colour"] = to_byte(255 * (K00 * array(gaussians.harmonics[:, 0]) + 0.5))
     records["alpha"] = alpha_to_byte(array(gaussians.opacities))
     records["rotation"] = to_byte(128 * unit(array(gaussians.quaternions)) + 128)

@@ -1,16 +1,17 @@
 """Niantic's compact format, https://github.com/nianticlabs/spz: a header and one stream of bytes per quantity.
 
-Versions 1 to 3 have gzip around all of it, version 4 a table of streams, each packed by zstd. All four are read. 3 is
-written: most programs know it, and it gives a rotation three components of 10 bits instead of 8. Version 2 is within
-1/255 a component, so that a half turn, whose w is near 0, can come back turned by 13 degrees.
+Versions 1 to 3 have gzip around all of it, version 4 a table of streams, each packed by zstd. All four are read, and 4,
+the current one, is written; pages hold 3, which unpacks where there is no zstd and says the same. Both give a rotation
+three components of 10 bits. Version 2 is within 1/255 a component, so that a half turn, whose w is near 0, can come
+back turned by 13 degrees.
 
-Axes are x right, y up, z back; PLY files and this house have y down and z forward. Half a turn around x lies between
-them, so y and z change their signs, and with them those harmonics that are odd in y and z together.
+Axes are x right, y up, z back: see `axes`.
 
 What is lost: positions are fixed-point numbers of 24 bits, within 2^-17 while all lie inside ±128, coarser for wider
 clouds. Scales are within 1/32 (3%) of their logarithm from -10 to 5.9. Opacities are within 1/510, plain colours within
 0.0037 from -0.44 to 1.44; harmonics, cut to [-1, 1), within 1/32 for degree 1 and 1/16 for 2 and 3. Components of a
-rotation other than the largest are within 0.0007. Before gzip a Gaussian takes 20 bytes and 3 (K - 1) of harmonics.
+rotation other than the largest are within 0.0007. Before it is packed a Gaussian
+takes 20 bytes and 3 (K - 1) of harmonics.
 """
 
 from __future__ import annotations
@@ -33,11 +34,12 @@ from ..files import write_bytes
 from ..gaussians import Gaussians
 from ..packing.streams import DENSEST as DENSEST_ZSTD
 from ..packing.streams import take
+from .axes import TURN_HARMONICS, TURN_MEAN, TURN_ROTATION
 from .checks import check_room
 from .codes import LOGITS, alpha_to_byte, array, cloud, to_byte, with_largest, without_largest
 
 HEADER = struct.Struct("<4sIIBBBB")  # magic, version, count, degree, bits behind the point, flags, reserved
-MAGIC, VERSION, NEWEST = b"NGSP", 3, 4
+MAGIC, GZIPPED, NEWEST = b"NGSP", 3, 4
 TABLED = struct.Struct("<4sIIBBBBI12x")  # version 4: ..., flags, number of streams, where their table begins
 STREAM = struct.Struct("<QQ")  # packed and unpacked bytes
 ANTIALIASED, EXTENDED = 1, 2  # flags
@@ -48,11 +50,7 @@ STEPS = 8, 16  # of 1/128, for harmonics of degree 1 and beyond: 5 and 4 bits
 DENSEST = 1032  # times that deflate can shrink what it is given
 LONGEST_EXTENSIONS = 1 << 20  # bytes
 LEVEL = 4  # of gzip; 6, the usual one, takes up to four times as long and saves 1% at most
-
-# Half a turn around x, as signs. Of harmonics: y, z, x | xy, yz, z^2, xz, x^2 - y^2 | and so on.
-TURN_MEAN = np.array([1, -1, -1])
-TURN_ROTATION = np.array([1, 1, -1, -1])
-TURN_HARMONICS = np.array([1, -1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1], np.float32)[:, None]
+ZSTD_LEVEL = 12
 
 
 def read(path: Path) -> Gaussians:
@@ -82,12 +80,26 @@ def _told(path: Path) -> Iterator[None]:
 
 
 def write(path: Path, gaussians: Gaussians) -> None:
-    """Version 3. Raises LumigraphError if the cloud is wider than 24 bits can say."""
-    write_bytes(path, encode(gaussians, str(path)), "splats")
+    """Version 4. Raises LumigraphError if the cloud is wider than 24 bits can say."""
+    (bits, flags), streams = _streams(gaussians, str(path), STEPS)
+    raw = [stream.tobytes() for stream in streams if stream.shape[1]]
+    packed = [zstandard.ZstdCompressor(ZSTD_LEVEL).compress(stream) for stream in raw]
+    about = NEWEST, len(gaussians), gaussians.degree, bits, flags, len(raw), TABLED.size
+    table = [STREAM.pack(len(few), len(many)) for few, many in zip(packed, raw, strict=True)]
+    write_bytes(path, b"".join([TABLED.pack(MAGIC, *about), *table, *packed]), "splats")
 
 
-def encode(gaussians: Gaussians, name: str = "a .spz file", steps: tuple[int, int] = STEPS) -> bytes:
-    """What `write` writes. steps: of 1/128, to which harmonics of degree 1 and beyond are rounded; 1 is the finest."""
+def gzipped(gaussians: Gaussians, steps: tuple[int, int] = STEPS) -> bytes:
+    """Version 3. steps: of 1/128, to which harmonics of degree 1 and beyond are rounded; 1 is the finest."""
+    (bits, flags), streams = _streams(gaussians, "a .spz file", steps)
+    header = HEADER.pack(MAGIC, GZIPPED, len(gaussians), gaussians.degree, bits, flags, 0)
+    return gzip.compress(b"".join([header, *(stream.tobytes() for stream in streams)]), LEVEL, mtime=0)
+
+
+def _streams(
+    gaussians: Gaussians, name: str, steps: tuple[int, int]
+) -> tuple[tuple[int, int], list[UInt8[np.ndarray, "gaussian width"]]]:
+    """Bits behind the point and flags, and the bytes of each quantity."""
     extent = float(np.abs(array(gaussians.means)).max()) if len(gaussians) else 0.0
     if extent > FARTHEST:
         raise LumigraphError(
@@ -97,17 +109,14 @@ def encode(gaussians: Gaussians, name: str = "a .spz file", steps: tuple[int, in
     flags = ANTIALIASED if gaussians.antialiased else 0
     fixed = np.rint(array(gaussians.means).astype(np.float64) * TURN_MEAN * 2**bits).clip(-FARTHEST, FARTHEST)
     harmonics = array(gaussians.harmonics) * TURN_HARMONICS[: gaussians.harmonics.shape[1]]
-    streams = [
+    return (bits, flags), [
         fixed.astype("<i4").reshape(-1, 1).view(np.uint8)[:, :3],
-        alpha_to_byte(array(gaussians.opacities)),
+        alpha_to_byte(array(gaussians.opacities))[:, None],
         to_byte(255 * (COLOUR * harmonics[:, 0] + 0.5)),
         to_byte(16 * (array(gaussians.log_scales) + 10)),
         _smallest_three(array(gaussians.quaternions) * TURN_ROTATION),
-        _in_buckets(harmonics[:, 1:], steps),
+        _in_buckets(harmonics[:, 1:], steps).reshape(len(fixed), 3 * (harmonics.shape[1] - 1)),
     ]
-    header = HEADER.pack(MAGIC, VERSION, len(gaussians), gaussians.degree, bits, flags, 0)
-    content = b"".join([header, *(stream.tobytes() for stream in streams)])
-    return gzip.compress(content, LEVEL, mtime=0)
 
 
 def _decode(path: Path, stream: io.BufferedIOBase, limit: int) -> Gaussians:
@@ -118,7 +127,7 @@ def _decode(path: Path, stream: io.BufferedIOBase, limit: int) -> Gaussians:
     if not 1 <= version < NEWEST:
         raise LumigraphError(
             f"{path} is of version {version} of .spz, of which 1 to {NEWEST} can be read; "
-            f"save it as version {VERSION} or as .ply, for instance with splat-transform"
+            f"save it as version {NEWEST} or as .ply, for instance with splat-transform"
         )
     count, degree, bits, flags, _ = struct.unpack("<IBBBB", take(stream, 8))
     widths = _widths(path, version, degree)

@@ -19,15 +19,19 @@ from ..files import claim, claim_folder, replacing_folder, write_json
 from ..memory import ask_for_picture
 from ..method import Method
 from ..progress import track
+from .exr import exr, light_of
 from .video import open_video
 
 PROBES, PROBE_SIZE = 6, 64  # frames, and their pixels, that tell the depths to expect
 
 
-def film(method: Method | Sequence[Method], cameras: Camera, path: Path, fps: float = 30.0) -> dict[str, Any]:
+def film(
+    method: Method | Sequence[Method], cameras: Camera, path: Path, fps: float = 30.0, light: bool = False
+) -> dict[str, Any]:
     """Render every camera of one size. Returns what is written to the JSON file.
 
     method: one for all frames, or one for each, such as what `animated` makes
+    light:  write the pictures' linear light as well, path/orbit/0000.exr
     For path/orbit.mp4 also writes path/orbit-depth.mp4, the pictures path/orbit/0000.png and 0000-depth.png, and
     path/orbit.json with the cameras (poses in the scene's frame; source_from_scene leads back to the capture's) and
     what the method was told. Raises LumigraphError, before anything is rendered, if something else lies there.
@@ -53,6 +57,8 @@ def film(method: Method | Sequence[Method], cameras: Camera, path: Path, fps: fl
             for target, ending, picture in zip(targets, ("", "-depth"), pictures, strict=True):
                 target.add(picture)
                 Image.fromarray(picture.numpy()).save(folder / f"{i:04d}{ending}.png")
+            if light:
+                (folder / f"{i:04d}.exr").write_bytes(exr(light_of(seen)))
         seconds = (time.perf_counter() - begin) / len(cameras)
     about = {
         "frames": len(cameras),

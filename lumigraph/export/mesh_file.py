@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-import struct
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +10,7 @@ import trimesh
 from jaxtyping import Float
 
 from ..errors import LumigraphError
+from ..exchange import gltf
 from ..files import write_bytes
 from ..geometry import to_quaternion, turning
 from ..mesh import Mesh
@@ -21,8 +20,6 @@ from .surface import vertex_normals
 from .usdz import usdz
 
 Z = np.array([0.0, 0.0, 1.0])
-FLOAT, UNSIGNED_INT = 5126, 5125  # glTF 2.0, 3.6.2.2
-VERTICES, INDICES = 34962, 34963  # glTF 2.0, 5.11.5
 
 
 def write_mesh(path: Path, mesh: Mesh, up: Float[np.ndarray, " 3"] = Z) -> None:
@@ -62,23 +59,12 @@ def obj(mesh: Mesh, upright: Float[np.ndarray, "3 3"]) -> bytes:
 
 def glb(mesh: Mesh, upright: Float[np.ndarray, "3 3"]) -> bytes:
     """A binary glTF 2.0 of one mesh in its own frame, below a node that turns it upright."""
-    positions = mesh.vertices.astype("<f4")
-    parts = [
-        (positions, FLOAT, "VEC3", VERTICES),
-        (vertex_normals(mesh.vertices, mesh.faces).astype("<f4"), FLOAT, "VEC3", VERTICES),
-        (linear_from_srgb(mesh.colours / 255).astype("<f4"), FLOAT, "VEC3", VERTICES),
-        (mesh.faces.astype("<u4").reshape(-1), UNSIGNED_INT, "SCALAR", INDICES),
+    columns = [
+        gltf.Column(mesh.vertices.astype("<f4"), bounded=True),
+        gltf.Column(vertex_normals(mesh.vertices, mesh.faces).astype("<f4")),
+        gltf.Column(linear_from_srgb(mesh.colours / 255).astype("<f4")),
+        gltf.Column(mesh.faces.astype("<u4").reshape(-1), target=gltf.INDICES),
     ]
-    starts = np.cumsum([0, *(data.nbytes for data, *_ in parts)]).tolist()
-    views = [
-        {"buffer": 0, "byteOffset": start, "byteLength": data.nbytes, "target": target}
-        for (data, _, _, target), start in zip(parts, starts, strict=False)
-    ]
-    accessors = [
-        {"bufferView": i, "componentType": kind, "type": shape, "count": len(data)}
-        for i, (data, kind, shape, _) in enumerate(parts)
-    ]
-    accessors[0] |= {"min": positions.min(0).tolist(), "max": positions.max(0).tolist()}
     about = {
         "asset": {"version": "2.0", "generator": "Lumigraph"},
         "extensionsUsed": ["KHR_materials_unlit"],
@@ -102,15 +88,8 @@ def glb(mesh: Mesh, upright: Float[np.ndarray, "3 3"]) -> bytes:
                 "pbrMetallicRoughness": {"metallicFactor": 0.0, "roughnessFactor": 1.0},
             }
         ],
-        "accessors": accessors,
-        "bufferViews": views,
-        "buffers": [{"byteLength": starts[-1]}],
     }
-    text = json.dumps(about, separators=(",", ":")).encode()
-    text += b" " * (-len(text) % 4)
-    chunks = [(b"JSON", text), (b"BIN\0", b"".join(data.tobytes() for data, *_ in parts))]
-    body = b"".join(struct.pack("<I4s", len(data), name) + data for name, data in chunks)
-    return struct.pack("<4sII", b"glTF", 2, 12 + len(body)) + body
+    return gltf.encoded(about, columns)
 
 
 def quaternion(rotation: Float[np.ndarray, "3 3"]) -> list[float]:

@@ -125,7 +125,7 @@ def splats_page(path: Path, gaussians: Gaussians, opening: Opening) -> None:
     """Write a page that draws a cloud in the scene's frame as splats with harmonics, held as .spz, with its loss."""
     settings = asdict(opening) | {"webgl": True, "packed": False, "antialiased": gaussians.antialiased}
     with counting(f"Packing {len(gaussians):,} Gaussians"):
-        packed = spz.encode(gaussians, steps=FINE)
+        packed = spz.gzipped(gaussians, steps=FINE)
     write_page(path, "splats", settings, packed)
 
 

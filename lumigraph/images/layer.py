@@ -22,11 +22,14 @@ ENCODINGS = {
     "linear premultiplied": "light multiplied by the alpha in a fourth channel",
     "distance": "lengths along the pixel's ray",
     "z-depth": "lengths along the optical axis",
+    "mosaic": "light behind a filter of one colour each, in squares of two by two pixels that repeat",
     "index": "whole numbers that name something",
+    "filter": "whole numbers that name the filter over each pixel of a mosaic",
     "direction": "unit vectors in the scene's frame",
     "pixels": "offsets (x, y) in pixels of the picture",
     "plain": "numbers of any other kind",
 }
+NUMBERED = ("index", "filter")  # encodings of whole numbers
 UNNAMED = -1  # an index that is not known
 
 
@@ -102,7 +105,7 @@ class Layer:
         cosine: of the angle between each pixel's ray and the optical axis; asked for where lengths lie along the axis
         """
         sure = self.known(stored)
-        if self.encoding == "index":
+        if self.encoding in NUMBERED:
             return torch.from_numpy(np.where(sure, stored, UNNAMED).astype(np.int64))
         values = torch.from_numpy(stored.astype(np.float64) * self.scale)
         if self.empty:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from jaxtyping import Bool, Int
+from jaxtyping import Bool, Int, Shaped
 from PIL import Image
 
 Size = tuple[int, int]
@@ -18,19 +18,36 @@ def resized(
     """Values (height, width) or (height, width, channels) at a size (width, height), in their own type.
 
     Light is averaged over each new pixel's area, over known values alone, and as much as they cover where a fourth
-    channel says so. All else is picked, never mixed: the value at the new pixel's centre, or if that is not known,
-    the known one nearest to it within the new pixel. Offsets in pixels follow the size.
+    channel says so. A mosaic stays one (`in_phase`). All else is picked, never mixed: the value at the new
+    pixel's centre, or if that is not known, the known one nearest to it within the new pixel. Offsets in pixels follow
+    the size.
     """
     height, width = values.shape[:2]
     if (width, height) == size:
         return values
     if encoding in AVERAGED and size[0] <= width and size[1] <= height:
         return averaged(values, size, known, straight=encoding != "linear premultiplied")
+    if encoding == "mosaic":
+        return in_phase(values, size)
+    if encoding == "filter":
+        return np.tile(values[:2, :2], (-(-size[1] // 2), -(-size[0] // 2)))[: size[1], : size[0]]
     index = picked((width, height), size, known)
     found = values.reshape(height * width, *values.shape[2:])[index].reshape(size[1], size[0], *values.shape[2:])
     return (
         (found * np.array([size[0] / width, size[1] / height])).astype(values.dtype) if encoding == "pixels" else found
     )
+
+
+def in_phase(values: Shaped[np.ndarray, "height width"], size: Size) -> np.ndarray:
+    """A mosaic at another size: of each new pixel the mean of those within it whose place in the square of four is its
+    own, so that the same filter lies over them; NaN where there is none."""
+    found = np.empty(size[::-1], values.dtype)
+    for phase in np.ndindex(2, 2):
+        own = tuple(slice(first, None, 2) for first in phase)
+        there = np.zeros(values.shape, bool)
+        there[own] = True
+        found[own] = averaged(values, size, there, straight=True)[own]
+    return found
 
 
 def averaged(values: np.ndarray, size: Size, known: np.ndarray | None, straight: bool) -> np.ndarray:

@@ -4,6 +4,7 @@ from ._dispatch import Engine as Engine
 from ._dispatch import using as using
 from .composite import composite as composite
 from .dense_grid import dense_grid as dense_grid
+from .distortion import distortion as distortion
 from .factor_grid import Factors as Factors
 from .factor_grid import factor_grid as factor_grid
 from .harmonic_grid import harmonic_grid as harmonic_grid

@@ -13,14 +13,15 @@ from torch import Tensor, nn
 from .. import kernels
 from ..camera import Camera
 from ..choice import evenly
+from ..components.clouds.dense_points import compile_sweep
 from ..components.fields.mlp import MLP
 from ..components.fields.voxels import VoxelGrid, corners, tight_box
 from ..components.sampling.carving import visual_hull
-from ..components.sampling.grid_march import UNSETTLED, asked_by_cells, empty_below, march, reach_of
 from ..components.sampling.importance import importance
 from ..components.sampling.marching import FIRST_RAYS, rays_for, weighty
 from ..components.sampling.occupancy import OccupancyGrid
 from ..components.sampling.spaces import NDC, space_of
+from ..components.sampling.unbounded import RAYS, OpenNumbers, Unbounded, rays_of, unbounded
 from ..components.training.lazy_adam import LazyAdam
 from ..components.training.photometric import backdrop, residuals
 from ..components.training.schedules import falling
@@ -28,7 +29,7 @@ from ..components.training.smoothness import variation
 from ..method import RayMethod
 from ..packing import Stored, most_important
 from ..ranges import Layers, LearningRate, NonNegative, PositiveShare, Seed, Share, Steps, Width, between
-from ..rays import Look, Rays, Rendering, Samples
+from ..rays import Look, Rays, Rendering
 from ..scene import Batch, Frame, Scene
 from ..volume import composite
 
@@ -36,7 +37,7 @@ Voxels = Annotated[int, between(64, 1 << 30)]
 
 
 @dataclass(frozen=True)
-class Config:
+class Config(OpenNumbers):
     """The paper's numbers, with where it or its published code gives them; `DVGO.preset` says what a CPU does."""
 
     coarse_voxels: Voxels = 100**3  # of the coarse stage, section 6.1
@@ -53,7 +54,6 @@ class Config:
     growing_share: Share = 0.2  # of the fine stage, in which that happens: 4 of 20 thousand steps
     box_alpha: PositiveShare = 1e-3  # of a voxel, above which it is inside the tight box
     step_size: PositiveShare = 0.5  # of a voxel's edge, section 6.1
-    cone_angle: Share = 1 / 256  # growth of steps with distance, where there is no bound
     transmittance_threshold: Share = 1e-4  # at which a ray is spent
     weight_threshold: Share = 1e-4  # of a sample, below which it is asked for no colour in the fine stage
     samples_per_step: Annotated[int, between(64, 1 << 24)] = 1 << 20  # 8192 rays, section 6.1
@@ -108,8 +108,12 @@ class DVGO(RayMethod):
             torch.manual_seed(config.seed)
             hidden = [config.hidden_width] * config.hidden_layers
             self.colour_network = MLP(config.feature_channels + config.sh_bands**2, *hidden, 3)
-        self.occupancy = OccupancyGrid(reach_of(frame), config.occupancy_resolution)
-        self.register_buffer("rays_per_step", torch.tensor(FIRST_RAYS))
+        self.occupancy = OccupancyGrid(1.0, config.occupancy_resolution)
+        self.unbounded = unbounded(frame, self.space, config)
+        if self.unbounded:
+            self.rays_per_chunk = RAYS
+        first = rays_of(self._samples, config) if self.unbounded else FIRST_RAYS
+        self.register_buffer("rays_per_step", torch.tensor(first))
         self.register_buffer("stage", torch.tensor(0))  # 0: coarse; k: fine, after k - 1 doublings
         sides = [high - low for low, high in zip(*box, strict=True)]
         self.register_buffer("edge", torch.tensor((math.prod(sides) / config.coarse_voxels) ** (1 / 3)))
@@ -128,7 +132,6 @@ class DVGO(RayMethod):
             doublings=3,
             growing_share=0.4,
             step_size=0.8,
-            cone_angle=1 / 96,
             transmittance_threshold=1e-3,
             samples_per_step=1 << 17,
             open_samples_per_step=1 << 16,
@@ -164,17 +167,14 @@ class DVGO(RayMethod):
     @classmethod
     def further_bytes(cls, frame: Frame, config: Any, learning: bool) -> int:
         numbers = config.voxels * (1 + config.feature_channels)
-        return 4 * numbers * (4 if learning else 1)  # the values, their gradient, two moments
+        grids = Unbounded.bytes_of(frame, learning)
+        return grids + 4 * numbers * (4 if learning else 1)  # the values, their gradient, two moments
 
     # What is learnt
 
     def density(self, points: Float[Tensor, "sample 3"]) -> Float[Tensor, " sample"]:
         """Density per scene unit: interpolate, then activate (section 4.1, "post-activation")."""
         return self._activated(self.density_grid(self.space.warp(points))[:, 0], points)
-
-    def _density(self, coordinates: Float[Tensor, "sample 3"]) -> Float[Tensor, " sample"]:
-        """Density per unit of the coordinates."""
-        return nn.functional.softplus(self.density_grid(coordinates)[:, 0] + self.shift) * float(1 / self.edge)
 
     def field(
         self, points: Float[Tensor, "point 3"], directions: Float[Tensor, "point 3"]
@@ -199,6 +199,7 @@ class DVGO(RayMethod):
             **dict.fromkeys(networks, Stored("half")),
             "occupancy.density": Stored("nothing"),
             "occupancy.possible": Stored("nothing", fill=1.0),
+            **(self.unbounded.storage() if self.unbounded else {}),
         }
 
     def importance(self, camera: Camera) -> dict[str, Float[Tensor, " row"]]:
@@ -235,32 +236,36 @@ class DVGO(RayMethod):
 
     # Along rays
 
-    def looks(self, rays: Rays, jitter: Float[Tensor, " ray"] | None = None) -> list[Look]:
-        found = self._march(rays, jitter)
+    def looks(self, rays: Rays) -> list[Look]:
+        return [self.unbounded.look(self.field, rays)[0] if self.unbounded else self._march(rays)]
+
+    def _march(self, rays: Rays, jitter: Float[Tensor, " ray"] | None = None) -> Look:
+        """Samples in what is not known to be free, a share of a voxel from one to the next."""
         c = self.config
+        step = c.step_size * self.density_grid.edge
+        found = self.occupancy.sample(rays, self.frame.near, step, jitter=jitter)
         least = c.weight_threshold if self.stage > 0 else 0.0  # in the coarse stage all is thin at first
         samples = weighty(rays, found, self.density, c.transmittance_threshold, least)
         points, directions = samples.along(rays)
         density, rgb = self.field(points, directions)
         self.figures |= {"rays": len(rays), "samples": len(found), "visible_samples": len(samples)}
-        return [Look("samples", samples, density, rgb)]
-
-    def _march(self, rays: Rays, jitter: Float[Tensor, " ray"] | None) -> Samples:
-        """Samples in what is not known to be free, a share of a voxel from one to the next."""
-        grid = self.density_grid
-        step = self.config.step_size * (grid.longest if isinstance(self.space, NDC) else grid.edge)
-        growth = self.config.cone_angle if self.frame.reach > 1 else 0.0
-        return march(self.space, self.occupancy, rays, self.frame.near, step, growth, jitter)
+        return Look("samples", samples, density, rgb)
 
     def loss(self, batch: Batch, step: int) -> dict[str, Tensor]:
         """Eqs. 11 to 13: squared error of rays, of each sample by its weight, entropy of opacity."""
         generator = self.random(step)
-        jitter = torch.rand(len(batch), generator=generator).to(self.device)
+        jitter = torch.rand(len(batch), 2 if self.unbounded else 1, generator=generator).to(self.device)
         background = backdrop(batch, self.background, generator, self.frame.reach > 1)
-        (look,) = self.looks(batch.rays, jitter)
+        further = dict[str, Tensor]()
+        if self.unbounded:
+            look, proposed = self.unbounded.look(self.field, batch.rays, jitter)
+            further = self.unbounded.terms(self.density, proposed, look.density, generator)
+            self.figures |= {"rays": len(batch), "samples": len(look.samples)}
+        else:
+            look = self._march(batch.rays, jitter[:, 0])
         rendering = composite(look.samples, look.density, look.rgb, background)
         residual, self.figures["mse"] = residuals(rendering, batch, background)
-        terms, c = {"colour": residual.square().mean()}, self.config
+        terms, c = {"colour": residual.square().mean(), **further}, self.config
         if weight := c.point_weight:
             terms["points"] = weight * self._points(look, batch.before(self.background))
         if weight := c.entropy_weight:
@@ -283,7 +288,7 @@ class DVGO(RayMethod):
     # Learning
 
     def rays_in_a_step(self, data: Scene) -> float:
-        return self._samples / SAMPLES_OF_A_RAY
+        return self._samples / (self.config.samples_per_ray if self.unbounded else SAMPLES_OF_A_RAY)
 
     @property
     def _samples(self) -> int:
@@ -304,22 +309,30 @@ class DVGO(RayMethod):
         ]
         self._adam = LazyAdam(grids, betas=(0.9, 0.99))
         network = [{"params": [*self.colour_network.parameters()], "name": "network"}]
-        return [self._adam, torch.optim.Adam(network, betas=(0.9, 0.99))]
+        optimizers = [self._adam, torch.optim.Adam(network, betas=(0.9, 0.99))]
+        return [*optimizers, self.unbounded.optimizer()] if self.unbounded else optimizers
 
     def learning_rate(self, step: int, progress: float) -> dict[str, float]:
         c = self.config
         share = falling(1.0, c.final_learning_rate, progress) * min(1.0, (step + 1) / 20)
         rates = {"density": c.density_learning_rate, "features": c.feature_learning_rate}
-        return {name: share * rate for name, rate in {**rates, "network": c.network_learning_rate}.items()}
+        found = {name: share * rate for name, rate in {**rates, "network": c.network_learning_rate}.items()}
+        return found | {"proposal": Unbounded.rate(progress)}
 
     def begin(self, scene: Scene, seconds: float = math.inf) -> None:
         """What no learning is needed for: the silhouettes' hull, and how many photographs see each voxel."""
         if scene.images.has_alpha and self.frame.reach <= 1:
             self.occupancy.rule_out(visual_hull(scene, self.config.occupancy_resolution)[None])
+        if self.unbounded:
+            self.unbounded.begin(scene, seconds, self.random(1))
         if self._adam is not None:
             rates = self._views(scene)
             for group in self._adam.param_groups:
                 group["rates"] = rates
+
+    def rehearse_begin(self) -> None:
+        if self.unbounded:
+            compile_sweep()
 
     @torch.no_grad()
     def _views(self, scene: Scene) -> Float[Tensor, " corner"]:
@@ -346,16 +359,19 @@ class DVGO(RayMethod):
 
     def before_step(self, step: int, progress: float) -> None:
         c = self.config
-        settled = progress >= (WARM * c.coarse_share if self.frame.reach <= 1 else UNSETTLED)
+        if self.unbounded:
+            self.unbounded.before_step(progress)
+        settled = not self.unbounded and progress >= WARM * c.coarse_share
         if self._stage_at(progress) > int(self.stage):
             self._advance(self._stage_at(progress))
             if settled:
                 self._look(step, 1.0)
         elif settled and step % c.occupancy_interval == 0:
-            first = self.frame.reach > 1 and not self.occupancy.density.any()  # a cell not looked at counts as empty
-            self._look(step, 1.0 if first else PROBES)
+            self._look(step, PROBES)
 
     def after_step(self, step: int) -> None:
+        if self.unbounded:
+            return
         rays = rays_for(self._samples, int(self.rays_per_step), self.figures["samples"])
         self.rays_per_step.fill_(rays)
 
@@ -405,6 +421,4 @@ class DVGO(RayMethod):
         c = self.config
         budget = self._samples * LOOKS if share < 1 else None
         generator = self.random(~step)
-        density = asked_by_cells(self.space, self.density, self._density)
-        least = empty_below(self.frame, c.occupancy_threshold, self.occupancy.resolution)
-        self.occupancy.update(density, least, generator, c.occupancy_decay, share, budget)
+        self.occupancy.update(self.density, c.occupancy_threshold, generator, c.occupancy_decay, share, budget)

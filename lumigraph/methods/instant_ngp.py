@@ -10,21 +10,22 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from .. import kernels
 from ..camera import Camera
-from ..components.fields.activations import truncated_exp
-from ..components.fields.mlp import MLP
+from ..components.clouds.dense_points import compile_sweep
+from ..components.fields.hash_field import HashField, bytes_kept, check_levels
 from ..components.sampling.carving import visual_hull
+from ..components.sampling.coarse_to_fine import SAMPLES_OF_A_RAY, first_grid, keep_looking, lattice, stage
 from ..components.sampling.importance import importance
 from ..components.sampling.marching import FIRST_RAYS, rays_for, reached
 from ..components.sampling.occupancy import OccupancyGrid
+from ..components.sampling.spaces import Box, space_of
+from ..components.sampling.unbounded import RAYS, OpenNumbers, Unbounded, rays_of, unbounded
 from ..components.training.corrections import Exposure
 from ..components.training.lazy_adam import LazyAdam
 from ..components.training.photometric import backdrop, residuals
 from ..components.training.pose_refinement import PoseRefinement
-from ..components.training.schedules import falling
+from ..components.training.schedules import held
 from ..controls import Control
-from ..errors import LumigraphError
 from ..method import RayMethod
 from ..packing import Stored, most_important
 from ..ranges import Layers, LearningRate, NonNegative, PositiveShare, Seed, Share, Steps, Width, between
@@ -34,7 +35,7 @@ from ..volume import composite
 
 
 @dataclass(frozen=True)
-class Config:
+class Config(OpenNumbers):
     """The paper's numbers, with where it gives them; `InstantNGP.preset` says what a plain CPU does otherwise."""
 
     levels: Annotated[int, between(1, 32)] = 16  # L, table 1
@@ -60,6 +61,7 @@ class Config:
     decay_start: Annotated[float, between(0, 0.99)] = 0.3  # share of the budget before the learning rate falls
     hash_weight_decay: NonNegative = 0.0  # of the table, decoupled; of objects only, for it pulls density towards 1
     huber_delta: PositiveShare = 0.1  # residual at which the loss turns from square to linear
+    contraction: bool = True  # of open captures (Barron 2022), with proposals; or section 5.4's cascades around them
     exposure_correction: bool = False  # learn a gain per photograph
     refine_cameras: bool = False  # learn where each photograph was taken from, coarse to fine (Lin 2021, BARF)
     pose_learning_rate: LearningRate = 5e-4  # radians by which a step moves a picture, with refine_cameras
@@ -67,65 +69,14 @@ class Config:
 
     def check(self) -> None:
         """Raises LumigraphError for numbers that contradict each other."""
-        if self.base_resolution > self.max_resolution:
-            raise LumigraphError(
-                f"The coarsest level cannot be finer than the finest: --base-resolution {self.base_resolution:,} is "
-                f"above --max-resolution {self.max_resolution:,}"
-            )
-        if self.levels << self.log2_hashmap_size >= 1 << 32:
-            raise LumigraphError(
-                f"--levels {self.levels} with --log2-hashmap-size {self.log2_hashmap_size} make more entries than "
-                f"32 bits count; give a smaller one"
-            )
-
-
-# Coarse to fine: share of the budget from which on, and which part of occupancy_resolution and steps_per_diagonal.
-STAGES = ((0.0, 1 / 4, 1 / 4), (0.04, 1 / 2, 1 / 2), (0.12, 1, 2 / 3), (0.75, 1, 1))
-LOOKS = 4  # cells updated at most, for each sample of a step
-PROBES = 0.02  # share of all cells updated at random, in case something has grown there
-SAMPLES_OF_A_RAY = 24  # that a ray needs, about, once empty space is known
-
-
-class Field(nn.Module):
-    """Density from position, colour from position and direction (figure 3 and section 5.4)."""
-
-    def __init__(self, config: Config, reach: float):
-        super().__init__()
-        self.reach, self.bands = reach, config.sh_bands
-        finest = int(config.max_resolution * reach)
-        self.levels = kernels.HashLevels(
-            config.levels, config.features_per_level, config.log2_hashmap_size, config.base_resolution, finest
-        )
-        self.table = nn.Parameter(torch.empty(self.levels.offsets[-1], config.features_per_level).uniform_(-1e-4, 1e-4))
-        hidden = [config.hidden_width] * config.density_layers
-        self.density_network = MLP(config.levels * config.features_per_level, *hidden, config.geometry_features)
-        hidden = [config.hidden_width] * config.colour_layers
-        self.colour_network = MLP(config.geometry_features + self.bands**2, *hidden, 3)
-
-    def encode(
-        self, points: Float[Tensor, "sample 3"], weights: Float[Tensor, " level"] | None = None
-    ) -> Float[Tensor, "sample width"]:
-        """Features of all levels, the coarsest first. weights: of the levels, where not all count fully"""
-        encoded = kernels.hash_encode(points * (0.5 / self.reach) + 0.5, self.table, self.levels)
-        return encoded if weights is None else encoded * weights.repeat_interleave(self.levels.features)
-
-    def density(
-        self, encoded: Float[Tensor, "sample width"]
-    ) -> tuple[Float[Tensor, " sample"], Float[Tensor, "sample geometry"]]:
-        """Density per scene unit, and the features of each place that the colour network takes."""
-        geometry = self.density_network(encoded)
-        return truncated_exp(geometry[:, 0]), geometry
-
-    def colour(
-        self, geometry: Float[Tensor, "sample geometry"], directions: Float[Tensor, "sample 3"]
-    ) -> Float[Tensor, "sample 3"]:
-        """sRGB-encoded colour."""
-        harmonics = kernels.spherical_harmonics(directions, self.bands)
-        return torch.sigmoid(self.colour_network(torch.cat([geometry.t(), harmonics.t()]).t()))
+        check_levels(self)
 
 
 class InstantNGP(RayMethod):
-    """Rays are sampled in occupied cells; a first pass without gradients drops hidden samples, a second one learns."""
+    """Rays are sampled in occupied cells; a first pass without gradients drops hidden samples, a second one learns.
+
+    Open captures are contracted, and sampled where a grid proposes; see `components.sampling.unbounded`.
+    """
 
     Config = Config
     formerly_weights: ClassVar[dict[str, str]] = {"field.": "network."}
@@ -149,20 +100,26 @@ class InstantNGP(RayMethod):
         "huber": "huber_delta",
         "exposure": "exposure_correction",
     }
+    before: ClassVar[dict[str, Any]] = {"contraction": False}
     rays_per_step: Tensor
 
     def __init__(self, frame: Frame, config: Any = None):
         config = config or Config()
         super().__init__(frame, config)
+        self.space = space_of(frame) if config.contraction else Box(frame.bounds, frame.near)
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(config.seed)
-            self.network = Field(config, frame.reach)
+            self.network = HashField(config, self.space, frame.reach)
+        self.unbounded = unbounded(frame, self.space, config) if config.contraction else None
+        if self.unbounded:
+            self.rays_per_chunk = RAYS
         self.exposure = Exposure(frame.image_count) if config.exposure_correction else None
         refining, rate = config.refine_cameras, config.pose_learning_rate
         self.poses = PoseRefinement(frame.image_count, rate) if refining else None
-        self.occupancy = OccupancyGrid(frame.reach, max(4, int(config.occupancy_resolution * STAGES[0][1])))
-        self._set_steps(1.0)
-        self.register_buffer("rays_per_step", torch.tensor(FIRST_RAYS))
+        self.occupancy = first_grid(config, frame.reach)
+        self.lattice = lattice(config, frame.reach)
+        first = rays_of(config.samples_per_step, config) if self.unbounded else FIRST_RAYS
+        self.register_buffer("rays_per_step", torch.tensor(first))
 
     @classmethod
     def preset(cls, device: torch.device) -> Any:
@@ -207,47 +164,63 @@ class InstantNGP(RayMethod):
 
     @classmethod
     def further_bytes(cls, frame: Frame, config: Any, learning: bool) -> int:
-        hidden = config.hidden_width * (config.density_layers + config.colour_layers)
-        step = 4 * config.samples_per_step * (config.levels * config.features_per_level + hidden)
-        return OccupancyGrid.bytes_of(frame.reach, config.occupancy_resolution) + step * learning
+        grids = OccupancyGrid.bytes_of(frame.reach, config.occupancy_resolution) + Unbounded.bytes_of(frame, learning)
+        return grids + bytes_kept(config) * learning
 
     def rays_in_a_step(self, data: Scene) -> float:
-        return self.config.samples_per_step / SAMPLES_OF_A_RAY
+        c = self.config
+        return c.samples_per_step / (c.samples_per_ray if self.unbounded else SAMPLES_OF_A_RAY)
 
     def begin(self, scene: Scene, seconds: float = math.inf) -> None:
         if self.poses:  # silhouettes seen from wrong poses would carve what is there
             self.poses.begin(scene.cameras, scene.frame)
         elif scene.images.has_alpha and self.frame.reach == 1:
             self.occupancy.rule_out(visual_hull(scene, self.config.occupancy_resolution)[None])
+        if self.unbounded and not self.poses:
+            self.unbounded.begin(scene, seconds, self.random(1))
+
+    def rehearse_begin(self) -> None:
+        if self.unbounded:
+            compile_sweep()
 
     def batch(self, data: Scene, generator: torch.Generator) -> Batch:
         return data.sample_rays(int(self.rays_per_step), generator).to(self.device)
 
-    def render_rays(
-        self, rays: Rays, background: Float[Tensor, "#ray 3"], jitter: Float[Tensor, " ray"] | None = None
-    ) -> Rendering:
-        (look,) = self.looks(rays, jitter)
+    def render_rays(self, rays: Rays, background: Float[Tensor, "#ray 3"]) -> Rendering:
+        (look,) = self.looks(rays)
         return composite(look.samples, look.density, look.rgb, background)
 
-    def looks(self, rays: Rays, jitter: Float[Tensor, " ray"] | None = None) -> list[Look]:
-        step = 2 * math.sqrt(3) / self.steps_per_diagonal
-        found = self.occupancy.sample(rays, self.frame.near, step, self.cone_angle, jitter=jitter)
+    def looks(self, rays: Rays) -> list[Look]:
+        return [self.unbounded.look(self.field, rays)[0] if self.unbounded else self._march(rays)]
+
+    def _march(self, rays: Rays, jitter: Float[Tensor, " ray"] | None = None) -> Look:
+        found = self.occupancy.sample(rays, self.frame.near, *self.lattice, jitter=jitter)
         samples, asked = reached(rays, found, self.density, self.config.transmittance_threshold)
         points, directions = samples.along(rays)
         density, rgb = self.field(points, directions)
         self.figures |= {"rays": len(rays), "samples": asked, "visible_samples": len(samples)}
-        return [Look("samples", samples, density, rgb)]
+        return Look("samples", samples, density, rgb)
+
+    def look_to_learn(self, rays: Rays, generator: torch.Generator) -> tuple[Look, dict[str, Tensor]]:
+        """A step's look along rays, at random places, and what it costs beside colours, by name."""
+        if not self.unbounded:
+            return self._march(rays, torch.rand(len(rays), generator=generator).to(self.device)), {}
+        jitter = torch.rand(len(rays), 2, generator=generator).to(self.device)
+        look, proposed = self.unbounded.look(self.field, rays, jitter)
+        self.figures |= {"rays": len(rays), "samples": len(look.samples)}
+        return look, self.unbounded.terms(self.density, proposed, look.density, generator)
 
     def loss(self, batch: Batch, step: int) -> dict[str, Tensor]:
         generator = self.random(step)
-        jitter = torch.rand(len(batch), generator=generator).to(self.device)
-        background = backdrop(batch, self.background, generator)
         rays = self.poses(batch.rays) if self.poses else batch.rays
-        rendering = self.render_rays(rays, background, jitter)
+        look, terms = self.look_to_learn(rays, generator)
+        background = backdrop(batch, self.background, generator, opaque=self.unbounded is not None)
+        rendering = composite(look.samples, look.density, look.rgb, background)
         residual, self.figures["mse"] = residuals(rendering, batch, background, self.exposure)
         # Divided by delta, so that the linear part has slope 1.
         delta = self.config.huber_delta
-        return {"huber": nn.functional.huber_loss(residual, torch.zeros_like(residual), delta=delta) / delta}
+        huber = nn.functional.huber_loss(residual, torch.zeros_like(residual), delta=delta) / delta
+        return {"huber": huber, **terms}
 
     def optimizers(self) -> list[torch.optim.Optimizer]:
         networks = [*self.network.density_network.parameters(), *self.network.colour_network.parameters()]
@@ -258,31 +231,30 @@ class InstantNGP(RayMethod):
         decay = self.config.hash_weight_decay if self.frame.reach == 1 else 0.0
         table = LazyAdam([self.network.table], weight_decay=decay, **common)
         optimizers = [table, torch.optim.Adam(groups, foreach=True, **common)]
+        if self.unbounded:
+            optimizers.append(self.unbounded.optimizer())
         return [*optimizers, self.poses.optimizer()] if self.poses and not older else optimizers
 
-    def learning_rate(self, step: int, progress: float) -> float | dict[str, float]:
+    def learning_rate(self, step: int, progress: float) -> dict[str, float]:
         """Twenty steps of warm-up, then constant, then exponential decay (section 4 decays likewise)."""
         c = self.config
-        fall = max(0.0, progress - c.decay_start) / (1 - c.decay_start)
-        rate = falling(c.learning_rate, c.final_learning_rate, fall) * min(1.0, (step + 1) / 20)
-        return {"": rate, "poses": self.poses.rate(progress)} if self.poses else rate
+        rate = held(c.learning_rate, c.final_learning_rate, step, progress, c.decay_start)
+        rates = {"": rate, "proposal": Unbounded.rate(progress)}
+        return rates | {"poses": self.poses.rate(progress)} if self.poses else rates
 
     def before_step(self, step: int, progress: float) -> None:
         if self.poses:
             self.poses.progress.fill_(progress)
-        _, cells, steps = max(stage for stage in STAGES if stage[0] <= progress)
-        self._set_steps(steps)
-        finer = False
-        while self.occupancy.resolution < self.config.occupancy_resolution * cells:
-            self.occupancy.refine()
-            finer = True
-        if finer or step % (4 if step < 32 else self.config.occupancy_interval) == 0:
-            share, budget = (1.0, None) if finer or step < 32 else (PROBES, self.config.samples_per_step * LOOKS)
-            thickness, decay = self.config.occupancy_threshold, self.config.occupancy_decay
-            self.occupancy.update(self.density, thickness, self.random(~step), decay, share, budget)
+        if self.unbounded:
+            self.unbounded.before_step(progress)
+            return
+        self.lattice = lattice(self.config, self.frame.reach, stage(progress).steps)
+        keep_looking(self.occupancy, self.density, self.config, step, progress, self.random(~step))
 
     def after_step(self, step: int) -> None:
         """Set the next step's number of rays so that they give about `samples_per_step` samples."""
+        if self.unbounded:
+            return
         rays = rays_for(self.config.samples_per_step, int(self.rays_per_step), self.figures["samples"])
         self.rays_per_step.fill_(rays)
 
@@ -291,16 +263,19 @@ class InstantNGP(RayMethod):
     ) -> tuple[Float[Tensor, " point"], Float[Tensor, "point 3"]]:
         """Density per scene unit, and sRGB-encoded colour seen along unit directions."""
         density, geometry = self.network.density(self._encoded(points))
+        density = density * self.space.stretch(points)
         rgb = self.network.colour(geometry, directions)
         return density, rgb * self.exposure.gain(self.told) if self.told and self.exposure else rgb
 
     def density(self, points: Float[Tensor, "sample 3"]) -> Float[Tensor, " sample"]:
         """Density per scene unit."""
-        return self.network.density(self._encoded(points))[0]
+        return self.network.density(self._encoded(points))[0] * self.space.stretch(points)
 
     def _encoded(self, points: Float[Tensor, "sample 3"]) -> Float[Tensor, "sample width"]:
         """The network's input; while poses are refined, of as many levels as have joined."""
-        return self.network.encode(points, self.poses.weights(self.config.levels) if self.poses else None)
+        return self.network.encode(
+            self.space.warp(points), self.poses.weights(self.config.levels) if self.poses else None
+        )
 
     def storage(self) -> dict[str, Stored]:
         """The table as whole numbers, the networks as halves; of the grid, marks alone are needed for pictures."""
@@ -310,11 +285,12 @@ class InstantNGP(RayMethod):
             **dict.fromkeys(networks, Stored("half")),
             "occupancy.density": Stored("nothing"),
             "occupancy.possible": Stored("nothing", fill=1.0),
+            **(self.unbounded.storage() if self.unbounded else {}),
         }
 
     def importance(self, camera: Camera) -> dict[str, Float[Tensor, " row"]]:
         """How much each entry of the table adds to one picture; see `components.sampling.importance`."""
-        (shares,) = importance(self, camera, self.network.encode, [self.network.table])
+        (shares,) = importance(self, camera, self._encoded, [self.network.table])
         return {"network.table": shares.mean(-1)}
 
     @torch.no_grad()
@@ -329,8 +305,3 @@ class InstantNGP(RayMethod):
 
     def refined(self, cameras: Camera) -> Camera:
         return self.poses.refined(cameras) if self.poses else cameras
-
-    def _set_steps(self, share: float) -> None:
-        """Set a step's length and its growth with distance: with a share below 1 both are coarser by as much."""
-        self.steps_per_diagonal = int(self.config.steps_per_diagonal * share)
-        self.cone_angle = self.config.cone_angle / share if self.frame.reach > 1 else 0.0

@@ -11,13 +11,13 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from ..camera import Camera
+from ..components.clouds.dense_points import compile_sweep
 from ..components.fields.sparse_voxels import Cells, Part, SparseVoxels
 from ..components.sampling.carving import visual_hull
-from ..components.sampling.grid_march import UNSETTLED, asked_by_cells, empty_below, march, reach_of
 from ..components.sampling.importance import importance
-from ..components.sampling.marching import FIRST_RAYS, rays_for
 from ..components.sampling.occupancy import OccupancyGrid
-from ..components.sampling.spaces import NDC, Contraction, space_of
+from ..components.sampling.spaces import NDC, space_of
+from ..components.sampling.unbounded import RAYS, OpenNumbers, Unbounded, rays_of, unbounded
 from ..components.training.corrections import Exposure
 from ..components.training.lazy_rmsprop import LazyRMSprop
 from ..components.training.photometric import backdrop, residuals
@@ -37,7 +37,7 @@ DensityRate = Annotated[float, between(1e-6, 1e4)]
 
 
 @dataclass(frozen=True)
-class Config:
+class Config(OpenNumbers):
     """The paper's numbers for synthetic scenes (section 3, and the authors' release); `Plenoxels.preset` says what a
     plain CPU does otherwise."""
 
@@ -89,9 +89,7 @@ class Config:
 
 DELAYED = 0.01  # what the density's learning rate begins with, as a share
 REMEMBERED = 0.9  # of a cell's density and a voxel's weight, from one look of the occupancy grid to the next
-PROBES, LOOKS = 0.02, 4  # where there is no bound: share of cells looked at again at random; cells for each sample
 NOTED = 4  # steps between those whose samples' weights are remembered for pruning
-SAMPLES_OF_A_RAY = 64  # that a ray meets, about, where there is no bound
 EDGE = 1e-3  # opacities are kept so far from 0 and 1 in the beta loss
 
 
@@ -109,10 +107,13 @@ class Plenoxels(RayMethod):
         self.space = space_of(frame)
         first, _ = config.resolutions(frame.reach > 1)
         self.voxels = SparseVoxels(cells_of(frame, first), config.initial_density)
-        self.occupancy = OccupancyGrid(reach_of(frame), config.occupancy_resolution)
+        self.occupancy = OccupancyGrid(1.0, config.occupancy_resolution)
         self.exposure = Exposure(frame.image_count) if config.exposure_correction else None
-        first = config.rays_per_step if frame.reach <= 1 else min(FIRST_RAYS, config.rays_per_step)
-        self.register_buffer("rays_per_step", torch.tensor(first))
+        self.unbounded, rays = unbounded(frame, self.space, config), config.rays_per_step
+        if self.unbounded:
+            self.rays_per_chunk, rays = RAYS, min(rays, rays_of(config.samples_per_step, config))
+        self.register_buffer("rays_per_step", torch.tensor(rays))
+        self._touched: tuple[Tensor, Part]
         self._table: LazyRMSprop | None = None
 
     @classmethod
@@ -172,20 +173,13 @@ class Plenoxels(RayMethod):
     def further_bytes(cls, frame: Frame, config: Any, learning: bool) -> int:
         _, last = config.resolutions(frame.reach > 1)
         grown = SparseVoxels.bytes_of(cells_of(frame, last), learning)
-        return grown + OccupancyGrid.bytes_of(reach_of(frame), config.occupancy_resolution)
+        return grown + OccupancyGrid.bytes_of(1.0, config.occupancy_resolution) + Unbounded.bytes_of(frame, learning)
 
     def rays_in_a_step(self, data: Scene) -> float:
-        c = self.config
-        return min(c.rays_per_step, c.samples_per_step / SAMPLES_OF_A_RAY) if self.frame.reach > 1 else c.rays_per_step
+        return int(self.rays_per_step)
 
     def batch(self, data: Scene, generator: torch.Generator) -> Batch:
         return data.sample_rays(int(self.rays_per_step), generator).to(self.device)
-
-    def after_step(self, step: int) -> None:
-        """Where rays are long, set the next step's number of them so that they meet `samples_per_step` samples."""
-        if self.frame.reach > 1:
-            rays = rays_for(self.config.samples_per_step, int(self.rays_per_step), self.figures["samples"])
-            self.rays_per_step.fill_(min(rays, self.config.rays_per_step))
 
     # Being seen
 
@@ -194,6 +188,8 @@ class Plenoxels(RayMethod):
         return composite(look.samples, look.density, look.rgb, background)
 
     def looks(self, rays: Rays) -> list[Look]:
+        if self.unbounded:
+            return [self.unbounded.look(self.field, rays)[0]]
         samples, _ = self._reached(rays)
         return [Look("samples", samples, *self.field(*samples.along(rays)))]
 
@@ -202,8 +198,7 @@ class Plenoxels(RayMethod):
     ) -> tuple[Samples, Float[Tensor, " sample"]]:
         """The samples of rays that light reaches and that are not clear, and how much each weighs in a picture."""
         step = self.config.step_size * 2 / int(self.voxels.cells.amax())
-        growth = step if isinstance(self.space, Contraction) else 0.0  # beyond its inner half, voxels grow evenly
-        found = march(self.space, self.occupancy, rays, self.frame.near, step, growth, jitter)
+        found = self.occupancy.sample(rays, self.frame.near, step, jitter=jitter)
         with torch.no_grad():  # a lookup of density is so quick that all are asked about at once
             density = self.density(found.along(rays)[0])
             weights = weights_of(found, density, self.config.transmittance_threshold)
@@ -241,6 +236,7 @@ class Plenoxels(RayMethod):
             "voxels.weights": Stored("nothing"),
             "occupancy.density": Stored("nothing"),
             "occupancy.possible": Stored("nothing", fill=1.0),
+            **(self.unbounded.storage() if self.unbounded else {}),
         }
 
     def importance(self, camera: Camera) -> dict[str, Float[Tensor, " row"]]:
@@ -271,6 +267,12 @@ class Plenoxels(RayMethod):
             hull = visual_hull(scene, self.config.occupancy_resolution)
             self.occupancy.rule_out(hull[None])
             self.voxels.rebuild(hull, self.cells, self._table)
+        if self.unbounded:
+            self.unbounded.begin(scene, seconds, self.random(1))
+
+    def rehearse_begin(self) -> None:
+        if self.unbounded:
+            compile_sweep()
 
     @property
     def cells(self) -> Cells:
@@ -279,22 +281,27 @@ class Plenoxels(RayMethod):
 
     def loss(self, batch: Batch, step: int) -> dict[str, Tensor]:
         config, generator = self.config, self.random(step)
-        jitter = torch.rand(len(batch), generator=generator).to(self.device)
-        samples, weights = self._reached(batch.rays, jitter)
-        points, directions = samples.along(batch.rays)
-        places = self.space.warp(points)
-        if step % NOTED == 0:
-            self.voxels.note(places, weights)
-        rows = self.voxels.touched(places)
-        part = self.voxels.part(rows)
-        density, rgb = self._field(points, directions, part)
+        jitter = torch.rand(len(batch), 2 if self.unbounded else 1, generator=generator).to(self.device)
+        further = dict[str, Tensor]()
+        if self.unbounded:
+            look, proposed = self.unbounded.look(self._learnt, batch.rays, jitter)
+            rows, part = self._touched
+            further = self.unbounded.terms(self.density, proposed, look.density, generator)
+            self.figures |= {"rays": len(batch), "samples": len(look.samples)}
+        else:
+            samples, weights = self._reached(batch.rays, jitter[:, 0])
+            points, directions = samples.along(batch.rays)
+            if step % NOTED == 0:
+                self.voxels.note(self.space.warp(points), weights)
+            look = Look("samples", samples, *self._learnt(points, directions))
+            rows, part = self._touched
         background = backdrop(batch, self.background, generator, self.frame.reach > 1)
-        rendering = composite(samples, density, rgb, background)
+        rendering = composite(look.samples, look.density, look.rgb, background)
         residual, self.figures["mse"] = residuals(rendering, batch, background, self.exposure)
         self.figures |= {"voxels": len(self.voxels), "touched": len(rows)}
-        terms = {"colour": residual.square().mean()}
+        terms = {"colour": residual.square().mean(), **further}
         if config.sparsity:
-            terms["sparsity"] = config.sparsity * cauchy(density, len(batch))
+            terms["sparsity"] = config.sparsity * cauchy(look.density, len(batch))
         if step % config.tv_interval == 0:
             drawn = torch.rand(len(rows), generator=generator).to(rows.device) < config.tv_share
             chosen = self.voxels.numbers[rows[drawn]].long()
@@ -307,14 +314,23 @@ class Plenoxels(RayMethod):
             terms["beta"] = config.beta * undecided(rendering.opacity)
         return terms
 
+    def _learnt(
+        self, points: Float[Tensor, "point 3"], directions: Float[Tensor, "point 3"]
+    ) -> tuple[Float[Tensor, " point"], Float[Tensor, "point 3"]]:
+        """`field` of the rows that points touch alone, which are remembered: gradients of the others are not made."""
+        rows = self.voxels.touched(self.space.warp(points))
+        self._touched = rows, self.voxels.part(rows)
+        return self._field(points, directions, self._touched[1])
+
     def optimizers(self) -> list[torch.optim.Optimizer]:
         density = {"params": [self.voxels.density], "name": "density"}
         harmonics = {"params": [self.voxels.harmonics], "name": "harmonics"}
         self._table = LazyRMSprop([density, harmonics])
-        if not self.exposure:
-            return [self._table]
-        gains = {"params": [*self.exposure.parameters()], "name": "harmonics", "scale": 0.05}
-        return [self._table, torch.optim.Adam([gains])]
+        optimizers: list[torch.optim.Optimizer] = [self._table]
+        if self.exposure:
+            gains = {"params": [*self.exposure.parameters()], "name": "harmonics", "scale": 0.05}
+            optimizers.append(torch.optim.Adam([gains]))
+        return [*optimizers, self.unbounded.optimizer()] if self.unbounded else optimizers
 
     def learning_rate(self, step: int, progress: float) -> dict[str, float]:
         """Exponential decay; the density's rate comes up slowly at first (the release's delayed rates). It is in
@@ -325,6 +341,7 @@ class Plenoxels(RayMethod):
         return {
             "density": share * (DELAYED + (1 - DELAYED) * up) * falling(*density, progress),
             "harmonics": falling(c.harmonics_learning_rate, c.final_harmonics_learning_rate, progress),
+            "proposal": Unbounded.rate(progress),
         }
 
     def before_step(self, step: int, progress: float) -> None:
@@ -336,15 +353,10 @@ class Plenoxels(RayMethod):
             self.occupancy.density.zero_()
         if step % c.occupancy_interval == 0:
             self.voxels.weights *= REMEMBERED
-        settled = self.frame.reach <= 1 or progress >= UNSETTLED
-        if settled and (finer or (step and step % c.occupancy_interval == 0)):
-            density_at = asked_by_cells(self.space, self.density, self._density)
-            first = not self.occupancy.density.any()  # a cell that was never looked at counts as empty
-            whole = finer or first or self.frame.reach <= 1
-            share, budget = (1.0, None) if whole else (PROBES, LOOKS * c.samples_per_step)
-            generator = self.random(~step)
-            least = empty_below(self.frame, c.occupancy_threshold, c.occupancy_resolution)
-            self.occupancy.update(density_at, least, generator, REMEMBERED, share, budget)
+        if self.unbounded:
+            self.unbounded.before_step(progress)
+        elif finer or (step and step % c.occupancy_interval == 0):
+            self.occupancy.update(self.density, c.occupancy_threshold, self.random(~step), REMEMBERED)
 
     def _kept(self) -> Bool[Tensor, "x y z"]:
         """Cells that are not pruned. Where there is no bound, a step's few long rays leave most nodes without a known

@@ -12,15 +12,16 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from ..camera import Camera
+from ..components.clouds.dense_points import compile_sweep
 from ..components.fields.factorised import FactorGrid, nodes_in
 from ..components.fields.mlp import MLP
 from ..components.fields.truncation import truncate
 from ..components.sampling.carving import visual_hull
-from ..components.sampling.grid_march import UNSETTLED, asked_by_cells, empty_below, march, reach_of
 from ..components.sampling.importance import importance
 from ..components.sampling.marching import FIRST_RAYS, rays_for, reached
 from ..components.sampling.occupancy import OccupancyGrid
 from ..components.sampling.spaces import Box, space_of
+from ..components.sampling.unbounded import OpenNumbers, Unbounded, unbounded
 from ..components.training.exchange import exchange
 from ..components.training.lazy_adam import LazyAdam
 from ..components.training.photometric import backdrop, residuals
@@ -40,7 +41,7 @@ Components = Annotated[int, between(1, 1024)]  # of each factor
 
 
 @dataclass(frozen=True)
-class Config:
+class Config(OpenNumbers):
     """VM-192 as the paper and its code for Blender's scenes have it; `TensoRF.preset` says what a plain CPU does."""
 
     factors: Literal["vm", "cp"] = "vm"  # planes and lines, or lines alone, section 3
@@ -57,9 +58,9 @@ class Config:
     density_shift: Annotated[float, between(-30, 30)] = -7.0  # before the softplus; under the code's -10 L1 wins here
     density_scale: Positive = 25.0  # after it, the code's
     step_ratio: Annotated[float, between(0.05, 8)] = 0.5  # of a sample to the distance of nodes, the code's
-    cone_angle: Share = 1 / 128  # growth of steps with distance, in captures without bounds
     rays_per_step: BatchSize = 4096  # section 5; at most
     samples_per_step: Annotated[int, between(64, 1 << 24)] = 1 << 20  # that these rays may meet in occupied cells
+    open_samples_per_step: Annotated[int, between(64, 1 << 24)] = 1 << 17  # the same where there is no bound
     transmittance_threshold: Share = 1e-4  # at which a ray is spent
     weight_threshold: Share = 1e-4  # weight of a sample below which it gets no colour, the code's
     l1_weight: NonNegative = 8e-5  # of objects, of density's factors, the code's
@@ -167,7 +168,8 @@ class TensoRF(RayMethod):
         self.register_buffer("box", torch.tensor(whole))  # in the space's coordinates: where the grid is
         self.register_buffer("stage", torch.tensor(0))  # how often the grid has become finer
         self.register_buffer("rays_per_step", torch.tensor(min(FIRST_RAYS, config.rays_per_step)))
-        self.occupancy = OccupancyGrid(reach_of(frame), max(4, int(config.occupancy_resolution * MASKS[0][1])))
+        self.unbounded = unbounded(frame, self.space, config)
+        self.occupancy = OccupancyGrid(1.0, max(4, int(config.occupancy_resolution * MASKS[0][1])))
         self._optimizer: torch.optim.Optimizer | None = None
 
     @classmethod
@@ -184,12 +186,12 @@ class TensoRF(RayMethod):
             feature_frequencies=0,
             rays_per_step=4096,
             samples_per_step=1 << 17,
+            open_samples_per_step=1 << 15,
             step_ratio=1.0,
             density_shift=-8.0,
             l1_weight=0.0,
             final_l1_weight=0.0,
             tv_interval=8,
-            cone_angle=1 / 64,
             occupancy_threshold=0.05,
             transmittance_threshold=1e-3,
             weight_threshold=1e-3,
@@ -227,10 +229,18 @@ class TensoRF(RayMethod):
         width = config.density_components + config.appearance_components
         step = 4 * config.samples_per_step * 32
         grown = 4 * (last - first) * width * (4 if learning else 1)
-        return OccupancyGrid.bytes_of(reach_of(frame), config.occupancy_resolution) + grown + step * learning
+        grids = OccupancyGrid.bytes_of(1.0, config.occupancy_resolution) + Unbounded.bytes_of(frame, learning)
+        return grids + grown + step * learning
 
     def rays_in_a_step(self, data: Scene) -> float:
-        return min(self.config.rays_per_step, self.config.samples_per_step / SAMPLES_OF_A_RAY)
+        c = self.config
+        samples = c.samples_per_ray if self.unbounded else SAMPLES_OF_A_RAY
+        return min(c.rays_per_step, self._samples / samples)
+
+    @property
+    def _samples(self) -> int:
+        """That a step asks about, at most."""
+        return self.config.open_samples_per_step if self.unbounded else self.config.samples_per_step
 
     def begin(self, scene: Scene, seconds: float = math.inf) -> None:
         """Where photographs say what is transparent, the grid's box is that of the visual hull from the beginning."""
@@ -238,19 +248,26 @@ class TensoRF(RayMethod):
             self.occupancy.rule_out(visual_hull(scene, self.config.occupancy_resolution)[None])
             self._shrink()
             self._resample(self.config.initial_resolution, self.box, fresh=self.random(0))
+        if self.unbounded:
+            self.unbounded.begin(scene, seconds, self.random(1))
+
+    def rehearse_begin(self) -> None:
+        if self.unbounded:
+            compile_sweep()
 
     def batch(self, data: Scene, generator: torch.Generator) -> Batch:
         return data.sample_rays(int(self.rays_per_step), generator).to(self.device)
 
-    def render_rays(
-        self, rays: Rays, background: Float[Tensor, "#ray 3"], jitter: Float[Tensor, " ray"] | None = None
-    ) -> Rendering:
-        (look,) = self.looks(rays, jitter)
+    def render_rays(self, rays: Rays, background: Float[Tensor, "#ray 3"]) -> Rendering:
+        (look,) = self.looks(rays)
         return composite(look.samples, look.density, look.rgb, background)
 
-    def looks(self, rays: Rays, jitter: Float[Tensor, " ray"] | None = None) -> list[Look]:
-        c, growth = self.config, self.config.cone_angle if self.frame.reach > 1 else 0.0
-        found = march(self.space, self.occupancy, rays, self.frame.near, self._step(), growth, jitter)
+    def looks(self, rays: Rays) -> list[Look]:
+        return [self.unbounded.look(self.field, rays)[0] if self.unbounded else self._march(rays)]
+
+    def _march(self, rays: Rays, jitter: Float[Tensor, " ray"] | None = None) -> Look:
+        c = self.config
+        found = self.occupancy.sample(rays, self.frame.near, self._step(), jitter=jitter)
         samples, asked = reached(rays, found, self.density, c.transmittance_threshold)
         ray = samples.ray_index
         towards = rays.directions.index_select(0, ray)
@@ -264,14 +281,22 @@ class TensoRF(RayMethod):
         rgb = rgb.new_zeros(len(samples), 3).index_copy(0, coloured, rgb)
         self.figures |= {"rays": len(rays), "samples": asked, "visible_samples": len(samples)}
         self.figures["coloured_samples"] = len(coloured)
-        return [Look("samples", samples, density, rgb)]
+        return Look("samples", samples, density, rgb)
 
     def loss(self, batch: Batch, step: int) -> dict[str, Tensor]:
         generator, c = self.random(step), self.config
-        jitter = torch.rand(len(batch), generator=generator).to(self.device)
+        jitter = torch.rand(len(batch), 2 if self.unbounded else 1, generator=generator).to(self.device)
         background = backdrop(batch, self.background, generator, self.frame.reach > 1)
-        residual, self.figures["mse"] = residuals(self.render_rays(batch.rays, background, jitter), batch, background)
-        terms = {"colour": residual.square().mean()}
+        further = dict[str, Tensor]()
+        if self.unbounded:
+            look, proposed = self.unbounded.look(self.field, batch.rays, jitter)
+            further = self.unbounded.terms(self.density, proposed, look.density, generator)
+            self.figures |= {"rays": len(batch), "samples": len(look.samples)}
+        else:
+            look = self._march(batch.rays, jitter[:, 0])
+        rendering = composite(look.samples, look.density, look.rgb, background)
+        residual, self.figures["mse"] = residuals(rendering, batch, background)
+        terms = {"colour": residual.square().mean(), **further}
         if self.frame.reach <= 1:
             if weight := c.final_l1_weight if self.stage else c.l1_weight:
                 terms["l1"] = weight * self.network.density_grid.sparsity()
@@ -290,14 +315,14 @@ class TensoRF(RayMethod):
         networks = [x for x in self.network.parameters() if id(x) not in known]
         group = {"params": networks, "scale": c.network_learning_rate / max(c.learning_rate, 1e-12)}
         self._optimizer = LazyAdam(tables, c.learning_rate, betas=(0.9, 0.99))
-        return [self._optimizer, torch.optim.Adam([group], c.learning_rate, betas=(0.9, 0.99), foreach=True)]
+        optimizers = [self._optimizer, torch.optim.Adam([group], c.learning_rate, betas=(0.9, 0.99), foreach=True)]
+        return [*optimizers, self.unbounded.optimizer()] if self.unbounded else optimizers
 
-    def learning_rate(self, step: int, progress: float) -> float:
+    def learning_rate(self, step: int, progress: float) -> dict[str, float]:
         """Constant until the grid is as fine as it gets, then exponential decay."""
-        last = UPSAMPLINGS[-1]
-        return falling(
-            self.config.learning_rate, self.config.final_learning_rate, max(0.0, progress - last) / (1 - last)
-        )
+        c, last = self.config, UPSAMPLINGS[-1]
+        rate = falling(c.learning_rate, c.final_learning_rate, max(0.0, progress - last) / (1 - last))
+        return {"": rate, "proposal": Unbounded.rate(progress)}
 
     def before_step(self, step: int, progress: float) -> None:
         stage = bisect_right(UPSAMPLINGS, progress)
@@ -307,11 +332,14 @@ class TensoRF(RayMethod):
                 self._shrink()
             self._resample(self._resolution(stage), old)
             self.stage.fill_(stage)
-        self._look_around(step, progress)
+        if self.unbounded:
+            self.unbounded.before_step(progress)
+        else:
+            self._look_around(step, progress)
 
     def after_step(self, step: int) -> None:
         """Set the next step's number of rays so that they meet at most about `samples_per_step` samples."""
-        rays = rays_for(self.config.samples_per_step, int(self.rays_per_step), self.figures["samples"])
+        rays = rays_for(self._samples, int(self.rays_per_step), self.figures["samples"])
         self.rays_per_step.fill_(min(rays, self.config.rays_per_step))
 
     def field(
@@ -330,6 +358,8 @@ class TensoRF(RayMethod):
         grids = {f"network.{name}.table": Stored("scaled") for name in GRIDS}
         others = [name for name, _ in self.named_parameters() if name not in grids]
         nothing = {"occupancy.density": Stored("nothing"), "occupancy.possible": Stored("nothing", fill=1.0)}
+        if self.unbounded:
+            nothing |= self.unbounded.storage()
         return grids | dict.fromkeys(others, Stored("half")) | nothing
 
     def importance(self, camera: Camera) -> dict[str, Float[Tensor, " row"]]:
@@ -356,19 +386,10 @@ class TensoRF(RayMethod):
 
     def _places(self, points: Float[Tensor, "point 3"]) -> tuple[Float[Tensor, "point 3"], Bool[Tensor, " point"]]:
         """Where in the grid's cube points are, and which are in it."""
-        return self._in_cube(self.space.warp(points))
-
-    def _in_cube(
-        self, coordinates: Float[Tensor, "point 3"]
-    ) -> tuple[Float[Tensor, "point 3"], Bool[Tensor, " point"]]:
+        coordinates = self.space.warp(points)
         low, high = self.box
         places = (coordinates - low) / (high - low)
         return places, ((places > 0) & (places < 1)).all(-1)  # what lies before the plane of a forward capture is on it
-
-    def _density_in(self, coordinates: Float[Tensor, "point 3"]) -> Float[Tensor, " point"]:
-        """Density per unit of the coordinates."""
-        places, inside = self._in_cube(coordinates)
-        return self.network.density(places) * inside
 
     def _density(
         self, points: Float[Tensor, "point 3"], places: Float[Tensor, "point 3"], inside: Bool[Tensor, " point"]
@@ -416,15 +437,7 @@ class TensoRF(RayMethod):
         while self.occupancy.resolution < wanted:
             self.occupancy.refine()
             finer = True
-        if self.frame.reach > 1 and progress < UNSETTLED:
-            return
         if finer or step % (4 if step < 32 else c.occupancy_interval) == 0:
             share, budget = (1.0, None) if finer or step < 32 else (PROBES, LOOKS)
-            self.occupancy.update(
-                asked_by_cells(self.space, self.density, self._density_in),
-                empty_below(self.frame, c.occupancy_threshold, self.occupancy.resolution),
-                self.random(~step),
-                c.occupancy_decay,
-                share,
-                budget,
-            )
+            generator = self.random(~step)
+            self.occupancy.update(self.density, c.occupancy_threshold, generator, c.occupancy_decay, share, budget)

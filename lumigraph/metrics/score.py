@@ -9,7 +9,12 @@ from typing import Annotated, Any, Literal
 from ..ranges import between
 
 # As files have them that were written before scores had names: key, name, unit, better, digits.
-KEYS = (("psnr", "PSNR", "dB", "higher", 2), ("ssim", "SSIM", "", "higher", 4), ("lpips", "LPIPS", "", "lower", 4))
+KEYS = (
+    ("psnr", "PSNR", "dB", "higher", 2),
+    ("ssim", "SSIM", "", "higher", 4),
+    ("lpips", "LPIPS", "", "lower", 4),
+    ("clean_psnr", "clean PSNR", "dB", "higher", 2),
+)
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,8 @@ from torch import Tensor
 
 LEARNT_FROM = 1 << 17  # rows at most; each then counts as much as its weight says
 PASSES = 8  # over them; the error falls by less than 1 % in any further one
-CHUNK = 1 << 13  # rows whose distances to the whole codebook are held at once
+CHUNK = 1 << 13  # rows whose distances to the whole codebook are held at once, fewer if it is long
+HELD = 1 << 26  # distances that are held at once
 
 
 @torch.no_grad()
@@ -46,10 +47,11 @@ def nearest(
     """The code of each row, and its squared distance."""
     half = 0.5 * book.square().sum(-1)
     codes, errors = torch.empty(len(rows), dtype=torch.int64), torch.empty(len(rows))
-    for i in range(0, len(rows), CHUNK):
-        some = rows[i : i + CHUNK]
-        least, codes[i : i + CHUNK] = torch.addmm(half, some, book.t(), alpha=-1).min(-1)
-        errors[i : i + CHUNK] = (2 * least + some.square().sum(-1)).clamp_min(0)
+    chunk = min(CHUNK, max(1, HELD // max(1, len(book))))
+    for i in range(0, len(rows), chunk):
+        some = rows[i : i + chunk]
+        least, codes[i : i + chunk] = torch.addmm(half, some, book.t(), alpha=-1).min(-1)
+        errors[i : i + chunk] = (2 * least + some.square().sum(-1)).clamp_min(0)
     return codes, errors
 
 

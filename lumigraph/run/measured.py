@@ -37,6 +37,7 @@ class Protocol:
     resolution: str | list[str] = ""
     background: list[float] | None = None
     masked: bool = False
+    halves: str | None = None
 
     def __post_init__(self) -> None:
         if self.views is None and self.shapes is None:
@@ -51,6 +52,7 @@ class View:
     psnr: float
     ssim: float | None = None
     lpips: float | None = None
+    clean_psnr: float | None = None
 
 
 @dataclass(frozen=True)
@@ -61,6 +63,7 @@ class Size:
     psnr: float | None = None
     ssim: float | None = None
     lpips: float | None = None
+    clean_psnr: float | None = None
 
 
 @dataclass(frozen=True)
@@ -75,6 +78,7 @@ class Evaluation:
     psnr: float | None = None
     ssim: float | None = None
     lpips: float | None = None
+    clean_psnr: float | None = None
     seconds_per_view: Lasted | None = None
     training_seconds: Lasted | None = None
     evaluated_on: str = "unknown"

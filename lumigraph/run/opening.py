@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from ..errors import LumigraphError
-from ..exchange import is_splat_file
+from ..exchange import is_splat_file, place_of
 from ..files import is_file
 from .composition import Composition
 from .folder import Run
@@ -14,14 +14,14 @@ from .splat_file import SplatFile
 
 
 def open_any(path: Path | str, within: tuple[Path, ...] = ()) -> Opened:
-    """What lies at a path: a run's folder, a splat file (.ply, .compressed.ply, .spz, .splat) or a composition (.json).
+    """What lies at a path: a run's folder, a splat file (`exchange.SUFFIXES`, a folder of SOG), a composition (.json).
 
     within: compositions that it is opened as a part of
     Raises LumigraphError, in one sentence, for anything else.
     """
     path = Path(path)
     if is_splat_file(path):
-        return SplatFile(path)
+        return SplatFile(place_of(path))
     if path.suffix.lower() == ".json" and not path.is_dir():
         return Composition(path, open_any, within)
     if is_file(path):

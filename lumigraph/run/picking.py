@@ -15,7 +15,7 @@ from torch import Tensor
 from .. import files
 from ..capabilities import CanPrune, HasGaussians, needs
 from ..errors import LumigraphError
-from ..exchange import SUFFIXES, is_splat_file, write_gaussians
+from ..exchange import SUFFIXES, claim_splats, names_splats, write_gaussians
 from ..export.splats import export_splats
 from .checkpoint import Checkpoints
 from .folder import Run, check_new
@@ -26,7 +26,7 @@ from .splat_file import SplatFile
 def check_output(opened: Opened, output: Path, overwrite: bool | None = None, reads: Iterable[Path] = ()) -> None:
     """Raises LumigraphError unless what is picked may go there: to a file, see `files.claim`, or of a run to a new
     folder."""
-    if not is_splat_file(output):
+    if not names_splats(output):
         if not isinstance(opened, Run):
             raise LumigraphError(
                 f"{opened.path} is no run, so it cannot become another one; give --output a file that ends in "
@@ -34,7 +34,7 @@ def check_output(opened: Opened, output: Path, overwrite: bool | None = None, re
             )
         check_new(output)
     else:
-        files.claim(output, "splats", overwrite, reads)
+        claim_splats(output, overwrite, reads)
 
 
 def save_picked(opened: Opened, keep: Bool[Tensor, " gaussian"], output: Path, why: dict[str, Any]) -> None:
@@ -47,7 +47,7 @@ def save_picked(opened: Opened, keep: Bool[Tensor, " gaussian"], output: Path, w
     check_output(opened, output)
     if isinstance(opened, SplatFile):
         write_gaussians(output, opened.gaussians[keep])
-    elif is_splat_file(output):
+    elif names_splats(output):
         export_splats(needs(opened.method(), HasGaussians).gaussians()[keep], opened.frame, output)
     else:
         assert isinstance(opened, Run)

@@ -93,11 +93,12 @@ class Settings:
         return replace(self, budget=budget)
 
     def method_config(self, kind: type[Method], file: Path) -> Any:
-        """The numbers as the Config of a kind of method; those with a former name arrive under today's.
+        """The numbers as the Config of a kind of method; those with a former name arrive under today's, and those that
+        the run is older than are as they were `before`.
 
         file: to name where a number is unknown, of another type, or beyond its range
         """
-        return typed(kind.Config, renamed(self.config, kind.formerly), file, closed=True)
+        return typed(kind.Config, kind.before | renamed(self.config, kind.formerly), file, closed=True)
 
     def agrees(self, frame: Frame) -> bool:
         """Whether a frame is the run's, up to rounding. Older runs know fewer numbers of a frame than newer ones."""

@@ -54,7 +54,8 @@ def add(gui: Any, control: Control, value: Value) -> Any:
     """A slider or a list, set to a value."""
     label = f"{control.name.replace('_', ' ').capitalize()}{f' ({control.unit})' if control.unit else ''}"
     if control.range is None:
-        return gui.add_dropdown(label, control.choices, initial_value=value, hint=control.about or None)
+        choices = tuple(dict.fromkeys((*control.choices, str(value))))  # a blend of two is told, and none of them
+        return gui.add_dropdown(label, choices, initial_value=value, hint=control.about or None)
     least, most = control.range
     step = max((most - least) / STEPS, 1e-9)
     return gui.add_slider(label, least, most, step, float(value), hint=control.about or None)

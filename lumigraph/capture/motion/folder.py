@@ -21,6 +21,7 @@ from ..masks import MASKS as MASKS
 from ..photos import Photo
 from ..photos.track import Track
 from ..pictures import list_images, read_grey
+from ..raw import REMEMBERED
 from ..transforms import OPENCV_FROM_OPENGL, Made
 
 WORK = "work"
@@ -28,7 +29,7 @@ RESULT = "capture.json"
 OWNER = "sources.json"  # inside WORK: what the folder was made of
 POINTS = "points.ply"
 DRAWN = "capture.png", "photographs.png"
-WRITTEN = (RESULT, "transforms.json", POINTS, *DRAWN)
+WRITTEN = (RESULT, "transforms.json", POINTS, REMEMBERED, *DRAWN)
 
 # COLMAP's parameters by the names that transforms.json has for them.
 NAMES = {

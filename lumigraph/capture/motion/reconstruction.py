@@ -22,6 +22,7 @@ from ...ranges import typed
 from ..library import pycolmap
 from ..photos import Intake, Photo, gather
 from ..photos.track import Track, untracked
+from ..raw import REMEMBERED, Remembered
 from ..transforms import Made
 from .diagnosis import FEW_FEATURES, Diagnosis, Matches, counted, diagnose, folds, read_matches
 from .drawings import draw_capture, draw_photographs
@@ -108,13 +109,15 @@ def with_safe_names(intake: Intake) -> Intake:
         photos=[replace(photo, name=new[photo.name]) for photo in intake.photos],
         blurred={new[name]: why for name, why in intake.blurred.items()},
         duplicates={new[name]: new[other] for name, other in intake.duplicates.items()},
+        raw={new[name]: raw for name, raw in intake.raw.items()},
     )
 
 
 def intake_identity(intake: Intake) -> list[Any]:
     """All of the intake that the result depends on, as JSON."""
     photos = [[p.name, *stamp(p.path), p.device, p.focal, p.gps, round(p.brightness, 3)] for p in intake.photos]
-    return [photos, intake.in_order, intake.blurred, intake.duplicates, intake.unreadable]
+    raw = [Remembered(intake.raw).to_json()] if intake.raw else []
+    return [photos, intake.in_order, intake.blurred, intake.duplicates, intake.unreadable, *raw]
 
 
 def finished(folder: Path, key: str) -> dict[str, Any] | None:
@@ -305,6 +308,8 @@ class Reconstruction:
         diagnosis = replace(diagnosis, warnings=[*diagnosis.warnings, *told])
         known = place is not None and place.new_from_old is not None
         write_model(self.folder, model, self.photos, z_up=known)
+        if self.intake.raw:
+            write_json(self.folder / REMEMBERED, Remembered(self.intake.raw).to_json(), "capture")
         capture_sheet, photograph_sheet = (self.folder / name for name in DRAWN)
         draw_capture(capture_sheet, model, diagnosis, known)
         draw_photographs(photograph_sheet, self.intake, diagnosis)

@@ -17,7 +17,9 @@ from ...files import explained
 from ...names import natural
 from ..masks import MASKS, OBJECT_MASKS, find_mask
 from ..pictures import describe, reductions
+from ..raw import Developed, is_raw
 from . import upright
+from .developed import develop
 from .exif import read_facts
 from .judge import Judgement, blurred, duplicates, judge
 from .photo import Intake, Photo
@@ -49,13 +51,34 @@ def gather(sources: Sequence[Path], work: Path, frames: int | None = None, track
         return of_video(films[0], source, work, frames, track)
     upright.learn_formats()
     files = named_files(list_photographs(sources, work))
+    raw: dict[str, Developed] = {}
+    unreadable: dict[str, str] = {}
+    if all_raw(files, source):
+        pictures = work / "developed"
+        made = develop(files, pictures, track)
+        unreadable = {name: why for name, why in made.items() if isinstance(why, str)}
+        raw = {f"{name}.jpg": one for name, one in made.items() if isinstance(one, Developed)}
+        files = {name: pictures / name for name in raw}
     taken = examine(files, work / "upright", track)
-    unreadable = {name: why for name, why in taken.items() if isinstance(why, str)}
+    unreadable |= {name: why for name, why in taken.items() if isinstance(why, str)}
     readable = {name: one for name, one in taken.items() if isinstance(one, Candidate)}
     seen = [readable[name] for name in sorted(readable, key=natural)]
     if not seen:
         raise LumigraphError(nothing(source, unreadable))
-    return assess(Intake(source, with_altitudes([one.photo for one in seen]), unreadable=unreadable), seen)
+    photos = with_altitudes([one.photo for one in seen])
+    return assess(Intake(source, photos, unreadable=unreadable, raw=raw), seen)
+
+
+def all_raw(files: Mapping[str, Path], source: str) -> bool:
+    """Whether photographs are raw files. Raises LumigraphError where some are and others are not."""
+    raw = [name for name, path in files.items() if is_raw(path)]
+    if raw and len(raw) < len(files):
+        other = next(name for name in files if name not in raw)
+        raise LumigraphError(
+            f"{source} has {len(raw)} raw files and {len(files) - len(raw)} other photographs, such as {raw[0]} and "
+            f"{other}, whose light is not comparable; name the files of one kind alone"
+        )
+    return bool(raw)
 
 
 def of_video(path: Path, source: str, work: Path, frames: int | None, track: Track) -> Intake:
@@ -137,7 +160,7 @@ def walk(folder: Path, work: Path | None = None) -> Iterator[Path]:
         if entry.is_dir():
             if not entry.is_symlink() and not any((entry / name).exists() for name in MADE):
                 yield from walk(entry, work)
-        elif entry.suffix.lower() in PHOTOGRAPHS:
+        elif entry.suffix.lower() in PHOTOGRAPHS or is_raw(entry):
             yield entry
 
 

@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from ..raw import Developed
+
 
 @dataclass(frozen=True)
 class Photo:
@@ -44,6 +46,7 @@ class Intake:
     duplicates: names of photos that show what another one shows, pixel for pixel or nearly; value: that other one's
                 name. They are in `photos` all the same
     unreadable: names of files that are no pictures, with why in a few words
+    raw:        the raw files that photos were developed from, by the photos' names
     """
 
     source: str
@@ -52,3 +55,4 @@ class Intake:
     blurred: dict[str, str] = field(default_factory=dict)
     duplicates: dict[str, str] = field(default_factory=dict)
     unreadable: dict[str, str] = field(default_factory=dict)
+    raw: dict[str, Developed] = field(default_factory=dict)

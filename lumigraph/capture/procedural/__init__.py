@@ -16,7 +16,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from functools import partial
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 
@@ -24,10 +24,11 @@ from ...camera import Camera
 from ...errors import LumigraphError
 from ...ranges import Seed, between, typed
 from ..capture import Capture, Plane, Shot
+from ..raw import RawPhoto, facts, planes
 from . import scenes as scenes
 from .blender_folder import write_blender as write_blender
 from .jitter import jittered as jittered
-from .rendering import eight_bits, photograph
+from .rendering import eight_bits, photograph, radiance
 from .rendering import render as render
 from .rendering import signed_distance as signed_distance
 from .rendering import trace as trace
@@ -95,7 +96,7 @@ def capture(stage: Stage, source: str, found: dict[str, Camera] | None = None) -
             split=split,
             planes=known_planes(stage, cameras[i]),
             time=None if cameras.time is None else float(cameras.time[i]),
-            about={} if found is None else {TRUE_POSE: cameras.pose[i].double().numpy()},
+            about=known_facts(stage, cameras[i], jittered=found is not None),
         )
         for split, cameras in stage.cameras.items()
         for i in range(len(cameras))
@@ -115,12 +116,32 @@ def known_planes(stage: Stage, camera: Camera) -> dict[str, Plane]:
     lasting = (
         {} if stage.lasting is None else {"clean": Plane(clean, "sRGB", 1 / 255, dtype=np.dtype(np.uint8), channels=3)}
     )
+    if stage.sensor is not None:
+        light = partial(radiance, stage.world_of(camera), camera)
+        truth = Plane(light, "linear", dtype=np.dtype(np.float32), channels=3)
+        lasting |= planes(taken_raw(stage, camera)) | {"radiance": truth}
     return lasting | {
         "depth": plane("depth", "distance", np.float32),
         "normals": plane("normals", "direction", np.float32, 3),
         "labels": plane("labels", "index", np.int64, names=stage.world.names),
         "albedo": plane("albedo", "linear", np.float32, 3),
     }
+
+
+def known_facts(stage: Stage, camera: Camera, jittered: bool) -> dict[str, Any]:
+    """What one photograph says of itself. jittered: whether its pose is not the true one, which is told then"""
+    known = {TRUE_POSE: camera.pose[0].double().numpy()} if jittered else {}
+    if stage.sensor is None or camera.image_index is None:
+        return known
+    return known | facts(taken_raw(stage, camera), stage.sensor.brightness(int(camera.image_index)))
+
+
+def taken_raw(stage: Stage, camera: Camera) -> RawPhoto:
+    """The photograph as the stage's sensor takes it; nothing is traced before its pixels are read."""
+    assert stage.sensor is not None and camera.image_index is not None
+    width, height = camera.size[0].tolist()
+    light = partial(radiance, stage.world_of(camera), camera)
+    return stage.sensor.photograph(light, (width, height), int(camera.image_index))
 
 
 def without_passers_by(stage: Stage, camera: Camera) -> np.ndarray:
@@ -140,4 +161,6 @@ def known(stage: Stage, camera: Camera, name: str) -> np.ndarray:
 
 def picture(stage: Stage, camera: Camera) -> np.ndarray:
     """Bytes (height, width, 3), or (height, width, 4) with straight alpha where the background is transparent."""
+    if stage.sensor is not None and camera.image_index is not None:
+        return taken_raw(stage, camera).developed(stage.sensor.brightness(int(camera.image_index)))
     return eight_bits(*photograph(stage.world_of(camera), camera), alpha=not stage.world.sky.visible)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from functools import cache
 from typing import NamedTuple
 
@@ -19,6 +20,7 @@ from . import tracer
 from .world import World
 
 RAYS_PER_TASK = 4096
+HEADROOM = 64.0  # how much brighter than white light may be and still be below the film's shoulder
 CONTRAST = 0.08  # samples of a pixel that differ by more than this are not enough (0 is black, 1 white, as it looks)
 
 
@@ -68,6 +70,14 @@ def photograph(world: World, camera: Camera, samples: int = 4, more: int = 8) ->
     rgb = srgb_from_linear(pixels[:, :3] / np.maximum(pixels[:, 3:4], 1)).astype(np.float32)
     opacity = (pixels[:, 3:4] / count).astype(np.float32)
     return rgb.reshape(height, width, 3), opacity.reshape(height, width)
+
+
+def radiance(world: World, camera: Camera, samples: int = 12) -> np.ndarray:
+    """The light of every pixel, linear sRGB (height, width, 3), without a film that bends what is bright."""
+    width, height = camera.size[0].tolist()
+    dim = replace(world, sky=replace(world.sky, exposure=world.sky.exposure / HEADROOM))
+    pixels = _gather(dim, camera, camera.pixels(), samples, aims=1)
+    return (HEADROOM / samples * pixels[:, :3]).astype(np.float32).reshape(height, width, 3)
 
 
 def eight_bits(rgb: np.ndarray, opacity: np.ndarray, alpha: bool) -> np.ndarray:

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from ...camera import Camera
+from .sensor import Sensor
 from .world import Vector, World
 
 
@@ -22,6 +23,7 @@ class Stage:
     differing: the world when a photograph was taken, by its `image_index`, where light or people differ from one to the
              next; None where they do not
     lasting: the same without whatever only passed by
+    sensor:  what takes its photographs raw, which the cameras' `image_index` counts; None where they are pictures alone
     """
 
     world: World
@@ -32,6 +34,7 @@ class Stage:
     moving: Callable[[float], World] | None = None
     differing: Callable[[int], World] | None = None
     lasting: Callable[[int], World] | None = None
+    sensor: Sensor | None = None
 
     def world_of(self, camera: Camera) -> World:
         """The world at the moment when a camera (a batch of one) takes its photograph."""

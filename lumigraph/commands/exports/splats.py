@@ -9,7 +9,6 @@ from typing import Annotated
 from tyro.conf import OmitArgPrefixes, Positional
 
 from ...errors import LumigraphError
-from ...files import claim
 from ..common import Overwrite, needed, show
 from ..controls import Set, tell
 from ..keeping import Keeping
@@ -19,8 +18,9 @@ from ..keeping import Keeping
 class ExportSplats:
     """A trained cloud of Gaussians for splat viewers, or one splat format turned into another.
 
-    The ending says which format: .ply (all there is), .compressed.ply, .spz, .splat (no view-dependent colour). What a
-    run exports lies in the frame of the photographs it was trained on.
+    The ending says which format: .ply (all there is), .glb (glTF), .sog, .spz, .compressed.ply, .splat (no
+    view-dependent colour); NEW/meta.json is a folder of SOG. What a run exports lies in the frame of the photographs it
+    was trained on.
     """
 
     source: Annotated[Positional[Path], needed("RUN_OR_FILE")]
@@ -33,13 +33,13 @@ class ExportSplats:
 
     def run(self) -> int:
         from ...capabilities import HasGaussians, needs
-        from ...exchange import check_ending, is_splat_file, read_gaussians, write_gaussians
+        from ...exchange import check_ending, claim_splats, is_splat_file, read_gaussians, size_of, write_gaussians
         from ...export.splats import export_splats
         from ...run import open_any
         from ...run.splat_file import frame_of
 
         check_ending(self.output)
-        claim(self.output, "splats", self.overwrite, [self.source])
+        claim_splats(self.output, self.overwrite, [self.source])
         if is_splat_file(self.source):
             if self.told:
                 raise LumigraphError(f"{self.source} is a file of Gaussians, which has no controls; leave out --set")
@@ -55,7 +55,7 @@ class ExportSplats:
             gaussians = needs(method, HasGaussians).gaussians()
             gaussians = self.part.of_gaussians(gaussians, self.part.crop(method.frame))
             written = export_splats(gaussians, method.frame, self.output)
-        size = self.output.stat().st_size
+        size = size_of(self.output)
         show(
             {
                 "file": str(self.output),

@@ -40,10 +40,16 @@ class Points:
     positions: Float[Tensor, "point 3"]
     colours: Float[Tensor, "point 3"]
     sizes: Float[Tensor, " point"]
+    origins: Float[Tensor, "point 3"]
+
+
+def dense_points(scene: Scene, seconds: float = math.inf) -> Points:
+    """Points on what at least two or three of the training photographs see, a pixel or so apart; see `seen_points`."""
+    return thinned(seen_points(scene, seconds))
 
 
 @torch.no_grad()
-def dense_points(scene: Scene, seconds: float = math.inf) -> Points:
+def seen_points(scene: Scene, seconds: float = math.inf) -> Points:
     """Points on what at least two or three of the training photographs see, a pixel or so apart; maybe none.
 
     seconds: that sweeping may take, about; fewer photographs are asked where all would take longer
@@ -57,7 +63,7 @@ def dense_points(scene: Scene, seconds: float = math.inf) -> Points:
         seconds = seconds / 2
         known = swept(small, [everywhere(view, scene) for view in small], "Looking for depth", seconds).positions
     ranges = [around(view, known) or everywhere(view, scene) for view in views]
-    return thinned(swept(views, ranges, "Sweeping for points", seconds))
+    return swept(views, ranges, "Sweeping for points", seconds)
 
 
 def compile_sweep() -> None:
@@ -91,6 +97,7 @@ def swept(views: Sequence[FlatView], ranges: Sequence[tuple[float, float]], what
     for i in track(range(len(views)), what, len(views)):
         depths.append(sweep(views[i], [views[j] for j in neighbours[i]], ranges[i]))
     positions, colours, sizes = [torch.zeros(0, 3)], [torch.zeros(0, 3)], [torch.zeros(0)]
+    origins = [torch.zeros(0, 3)]
     for i, view in enumerate(views):
         found = depths[i] > 0
         places = view.pose[:, 3] + view.rays[found] * depths[i][found][:, None]
@@ -102,7 +109,8 @@ def swept(views: Sequence[FlatView], ranges: Sequence[tuple[float, float]], what
         positions.append(places[kept])
         colours.append(view.rgb[found][kept])
         sizes.append(depths[i][found][kept] / view.intrinsics[0, 0])
-    return Points(torch.cat(positions), torch.cat(colours), torch.cat(sizes))
+        origins.append(view.pose[:, 3].expand(int(kept.sum()), 3))
+    return Points(*(torch.cat(parts) for parts in (positions, colours, sizes, origins)))
 
 
 def affordable(views: Sequence[FlatView], ranges: Sequence[tuple[float, float]], seconds: float) -> int:
@@ -192,4 +200,4 @@ def thinned(points: Points, spacing: float = 1.0) -> Points:
         total = values.new_zeros(len(count), *values.shape[1:]).index_add_(0, place, values)
         return total / count.view(-1, *[1] * (values.ndim - 1))
 
-    return Points(mean(points.positions), mean(points.colours), mean(points.sizes))
+    return Points(mean(points.positions), mean(points.colours), mean(points.sizes), mean(points.origins))

@@ -44,9 +44,19 @@ class CoordinateNetwork(nn.Module):
         self, position: Encoded, direction: Float[Tensor, "sample direction"]
     ) -> tuple[Float[Tensor, " sample"], Float[Tensor, "sample 3"]]:
         """Raw density and colour."""
+        density, feature = self.geometry(position)
+        return density, self.seen(feature, direction)
+
+    def geometry(self, position: Encoded) -> tuple[Float[Tensor, " sample"], Float[Tensor, "sample width"]]:
+        """Raw density, and what the colour layers take of each place."""
         h = self._trunk(position)
-        seen = torch.cat([self.feature(h), direction.to(h.dtype)], -1)
-        return self.density_layer(h).float()[:, 0], self.colour(seen).float()
+        return self.density_layer(h).float()[:, 0], self.feature(h)
+
+    def seen(
+        self, feature: Float[Tensor, "sample width"], direction: Float[Tensor, "sample direction"]
+    ) -> Float[Tensor, "sample 3"]:
+        """Raw colour of places whose features `geometry` gave."""
+        return self.colour(torch.cat([feature, direction.to(feature.dtype)], -1)).float()
 
     def density(self, position: Encoded) -> Float[Tensor, " sample"]:
         """Raw density alone, in two thirds of the time."""

@@ -11,14 +11,17 @@ import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from ... import loops
 from ...rays import Rays, Samples
 from ...scene import Forward, Frame, Vector
 
 INFINITY = 1000.0  # times the near plane's distance: rays in normalised device coordinates end at 0.998 instead of 1
+NOTHING = np.empty(0, np.float32)  # asked of a loop
 SIDEWAYS = 1e-3  # sine of the angle to the near plane, below which a ray is said not to reach it
 
 
@@ -196,6 +199,11 @@ class Contraction(Space):
         return torch.lerp(near[:, None], far[:, None], even_in_inverse(share, near[:, None], far[:, None]))
 
     def warp(self, points):
+        if looped(points):
+            coordinates = points.new_empty(points.shape)
+            rows = (x.view(-1, 3).numpy() for x in (points.detach().contiguous(), coordinates))
+            loops.contract(*rows, NOTHING)
+            return coordinates
         return points * self._across(points)[..., None]
 
     def jacobian(self, points):
@@ -205,6 +213,10 @@ class Contraction(Space):
         return across[:, None, None] * identity + (radial - across)[:, None, None] * out[:, :, None] * out[:, None]
 
     def stretch(self, points):
+        if looped(points):
+            coordinates, stretch = points.new_empty(points.shape), points.new_empty(len(points))
+            loops.contract(*(x.numpy() for x in (points.detach().contiguous(), coordinates, stretch)))
+            return stretch
         return (self._radial(points) * self._across(points).square()) ** (1 / 3)
 
     def _radius(self, points: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n"]:
@@ -218,6 +230,15 @@ class Contraction(Space):
     def _radial(self, points: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n"]:
         """Coordinates for a unit of the scene on the way out."""
         return 0.5 / self._radius(points).square()
+
+
+def looped(points: Tensor) -> bool:
+    """Whether a loop of `loops.py` may do: float32 on a CPU, where no gradient is asked for."""
+    return (
+        points.device.type == "cpu"
+        and points.dtype == torch.float32
+        and not (torch.is_grad_enabled() and points.requires_grad)
+    )
 
 
 def even_in_inverse(share: Tensor, first: Tensor, last: Tensor) -> Tensor:

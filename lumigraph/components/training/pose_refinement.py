@@ -112,7 +112,8 @@ def whitening(camera: Camera, frame: Frame) -> Float[Tensor, "6 6"]:
     jacobian = torch.cat([-turns[:, None].expand_as(shifts), shifts], -1).flatten(0, 2)
     sigma = jacobian.T @ jacobian / t.numel()
     values, vectors = torch.linalg.eigh(sigma + DAMPING * sigma.diagonal().diag() + LEAST * torch.eye(6).to(sigma))
-    return (vectors * values.rsqrt() @ vectors.T).float()
+    found = vectors * values.rsqrt() @ vectors.T
+    return found.round(decimals=6).float()  # to the same bits, however threads share out the sums
 
 
 def seen_places(camera: Camera, frame: Frame) -> tuple[Rays, Float[Tensor, "ray depth"]]:

@@ -1,0 +1,89 @@
+"""Raw photographs become pictures in which cameras can be found, all as bright as one another."""
+
+from __future__ import annotations
+
+import os
+import statistics
+from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+from PIL import Image
+
+from ...choice import evenly
+from ...errors import LumigraphError
+from ...files import read_json, replacing, write_json
+from ..raw import REMEMBERED, Developed, RawPhoto, Remembered, exif_of, open_raw
+from .track import Track
+from .upright import QUALITY, is_current
+
+PROBES = 8  # photographs that tell how bright all are to be
+AT_ONCE = 2  # photographs in memory, each some ten times as large there as its file
+
+
+def develop(files: Mapping[str, Path], folder: Path, track: Track) -> dict[str, Developed | str]:
+    """Pictures of raw files by the files' names: a JPEG NAME.jpg of each in a folder; or why there is none.
+
+    Where every file says its exposure, all pictures show one light equally bright, however long they were exposed, so
+    that a scene has one colour in all of them. Otherwise each is as bright as it has to be for itself.
+    What lies in the folder of an earlier call is used again if it still fits.
+    """
+    opened: dict[str, RawPhoto | str] = {name: open_or_why(path) for name, path in files.items()}
+    photos = {name: one for name, one in opened.items() if isinstance(one, RawPhoto)}
+    record = folder / REMEMBERED
+    before = read_json(record, Remembered).photographs if record.is_file() else {}
+    common = brightness_of_all(list(photos.values()))
+
+    def make(name: str) -> Developed | str:
+        photo, target, known = photos[name], folder / f"{name}.jpg", before.get(name)
+        try:
+            wanted = None if common is None or photo.exposure is None else common / photo.exposure
+            if known and is_current(target, photo.path) and known.brightness and wanted in (None, known.brightness):
+                return known
+            brightness = 1 / photo.highlight() if wanted is None else wanted
+            write(photo, brightness, target)
+        except LumigraphError as fault:
+            return str(fault)
+        return Developed(str(photo.path.resolve()), brightness)
+
+    with ThreadPoolExecutor(AT_ONCE) as pool:
+        try:
+            made = dict(
+                zip(photos, track(pool.map(make, photos), "Developing raw photographs", len(photos)), strict=True)
+            )
+        except BaseException:
+            pool.shutdown(wait=False, cancel_futures=True)
+            raise
+    write_json(record, Remembered({k: v for k, v in made.items() if isinstance(v, Developed)}).to_json(), ours=True)
+    return {name: made.get(name, opened[name]) for name in files}
+
+
+def open_or_why(path: Path) -> RawPhoto | str:
+    try:
+        return open_raw(path)
+    except LumigraphError as fault:
+        return str(fault)
+
+
+def brightness_of_all(photos: list[RawPhoto]) -> float | None:
+    """What each photograph's light is to be multiplied by, times its exposure; None where some do not say theirs."""
+    found = []
+    for photo in evenly(photos, PROBES):
+        if photo.exposure is None:
+            return None
+        try:
+            found.append(photo.exposure / photo.highlight())
+        except LumigraphError:  # it will be said of this one when it is developed
+            continue
+    known = all(photo.exposure is not None for photo in photos)
+    return statistics.median(found) if found and known else None
+
+
+def write(photo: RawPhoto, brightness: float, target: Path) -> None:
+    """A developed picture, with what the raw file says of how it was taken, and its date."""
+    picture = Image.fromarray(photo.developed(brightness))
+    exif = exif_of(photo.path)
+    with replacing(target, ours=True) as partial:
+        picture.save(partial, "JPEG", quality=QUALITY, subsampling=0, exif=exif)
+        stat = photo.path.stat()
+        os.utime(partial, ns=(stat.st_atime_ns, stat.st_mtime_ns))

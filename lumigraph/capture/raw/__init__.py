@@ -1,0 +1,17 @@
+"""Raw photographs: what each pixel of the sensor measured behind its colour's filter, in linear light.
+
+photo = open_raw(path)             a camera's own file, or one of a folder of mosaics
+photo.read()                       light (height, width): 0 at black, 1 at white, noise and all
+photo.developed(brightness)        an ordinary picture of it
+"""
+
+from .library import exif_of as exif_of
+from .opening import is_raw as is_raw
+from .opening import open_raw as open_raw
+from .photo import RawPhoto as RawPhoto
+from .remembered import REMEMBERED as REMEMBERED
+from .remembered import Developed as Developed
+from .remembered import Remembered as Remembered
+from .remembered import facts as facts
+from .remembered import planes as planes
+from .remembered import with_raw as with_raw

@@ -1,0 +1,135 @@
+"""Cameras' own raw files (DNG, NEF, CR2, ARW ...), which LibRaw reads, by way of rawpy."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterator
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import ExifTags, Image
+
+from ...errors import LumigraphError
+from ..numbers import check_pixels
+from .demosaic import Pattern
+from .photo import RawPhoto, srgb_from_camera
+
+SUFFIXES = (
+    ".dng", ".nef", ".nrw", ".cr2", ".cr3", ".crw", ".arw", ".srf", ".sr2", ".raf", ".orf", ".rw2", ".pef", ".srw",
+    ".3fr", ".fff", ".iiq", ".erf", ".kdc", ".dcr", ".mrw", ".x3f", ".rwl",
+)  # fmt: skip
+TURNS = {0: 0, 3: 2, 5: 1, 6: 3}  # LibRaw's flip, and quarter turns to the left
+TIFF = (b"II*\0", b"MM\0*")  # how the files of most cameras begin
+TOLD = (
+    "ExposureTime", "FNumber", "ISOSpeedRatings", "FocalLength", "FocalLengthIn35mmFilm", "DateTimeOriginal",
+    "OffsetTimeOriginal", "SubsecTimeOriginal",
+)  # fmt: skip
+
+
+def open_file(path: Path) -> RawPhoto:
+    """A camera's raw file, of which only what is said of the pixels is read.
+
+    Raises LumigraphError where rawpy is not installed, for a camera that LibRaw does not know, a file cut short, and
+    filters that are not Bayer's.
+    """
+    with opened(path) as raw:
+        width, height = raw.sizes.width, raw.sizes.height
+        try:
+            check_pixels((width, height))
+        except ValueError as fault:
+            raise LumigraphError(f"{path} cannot be read ({fault}); restore it") from fault
+        turns = TURNS.get(raw.sizes.flip, 0)
+        gains = np.array(raw.camera_whitebalance[:3], np.float64)
+        if not (gains > 0).all():  # the camera did not judge
+            gains = np.array(raw.daylight_whitebalance[:3], np.float64)
+        matrix = colours_of(raw)
+        about, pattern = raw.other, turned_pattern(bayer(raw, path), (width, height), turns)
+    light = about.shutter_speed * (about.iso_speed or 100) / 100 / (about.aperture or 1) ** 2
+    return RawPhoto(
+        path,
+        (height, width) if turns % 2 else (width, height),
+        pattern,
+        tuple((gains / gains[1]).tolist()) if (gains > 0).all() else (1.0, 1.0, 1.0),
+        matrix,
+        light if np.isfinite(light) and light > 0 else None,
+        partial(read_light, path, turns),
+    )
+
+
+def read_light(path: Path, turns: int) -> np.ndarray:
+    """The light of every pixel, 0 at black and 1 at white, upright; float32 (height, width)."""
+    with opened(path) as raw:
+        raw.unpack()
+        black = np.array(raw.black_level_per_channel, np.float32)[raw.raw_colors_visible]
+        light = (raw.raw_image_visible - black) / (np.float32(raw.white_level) - black)
+    return np.ascontiguousarray(np.rot90(light, turns), np.float32)
+
+
+def colours_of(raw: Any) -> np.ndarray:
+    """The way from white-balanced camera colours to linear sRGB: as the file says, else as LibRaw knows the camera."""
+    own = np.array(raw.color_matrix, np.float64)[:3, :3]
+    if np.allclose(own.sum(-1), 1, atol=0.01):
+        return own
+    known = np.array(raw.rgb_xyz_matrix[:3], np.float64)
+    return srgb_from_camera(known if np.isfinite(known).all() and abs(np.linalg.det(known)) > 1e-6 else None)
+
+
+def bayer(raw: Any, path: Path) -> Pattern:
+    """The filters over each square of four pixels. Raises LumigraphError for any others."""
+    pattern, colours = raw.raw_pattern, raw.color_desc.decode()
+    if pattern is None or pattern.shape != (2, 2) or not set(colours) <= set("RGB"):
+        raise LumigraphError(
+            f"{path} has not the filters of Bayer's mosaic, which alone are read here; develop it elsewhere, to JPEG"
+        )
+    (a, b), (c, d) = ["RGB".index(colours[k]) for k in pattern[0]], ["RGB".index(colours[k]) for k in pattern[1]]
+    return (a, b), (c, d)
+
+
+def turned_pattern(pattern: Pattern, size: tuple[int, int], turns: int) -> Pattern:
+    """The pattern of a picture of a size (width, height) after quarter turns to the left."""
+    few = np.tile(np.array(pattern), (2, 2))[: 2 + size[1] % 2, : 2 + size[0] % 2]  # it ends as the picture does
+    (a, b), (c, d) = np.rot90(few, turns)[:2, :2].tolist()
+    return (a, b), (c, d)
+
+
+@contextlib.contextmanager
+def opened(path: Path) -> Iterator[Any]:
+    """A file opened by LibRaw; whatever it raises within the block becomes one sentence."""
+    try:
+        import rawpy
+    except ImportError as fault:
+        raise LumigraphError(
+            f"{path} is a raw photograph, and rawpy, which reads those, is missing; pip install 'lumigraph[raw]'"
+        ) from fault
+    try:
+        with rawpy.RawPy() as raw:
+            raw.open_file(str(path))
+            yield raw
+    except rawpy.LibRawFileUnsupportedError as fault:
+        raise LumigraphError(
+            f"{path} is no raw file, or of a camera that LibRaw {'.'.join(map(str, rawpy.libraw_version))} does not "
+            f"know; convert it to DNG"
+        ) from fault
+    except rawpy.LibRawError as fault:
+        said = fault.args[0].decode() if fault.args and isinstance(fault.args[0], bytes) else str(fault)
+        raise LumigraphError(f"{path} is cut short or damaged ({said.lower()}); restore it") from fault
+
+
+def exif_of(path: Path) -> Image.Exif:
+    """What a raw file says of how it was taken, for the picture that is developed from it: empty where LibRaw's formats
+    are not TIFF within."""
+    told, found = Image.Exif(), Image.Exif()
+    with open(path, "rb") as file, contextlib.suppress(Exception):  # Pillow raises anything for odd tags
+        if file.read(4) in TIFF:
+            file.seek(0)
+            found.load_from_fp(file)
+            for tag in (ExifTags.Base.Make, ExifTags.Base.Model):
+                if tag in found:
+                    told[tag] = found[tag]
+            details = {**found, **found.get_ifd(ExifTags.IFD.Exif)}
+            tags = [ExifTags.Base[name] for name in TOLD]
+            told.get_ifd(ExifTags.IFD.Exif).update({tag: details[tag] for tag in tags if tag in details})
+            told.get_ifd(ExifTags.IFD.GPSInfo).update(found.get_ifd(ExifTags.IFD.GPSInfo))
+    return told

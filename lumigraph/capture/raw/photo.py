@@ -1,0 +1,77 @@
+"""RawPhoto: one raw photograph, its pixels not read yet, and how it becomes a picture."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from ...srgb import srgb_from_linear
+from .demosaic import GREEN, Pattern, demosaiced, repeated
+
+XYZ_FROM_SRGB = np.array(
+    [[0.412453, 0.357580, 0.180423], [0.212671, 0.715160, 0.072169], [0.019334, 0.119193, 0.950227]]
+)
+WHITE = 97  # percentile of the light that becomes white in a developed picture (Mildenhall 2022, supplement)
+
+
+@dataclass(frozen=True)
+class RawPhoto:
+    """A photograph as its sensor measured it, upright.
+
+    size:     (width, height) in pixels
+    pattern:  which colour's filter lies over each of four pixels: 0 red, 1 green, 2 blue
+    gains:    of red, green and blue, that make white white as the camera judged it
+    srgb_from_camera: from white-balanced colours of this camera to linear sRGB
+    exposure: light taken up to one factor, seconds · ISO / 100 / f-number²; None where the file does not say
+    read:     gives the light of every pixel, float32 (height, width): 0 at black level, 1 where the sensor is full.
+              Noise around black goes below 0 and stays, for its mean is 0 only so
+    """
+
+    path: Path
+    size: tuple[int, int]
+    pattern: Pattern
+    gains: tuple[float, float, float]
+    srgb_from_camera: Float[np.ndarray, "3 3"]
+    exposure: float | None
+    read: Callable[[], Float[np.ndarray, "height width"]]
+
+    @property
+    def filters(self) -> np.ndarray:
+        """Which filter lies over every pixel, int8 (height, width)."""
+        return repeated(self.pattern, self.size)
+
+    def linear(self) -> Float[np.ndarray, "height width 3"]:
+        """Linear sRGB of every pixel, 1 where the sensor is full; it may lie beyond [0, 1]."""
+        gains = np.array(self.gains, np.float32)
+        balanced = np.minimum(self.read(), 1) * gains[self.filters]
+        # Beyond what the least amplified colour can tell, highlights would turn that of the others: they are white.
+        rgb = np.minimum(demosaiced(balanced, self.pattern), gains.min())
+        return rgb @ self.srgb_from_camera.T.astype(np.float32)
+
+    def developed(self, brightness: float) -> UInt8[np.ndarray, "height width 3"]:
+        """An ordinary picture: black level, white balance, demosaicing, the camera's colours, sRGB's curve.
+
+        brightness: factor on the light before it is clipped and encoded
+        """
+        return (srgb_from_linear((self.linear() * brightness).clip(0, 1)) * 255 + 0.5).astype(np.uint8)
+
+    def highlight(self) -> float:
+        """The light that a developed picture shows as white: of green, which is nearest to what eyes call bright."""
+        green = self.read()[self.filters == GREEN] * self.gains[GREEN]
+        return max(float(np.percentile(green, WHITE)), 1e-6)
+
+
+def srgb_from_camera(camera_from_xyz: Float[np.ndarray, "3 3"] | None) -> Float[np.ndarray, "3 3"]:
+    """From white-balanced camera colours to linear sRGB, as DNG's specification and dcraw have it: rows of the way
+    there sum to 1, so that white stays white.
+
+    camera_from_xyz: the file's colour matrix; None leaves colours as they are
+    """
+    if camera_from_xyz is None:
+        return np.eye(3)
+    camera_from_srgb = np.asarray(camera_from_xyz, np.float64) @ XYZ_FROM_SRGB
+    return np.linalg.inv(camera_from_srgb / camera_from_srgb.sum(-1, keepdims=True))

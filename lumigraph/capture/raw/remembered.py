@@ -1,0 +1,120 @@
+"""Which raw file each photograph of a scene was developed from, and what it adds to the scene: layers and facts.
+
+raw.json in a scene's folder names the files, as `lumigraph capture` writes it. Without it, a folder `raw` beside the
+photographs may hold them, each called as its photograph is (RawNeRF's published captures have it so).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field, replace
+from functools import partial
+from pathlib import Path, PurePosixPath
+from typing import Annotated, Any
+
+import numpy as np
+
+from ...errors import LumigraphError
+from ...files import exists, read_json
+from ...ranges import Name, between
+from ..capture import Capture, Plane, Shot
+from ..masks import inner_names
+from ..pictures import same_shape, stat
+from .demosaic import repeated
+from .opening import is_raw, open_raw
+from .photo import RawPhoto
+
+REMEMBERED, FOLDER = "raw.json", "raw"
+FILTERS = ("red", "green", "blue")
+NOT_KNOWN = -1
+
+
+@dataclass(frozen=True)
+class Developed:
+    """The raw file of a picture, and the factor on its light with which it was developed; None where nobody knows."""
+
+    file: Name
+    brightness: Annotated[float, between(1e-9, 1e9)] | None = None
+
+
+@dataclass(frozen=True)
+class Remembered:
+    """raw.json: raw files by the names of their pictures."""
+
+    photographs: dict[Name, Developed] = field(default_factory=dict)
+
+    def to_json(self) -> dict[str, Any]:
+        return {"photographs": {k: {"file": v.file, "brightness": v.brightness} for k, v in self.photographs.items()}}
+
+
+def with_raw(capture: Capture, folder: Path) -> Capture:
+    """The capture with the raw files of its photographs, if it has some.
+
+    Each gives two layers, `mosaic` and `filter`, and says `exposure`, `white_balance`, `srgb_from_camera` and
+    `brightness`. Raises LumigraphError where a file is gone or has another shape than its picture.
+    """
+    known = raw_files(capture, folder)
+    if not known:
+        return capture
+    shots = [with_its_raw(shot, known[shot.name]) if shot.name in known else shot for shot in capture.shots]
+    told = list(capture.told)
+    if lacking := [shot.name for shot in shots if shot.name in known and "exposure" not in shot.about]:
+        told.append(
+            f"{len(lacking)} of {len(known)} raw files do not say how long they were exposed, such as that of "
+            f"{lacking[0]}; a method of raw photographs learns their brightness instead"
+        )
+    return replace(capture, shots=shots, told=told)
+
+
+def raw_files(capture: Capture, folder: Path) -> dict[str, Developed]:
+    """The raw files of a capture's photographs, by the photographs' names."""
+    if exists(folder / REMEMBERED):
+        files = read_json(folder / REMEMBERED, Remembered).photographs
+    elif (folder / FOLDER).is_dir():
+        by_stem = {path.stem: path for path in sorted((folder / FOLDER).iterdir()) if is_raw(path)}
+        return {
+            s.name: Developed(str(by_stem[k])) for s in capture.shots if (k := PurePosixPath(s.name).stem) in by_stem
+        }
+    else:
+        return {}
+    found = {shot.name: [files[name] for name in inner_names(shot.name) if name in files] for shot in capture.shots}
+    return {name: one[0] for name, one in found.items() if one}
+
+
+def with_its_raw(shot: Shot, developed: Developed) -> Shot:
+    path = Path(developed.file)
+    if not exists(path):
+        raise LumigraphError(
+            f"{path}, from which {shot.name} was developed, does not exist; bring it back, or delete {REMEMBERED} "
+            f"to do without raw light"
+        )
+    photo = open_raw(path)
+    if shot.size is not None and not same_shape(photo.size, shot.size):
+        raise LumigraphError(
+            f"{path} has {photo.size[0]}x{photo.size[1]} pixels, and {shot.name} {shot.size[0]}x{shot.size[1]}, "
+            f"which is another shape; restore what was developed from it"
+        )
+    about = facts(photo, developed.brightness)
+    return replace(shot, planes=shot.planes | planes(photo, f"{path} {stat(path)}"), about=shot.about | about)
+
+
+def planes(photo: RawPhoto, identity: str | None = None) -> dict[str, Plane]:
+    """The layers of a raw photograph: what each pixel measured, and behind which filter."""
+    filters = partial(repeated, photo.pattern, photo.size)
+    return {
+        "mosaic": Plane(photo.read, "mosaic", dtype=np.dtype(np.float32), identity=identity),
+        "filter": Plane(
+            filters, "filter", unknown=(NOT_KNOWN,), names=FILTERS, dtype=np.dtype(np.int8), identity=f"{photo.pattern}"
+        ),
+    }
+
+
+def facts(photo: RawPhoto, brightness: float | None) -> dict[str, Any]:
+    """What a raw photograph says of itself, for `Scene.about`."""
+    said = {
+        "exposure": photo.exposure,
+        "white_balance": np.array(photo.gains),
+        "srgb_from_camera": photo.srgb_from_camera,
+        "brightness": brightness,
+    }
+    return {k: v for k, v in said.items() if v is not None and not (isinstance(v, float) and math.isnan(v))}

@@ -1,0 +1,88 @@
+"""A code per photograph: what differs from one to the next, light and colours first, learnt beside the scene.
+
+Generative latent optimisation (Bojanowski 2018), as Martin-Brualla 2021, section 4.1, has it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor, nn
+
+from ...controls import Control, blend
+from ...scene import Batch, Photograph
+from ..training.corrections import AVERAGE
+
+
+class PhotographCodes(nn.Module):
+    """Numbers of each photograph, zero at first; photographs that were not trained on keep zeros.
+
+    image_count: photographs of the scene, held-out ones included
+    width:       numbers to a photograph
+    """
+
+    def __init__(self, image_count: int, width: int):
+        super().__init__()
+        self.codes = nn.Parameter(torch.zeros(image_count, width))
+
+    def forward(self, image_index: Int[Tensor, " ray"]) -> Float[Tensor, "ray width"]:
+        return self.codes.index_select(0, image_index)
+
+    @property
+    def learnt(self) -> Bool[Tensor, " image"]:
+        """The photographs whose codes were learnt."""
+        return (self.codes != 0).any(-1)
+
+    @property
+    def average(self) -> Float[Tensor, " width"]:
+        """The mean of the codes that were learnt; zeros where none was."""
+        learnt = self.learnt
+        return self.codes[learnt].sum(0) / max(int(learnt.sum()), 1)
+
+    def told(self, value: str) -> Float[Tensor, " width"]:
+        """The code that a value of `control` stands for: a photograph's, the average, or one between two. A photograph
+        that nobody learnt from has the average."""
+        first, second, share = blend(value)
+        return torch.lerp(self._of(first), self._of(second), share)
+
+    def control(self, name: str, about: str) -> Control:
+        """The control that chooses among the codes, the average by default."""
+        photographs = tuple(str(i) for i in range(len(self.codes)))
+        return Control(name, AVERAGE, choices=(AVERAGE, *photographs), about=about, of_photographs=True, blends=True)
+
+    def _of(self, choice: str) -> Float[Tensor, " width"]:
+        known = choice != AVERAGE and bool(self.codes[int(choice)].any())
+        return self.codes[int(choice)] if known else self.average
+
+
+def fitted(
+    start: Float[Tensor, " width"],
+    error: Callable[[Float[Tensor, " width"]], Tensor],
+    steps: int,
+    learning_rate: float,
+) -> Float[Tensor, " width"]:
+    """The code that makes an error small, by so many steps of Adam from a start, with all else as it is.
+
+    error: a number that is differentiable in the code
+    """
+    with torch.enable_grad():
+        code = start.detach().clone().requires_grad_()
+        adam = torch.optim.Adam([code], learning_rate)
+        for step in range(steps):
+            (code.grad,) = torch.autograd.grad(error(code), [code])
+            adam.param_groups[0]["lr"] = learning_rate * (1 - step / steps)
+            adam.step()
+    return code.detach()
+
+
+def drawn(photograph: Photograph, count: int, generator: torch.Generator) -> Batch:
+    """Random pixels of a photograph that are to be trusted, no two the same; all of them where there are fewer. None
+    where there is none."""
+    trusted = torch.ones(len(photograph), dtype=torch.bool) if photograph.mask is None else photograph.mask.flatten()
+    there = trusted.nonzero()[:, 0]
+    chosen = there[torch.randperm(len(there), generator=generator)[:count]]
+    rays = photograph.camera.rays(photograph.camera.pixels()[chosen])
+    alpha = None if photograph.alpha is None else photograph.alpha.flatten()[chosen]
+    return Batch(rays, photograph.rgb.flatten(0, 1)[chosen], alpha)

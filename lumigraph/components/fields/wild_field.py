@@ -1,0 +1,142 @@
+"""A field that photographs see each in a light of their own, and with passers-by: its nouns, and what rays see of it.
+
+Martin-Brualla et al. 2021 (NeRF in the Wild), sections 4.1 and 4.2.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor, nn
+from torch.nn.functional import embedding
+
+from ... import kernels
+from ...rays import Rays, Rendering, Samples
+from ...scene import Scene
+from ...volume import composite
+
+LEAST = 1e-10  # opacity of a sample that is divided by at least
+
+
+@dataclass(frozen=True)
+class Places:
+    """Where rays were looked at in one pass, and what is there for every photograph alike.
+
+    density:  of what stays, per scene unit
+    seen:     what the colour head takes of each sample beside an appearance
+    unseen:   what the transient head takes of each sample beside a transient code
+    stretch:  the field's own units of length in a scene unit
+    asked:    samples that the field was asked about to find these
+    """
+
+    name: str
+    samples: Samples
+    density: Float[Tensor, " sample"]
+    seen: tuple[Float[Tensor, "sample _"], Float[Tensor, "sample _"]]
+    unseen: Float[Tensor, "sample feature"]
+    stretch: Float[Tensor, " sample"]
+    asked: int
+
+    def keep(self, mask: Bool[Tensor, " sample"]) -> Places:
+        """The samples that a mask picks."""
+        seen = self.seen[0][mask], self.seen[1][mask]
+        samples, unseen, stretch = self.samples.keep(mask), self.unseen[mask], self.stretch[mask]
+        return replace(self, samples=samples, density=self.density[mask], seen=seen, unseen=unseen, stretch=stretch)
+
+
+@dataclass(frozen=True)
+class Passing:
+    """What one photograph alone saw at places.
+
+    density: per scene unit
+    beta:    how little its colour is to be trusted, in units of colour
+    """
+
+    density: Float[Tensor, " sample"]
+    rgb: Float[Tensor, "sample 3"]
+    beta: Float[Tensor, " sample"]
+
+
+class WildField(nn.Module, ABC):
+    """What holds a scene: places along rays, their colour under an appearance, and what a photograph alone saw there.
+
+    rays_per_chunk: rendered at once
+    """
+
+    rays_per_chunk: int
+
+    @property
+    @abstractmethod
+    def batch_size(self) -> int:
+        """Rays of the next step."""
+
+    @abstractmethod
+    def passes(self, rays: Rays, generator: torch.Generator | None = None) -> list[Places]:
+        """Where to look along rays, the pass that is composited last. generator: of random places in training."""
+
+    @abstractmethod
+    def colour(self, places: Places, codes: Float[Tensor, "sample code"]) -> Float[Tensor, "sample 3"]:
+        """sRGB-encoded colour in the light of each sample's appearance."""
+
+    @abstractmethod
+    def passing(self, places: Places, codes: Float[Tensor, "sample code"]) -> Passing:
+        """What the photographs of some transient codes saw (eq. 10)."""
+
+    @abstractmethod
+    def density(self, points: Float[Tensor, "point 3"]) -> Float[Tensor, " point"]:
+        """Density of what stays, per scene unit."""
+
+    @abstractmethod
+    def field(
+        self, points: Float[Tensor, "point 3"], directions: Float[Tensor, "point 3"], code: Float[Tensor, " code"]
+    ) -> tuple[Float[Tensor, " point"], Float[Tensor, "point 3"]]:
+        """Density of what stays per scene unit, and its sRGB-encoded colour under one appearance."""
+
+    @abstractmethod
+    def optimizers(self, codes: list[nn.Parameter]) -> list[torch.optim.Optimizer]:
+        """Of the field, and of the photographs' codes with it."""
+
+    def begin(self, scene: Scene, seconds: float, generator: torch.Generator) -> None:
+        """Ahead of the first step; see `Method.begin`."""
+
+    def further_terms(self, generator: torch.Generator) -> dict[str, Tensor]:
+        """What the last `passes` cost beside colours, by name."""
+        return {}
+
+    def before_step(self, step: int, progress: float, generator: torch.Generator) -> None:
+        """Ahead of each step; see `Method.before_step`."""
+
+    def after_step(self, samples: float) -> None:
+        """Once a step is done. samples: that it asked about"""
+
+
+def with_passing(
+    places: Places, rgb: Float[Tensor, "sample 3"], passing: Passing, background: Float[Tensor, "#ray 3"]
+) -> Rendering:
+    """What rays see of both (eq. 9), and as the extra "beta" how uncertain its colours are (eq. 11), without beta_min.
+
+        C = sum_i T_i (alpha(sigma_i) c_i + alpha(sigma'_i) c'_i)      T_i = exp(-sum_{j<i} (sigma_j + sigma'_j) d_j)
+        beta = sum_i T'_i alpha(sigma'_i) beta_i                       T'_i = exp(-sum_{j<i} sigma'_j d_j)
+
+    A sample's weight T_i alpha(sigma_i + sigma'_i) is shared out so that each part has the alpha of its own density.
+    """
+    samples, length = places.samples, places.samples.length
+    whole = opaque((places.density + passing.density) * length).clamp_min(LEAST)
+    stays, passes = (opaque(density * length) / whole for density in (places.density, passing.density))
+    colours = stays[:, None] * rgb + passes[:, None] * passing.rgb
+    seen = composite(samples, places.density + passing.density, colours, background)
+    (beta, *_) = kernels.composite(passing.density * length, passing.beta[:, None], samples.ray_starts)
+    return seen.with_extra(beta=beta[:, 0])
+
+
+def opaque(thickness: Float[Tensor, " sample"]) -> Float[Tensor, " sample"]:
+    """alpha = 1 - exp(-sigma d): the share of light that optical thickness stops."""
+    return -torch.expm1(-thickness)
+
+
+def of_samples(codes: Float[Tensor, "ray code"], places: Places) -> Float[Tensor, "sample code"]:
+    """The code of each sample's ray. A lookup in an embedding, whose gradient is the quickest of a lookup's."""
+    return embedding(places.samples.ray_index, codes)

@@ -1,0 +1,124 @@
+"""Proposals: a coarse grid of density says where along a ray a field is worth asking (Barron 2022, section 3.1)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from ...rays import Rays, Samples
+from ...volume import weights_of
+from ..fields.activations import truncated_exp
+from ..fields.voxels import VoxelGrid
+from .sampling import inverse_transform
+from .spaces import NDC, Space
+
+FLAT = (1.5, 1.5, 0.5)  # a forward-facing capture has few depths and many pixels
+LITTLE = 1e-5  # weight that counts as none in the loss
+SLOPE = 10.0  # of annealing (Barron 2022, appendix)
+SHARP = 0.3  # share of the budget after which samples lie where the grid says
+DENSE, THIN = 3.0, -3.0  # log density per unit of the coordinates, where places on surfaces are known and elsewhere
+SPARE = 0.01  # share of samples that lie anywhere, however little was found there
+
+
+@dataclass(frozen=True)
+class Proposed:
+    """What a grid proposes for a batch of rays.
+
+    samples: intervals to ask a field about, as many on each ray
+    edges:   where they begin and end, as shares of the way from near to far
+    bins:    edges of the grid's own intervals, in the same unit
+    weights: that the grid finds in those
+    """
+
+    samples: Samples
+    edges: Float[Tensor, "ray edge"]
+    bins: Float[Tensor, "ray bin_edge"]
+    weights: Float[Tensor, "ray bin"]
+
+
+class Proposal(nn.Module):
+    """A voxel grid over a space's coordinates that learns to find at least the weights that a field finds.
+
+    Each ray is looked at everywhere, a lookup at a time, and then where something was found. So a ray costs the same in
+    fog and in clear air, and what no photograph has contradicted yet is never out of reach.
+    """
+
+    def __init__(self, space: Space, cells: int, bins: int, count: int):
+        super().__init__()
+        self.space, self.bins, self.count = space, bins, count
+        finer = FLAT if isinstance(space, NDC) else (1.0, 1.0, 1.0)
+        self.grid = VoxelGrid([[-1.0] * 3, [1.0] * 3], cells**3, 1, finer)
+        self.sharpness = 1.0
+
+    def anneal(self, progress: float) -> None:
+        """Begin with samples nearly everywhere, where nothing is known yet. progress: share of the budget spent"""
+        share = min(1.0, progress / SHARP)
+        self.sharpness = SLOPE * share / ((SLOPE - 1) * share + 1)
+
+    def sample(self, rays: Rays, jitter: Float[Tensor, "ray 2"] | None = None) -> Proposed:
+        """Intervals for a field, with gradients to the grid in the weights alone.
+
+        jitter: in [0, 1), moves each ray's intervals, the grid's and the field's, by that share of one
+        """
+        rays = replace(rays, origins=rays.origins.detach(), directions=rays.directions.detach())
+        near, far = self.space.interval(rays)
+        if jitter is None:
+            jitter = rays.origins.new_full((len(rays), 2), 0.5)
+        bins = edges_of(self.bins, jitter[:, 0])
+        looked = self._samples(bins, rays, near, far)
+        density = self._density(looked.along(rays)[0])
+        weights = weights_of(looked, density).view(len(rays), self.bins)
+        with torch.no_grad():
+            spread = weights**self.sharpness
+            spread = spread + SPARE / self.bins * spread.sum(-1, keepdim=True)
+            edges = inverse_transform(bins, spread, edges_of(self.count, jitter[:, 1]))
+            samples = self._samples(edges, rays, near, far)
+        return Proposed(samples, edges, bins, weights)
+
+    @torch.no_grad()
+    def begin(self, points: Float[Tensor, "point 3"]) -> None:
+        """Expect something where points are known, and little elsewhere."""
+        grid, (x, y, z) = self.grid, self.grid.shape
+        size = grid.size.to(points.device) - 1
+        index = ((self.space.warp(points) + 1) / 2 * size).clamp(min=0)
+        index = torch.minimum(index, size).round().long()
+        found = torch.zeros(x * y * z, device=points.device)
+        found[(index[:, 0] * y + index[:, 1]) * z + index[:, 2]] = 1
+        found = nn.functional.max_pool3d(found.view(1, x, y, z), 3, 1, 1)
+        grid.values.copy_(torch.where(found.view(-1, 1) > 0, DENSE, THIN))
+
+    def _density(self, points: Float[Tensor, "sample 3"]) -> Float[Tensor, " sample"]:
+        return truncated_exp(self.grid(self.space.warp(points))[:, 0]) * self.space.stretch(points)
+
+    def _samples(self, shares: Tensor, rays: Rays, near: Tensor, far: Tensor) -> Samples:
+        t = self._distance(shares, rays, near, far)
+        return Samples.rows(t[:, :-1], t[:, -1])
+
+    def _distance(self, shares: Tensor, rays: Rays, near: Tensor, far: Tensor) -> Tensor:
+        """Even in normalised device coordinates; elsewhere within a unit of the camera, and in disparity beyond."""
+        if isinstance(self.space, NDC):
+            return self.space.distance(shares, rays, near, far)
+        first, last = (torch.where(t < 1, t, 2 - 1 / t.clamp_min(1))[:, None] for t in (near, far))
+        s = torch.lerp(first, last, shares)
+        return torch.where(s < 1, s, 1 / (2 - s).clamp_min(1e-6))
+
+
+def edges_of(count: int, jitter: Float[Tensor, " ray"]) -> Float[Tensor, "ray edge"]:
+    """Edges of `count` intervals of [0, 1], all but the first and last moved by jitter - 1/2 of one."""
+    inner = torch.arange(1, count, device=jitter.device) + (jitter[:, None] - 0.5)
+    return nn.functional.pad(nn.functional.pad(inner / count, (1, 0)), (0, 1), value=1.0)
+
+
+def overlooked(proposed: Proposed, weights: Float[Tensor, " sample"]) -> Float[Tensor, ""]:
+    """By how much a field's weights exceed what the grid finds in all its intervals that they overlap, mean of all rays
+    (Barron 2022, eqs. 12 and 13). Gradients reach the grid alone.
+    """
+    w, edges = weights.detach().view(len(proposed.edges), -1), proposed.edges
+    below = nn.functional.pad(proposed.weights.cumsum(-1), (1, 0))
+    first = torch.searchsorted(proposed.bins, edges[:, :-1].contiguous(), right=True) - 1
+    last = torch.searchsorted(proposed.bins, edges[:, 1:].contiguous()).clamp(max=proposed.bins.shape[1] - 1)
+    bound = below.gather(-1, last) - below.gather(-1, first.clamp(0, proposed.bins.shape[1] - 1))
+    return ((w - bound).clamp_min(0).square() / (w + LITTLE)).sum(-1).mean()

@@ -1,0 +1,59 @@
+"""Against fog: what keeps rays from filling the air before a camera with what other photographs do not see."""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from ...kernels import distortion
+from ...rays import Samples
+
+
+def evened(t: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
+    """Distances t as t / (1 + t): what is near counts for more than what is far, and the horizon is at 1."""
+    return t / (1 + t)
+
+
+def spread(samples: Samples, weights: Float[Tensor, " sample"]) -> Float[Tensor, ""]:
+    """How far apart along its ray the weight of what a ray sees lies, mean of all rays (Barron 2022, eq. 15)."""
+    start, end = evened(samples.t_start), evened(samples.t_end)
+    return distortion(weights, 0.5 * (start + end), end - start, samples.ray_starts).mean()
+
+
+def elsewhere(
+    samples: Samples,
+    weights: Float[Tensor, " sample"],
+    distance: Float[Tensor, " ray"],
+    margin: float,
+) -> Float[Tensor, ""]:
+    """The share of rays that does not end where something is known to be, mean of all rays: light that is stopped too
+    early or too late, or not at all (as Deng 2022 supervises depth; linear, for what is known may be wrong).
+
+    distance: along each ray to what is known to be there
+    margin:   how far off counts as there, in evened distances, beside half a sample's own length
+    """
+    start, end, known = evened(samples.t_start), evened(samples.t_end), evened(distance)[samples.ray_index]
+    there = (start - margin < known) & (known < end + margin)
+    return 1 - (weights * there).sum() / len(distance)
+
+
+class _Scaled(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, scale, *values):
+        ctx.save_for_backward(scale)
+        return values
+
+    @staticmethod
+    def backward(ctx, *grads):
+        (scale,) = ctx.saved_tensors
+        return None, *(g * scale.view(-1, *[1] * (g.ndim - 1)) for g in grads)
+
+
+def scaled_by_distance(t: Float[Tensor, " sample"], *values: Float[Tensor, sample * _]) -> tuple[Tensor, ...]:
+    """The same values of samples at distances t, whose gradients count min(1, t^2) (Philip 2023, eq. 7).
+
+    As many rays pass a place near a camera as the inverse square of its distance says, and all of one photograph:
+    without this, learning would be fastest where least is known.
+    """
+    return _Scaled.apply(t.square().clamp(max=1), *values)

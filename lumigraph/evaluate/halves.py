@@ -1,0 +1,36 @@
+"""Halves: a method with a code for each photograph is told of a held-out one's left half, and judged by its right.
+
+A code cannot be known of a photograph that nobody has learnt from, and one found on all of it would know the answer
+(Martin-Brualla et al. 2021, section 5).
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import torch
+
+from ..method import Method
+from ..scene import Photograph, Scene
+
+DEFINITION = "each photograph's code is found on its left half, and its right half is compared"
+
+
+def judged_by_halves(method: Method) -> bool:
+    """Whether a method that learns from a Scene takes single photographs as evidence, and was told of none by a
+    control."""
+    takes = issubclass(method.learns_from, Scene) and Photograph in method.accepts
+    return takes and not any(control.of_photographs and control.name in method.told for control in method.controls)
+
+
+def left_half(photograph: Photograph) -> Photograph:
+    """The same photograph, of which only pixels left of the middle are to be trusted."""
+    trusted = torch.ones(photograph.rgb.shape[:2], dtype=torch.bool) if photograph.mask is None else photograph.mask
+    trusted = trusted.clone()
+    trusted[:, right_half(photograph)] = False
+    return replace(photograph, mask=trusted)
+
+
+def right_half(photograph: Photograph) -> slice:
+    """The columns from the middle on."""
+    return slice(photograph.rgb.shape[1] // 2, None)

@@ -1,0 +1,216 @@
+"""Clouds as glTF, one .glb file: the extension KHR_gaussian_splatting, ratified by Khronos in 2026.
+
+https://github.com/KhronosGroup/glTF/tree/main/extensions/2.0/Khronos/KHR_gaussian_splatting. A primitive of points has
+an attribute for each quantity, float32: POSITION, ROTATION (x, y, z, w), SCALE (no logarithm), OPACITY (after the
+sigmoid) and SH_DEGREE_l_COEF_n. COLOR_0, in linear light, is for programs that know points and not the extension.
+glTF has y up and z back, so all is turned half around x.
+
+Nothing is rounded but by float32, so opacities beyond 1 - 2^-24 become 1. `antialiased`, for which the extension has no
+word, is in the primitive's extras. A Gaussian takes 64 + 12 (K - 1) bytes.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float
+
+from ..errors import LumigraphError
+from ..files import write_bytes
+from ..gaussians import Gaussians
+from ..geometry import is_similarity, to_matrix
+from ..kernels.spherical_harmonics import K00
+from ..ranges import shown
+from ..srgb import linear_from_srgb
+from . import gltf
+from .axes import TURN_HARMONICS, TURN_MEAN, TURN_ROTATION
+from .checks import check_room
+from .codes import array, cloud, from_scales, to_scales, unit
+
+EXTENSION = "KHR_gaussian_splatting"
+ROTATION, SCALE, OPACITY = (f"{EXTENSION}:{name}" for name in ("ROTATION", "SCALE", "OPACITY"))
+HARMONICS = [f"{EXTENSION}:SH_DEGREE_{band}_COEF_{i}" for band in range(4) for i in range(2 * band + 1)]
+SHAPED = {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}  # what is written, and all that is read
+KNOWN = {EXTENSION, "KHR_mesh_quantization"}
+POINTS = 0
+ANTIALIASED = "antialiased"
+LONGEST = 1 << 24  # bytes of JSON
+
+
+def recognises(path: Path) -> bool:
+    """Whether a .glb file is of Gaussians rather than of meshes: its JSON names the extension."""
+    with open(path, "rb") as file:
+        head = file.read(gltf.HEADER.size + gltf.CHUNK.size)
+        return head[:4] == gltf.MAGIC and f'"{EXTENSION}"'.encode() in file.read(min(LONGEST, _length(head)))
+
+
+def _length(head: bytes) -> int:
+    return gltf.CHUNK.unpack_from(head, gltf.HEADER.size)[0] if len(head) >= gltf.HEADER.size + gltf.CHUNK.size else 0
+
+
+def read(path: Path) -> Gaussians:
+    """All clouds of the scene as one, where their nodes place them; meshes beside them are passed over.
+
+    Raises LumigraphError for extensions, kernels and colours that are not known, and for damaged files.
+    """
+    file = gltf.File(path)
+    if unknown := sorted({*file.about.extensions_required} - KNOWN):
+        raise LumigraphError(f"{path} needs {shown(', '.join(unknown))}, which is not read here; export it without")
+    placed = [
+        (primitive, matrix)
+        for mesh, matrix in _placed(file)
+        for primitive in file.one(file.about.meshes, mesh, "mesh").primitives
+        if EXTENSION in primitive.extensions
+    ]
+    if not placed:
+        raise LumigraphError(f"{path} holds no Gaussians, for nothing in its scene has {EXTENSION}; name another file")
+    most = max(_bands(file, primitive) for primitive, _ in placed)
+    check_room(path, sum(_count(file, primitive) for primitive, _ in placed), most**2)
+    parts = [_cloud(file, primitive, most, matrix) for primitive, matrix in placed]
+    return parts[0] if len(parts) == 1 else _joined(parts)
+
+
+def _placed(file: gltf.File) -> Iterator[tuple[int, Float[np.ndarray, "4 4"]]]:
+    """Meshes of the scene, and where they are. Raises LumigraphError if nodes are no trees."""
+    about = file.about
+    if about.scenes:
+        roots = file.one(about.scenes, about.scene, "scene").nodes
+    else:
+        roots = sorted({*range(len(about.nodes))} - {child for node in about.nodes for child in node.children})
+    waiting, seen = [(root, np.eye(4)) for root in reversed(roots)], set()
+    while waiting:
+        index, above = waiting.pop()
+        if index in seen:
+            raise LumigraphError(f"{file.path} has node {index} in two places, where nodes are trees; export it again")
+        seen.add(index)
+        node = file.one(about.nodes, index, "node")
+        matrix = above @ _matrix(file, node)
+        if node.mesh is not None:
+            yield node.mesh, matrix
+        waiting += [(child, matrix) for child in reversed(node.children)]
+
+
+def _matrix(file: gltf.File, node: gltf.Node) -> Float[np.ndarray, "4 4"]:
+    sizes = len(node.rotation), len(node.scale), len(node.translation), len(node.matrix or range(16))
+    if sizes != (4, 3, 3, 16):
+        raise LumigraphError(f"{file.path} has a node whose place is no place; export it again")
+    if node.matrix is not None:
+        return np.array(node.matrix).reshape(4, 4).T
+    x, y, z, w = node.rotation
+    turn = to_matrix(torch.tensor([[w, x, y, z]], dtype=torch.float64))[0].numpy()
+    matrix = np.eye(4)
+    matrix[:3, :3] = turn * np.array(node.scale)
+    matrix[:3, 3] = node.translation
+    return matrix
+
+
+def _bands(file: gltf.File, primitive: gltf.Primitive) -> int:
+    """How many bands of harmonics a primitive has. Raises LumigraphError if that or anything else is not as it must
+    be."""
+    said = primitive.extensions[EXTENSION]
+    said = said if isinstance(said, dict) else {}
+    if primitive.mode != POINTS or any(said.get(name) != value for name, value in SHAPED.items()):
+        found = f"mode {primitive.mode}, kernel {shown(said.get('kernel'))}, colours {shown(said.get('colorSpace'))}"
+        raise LumigraphError(
+            f"{file.path} has Gaussians of another kind ({found}), where points, ellipse and srgb_rec709_display are "
+            "read; export it as those"
+        )
+    if inner := said.get("extensions"):
+        by = ", ".join(inner) if isinstance(inner, dict) else inner
+        raise LumigraphError(f"{file.path} packs its Gaussians by {shown(by)}; export it without compression")
+    bands = 1 + math.isqrt(max((i for i, name in enumerate(HARMONICS) if name in primitive.attributes), default=0))
+    wanted = ["POSITION", ROTATION, SCALE, OPACITY, *HARMONICS[: bands**2]]
+    if missing := [name for name in wanted if name not in primitive.attributes]:
+        raise LumigraphError(f"{file.path} lacks {', '.join(missing)}; export it again")
+    return bands
+
+
+def _count(file: gltf.File, primitive: gltf.Primitive) -> int:
+    """How many Gaussians. Raises LumigraphError unless all attributes have as many."""
+    names = ["POSITION", ROTATION, SCALE, OPACITY, *(name for name in HARMONICS if name in primitive.attributes)]
+    counts = {file.accessor(primitive.attributes[name]).count for name in names}
+    if len(counts) > 1:
+        raise LumigraphError(
+            f"{file.path} has attributes of {sorted(counts)} rows where all are alike; export it again"
+        )
+    return counts.pop()
+
+
+def _cloud(file: gltf.File, primitive: gltf.Primitive, most: int, matrix: Float[np.ndarray, "4 4"]) -> Gaussians:
+    """A primitive in this house's axes, with zeros for bands that only others have."""
+    at, bands = primitive.attributes, _bands(file, primitive)
+    harmonics = np.stack([file.numbers(at[name], (3,)) for name in HARMONICS[: bands**2]], 1)
+    with np.errstate(divide="ignore"):  # 0 and 1 have logits that are infinite, and get others later
+        opacities = file.numbers(at[OPACITY], (1,))[:, 0].astype(np.float64)
+        opacities = np.where((opacities >= 0) & (opacities <= 1), opacities, np.nan)
+        logits = np.log(opacities) - np.log1p(-opacities)
+    found = cloud(
+        file.numbers(at["POSITION"], (3,)),
+        np.roll(file.numbers(at[ROTATION], (4,)), 1, -1),
+        from_scales(file.numbers(at[SCALE], (3,))),
+        logits,
+        np.pad(harmonics, [(0, 0), (0, most**2 - bands**2), (0, 0)]),
+        isinstance(primitive.extras, dict) and primitive.extras.get(ANTIALIASED) is True,
+    )
+    if not np.array_equal(matrix, np.eye(4)):
+        place = torch.from_numpy(matrix)
+        if not is_similarity(place):
+            raise LumigraphError(f"{file.path} stretches or mirrors its Gaussians by a node; apply its place to them")
+        found = found.transformed(place)
+    return cloud(
+        array(found.means) * TURN_MEAN,
+        array(found.quaternions) * TURN_ROTATION,
+        array(found.log_scales),
+        array(found.opacities),
+        array(found.harmonics) * TURN_HARMONICS[: most**2],
+        found.antialiased,
+    )
+
+
+def _joined(parts: list[Gaussians]) -> Gaussians:
+    def of(name: str) -> Any:
+        return torch.cat([getattr(part, name) for part in parts])
+
+    alike = all(part.antialiased for part in parts)
+    return Gaussians(of("means"), of("quaternions"), of("log_scales"), of("opacities"), of("harmonics"), alike)
+
+
+def write(path: Path, gaussians: Gaussians) -> None:
+    """Raises LumigraphError for a cloud of none, for glTF has no arrays of nothing."""
+    if not len(gaussians):
+        raise LumigraphError(f"{path} cannot hold a cloud of no Gaussians; write it as .ply")
+    harmonics = array(gaussians.harmonics)
+    opacities = 0.5 * (1 + np.tanh(array(gaussians.opacities).astype(np.float64) / 2))
+    light = linear_from_srgb(np.clip(K00 * harmonics[:, 0] + 0.5, 0, 1))
+    fallback = np.rint(65535 * np.concatenate([light, opacities[:, None]], 1)).astype("<u2")
+    rotations = np.roll(unit(array(gaussians.quaternions)) * TURN_ROTATION, -1, -1)
+    columns = {
+        "POSITION": gltf.Column((array(gaussians.means) * TURN_MEAN).astype("<f4"), bounded=True),
+        "COLOR_0": gltf.Column(fallback, normalised=True),
+        ROTATION: gltf.Column(rotations.astype("<f4")),
+        SCALE: gltf.Column(to_scales(array(gaussians.log_scales)).astype("<f4")),
+        OPACITY: gltf.Column(opacities.astype("<f4")),
+    }
+    turned = (harmonics * TURN_HARMONICS[: harmonics.shape[1]]).astype("<f4")
+    columns |= {HARMONICS[i]: gltf.Column(turned[:, i]) for i in range(turned.shape[1])}
+    primitive = {
+        "mode": POINTS,
+        "attributes": {name: i for i, name in enumerate(columns)},
+        "extensions": {EXTENSION: SHAPED},
+    }
+    if gaussians.antialiased:
+        primitive["extras"] = {ANTIALIASED: True}
+    about = {
+        "asset": {"version": "2.0", "generator": "Lumigraph"},
+        "extensionsUsed": [EXTENSION],
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"mesh": 0}],
+        "meshes": [{"primitives": [primitive]}],
+    }
+    write_bytes(path, gltf.encoded(about, [*columns.values()]), "splats")

@@ -1,0 +1,211 @@
+"""Binary glTF 2.0: JSON that says what there is, and one buffer that holds its numbers, in one .glb file.
+
+https://registry.khronos.org/glTF/specs/2.0/glTF-2.0.html. Whatever the JSON says of sizes is held against the bytes
+that are there before any of them is touched.
+"""
+
+from __future__ import annotations
+
+import json
+import struct
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import msgspec
+import numpy as np
+
+from ..errors import LumigraphError
+from ..files import from_json
+from ..ranges import Coordinate, Tally, between, shown, typed
+
+HEADER, CHUNK = struct.Struct("<4sII"), struct.Struct("<I4s")
+MAGIC, JSON, BINARY = b"glTF", b"JSON", b"BIN\0"
+VERTICES, INDICES = 34962, 34963  # section 5.11.5: what a part of the buffer is for
+KINDS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}  # 3.6.2.2
+NUMBERS = {np.dtype(kind): number for number, kind in KINDS.items()}
+SHAPES = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
+NAMES = {width: name for name, width in SHAPES.items()}
+
+Index = Annotated[int, between(0, 1 << 32)]
+Matrix = tuple[Coordinate, ...]  # of 16, column after column
+
+
+class View(msgspec.Struct, rename="camel"):
+    """A part of the buffer."""
+
+    buffer: Index
+    byte_length: Tally
+    byte_offset: Tally = 0
+    byte_stride: Annotated[int, between(0, 252)] = 0
+
+
+class Accessor(msgspec.Struct, rename="camel"):
+    """Numbers in a part of the buffer."""
+
+    component_type: int
+    count: Tally
+    type: str
+    buffer_view: Index | None = None
+    byte_offset: Tally = 0
+    normalized: bool = False
+    sparse: Any = None
+
+
+class Buffer(msgspec.Struct, rename="camel"):
+    byte_length: Tally
+    uri: Any = None
+
+
+class Primitive(msgspec.Struct, rename="camel"):
+    attributes: dict[str, Index]
+    mode: int = 4
+    extensions: dict[str, Any] = {}
+    extras: Any = None
+
+
+class Mesh(msgspec.Struct, rename="camel"):
+    primitives: list[Primitive]
+
+
+class Node(msgspec.Struct, rename="camel"):
+    """A place in the scene: a matrix, or a scale, a rotation (x, y, z, w) and a translation, in this order."""
+
+    mesh: Index | None = None
+    children: list[Index] = []
+    matrix: Matrix | None = None
+    rotation: tuple[Coordinate, ...] = (0.0, 0.0, 0.0, 1.0)
+    scale: tuple[Coordinate, ...] = (1.0, 1.0, 1.0)
+    translation: tuple[Coordinate, ...] = (0.0, 0.0, 0.0)
+
+
+class Scene(msgspec.Struct, rename="camel"):
+    nodes: list[Index] = []
+
+
+class About(msgspec.Struct, rename="camel"):
+    """What the JSON says, as far as it is of use here."""
+
+    accessors: list[Accessor] = []
+    buffer_views: list[View] = []
+    buffers: list[Buffer] = []
+    meshes: list[Mesh] = []
+    nodes: list[Node] = []
+    scenes: list[Scene] = []
+    scene: Index = 0
+    extensions_used: list[str] = []
+    extensions_required: list[str] = []
+
+
+@dataclass(frozen=True)
+class Column:
+    """Numbers to be written, [row] or [row, component].
+
+    normalised: whether whole numbers stand for [0, 1] or [-1, 1]
+    bounded:    whether the least and the greatest are said, as positions need
+    """
+
+    numbers: np.ndarray
+    normalised: bool = False
+    bounded: bool = False
+    target: int = VERTICES
+
+
+def encoded(about: dict[str, Any], columns: list[Column]) -> bytes:
+    """A .glb file: `about` and an accessor for each column, in their order. Each begins at a multiple of 4 bytes."""
+    parts = [np.ascontiguousarray(column.numbers).tobytes() for column in columns]
+    starts = np.cumsum([0, *(len(part) + -len(part) % 4 for part in parts)]).tolist()
+    views = [
+        {"buffer": 0, "byteOffset": start, "byteLength": len(part), "target": column.target}
+        for start, part, column in zip(starts, parts, columns, strict=False)
+    ]
+    accessors = [_accessor(i, column) for i, column in enumerate(columns)]
+    whole = about | {"accessors": accessors, "bufferViews": views, "buffers": [{"byteLength": starts[-1]}]}
+    text = json.dumps(whole, separators=(",", ":"), allow_nan=False).encode()
+    text += b" " * (-len(text) % 4)
+    body = CHUNK.pack(len(text), JSON) + text + CHUNK.pack(starts[-1], BINARY)
+    body += b"".join(part + bytes(-len(part) % 4) for part in parts)
+    return HEADER.pack(MAGIC, 2, HEADER.size + len(body)) + body
+
+
+def _accessor(view: int, column: Column) -> dict[str, Any]:
+    numbers = column.numbers
+    shape = NAMES[numbers.shape[1] if numbers.ndim > 1 else 1]
+    said = {"bufferView": view, "componentType": NUMBERS[numbers.dtype], "type": shape, "count": len(numbers)}
+    if column.normalised:
+        said["normalized"] = True
+    if column.bounded:
+        said |= {"min": numbers.min(0).tolist(), "max": numbers.max(0).tolist()}
+    return said
+
+
+class File:
+    """A .glb file that was opened: `about` it, and the numbers of its accessors when asked for.
+
+    Raises LumigraphError if it is none, is cut, or leads to other files.
+    """
+
+    about: About
+
+    def __init__(self, path: Path):
+        self.path, data = path, path.read_bytes()
+        if len(data) < HEADER.size + CHUNK.size or data[:4] != MAGIC:
+            raise LumigraphError(f"{path} is no .glb file, for it does not begin like one; name another one")
+        _, version, size = HEADER.unpack_from(data)
+        if version != 2:
+            raise LumigraphError(f"{path} is glTF of version {version}, of which 2 can be read; export it again")
+        if size > len(data):
+            raise LumigraphError(f"{path} ends early, for it promises {size:,} bytes; copy or download it again")
+        text, after = self._chunk(data, HEADER.size, JSON)
+        self.about = typed(About, from_json(text, path), path)
+        self.buffer = self._chunk(data, after, BINARY)[0] if after + CHUNK.size <= len(data) else b""
+
+    def _chunk(self, data: bytes, at: int, name: bytes) -> tuple[bytes, int]:
+        size, found = CHUNK.unpack_from(data, at)
+        start = at + CHUNK.size
+        if found != name or start + size > len(data):
+            raise LumigraphError(
+                f"{self.path} is damaged, for its {name[:4].strip(bytes(1)).decode()} is cut or not where "
+                "it should be; copy or download it again"
+            )
+        return data[start : start + size], start + size
+
+    def accessor(self, index: int) -> Accessor:
+        return self.one(self.about.accessors, index, "accessor")
+
+    def one(self, things: list[Any], index: int, what: str) -> Any:
+        """The thing of a number. Raises LumigraphError if there is none."""
+        if index >= len(things):
+            raise LumigraphError(f"{self.path} names {what} {index}, and has {len(things)}; export it again")
+        return things[index]
+
+    def numbers(self, index: int, widths: tuple[int, ...]) -> np.ndarray:
+        """What an accessor holds, float32 [row, component]; whole numbers that are normalised within [-1, 1].
+
+        widths: how many components it may have
+        Raises LumigraphError if it is of another shape or kind, or reaches beyond what is there.
+        """
+        accessor = self.accessor(index)
+        kind, width = KINDS.get(accessor.component_type), SHAPES.get(accessor.type)
+        if kind is None or width not in widths or accessor.sparse is not None or accessor.buffer_view is None:
+            raise LumigraphError(
+                f"{self.path}: accessor {index} is of a kind that is not read here ({shown(accessor.type)} of type "
+                f"{accessor.component_type}, sparse or without numbers); export it without compression"
+            )
+        view = self.one(self.about.buffer_views, accessor.buffer_view, "buffer view")
+        buffer = self.one(self.about.buffers, view.buffer, "buffer")
+        if view.buffer or buffer.uri is not None:
+            raise LumigraphError(f"{self.path} leads to other files for its numbers; export it as one .glb")
+        dtype = np.dtype(kind)
+        stride = view.byte_stride or dtype.itemsize * width
+        end = accessor.byte_offset + (stride * (accessor.count - 1) + dtype.itemsize * width if accessor.count else 0)
+        if end > view.byte_length or view.byte_offset + view.byte_length > min(len(self.buffer), buffer.byte_length):
+            raise LumigraphError(
+                f"{self.path}: accessor {index} promises {accessor.count:,} rows, and the buffer of "
+                f"{len(self.buffer):,} bytes ends before; copy or download it again"
+            )
+        start, strides = view.byte_offset + accessor.byte_offset, (stride, dtype.itemsize)
+        found = np.ndarray((accessor.count, width), dtype, self.buffer, start, strides).astype(np.float32)
+        if accessor.normalized and dtype.kind in "iu":
+            found = np.maximum(found / np.float32(np.iinfo(dtype).max), -1)
+        return found

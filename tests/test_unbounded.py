@@ -1,0 +1,132 @@
+"""Open captures: samples lie where a grid proposes, and what makes fog costs something."""
+
+import pytest
+import torch
+
+from lumigraph.components.sampling.proposal import Proposal, edges_of, overlooked
+from lumigraph.components.sampling.spaces import NDC, Contraction
+from lumigraph.components.sampling.unbounded import OpenNumbers, Unbounded
+from lumigraph.components.training.fog import elsewhere, scaled_by_distance, spread
+from lumigraph.rays import Rays, Samples
+from lumigraph.scene import Forward
+
+AHEAD = Forward(((1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0)), (1.0, 1.0), 1.0)
+SPACES = {"contracted": Contraction(0.1, 30.0), "forward": NDC(AHEAD, 0.1)}
+
+
+def rays(count: int = 5) -> Rays:
+    across = torch.linspace(-0.2, 0.2, count)
+    directions = torch.nn.functional.normalize(torch.stack([across, across / 2, torch.ones(count)], -1), dim=-1)
+    return Rays(torch.zeros(count, 3), directions, torch.full((count,), 1e-3))
+
+
+@pytest.fixture(params=SPACES)
+def proposal(request):
+    return Proposal(SPACES[request.param], 48, 32, 8)
+
+
+def test_intervals_join_from_near_to_far(proposal):
+    found = proposal.sample(rays(), torch.rand(5, 2))
+    t_start, t_end = (x.view(5, 8) for x in (found.samples.t_start, found.samples.t_end))
+    near, far = proposal.space.interval(rays())
+    torch.testing.assert_close(t_start[:, 1:], t_end[:, :-1])
+    torch.testing.assert_close(t_start[:, 0], near)
+    torch.testing.assert_close(t_end[:, -1], far, rtol=1e-3, atol=1e-3)
+    assert (found.samples.length > 0).all()
+
+
+def test_samples_lie_where_places_are_known(proposal):
+    known = rays().at(torch.full((5,), 2.5))
+    before = proposal.sample(rays()).samples
+    proposal.begin(known)
+    after = proposal.sample(rays()).samples
+
+    def nearest(samples: Samples) -> torch.Tensor:
+        return (samples.t.view(5, 8) - 2.5).abs().sort(-1).values[:, :4].mean()
+
+    assert nearest(after) < 0.3 < nearest(before)
+
+
+def test_a_new_grid_looks_everywhere_whatever_it_holds(proposal):
+    proposal.begin(rays().at(torch.full((5,), 2.5)))
+    proposal.anneal(0.0)
+    even = proposal.sample(rays()).edges
+    torch.testing.assert_close(even, edges_of(8, torch.full((5,), 0.5)), atol=1e-4, rtol=0)
+
+
+def test_the_grid_learns_what_it_overlooked(proposal):
+    """Weight at one place: gradient descent on the loss alone makes the grid propose it."""
+    with torch.no_grad():
+        proposal.grid.values.fill_(-3.0)
+    adam = torch.optim.Adam([proposal.grid.values], 0.3)
+    generator = torch.Generator().manual_seed(0)
+    losses = []
+    for _ in range(60):
+        found = proposal.sample(rays(), torch.rand(5, 2, generator=generator))
+        there = (found.samples.t_start <= 2.5) & (found.samples.t_end > 2.5)
+        loss = overlooked(found, there.float())
+        adam.zero_grad()
+        loss.backward()
+        adam.step()
+        losses.append(float(loss.detach()))
+    assert losses[-1] < 0.2 * losses[0]
+    assert ((proposal.sample(rays()).samples.t - 2.5).abs().view(5, 8).median(-1).values < 1.0).all()
+
+
+def test_nothing_is_overlooked_within_a_bound():
+    proposal = Proposal(SPACES["contracted"], 16, 32, 8)
+    found = proposal.sample(rays())
+    whole = found.weights.sum(-1, keepdim=True).expand(5, 8).flatten()
+    assert float(overlooked(found, 0 * whole)) == 0
+    assert float(overlooked(found, 2 * whole)) > 0
+
+
+def test_weight_in_one_place_is_not_spread():
+    samples = Samples.rows(torch.linspace(1, 3, 9)[:-1].expand(2, 8), torch.full((2,), 3.0))
+    one, two = torch.zeros(2, 8), torch.zeros(2, 8)
+    one[:, 3] = 1
+    two[:, 0] = two[:, 7] = 0.5
+    assert spread(samples, one.flatten()) < 0.3 * spread(samples, two.flatten())
+
+
+def test_rays_should_end_where_something_is_known_to_be():
+    samples = Samples.rows(torch.linspace(1, 3, 9)[:-1].expand(3, 8), torch.full((3,), 3.0))
+    weights = torch.zeros(3, 8)
+    weights[0, 3], weights[1, 7] = 1, 1  # at 1.75 to 2, behind that, and nowhere
+    found = elsewhere(samples, weights.flatten(), torch.full((3,), 1.8), 1e-3)
+    torch.testing.assert_close(found, torch.tensor(2 / 3))
+
+
+def test_what_is_near_is_learnt_slowly():
+    samples = Samples(torch.tensor([0.0, 1.0, 4.0]), torch.tensor([1.0, 1.5, 5.0]), torch.tensor([0, 3]))
+    density, rgb = torch.ones(3, requires_grad=True), torch.ones(3, 3, requires_grad=True)
+    sum(x.sum() for x in scaled_by_distance(samples.t, density, rgb)).backward()
+    torch.testing.assert_close(density.grad, torch.tensor([0.25, 1.0, 1.0]))
+    torch.testing.assert_close(rgb.grad, torch.tensor([0.25, 1.0, 1.0])[:, None].expand(3, 3))
+
+
+def test_rays_end_at_places_that_are_known_until_half_of_the_budget_is_spent():
+    unbounded = Unbounded(SPACES["contracted"], OpenNumbers(proposal_samples=32, samples_per_ray=16))
+    generator = torch.Generator().manual_seed(0)
+    unbounded.seen, unbounded.seen_from = torch.tensor([[0.0, 0.0, 2.0]]), torch.zeros(1, 3)
+    unbounded.before_step(0.1)
+
+    def wall(place: float):
+        return lambda points: 30.0 * (points.norm(dim=-1) > place)
+
+    errors = []
+    for place in (2.0, 1.0):
+        proposed = unbounded.proposal.sample(rays(), torch.rand(5, 2, generator=generator))
+        density = wall(place)(proposed.samples.along(rays())[0])
+        terms = unbounded.terms(wall(place), proposed, density, generator)
+        errors.append(float(terms["depth"]))
+    assert errors[0] < 0.8 * errors[1]
+    unbounded.before_step(0.9)
+    assert "depth" not in unbounded.terms(wall(1.0), proposed, density, generator)
+
+
+def test_contraction_loops_as_it_is_written():
+    space, points = SPACES["contracted"], 3 * torch.randn(200, 3)
+    slow = points.clone().requires_grad_()
+    torch.testing.assert_close(space.warp(points), space.warp(slow).detach())
+    torch.testing.assert_close(space.stretch(points), space.stretch(slow).detach())
