@@ -7,6 +7,7 @@ from typing import Any, Protocol, runtime_checkable
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
+from .baked import Atlas, Octree
 from .camera import Camera
 from .errors import LumigraphError
 from .gaussians import Gaussians
@@ -31,6 +32,32 @@ class HasField(Protocol):
         self, points: Float[Tensor, "point 3"], directions: Float[Tensor, "point 3"]
     ) -> tuple[Float[Tensor, " point"], Float[Tensor, "point 3"]]:
         """Density per scene unit, and sRGB-encoded colour seen along unit directions."""
+
+
+@runtime_checkable
+class FromField(Protocol):
+    """Can begin as what another method holds, instead of from photographs."""
+
+    def from_field(self, teacher: Any, cameras: Camera) -> None:
+        """Take over what a teacher holds, which has the same frame, as far as cameras see it: its `field` where it has
+        one, else what it renders and its Gaussians. Stands in place of `begin`, ahead of the first step; what is learnt
+        from then on continues there. Raises LumigraphError, in one sentence, where it cannot be taken over."""
+
+
+@runtime_checkable
+class HasOctree(Protocol):
+    """Is an octree of density and harmonics, for browsers and files."""
+
+    def octree(self) -> Octree:
+        """The scene as an octree, in the scene's frame. Raises LumigraphError while there is none yet."""
+
+
+@runtime_checkable
+class HasAtlas(Protocol):
+    """Is an atlas of diffuse colours and features, for browsers and files."""
+
+    def atlas(self) -> Atlas:
+        """The scene as an atlas, in the scene's frame. Raises LumigraphError while there is none yet."""
 
 
 @runtime_checkable
@@ -99,6 +126,9 @@ class CanCompress(Protocol):
 LACKING = {
     HasDensity: "holds no density at points; what is made of it comes from its renderings instead",
     HasField: "holds no density and colour at points, so it can be neither baked nor converted",
+    FromField: "cannot begin as what another method holds; `lumigraph convert --list` says which can",
+    HasOctree: "is no octree; `lumigraph convert` makes one of it, as plenoctrees",
+    HasAtlas: "is no atlas of baked values; `lumigraph convert` makes one of it, as snerg",
     HasDistance: "holds no distance to surfaces; a method that learns from shapes does",
     HasGaussians: "holds no Gaussians, so no splats can be made of it; train gaussian-splatting",
     CanPrune: "cannot learn on with fewer Gaussians; write a splat file instead, by an --output that ends in .ply",

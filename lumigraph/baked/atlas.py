@@ -1,0 +1,38 @@
+"""Atlas: a sparse grid of blocks, each with opacity, diffuse colour and features (Hedman 2021, arXiv 2103.14645)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from jaxtyping import Float, Int, UInt8
+from torch import Tensor
+
+
+@dataclass(frozen=True)
+class ViewNetwork:
+    """What adds to a pixel's diffuse colour what depends on direction (section 4.2): three layers, ReLU between them and
+    a sigmoid at the end. Inputs are the direction encoded at four frequencies (27), diffuse colour (3), features (4)."""
+
+    weights: tuple[Float[Tensor, "in out"], Float[Tensor, "in2 out2"], Float[Tensor, "in3 3"]]
+    biases: tuple[Float[Tensor, " out"], Float[Tensor, " out2"], Float[Tensor, "3"]]
+
+
+@dataclass(frozen=True)
+class Atlas:
+    """Voxels in blocks; `index` says where each block of the whole grid lies in the atlas, or −1 where nothing is.
+
+    index:    block's number in the atlas, for each block of the grid (x, y, z)
+    values:   of each voxel of each block with one voxel of apron around: red, green, blue, alpha, four features, all in
+              256 steps. Colours and features are premultiplied by alpha = 1 − exp(−density · voxel)
+    low:      corner of the grid, in the scene's frame
+    voxel:    side of a voxel, in scene units
+    block:    voxels along a block's side, without the apron
+    network:  None where the diffuse colour is all there is
+    """
+
+    index: Int[Tensor, "x y z"]
+    values: UInt8[Tensor, "block side side side 8"]
+    low: Float[Tensor, "3"]
+    voxel: float
+    block: int
+    network: ViewNetwork | None = None
