@@ -68,14 +68,120 @@ def along(origins, directions, t_start, t_end, ray_starts, positions, seen_along
 @njit(parallel=True, cache=True, error_model="numpy")
 def contract(points, coordinates, stretch):
     """Contraction.warp and Contraction.stretch."""
-    one, half = points.dtype.type(1), points.dtype.type(0.5)
     for i in prange(len(points)):
-        x, y, z = points[i]
-        inverse = one / max(math.sqrt(x * x + y * y + z * z), one)
-        across = half * (one + one - inverse) * inverse
-        coordinates[i, 0], coordinates[i, 1], coordinates[i, 2] = across * x, across * y, across * z
+        inverse, across = shrunk(points[i, 0], points[i, 1], points[i, 2])
+        for axis in range(3):
+            coordinates[i, axis] = across * points[i, axis]
         if len(stretch):
-            stretch[i] = np.cbrt(half * inverse * inverse * across * across)
+            stretch[i] = stretched(inverse, across)
+
+
+@njit(inline="always")
+def shrunk(x, y, z):
+    """1 / |x|, at most 1, and what a point is multiplied with to be in the contraction's ball."""
+    one = np.float32(1)
+    inverse = one / max(math.sqrt(x * x + y * y + z * z), one)
+    return inverse, np.float32(0.5) * (one + one - inverse) * inverse
+
+
+@njit(inline="always")
+def stretched(inverse, across):
+    """How much longer coordinates are than the scene, the mean of three directions; a half within the unit ball."""
+    if inverse == 1:
+        return across
+    return (np.float32(0.5) * inverse * inverse * across * across) ** np.float32(1 / 3)
+
+
+@njit(inline="always")
+def cell(x, size):
+    """Along one axis of corners that span [-1, 1]: the corner below a coordinate, and how far it is to the next."""
+    s = min(max((x + np.float32(1)) * (np.float32(0.5) * np.float32(size - 1)), np.float32(0)), np.float32(size - 1))
+    corner = max(min(np.int32(s), np.int32(size - 2)), np.int32(0))  # the last also where x is no number
+    return corner, s - np.float32(corner)
+
+
+@njit(inline="always")
+def blended(values, size, x, y, z):
+    """A grid's value at coordinates, between eight corners. values: flat, the last axis fastest"""
+    (i, a), (j, b), (k, c) = cell(x, size[0]), cell(y, size[1]), cell(z, size[2])
+    one, on = np.float32(1), size[2]
+    at = (i * size[1] + j) * on + k
+    plane = at + size[1] * on
+    low = (values[at] * (one - c) + values[at + 1] * c) * (one - b)
+    low += (values[at + on] * (one - c) + values[at + on + 1] * c) * b
+    high = (values[plane] * (one - c) + values[plane + 1] * c) * (one - b)
+    high += (values[plane + on] * (one - c) + values[plane + on + 1] * c) * b
+    return low * (one - a) + high * a
+
+
+@njit(inline="always")
+def distance(share, near, far, first, last, forward):
+    """Distance at a share of the way from near to far, as `Proposal` divides it.
+
+    first, last: depths of the way's ends in normalised device coordinates; else its ends in what is even up to one unit
+                 and in disparity beyond
+    """
+    one = np.float32(1)
+    if forward:
+        return near + (far - near) * (share * first / (share * first + (one - share) * last))
+    s = first + share * (last - first)
+    return s if s < one else one / max(one + one - s, np.float32(1e-6))
+
+
+@njit(parallel=True, cache=True, error_model="numpy")
+def propose(block, bins, origins, directions, near, far, values, size, device, limits, edges):
+    """Fill in the distances at which a field is asked, as `Proposal.sample` has them without jitter.
+
+    block:  rays that share their memory
+    device: of `NDC`, what turns its camera's x, y, z into coordinates, the near plane, and what `stretch` begins with;
+            rays are then in that camera's frame. Empty in a contraction
+    limits: what a log density counts for at most; the exponent of weights; the share of all weight that every bin has,
+            and the weight that it has besides
+    """
+    one, forward, count = np.float32(1), len(device) > 0, edges.shape[1] - 1
+    most, sharpness, spare, faint = limits[0], limits[1], limits[2], limits[3]
+    for part in prange(-(-len(origins) // block)):
+        found = np.empty(bins, np.float32)
+        for ray in range(part * block, min((part + 1) * block, len(origins))):
+            a, b = near[ray], far[ray]
+            if forward:
+                first = max(origins[ray, 2] + a * directions[ray, 2], device[2])
+                last = max(origins[ray, 2] + b * directions[ray, 2], device[2])
+            else:
+                first = a if a < one else one + one - one / a
+                last = b if b < one else one + one - one / b
+            passed, total, begins = one, np.float32(0), distance(np.float32(0), a, b, first, last, forward)
+            for i in range(bins):
+                ends = distance(np.float32(i + 1) / np.float32(bins), a, b, first, last, forward)
+                t = np.float32(0.5) * (begins + ends)
+                x = origins[ray, 0] + t * directions[ray, 0]
+                y = origins[ray, 1] + t * directions[ray, 1]
+                z = origins[ray, 2] + t * directions[ray, 2]
+                if forward:
+                    inverse = one / max(z, device[2])
+                    stretch = device[3] * inverse ** np.float32(4 / 3)
+                    x, y, z = device[0] * x * inverse, device[1] * y * inverse, one - (one + one) * device[2] * inverse
+                else:
+                    inverse, across = shrunk(x, y, z)
+                    stretch = stretched(inverse, across)
+                    x, y, z = across * x, across * y, across * z
+                density = math.exp(min(blended(values, size, x, y, z), most))
+                left = math.exp(-density * stretch * (ends - begins))
+                weight = passed * (one - left)
+                passed *= left
+                found[i] = weight if sharpness == one else weight**sharpness
+                total += found[i]
+                begins = ends
+            least = spare / np.float32(bins) * total + faint
+            whole = total + np.float32(bins) * least
+            below, i = np.float32(0), 0
+            for j in range(count + 1):
+                share = whole * np.float32(j / count)
+                while i < bins - 1 and below + found[i] + least <= share:
+                    below += found[i] + least
+                    i += 1
+                inside = min(max((share - below) / (found[i] + least), np.float32(0)), one)
+                edges[ray, j] = distance((np.float32(i) + inside) / np.float32(bins), a, b, first, last, forward)
 
 
 @njit(inline="always")

@@ -130,3 +130,16 @@ def test_contraction_loops_as_it_is_written():
     slow = points.clone().requires_grad_()
     torch.testing.assert_close(space.warp(points), space.warp(slow).detach())
     torch.testing.assert_close(space.stretch(points), space.stretch(slow).detach())
+
+
+@pytest.mark.parametrize("sharpness", [1.0, 0.4])
+def test_proposals_loop_as_they_are_written(proposal, sharpness, generator):
+    """Places without gradients are those of `sample`, in the loop and without it."""
+    proposal.sharpness = sharpness
+    proposal.grid.values.data = 3 * torch.randn(proposal.grid.values.shape, generator=generator)
+    some = rays()
+    expected = proposal.sample(some).samples
+    found = proposal.places(some)
+    torch.testing.assert_close(found.t_start, expected.t_start.detach(), rtol=2e-3, atol=1e-4)
+    torch.testing.assert_close(found.t_end, expected.t_end.detach(), rtol=2e-3, atol=1e-4)
+    assert len(some) * 8 == len(found)

@@ -191,7 +191,7 @@ class InstantNGP(RayMethod):
         return composite(look.samples, look.density, look.rgb, background)
 
     def looks(self, rays: Rays) -> list[Look]:
-        return [self.unbounded.look(self.field, rays)[0] if self.unbounded else self._march(rays)]
+        return [self.unbounded.look(self.field, rays) if self.unbounded else self._march(rays)]
 
     def _march(self, rays: Rays, jitter: Float[Tensor, " ray"] | None = None) -> Look:
         found = self.occupancy.sample(rays, self.frame.near, *self.lattice, jitter=jitter)
@@ -206,7 +206,7 @@ class InstantNGP(RayMethod):
         if not self.unbounded:
             return self._march(rays, torch.rand(len(rays), generator=generator).to(self.device)), {}
         jitter = torch.rand(len(rays), 2, generator=generator).to(self.device)
-        look, proposed = self.unbounded.look(self.field, rays, jitter)
+        look, proposed = self.unbounded.learn(self.field, rays, jitter)
         self.figures |= {"rays": len(rays), "samples": len(look.samples)}
         return look, self.unbounded.terms(self.density, proposed, look.density, generator)
 

@@ -189,7 +189,7 @@ class Plenoxels(RayMethod):
 
     def looks(self, rays: Rays) -> list[Look]:
         if self.unbounded:
-            return [self.unbounded.look(self.field, rays)[0]]
+            return [self.unbounded.look(self.field, rays)]
         samples, _ = self._reached(rays)
         return [Look("samples", samples, *self.field(*samples.along(rays)))]
 
@@ -284,7 +284,7 @@ class Plenoxels(RayMethod):
         jitter = torch.rand(len(batch), 2 if self.unbounded else 1, generator=generator).to(self.device)
         further = dict[str, Tensor]()
         if self.unbounded:
-            look, proposed = self.unbounded.look(self._learnt, batch.rays, jitter)
+            look, proposed = self.unbounded.learn(self._learnt, batch.rays, jitter)
             rows, part = self._touched
             further = self.unbounded.terms(self.density, proposed, look.density, generator)
             self.figures |= {"rays": len(batch), "samples": len(look.samples)}

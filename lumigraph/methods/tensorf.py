@@ -263,7 +263,7 @@ class TensoRF(RayMethod):
         return composite(look.samples, look.density, look.rgb, background)
 
     def looks(self, rays: Rays) -> list[Look]:
-        return [self.unbounded.look(self.field, rays)[0] if self.unbounded else self._march(rays)]
+        return [self.unbounded.look(self.field, rays) if self.unbounded else self._march(rays)]
 
     def _march(self, rays: Rays, jitter: Float[Tensor, " ray"] | None = None) -> Look:
         c = self.config
@@ -289,7 +289,7 @@ class TensoRF(RayMethod):
         background = backdrop(batch, self.background, generator, self.frame.reach > 1)
         further = dict[str, Tensor]()
         if self.unbounded:
-            look, proposed = self.unbounded.look(self.field, batch.rays, jitter)
+            look, proposed = self.unbounded.learn(self.field, batch.rays, jitter)
             further = self.unbounded.terms(self.density, proposed, look.density, generator)
             self.figures |= {"rays": len(batch), "samples": len(look.samples)}
         else:

@@ -4,22 +4,25 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from ... import loops
 from ...rays import Rays, Samples
 from ...volume import weights_of
-from ..fields.activations import truncated_exp
+from ..fields.activations import LIMIT, truncated_exp
 from ..fields.voxels import VoxelGrid
-from .sampling import inverse_transform
-from .spaces import NDC, Space
+from .sampling import FAINT, inverse_transform
+from .spaces import NDC, Contraction, Space, looped
 
 FLAT = (1.5, 1.5, 0.5)  # a forward-facing capture has few depths and many pixels
 LITTLE = 1e-5  # weight that counts as none in the loss
 SLOPE = 10.0  # of annealing (Barron 2022, appendix)
 SHARP = 0.3  # share of the budget after which samples lie where the grid says
 DENSE, THIN = 3.0, -3.0  # log density per unit of the coordinates, where places on surfaces are known and elsewhere
+BLOCK = 64  # rays that a thread goes through at a time
 SPARE = 0.01  # share of samples that lie anywhere, however little was found there
 
 
@@ -77,6 +80,20 @@ class Proposal(nn.Module):
             edges = inverse_transform(bins, spread, edges_of(self.count, jitter[:, 1]))
             samples = self._samples(edges, rays, near, far)
         return Proposed(samples, edges, bins, weights)
+
+    @torch.no_grad()
+    def places(self, rays: Rays) -> Samples:
+        """The intervals of `sample` for a field, without jitter."""
+        if not (isinstance(self.space, Contraction | NDC) and looped(rays.origins)):
+            return self.sample(rays).samples
+        ends, lines, device = self.space.interval(rays), (rays.origins, rays.directions), []
+        if isinstance(self.space, NDC):
+            lines, device = self.space.in_device(rays)
+        tensors = [x.detach().contiguous().numpy() for x in (*lines, *ends, self.grid.values[:, 0])]
+        numbers = (np.array(x, np.float32) for x in (device, (2 * LIMIT, self.sharpness, SPARE, FAINT)))
+        t = rays.origins.new_empty(len(rays), self.count + 1)
+        loops.propose(BLOCK, self.bins, *tensors, self.grid.size.numpy(), *numbers, t.numpy())
+        return Samples.rows(t[:, :-1], t[:, -1])
 
     @torch.no_grad()
     def begin(self, points: Float[Tensor, "point 3"]) -> None:

@@ -166,6 +166,12 @@ class NDC(Space):
         scale_x, scale_y = self.forward.scale
         return (2 * scale_x * scale_y * self.forward.near) ** (1 / 3) * z ** (-4 / 3)
 
+    def in_device(self, rays: Rays) -> tuple[tuple[Tensor, Tensor], list[float]]:
+        """Origins and directions in the mean camera, and the four numbers of its device that `loops.propose` takes."""
+        pose, (scale_x, scale_y), near = self._pose(rays.origins), self.forward.scale, self.forward.near
+        lines = (rays.origins - pose[:, 3]) @ pose[:, :3], rays.directions @ pose[:, :3]
+        return lines, [scale_x, scale_y, near, (2 * scale_x * scale_y * near) ** (1 / 3)]
+
     def _pose(self, like: Tensor) -> Float[Tensor, "3 4"]:
         return like.new_tensor(self.forward.pose)
 

@@ -90,13 +90,16 @@ class Unbounded(nn.Module):
         self.progress = progress
         self.proposal.anneal(1.0 if len(self.seen) else progress)
 
-    def look(self, field: Field, rays: Rays, jitter: Float[Tensor, "ray 2"] | None = None) -> tuple[Look, Proposed]:
-        """What a field has along rays, and what was proposed. jitter: as for `Proposal.sample`, while learning"""
+    def look(self, field: Field, rays: Rays) -> Look:
+        """What a field has along rays."""
+        samples = self.proposal.places(rays)
+        return Look("samples", samples, *field(*samples.along(rays)))
+
+    def learn(self, field: Field, rays: Rays, jitter: Float[Tensor, "ray 2"]) -> tuple[Look, Proposed]:
+        """The same while it learns, and what was proposed. jitter: as for `Proposal.sample`"""
         proposed = self.proposal.sample(rays, jitter)
         samples = proposed.samples
-        density, rgb = field(*samples.along(rays))
-        if jitter is not None:
-            density, rgb = scaled_by_distance(samples.t, density, rgb)
+        density, rgb = scaled_by_distance(samples.t, *field(*samples.along(rays)))
         return Look("samples", samples, density, rgb), proposed
 
     def terms(
