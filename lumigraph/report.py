@@ -105,7 +105,7 @@ def heading(title: str, sentence: str, figures: Sequence[tuple[str, str, str]]) 
 def films(run: Run) -> str:
     """HTML of the first film in the run's folder, beside its depth."""
     found = [path for path in sorted((run.folder / "renders").glob("*.mp4")) if not path.stem.endswith("-depth")]
-    found = sorted(found, key=lambda path: path.stem != "orbit")
+    found = sorted(found, key=lambda path: path.stem not in ("orbit", "sweep"))
     if not found:
         return ""
     players = "".join(

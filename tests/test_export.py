@@ -25,7 +25,16 @@ from lumigraph.export.video import open_video
 from lumigraph.figures import NOTHING, RAMP, colour_depth, colour_error, depth_range, hex_colour, save_picture
 from lumigraph.geometry import look_at, unit
 from lumigraph.lens import Equirectangular, Pinhole
-from lumigraph.paths import PATHS, Surroundings, angle_of_view, best_centred, camera_path, film_size, pivot
+from lumigraph.paths import (
+    PATHS,
+    Surroundings,
+    angle_of_view,
+    best_centred,
+    camera_path,
+    film_size,
+    fitting,
+    pivot,
+)
 from lumigraph.paths.keyframes import CameraPath, Keyframe
 from lumigraph.report import write_report
 from lumigraph.run.settings import Source
@@ -120,6 +129,22 @@ def test_a_camera_turns_about_what_the_photographs_look_at():
     beside[5] = 0
     crooked = cameras(ring().position, torch.stack([0 * beside, 0 * beside, beside], -1))
     assert best_centred(Surroundings(crooked, FRAME)) == 5
+
+
+def test_a_sweep_stays_among_cameras_that_look_the_same_way():
+    """A drone's photographs, straight down and a little askew: an orbit about them would turn on the spot."""
+    x, y = torch.meshgrid(torch.linspace(-2, 2, 5), torch.linspace(-1, 1, 4), indexing="ij")
+    place = torch.stack([x, y, 3 + 0.1 * x], -1).view(-1, 3)
+    askew = torch.stack([0.1 * y, 0.1 * x, 0 * x], -1).view(-1, 3)
+    drone = cameras(place, place * torch.tensor([1.0, 1.0, 0.0]) + askew)
+    assert fitting(drone, FRAME) == "sweep" and fitting(ring(), FRAME) == "orbit"
+    path = camera_path("sweep", drone, FRAME, 36, (64, 48))
+    across = path.position.abs()
+    assert across[:, 0].max() < 2 and across[:, 0].max() > 0.6 and across[:, 1].max() < 1
+    assert (path.position[:, 2] - 3).abs().max() < 0.2 and path.forward[:, 2].max() < -0.99
+    up = -path.pose[:, :, 1]
+    assert (up[1:] * up[:-1]).sum(-1).min() > 0.99 and (up[0] * up[-1]).sum() > 0.99  # it does not turn
+    assert (path.position - path.position.roll(1, 0)).norm(dim=-1).max() < 0.4  # and closes
 
 
 def test_a_far_stray_camera_does_not_pull_the_orbit():

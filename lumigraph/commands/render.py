@@ -14,22 +14,26 @@ from .common import Overwrite, needed, option, show
 from .controls import Animate, Set, animate, open_method
 
 # As `paths.film` has them, which help does not wait for.
-PATHS = ("orbit", "spiral", "interpolate", "held-out")
-LONGEST = 480
+PATHS = ("orbit", "sweep", "spiral", "interpolate", "held-out")
+LONGEST, AUTO = 480, "auto"
+CHOSEN = {
+    "orbit": "orbit, for the photographs go round",
+    "sweep": "sweep, for the photographs look the same way; --path orbit goes to and fro",
+}
 
 
 @dataclass(frozen=True)
 class Render:
     """Fly a camera through a run, a splat file or a composition: colour and depth, as films and as pictures.
 
-    Paths keep to where the photographs were taken from. orbit goes round (or to and fro), spiral twice round while
-    rising, interpolate passes smoothly through photographs' places, held-out visits the test photographs' own cameras.
+    Paths keep to where the photographs were taken from. orbit goes round (or to and fro), sweep makes an oval among
+    cameras that look the same way, as from a drone; auto is one of these two. spiral goes twice round while rising, interpolate passes smoothly through photographs' places, held-out visits the test photographs' own cameras.
     A path of your own is a JSON file: keyframes saved in the viewer, or what lies beside a film of the same capture.
     """
 
     source: Annotated[Positional[Path], needed("RUN_OR_FILE")]
     """Folder of the run, a splat file (.ply, .spz, .sog, .glb, .splat), or a composition (.json)."""
-    path: Annotated[str, option("{" + ",".join(PATHS) + ",FILE.json}")] = "orbit"
+    path: Annotated[str, option("{" + ",".join((AUTO, *PATHS)) + ",FILE.json}")] = AUTO
     """Where the camera goes."""
     frames: Annotated[Count | None, option("N", "120; every held-out view; as long as keyframes say")] = None
     """Length in frames."""
@@ -50,25 +54,27 @@ class Render:
     def run(self) -> int:
         from ..export.film import claim_film, film
         from ..export.video import kind_of
-        from ..paths import film_cameras
+        from ..paths import film_cameras, fitting
 
-        flight = None if self.path in PATHS else read_path(self.path, self.fps)
+        flight = None if self.path in (AUTO, *PATHS) else read_path(self.path, self.fps)
         fps = self.fps or (flight.fps if flight else 30.0)
         reads = [self.source, *([Path(self.path)] if flight else [])]
         if self.output is not None:
             kind_of(self.output, fps)
             claim_film(self.output, self.overwrite, reads)
         opened, method, views = open_method(self.source, self.device, self.told)
-        output = self.output or opened.renders / f"{Path(self.path).stem}.mp4"
+        path = fitting(views["train"], opened.frame) if self.path == AUTO else self.path
+        output = self.output or opened.renders / f"{Path(path).stem}.mp4"
         kind_of(output, fps)
         claim_film(output, self.overwrite, reads)
-        cameras = film_cameras(views, opened.frame, flight or self.path, self.frames, self.size)
+        cameras = film_cameras(views, opened.frame, flight or path, self.frames, self.size)
         shown = animate(opened, method, self.animated, len(cameras))
         about = film(shown, cameras, output, fps, light=self.format == "exr")
         width, height = about["size"]
         show(
             {
                 "film": str(output),
+                **({"path": CHOSEN[path]} if self.path == AUTO else {}),
                 "depth": str(output.with_stem(f"{output.stem}-depth")),
                 "pictures": f"{output.with_suffix('')}/0000.{self.format} …",
                 "frames": f"{about['frames']} of {width}x{height}, {about['seconds_per_frame']:.3f} s each",

@@ -21,7 +21,7 @@ from ..progress import track
 from ..run import Run, check_new
 from ..run.checkpoint import Checkpoints
 from ..run.compressed import Compressed, bytes_in
-from .ladder import LADDER, Rung
+from .ladder import LADDER, PLACES, Rung, rung_at
 from .measure import Truth, truth_of
 from .model import Model
 
@@ -99,11 +99,11 @@ class Ladder:
         return model
 
     def by_size(self, most: int) -> Model:
-        """The lowest rung that is as small. Tuning changes the size a little, so that it may take the next one."""
-        rungs = range(len(LADDER))
-        first = bisect_left(rungs, True, key=lambda number: len(self.at(number).packed()) <= most)
-        for number in rungs[first:]:
-            model, self.tuned = self.at(number), 0.0
+        """The lowest place that is as small, on a rung or between two. Tuning changes the size a little, so that it may
+        take the next one."""
+        first = bisect_left(PLACES, True, key=lambda place: len(self.at(place).packed()) <= most)
+        for place in PLACES[first:]:
+            model, self.tuned = self.at(place), 0.0
             self.tune(model, 1.0)
             if len(model.packed()) <= most:
                 return model
@@ -112,9 +112,9 @@ class Ladder:
             f"{self.run.folder} cannot be made as small as {told(most)}; the smallest reached is {told(smallest)}"
         )
 
-    def at(self, number: int) -> Model:
-        """The run on a rung."""
-        rung, step = self.rung(number), self.run.state.step
+    def at(self, place: float) -> Model:
+        """The run on a rung, or between two."""
+        rung, step = self.rung(place), self.run.state.step
         method = self.run.method(self.device)
         if self.run.settings.budget:
             spent = Budget.from_json(self.run.settings.budget).progress(step, self.run.state.seconds)
@@ -122,8 +122,8 @@ class Ladder:
             self.run.restore_weights(method)
         return Model(method, self.importance, rung, step)
 
-    def rung(self, number: int) -> Rung:
-        rung = LADDER[number]
+    def rung(self, place: float) -> Rung:
+        rung = rung_at(place)
         if self.aim.codebook is None:
             return rung
         return replace(rung, recipe=replace(rung.recipe, codebook=self.aim.codebook))

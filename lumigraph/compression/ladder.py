@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from ..packing import Recipe
 
@@ -27,3 +27,15 @@ LADDER: tuple[Rung, ...] = (
     Rung(0.08, Recipe(1024, apart=0.0, coarser=3)),
     Rung(0.15, Recipe(256, apart=0.0, coarser=4)),
 )
+
+BETWEEN = 4  # places on the way from a rung to the next
+PLACES = [i / BETWEEN for i in range(BETWEEN * (len(LADDER) - 1) + 1)]
+
+
+def rung_at(place: float) -> Rung:
+    """A rung, or what lies between two: the lower one's recipe, with more pruned and fewer rows kept apart."""
+    low, high = LADDER[int(place)], LADDER[min(int(place) + 1, len(LADDER) - 1)]
+    share = place - int(place)
+    pruned = low.pruned + share * (high.pruned - low.pruned)
+    apart = low.recipe.apart + share * (high.recipe.apart - low.recipe.apart)
+    return Rung(pruned, replace(low.recipe, apart=apart))

@@ -24,6 +24,7 @@ from ..components.clouds.tidying import before_a_lens, confined, nearest_camera
 from ..components.clouds.witnesses import hold_back
 from ..components.fields.affine_colours import NUMBERS, changed, changed_harmonics, found
 from ..components.fields.appearance import PhotographCodes
+from ..components.training.lights import spread_of_light
 from ..components.training.pose_refinement import PoseRefinement
 from ..components.training.rhythm import Rhythm, haste, intervals
 from ..components.training.schedules import falling
@@ -76,11 +77,11 @@ class Config:
     filter_3d: bool = False  # Mip-Splatting's 3-D filter (Yu 2024, section 5.1)
     refine_cameras: bool = False  # learn where each photograph was taken from, small pictures first
     pose_learning_rate: LearningRate = 5e-3  # radians by which a step moves a picture, with refine_cameras
-    appearance: bool = False  # learn for each photograph how its colours differ from the scene's
+    appearance: Literal["auto", "yes", "no"] = "auto"  # learn how each photograph's colours differ; auto: where they do
     appearance_lr: LearningRate = 5e-3  # of those changes of colour
     final_appearance_lr: LearningRate = 5e-4
     appearance_regularization: NonNegative = 1e-3  # of a change's squared numbers in the loss
-    robust: Literal["auto", "yes", "no"] = "auto"  # leave out what moved between photographs; auto: with appearance
+    robust: Literal["auto", "yes", "no"] = "auto"  # leave out what moved; auto: where colours differ
     robust_start: Share = 0.1  # share of the budget before which every pixel counts
     seed: Seed = 0
 
@@ -97,6 +98,7 @@ STORAGE = {  # of tensors, where a run is compressed; positions need the most bi
 }
 SWEEPING = 0.08  # of the budget: the share that looking for points to begin at may take
 BLACK = 0.0, 0.0, 0.0
+STOPS = 0.3  # between neighbouring photographs, beyond which they are of different light
 NEAR = 0.1  # times the scene's near distance: the near plane of splats
 COARSE = 0.5  # of the budget: where poses are refined, plain colours, and half size if nothing else is said
 SMALLEST = 64  # pixels of a photograph's shorter side that are kept when it is reduced
@@ -111,6 +113,7 @@ class GaussianSplatting(Method):
     """A cloud of Gaussians that learns from one photograph a step; `density_control` changes their number."""
 
     Config = Config
+    before: ClassVar[dict[str, Any]] = {"appearance": "no", "robust": "no"}
     formerly: ClassVar[dict[str, str]] = {
         "degree": "sh_degree",
         "raise_degree_every": "sh_degree_interval",
@@ -148,13 +151,13 @@ class GaussianSplatting(Method):
         self.exploration = MarkovChain()
         refining, rate = config.refine_cameras, config.pose_learning_rate
         self.poses = PoseRefinement(frame.image_count, rate) if refining else None
-        self.appearance = PhotographCodes(frame.image_count, NUMBERS) if config.appearance else None
+        self.lights = PhotographCodes(frame.image_count, NUMBERS) if config.appearance != "no" else None
         self.found: Tensor | None = None  # the light of a photograph that was given
-        robust = config.robust == "yes" or (config.robust == "auto" and config.appearance)
-        self.trimming = Trimming() if robust else None
+        self.trimming = Trimming() if config.robust != "no" else None
         self.rhythm = Rhythm(config.refine_every, config.refine_every_share)
         self.register_buffer("extent", torch.tensor(1.0))
         self.register_buffer("drawn", torch.tensor(0))
+        self.register_buffer("differ", torch.tensor(config.appearance == "yes"))
         self.register_buffer("began", torch.tensor(len(self.cloud)))
         self.register_buffer("interval", torch.zeros(len(self.cloud) if config.filter_3d else 0))
         self._bands = config.sh_degree + 1
@@ -216,6 +219,7 @@ class GaussianSplatting(Method):
         self._cameras = scene.cameras[scene.splits["train"]]
         if config.filter_3d:
             self.interval = sampling_interval(self.cloud.means, self._cameras, self._near)
+        self._tell_apart(scene)
         if self.poses:
             self.poses.begin(scene.cameras, scene.frame)
         positions = self._cameras.position
@@ -260,8 +264,8 @@ class GaussianSplatting(Method):
             seen.centres.retain_grad()
         self._seen = seen
         self._difference = (rgb - target).detach()
-        if self.trimming and self._progress >= config.robust_start:
-            counted = self.trimming(self._difference.abs().mean(-1))
+        if self._trimming and self._progress >= config.robust_start:
+            counted = self._trimming(self._difference.abs().mean(-1))
             target = torch.where(counted[..., None], target, rgb.detach())
         difference = rgb - target
         terms = {
@@ -285,8 +289,8 @@ class GaussianSplatting(Method):
             {"params": [cloud.opacities], "lr": c.opacities_lr},
             {"name": "harmonics", "params": [cloud.harmonics], "lr": c.sh_lr, "columns": columns},
         ]
-        if self.appearance:  # one row a step has a gradient, as with Gaussians
-            groups.append({"name": "appearance", "params": [self.appearance.codes], "lr": c.appearance_lr})
+        if self.lights:  # one row a step has a gradient, as with Gaussians
+            groups.append({"name": "appearance", "params": [self.lights.codes], "lr": c.appearance_lr})
         self._optimizer = CloudAdam(groups)
         return [self._optimizer, self.poses.optimizer()] if self.poses else [self._optimizer]
 
@@ -297,7 +301,7 @@ class GaussianSplatting(Method):
         times = haste(step, progress, ENOUGH, c.most_haste)
         means = float(self.extent) * falling(c.means_lr, c.final_means_lr, progress)
         rates = {"means": means, "scales": times * c.scales_lr, "harmonics": times * c.sh_lr}
-        if self.appearance:
+        if self.lights:
             rates["appearance"] = falling(c.appearance_lr, c.final_appearance_lr, progress)
         return rates | ({"poses": self.poses.rate(progress)} if self.poses else {})
 
@@ -317,8 +321,8 @@ class GaussianSplatting(Method):
         due = self.due(step)
         assert seen.centres.grad is not None and self._cameras is not None
         self.cloud.see(self._image, seen.centres.grad.ne(0).any(-1))
-        if self.trimming:
-            self.trimming.note(self._difference.abs().mean(-1))
+        if self._trimming:
+            self._trimming.note(self._difference.abs().mean(-1))
         if config.strategy == "mcmc":
             self._sample(step, due, optimizer, self.random(step))
         elif self._progress < config.refine_until:
@@ -448,7 +452,30 @@ class GaussianSplatting(Method):
             rgb = changed(rgb, seen.opacity, code.detach()).clamp(0, 1)
         return replace(seen, rgb=over(rgb, seen.opacity, background))
 
-    # Being told something
+    # Photographs that differ
+
+    @property
+    def appearance(self) -> PhotographCodes | None:
+        """How each photograph's colours differ; None where they do not, or may not be told apart."""
+        return self.lights if bool(self.differ) else None
+
+    @property
+    def _trimming(self) -> Trimming | None:
+        return self.trimming if self.config.robust == "yes" or bool(self.differ) else None
+
+    def _tell_apart(self, scene: Scene) -> None:
+        """Find out whether photographs differ so much that each has to be seen in a light of its own."""
+        if self.config.appearance != "auto":
+            return
+        stops = spread_of_light(scene)
+        self.differ.fill_(stops > STOPS)
+        if bool(self.differ):
+            warnings.warn(
+                f"Neighbouring photographs differ by {stops:.1f} stops, so each has colours of its own, and what moved "
+                "between them is left out; `--appearance no` takes all for the same light",
+                LumigraphWarning,
+                stacklevel=2,
+            )
 
     @property
     def accepts(self) -> tuple[type, ...]:  # type: ignore[override]  # it depends on the run

@@ -32,6 +32,8 @@ OUTLYING = 4.0  # median deviations of log distance beyond which a camera does n
 FRAMES_PER_KEY = 6  # interpolated frames between two photographs, at least
 WIDEST, NARROWEST = 75.0, 20.0  # degrees, of a film's smaller angle of view
 FACING = 0.5  # cosine of the angle to the focus up to which a camera looks at it
+ALIKE = 0.9  # length of the mean of all gazes above which cameras look the same way
+SWEPT = 0.7  # of what the middle two thirds of the cameras span, how far a sweep goes
 ENOUGH = 0.4  # of the cameras that must look at the focus; gazes in all directions give a quarter to a third
 
 
@@ -115,6 +117,11 @@ class Surroundings:
         """Whether the cameras look at something between them. Some may look elsewhere, as where somebody walked around
         a courtyard and photographed both its fountain and its walls."""
         return float((self.cosine > FACING).double().mean()) > ENOUGH
+
+    @property
+    def alike(self) -> bool:
+        """Whether all cameras look about the same way: at a front, or down from a drone."""
+        return float(self.forward.mean(0).norm()) > ALIKE
 
     @cached_property
     def _offset(self) -> Float[Tensor, "camera 3"]:
@@ -206,8 +213,33 @@ def interpolate(around: Surroundings, frames: int) -> Poses:
     return look_at(curve[:, :3] * scale, curve[:, 3:6], curve[:, 6:])
 
 
+def sweep(around: Surroundings, frames: int) -> Poses:
+    """An oval among cameras that look the same way, seen as those nearby see it."""
+    angle, gaze = turn(frames), unit(around.forward.mean(0))
+    up = -around.cameras.pose[around.middle, :, 1].double().cpu()
+    down_picture = unit(up - (up @ gaze) * gaze)
+    flat = torch.stack([torch.linalg.cross(gaze, down_picture), down_picture])
+    offset = around.position - around.position.median(0).values
+    places = offset @ flat.T
+    axes = torch.linalg.eigh(places.T @ places).eigenvectors
+    low, high = torch.quantile(places @ axes, torch.tensor([1 / 6, 5 / 6], dtype=torch.double), dim=0)
+    oval = torch.stack([angle.cos(), angle.sin()], -1) * SWEPT * (high - low) / 2 + (low + high) / 2
+    wide = (high - low).norm().clamp_min(1e-9) / 4
+    near = torch.exp(-torch.cdist(oval, places @ axes).square() / (2 * wide**2)) + 1e-9
+    near = near / near.sum(-1, keepdim=True)
+    ahead = near @ (offset @ gaze)
+    position = around.position.median(0).values + (oval @ axes.T) @ flat + ahead[:, None] * gaze
+    return look_at(position, unit(near @ around.forward), up)
+
+
+def fitting(cameras: Camera, frame: Frame) -> str:
+    """The path of `PATHS` that a capture supports: a sweep where cameras look the same way, else an orbit."""
+    return "sweep" if Surroundings(cameras, frame).alike else "orbit"
+
+
 PATHS: dict[str, Callable[[Surroundings, int], Poses]] = {
     "orbit": orbit,
+    "sweep": sweep,
     "spiral": spiral,
     "interpolate": interpolate,
 }

@@ -10,7 +10,7 @@ from .keyframes import CameraPath
 
 LONGEST = 480  # pixels of a film, if nobody asks for more
 FRAMES = 120  # of a film along a path that does not say how long it is
-WAYS = ("orbit", "spiral", "interpolate", "held-out")
+WAYS = ("orbit", "sweep", "spiral", "interpolate", "held-out")
 
 
 def film_cameras(

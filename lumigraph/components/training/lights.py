@@ -1,0 +1,58 @@
+"""Whether photographs were taken in the same light, as far as the places that structure from motion found can tell."""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from ...camera import Camera
+from ...choice import evenly
+from ...scene import Scene
+from ..clouds.flat_view import FlatView, flat_view
+
+LOOKED_AT = 32  # photographs, each beside its neighbour
+LONGEST = 200  # pixels along their longer side
+POINTS = 1 << 14  # places at most
+FEWEST = 30  # places that two photographs must share to be compared
+DARKEST, BRIGHTEST = 0.05, 0.95  # colours between which a ratio says something
+
+
+@torch.no_grad()
+def spread_of_light(scene: Scene) -> float:
+    """How much brighter or darker, redder or bluer neighbouring photographs show the same places, in stops: the root
+    mean square over photographs and channels of the median log2 ratio. 0 where the scene has no points to tell by.
+
+    Neighbours see about the same side of things and the same things before others, so that what is left is the light
+    and the camera's reading of it.
+    """
+    if scene.points is None or len(train := scene.splits["train"]) < 2:
+        return 0.0
+    points = scene.points[evenly(range(len(scene.points)), POINTS)]
+    beside = neighbours(scene.cameras[train])
+    chosen = evenly(range(len(train)), LOOKED_AT)
+    views = {i: flat_view(scene.photograph(int(train[i])), LONGEST) for i in {*chosen, *beside[chosen].tolist()}}
+    ratios = [ratio for i in chosen if (ratio := brighter(points, views[i], views[int(beside[i])])) is not None]
+    return float(torch.stack(ratios).square().mean().sqrt()) if ratios else 0.0
+
+
+def neighbours(cameras: Camera) -> Int[Tensor, " camera"]:
+    """For each camera the one that stands nearest and looks most alike: their distance, over how far all of them are
+    apart, plus one minus the cosine between them."""
+    position, forward = cameras.position, cameras.forward
+    apart = torch.cdist(position, position)
+    unlike = apart / apart.amax().clamp_min(1e-9) + 1 - forward @ forward.T
+    return unlike.fill_diagonal_(torch.inf).argmin(-1)
+
+
+def brighter(points: Float[Tensor, "point 3"], one: FlatView, other: FlatView) -> Float[Tensor, 3] | None:
+    """Stops by which one picture shows points brighter than another, for each channel; None if they share too few."""
+    colours, known = [], torch.ones(len(points), dtype=torch.bool)
+    for view in (one, other):
+        seen, row, column, _ = view.sees(points)
+        rgb = view.rgb[row, column]
+        colours.append(rgb)
+        known &= seen & (view.trust[row, column] > 0.5) & (rgb > DARKEST).all(-1) & (rgb < BRIGHTEST).all(-1)
+    if int(known.sum()) < FEWEST:
+        return None
+    return (colours[0][known] / colours[1][known]).log2().median(0).values
