@@ -12,6 +12,7 @@ import torch
 from captures import HEIGHT, WIDTH, WRITERS, Tiny, write_ngp
 from listing import names
 from PIL import Image
+from test_gaussian_splatting import new
 
 from lumigraph.capture import open_scene
 from lumigraph.capture.motion.folder import copy_masks
@@ -22,6 +23,8 @@ from lumigraph.capture.objects.view import View
 from lumigraph.capture.photos import gather
 from lumigraph.capture.photos.track import untracked
 from lumigraph.errors import LumigraphError, LumigraphWarning
+from lumigraph.evaluate import evaluate
+from lumigraph.scene import Scene
 
 
 def write_masks(folder: Path, names: list[str], times: int = 1) -> None:
@@ -175,3 +178,19 @@ def test_the_table_is_the_plane_below(generator):
     found = find_table(torch.cat([table, thing]))
     assert found is not None and found.normal[2] > 0.999 and abs(found.height + 0.298) < 0.005
     assert find_table(thing) is None
+
+
+def test_a_photograph_that_is_masked_altogether_is_not_compared(monkeypatch):
+    scene, photograph = tiny.scene(), Scene.photograph
+
+    def masked(self, index, *layers):
+        shot = photograph(self, index, *layers)
+        return replace(shot, mask=torch.full(shot.rgb.shape[:2], index != bad))
+
+    monkeypatch.setattr(Scene, "photograph", masked)
+    method = new()[0]
+    bad = int(scene.splits["test"][1])
+    found = evaluate(method, scene)
+    assert len(found.views) == len(scene.splits["test"]) - 1 and np.isfinite(found.psnr)
+    with pytest.raises(LumigraphError, match="nothing of the views"):
+        evaluate(method, replace(scene, splits=scene.splits | {"test": scene.splits["test"][1:2]}))

@@ -27,7 +27,8 @@ class Render:
     """Fly a camera through a run, a splat file or a composition: colour and depth, as films and as pictures.
 
     Paths keep to where the photographs were taken from. orbit goes round (or to and fro), sweep makes an oval among
-    cameras that look the same way, as from a drone; auto is one of these two. spiral goes twice round while rising, interpolate passes smoothly through photographs' places, held-out visits the test photographs' own cameras.
+    cameras that look the same way, as from a drone; auto is one of these two. spiral goes twice round while rising,
+    interpolate passes smoothly through photographs' places, held-out visits the test photographs' own cameras.
     A path of your own is a JSON file: keyframes saved in the viewer, or what lies beside a film of the same capture.
     """
 

@@ -134,8 +134,9 @@ def evaluate(
     keep:  told each view's name and rendering
     views: so many of them at most, evenly spread over the split; None means all
     Cameras are those that the method refined; held-out ones are then found as `held_out_poses` says. Pixels that the
-    photograph's mask rules out do not count. A method that photographs can be given to is judged by halves (see
-    `evaluate.halves`). Raises LumigraphError if the split has no view.
+    photograph's mask rules out do not count, nor does a photograph that it rules out altogether. A method that
+    photographs can be given to is judged by halves (see `evaluate.halves`). Raises LumigraphError if the split has no
+    view.
     """
     chosen = scene.splits.get(split)
     if chosen is None or not len(chosen):
@@ -155,12 +156,14 @@ def evaluate(
     for index in track(compared, "Comparing views", len(compared)):
         shot = scene.photograph(index, [name for name in (CLEAN, LIGHT) if name in scene.layers])
         camera = found.camera(index) if found else method.refined(shot.camera)
+        columns = halves.right_half(shot) if by_halves else slice(None)
+        if shot.mask is not None and not shot.mask[:, columns].any():
+            continue
         photograph = shot.before(scene.frame.background)
         told = method.given(halves.left_half(shot)) if by_halves else method
         begin = time.perf_counter()
         seen = told.render(camera).cpu()
         seconds = time.perf_counter() - begin
-        columns = halves.right_half(shot) if by_halves else slice(None)
         rgb = seen.rgb.clamp(0, 1)
         if LIGHT in shot.extra:
             rgb, photograph = in_light(seen, shot.extra[LIGHT])
@@ -172,6 +175,10 @@ def evaluate(
         if all(score.psnr < other.psnr for other in scores):
             worst = {score.name: (photograph, seen)}
         scores.append(score)
+    if not scores:
+        raise LumigraphError(
+            f"{scene.source} has masks that leave nothing of the views in the split {split!r} to compare"
+        )
     stated = protocol(scene, split, compared, lpips, method) | ({"poses": PROTOCOL} if found else {})
     poses = tuple(pose_scores(method, scene))
     return Evaluation(scores, stated, compile_seconds, shown | worst, poses)
