@@ -70,6 +70,8 @@ def convert(
     kind, device = methods.find(name), torch.device(device)
     check(source, kind)
     scene, cameras, teacher = photographs(source, aim.source), source.cameras(), source.method(device)
+    how = way(type(teacher), kind)
+    assert how is not None  # for `check` has asked
     student = begun.new_method(device) if begun else new_student(kind, teacher, aim, device)
     around = teacher.refined(source.survey(cameras["train"]))
     if scene is None or aim.distil:
@@ -89,7 +91,7 @@ def convert(
     seen = [shown(method, scene, held_out, aim.views) for method in (teacher, student)]
     made = Converted(
         source=said["source"],
-        how=way(type(teacher), kind) or "pictures",
+        how=how,
         learnt_from=said["learnt_from"],
         teacher=Held(methods.name_of(teacher), bytes_in(source), seen[0].seconds, seen[0].psnr),
         student=Held(name, run.model_bytes, seen[1].seconds, seen[1].psnr),
