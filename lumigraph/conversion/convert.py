@@ -80,7 +80,7 @@ def convert(
     else:
         learnt_from, data = "photographs", seen_as(teacher, student, scene)
     if begun is None:
-        seconds = take_over(teacher, student, data, around)
+        seconds = take_over(teacher, student, data, around, as_taken=learnt_from == "photographs")
         said = {"source": str(source.path.resolve()), "learnt_from": learnt_from, "taking_over": round(seconds, 3)}
         begun = created(source, student, scene or data, output, budget_of(student, data, aim), aim.seed, said)
     run, said = begun, begun.settings.said["converted"]
@@ -111,14 +111,17 @@ def new_student(kind: type[Method], teacher: Method, aim: Aim, device: torch.dev
     return build(kind, teacher.frame, config, device, getattr(config, "seed", aim.seed), learning=True)
 
 
-def take_over(teacher: Method, student: Method, data: Scene, cameras: Camera) -> float:
+def take_over(teacher: Method, student: Method, data: Scene, cameras: Camera, as_taken: bool) -> float:
     """Let a student begin as its teacher, as far as it can: with what the teacher holds, and with its poses where both
-    learn them. Returns the seconds it took."""
+    learn them. Returns the seconds it took.
+
+    as_taken: whether the data's cameras are as they were given, rather than as the teacher has refined them
+    """
     begin = time.perf_counter()
     poses, own = (getattr(method, "poses", None) for method in (teacher, student))
     if own is not None:
         own.begin(data.cameras, data.frame)
-        if poses is not None:
+        if poses is not None and as_taken:
             own.load_state_dict(poses.state_dict())
     if can(student, FromField):
         needs(student, FromField).from_field(teacher, cameras)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -73,14 +72,12 @@ class Surface:
     """Places on surfaces, from where cameras see them.
 
     normals: unit length, either way
-    sizes:   how large a pixel is there, scene units
     origins: of the camera that saw each
     """
 
     points: Float[Tensor, "point 3"]
     normals: Float[Tensor, "point 3"]
     colours: Float[Tensor, "point 3"]
-    sizes: Float[Tensor, " point"]
     origins: Float[Tensor, "point 3"]
 
     def __len__(self) -> int:
@@ -88,9 +85,7 @@ class Surface:
 
     def __getitem__(self, index: Tensor) -> Surface:
         """The places that a mask or an index tensor picks."""
-        return Surface(
-            self.points[index], self.normals[index], self.colours[index], self.sizes[index], self.origins[index]
-        )
+        return Surface(self.points[index], self.normals[index], self.colours[index], self.origins[index])
 
 
 @torch.no_grad()
@@ -112,10 +107,12 @@ def sighted(method: Any, camera: Camera) -> Sight:
 
 def empty(points: Float[Tensor, "point 3"], sights: Sequence[Sight]) -> Bool[Tensor, " point"]:
     """Which points several cameras see past, so that nothing is there, whatever a field says of them."""
-    count = torch.zeros(len(points), dtype=torch.int64)
+    needed = min(WITNESSES, len(sights))
+    left, count = torch.arange(len(points)), torch.zeros(len(points), dtype=torch.int64)
     for sight in sights:
-        count += sight.sees_past(points)
-    return count >= min(WITNESSES, len(sights))
+        count[left] += sight.sees_past(points[left])
+        left = left[count[left] < needed]
+    return count >= needed
 
 
 def surface(sights: Sequence[Sight]) -> Surface:
@@ -126,9 +123,8 @@ def surface(sights: Sequence[Sight]) -> Surface:
         depth = sight.depth.flatten().nan_to_num(posinf=1e6)
         points = rays.at(depth)
         normals = normals_from_depth(points.view(*sight.depth.shape, 3), depth.view(sight.depth.shape)).view(-1, 3)
-        sizes = depth * rays.radius * math.sqrt(3)
-        found = Surface(points, normals, sight.rgb.view(-1, 3), sizes, rays.origins)
+        found = Surface(points, normals, sight.rgb.view(-1, 3), rays.origins)
         parts.append(found[solid & normals.isfinite().all(-1)])
-    names = ("points", "normals", "colours", "sizes", "origins")
+    names = ("points", "normals", "colours", "origins")
     every = Surface(*(torch.cat([getattr(part, name) for part in parts]) for name in names))
     return every[~empty(every.points, sights)]
