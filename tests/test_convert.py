@@ -150,6 +150,9 @@ def test_pictures_with_depth_become_a_shell(ball, known, generator):
     sees = torch.stack([sight.sees(RADIUS * ways) for sight in shell.sights])
     error = (colour - (0.5 + RADIUS * ways / 1.2)).abs().mean(-1)
     assert error[sees].median() < 0.06
+    density, rgb = shell.field(RADIUS * ways, -ways)
+    assert can(shell, HasField) and density.equal(shell.density(RADIUS * ways))
+    assert (rgb - (0.5 + RADIUS * ways / 1.2)).abs().mean(-1)[sees.any(0)].median() < 0.06
 
 
 def test_harmonics_are_found_again(known, generator):

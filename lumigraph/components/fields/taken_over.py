@@ -180,7 +180,12 @@ class OfField(TakenOver):
 
 
 class OfSights(TakenOver):
-    """Of pictures with depth: a shell around the surfaces that they show, solid from half its thickness on."""
+    """Of pictures with depth: a shell around the surfaces that they show, solid from half its thickness on.
+
+    It has a `field` itself, so it can stand for its teacher wherever one is needed that has.
+    """
+
+    device = torch.device("cpu")
 
     def _density(self, points):
         total, weight, thickness = (points.new_zeros(len(points)) for _ in range(3))
@@ -196,6 +201,18 @@ class OfSights(TakenOver):
         known = weight > 0
         inwards = (0.5 - total / weight.clamp_min(1e-12)).clamp(0, 1) * known
         return inwards * SPENT * weight / thickness.clamp_min(1e-12)
+
+    @torch.no_grad()
+    def field(
+        self, points: Float[Tensor, "point 3"], directions: Float[Tensor, "point 3"]
+    ) -> tuple[Float[Tensor, " point"], Float[Tensor, "point 3"]]:
+        """Density per scene unit, and the colour in that picture which sees the point most nearly along a direction."""
+        best, rgb = torch.full((len(points),), -2.0), torch.full_like(points, 0.5)
+        for sight in self.sights:
+            along = (unit(points - sight.camera.position) * directions).sum(-1)
+            nearer = ((along > best) & sight.sees(points)).nonzero()[:, 0]
+            best[nearer], rgb[nearer] = along[nearer], self.glance(points[nearer], sight)
+        return self.density(points), rgb
 
     def glance(self, points, sight):
         pixel, inside, _ = sight.pixels(points)
