@@ -211,7 +211,8 @@ def test_what_goes_into_what_follows_from_capabilities(capsys):
     for name, into in found.items():
         for other, how in into.items():
             if other in STUDENTS and how is not None:
-                assert how == ("field" if can(methods.find(name), HasField) else "depth")
+                cloud = name == other == "gaussian-splatting"
+                assert how == ("gaussians" if cloud else "field" if can(methods.find(name), HasField) else "depth")
     assert found["voxel-grid"]["plenoxels"] == "depth" and found["plenoxels"]["voxel-grid"] == "pictures"
     assert found["plenoxels"]["fourier-features"] is None and found["nerf"]["instant-ngp"] == "field"
     assert main(["convert", "--list"]) == 0
