@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import json
 from dataclasses import dataclass, replace
+from functools import partial
 
 import pytest
 import tiny
 import torch
 
 from lumigraph import methods
+from lumigraph.camera import ring
 from lumigraph.capabilities import FromField, HasField, can
 from lumigraph.cli import main
 from lumigraph.components.clouds.at_surfaces import facing
@@ -277,7 +279,8 @@ def test_photographs_are_learnt_from_where_they_are(ball_folder, tmp_path, capsy
     assert main(["eval", str(tmp_path / "b"), "--views", "1"]) == 0
 
 
-def test_a_splat_file_is_a_teacher(made, tmp_path):
+def test_a_splat_file_is_a_teacher(made, tmp_path, monkeypatch):
+    monkeypatch.setattr("lumigraph.run.splat_file.ring", partial(ring, size=48))
     export_splats(made.method().gaussians(), made.frame, tmp_path / "cloud.ply")
     kind = methods.find("plenoxels")
     said = convert(
