@@ -14,7 +14,7 @@ class ViewNetwork:
     a sigmoid at the end. Inputs are the direction encoded at four frequencies (27), diffuse colour (3), features (4)."""
 
     weights: tuple[Float[Tensor, "in out"], Float[Tensor, "in2 out2"], Float[Tensor, "in3 3"]]
-    biases: tuple[Float[Tensor, " out"], Float[Tensor, " out2"], Float[Tensor, "3"]]
+    biases: tuple[Float[Tensor, " out"], Float[Tensor, " out2"], Float[Tensor, 3]]
 
 
 @dataclass(frozen=True)
@@ -32,7 +32,7 @@ class Atlas:
 
     index: Int[Tensor, "x y z"]
     values: UInt8[Tensor, "block side side side 8"]
-    low: Float[Tensor, "3"]
+    low: Float[Tensor, 3]
     voxel: float
     block: int
     network: ViewNetwork | None = None
