@@ -142,14 +142,14 @@ def cases(generator: torch.Generator):
         (0, 1, 1.0, 0.0, 0.0),
         (1, 1, 1.0, 0.0, 0.0),
         (9, 2, 0.0, 0.0, 0.0),
-        (40, 4, 0.4, 0.0, 0.0),
-        (40, 3, 0.6, 0.7, 0.0),
-        (40, 4, 0.5, 0.1, 0.2),
-        (12, 7, 0.3, 0.0, 0.0),
+        (30, 3, 0.6, 0.0, 0.0),
+        (40, 2, 0.6, 0.7, 0.0),
+        (30, 3, 0.8, 0.1, 0.2),
+        (5, 6, 0.3, 0.0, 0.0),
     ]:
         tree = some_tree(depth, share, generator)
         yield steady(*some_rays(rays, generator), tree, 6 * torch.rand(tree.count, generator=generator), near, stop)
-    tree = some_tree(4, 0.5, generator)
+    tree = some_tree(3, 0.5, generator)
     part = tree.part(torch.arange(tree.count - 1, -1, -3))
     yield steady(*some_rays(20, generator), part, torch.rand(part.count, generator=generator), 0.0, 0.0)
 

@@ -145,7 +145,12 @@ def run(
     count, device = len(origins), origins.device
     given = [x.contiguous() for x in (origins, directions, tree.cells, tree.named, density)]
     numbers = count, float(near), -math.log(stop) if stop > 0 else math.inf
-    options = {"DEPTH": tree.depth, "BLOCK": BLOCK, "num_warps": 1, "enable_fp_fusion": False}  # both passes round alike
+    options = {
+        "DEPTH": tree.depth,
+        "BLOCK": BLOCK,
+        "num_warps": 1,
+        "enable_fp_fusion": False,
+    }  # both passes round alike
     counts = torch.zeros(count, dtype=torch.int32, device=device)
     ray_starts = torch.zeros(count + 1, dtype=torch.int64, device=device)
     rows = torch.empty(0, dtype=torch.int64, device=device)
