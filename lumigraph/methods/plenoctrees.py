@@ -16,7 +16,7 @@ from ..camera import Camera
 from ..capabilities import HasField, needs
 from ..components.fields.harmonic_field import HarmonicHash, HarmonicNetwork, colour
 from ..components.fields.hash_field import check_levels
-from ..components.fields.leaves import Leaves
+from ..components.fields.leaves import Leaves, ask_for_octree
 from ..components.fields.octree_baking import Baking, bake, fill
 from ..components.sampling.carving import visual_hull
 from ..components.sampling.coarse_to_fine import SAMPLES_OF_A_RAY, first_grid, keep_looking, lattice, stage
@@ -205,9 +205,12 @@ class PlenOctrees(RayMethod):
         density, harmonics = self.teacher(points)
         return density, colour(harmonics, directions)
 
-    def octree(self) -> Octree:
-        """The scene as an octree. Raises LumigraphError while it is not baked."""
-        return self._leaves().octree()
+    def octree(self, depth: int | None = None) -> Octree:
+        """The scene as an octree, of so many levels at most; what lies deeper is averaged. Raises LumigraphError while
+        it is not baked, and where it does not fit into memory, with the depth that does."""
+        leaves = self._leaves()
+        ask_for_octree(leaves, depth)
+        return (leaves if depth is None or depth >= leaves.tree.depth else leaves.coarser(depth)).octree()
 
     def _leaves(self) -> Leaves:
         if not self.baked:

@@ -11,8 +11,10 @@ from torch.nn.functional import embedding
 
 from ... import kernels
 from ...baked import Octree
+from ...errors import LumigraphError
 from ...kernels.octree_cells import Crossed, Tree, code_of, levels_of
 from ...kernels.octree_cells.reference import leaves
+from ...memory import free_on, gigabytes
 from ...rays import Rays, Rendering
 from .harmonic_field import colour
 
@@ -180,6 +182,25 @@ class Leaves(nn.Module):
         found.density = nn.Parameter(density[order])
         found.harmonics = nn.Parameter((harmonics / density.clamp_min(1e-9))[order])
         return found
+
+
+def ask_for_octree(leaves: Leaves, depth: int | None = None) -> None:
+    """Raise LumigraphError where the noun would not fit into memory, all cells of all nodes written out and half as much
+    again while that is done, with the depth that would."""
+    codes, levels = leaves.codes.long(), levels_of(leaves.codes.long())
+    device, deepest = codes.device, int(levels.max()) if len(codes) else 1
+    free, nodes, fits = free_on(device), 0, 0
+    for level in range(min(depth or deepest, deepest)):
+        below = levels > level
+        nodes += len(torch.unique(codes[below] >> 3 * (levels[below] - level)))
+        needed = nodes * 8 * 4 * (2 + 3 * leaves.basis) * 3 // 2
+        fits = level + 1 if needed <= free else fits
+    if fits < min(depth or deepest, deepest):
+        less = f"give --depth {fits}, which fits" if fits else "end other programs"
+        raise LumigraphError(
+            f"An octree of depth {depth or deepest} has {nodes:,} nodes and would need {gigabytes(needed)} of memory, "
+            f"and {gigabytes(free)} are free; {less}"
+        )
 
 
 Part = tuple[Tree, Tensor, Tensor]  # a tree for some rows, and those rows of density and harmonics
