@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -29,7 +30,7 @@ def write_octree(path: Path, octree: Octree, frame: Frame) -> bool:
     return bool(straight)
 
 
-def contents(octree: Octree, moved: Similarity) -> dict[str, np.ndarray]:
+def contents(octree: Octree, moved: Similarity) -> dict[str, Any]:
     """The arrays of the file, by name. moved: to the file's frame; without rotation
 
     data: of each cell, all coefficients of red, of green, of blue, then density per unit of the file's frame

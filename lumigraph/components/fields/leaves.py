@@ -185,8 +185,8 @@ class Leaves(nn.Module):
 
 
 def ask_for_octree(leaves: Leaves, depth: int | None = None) -> None:
-    """Raise LumigraphError where the noun would not fit into memory, all cells of all nodes written out and half as much
-    again while that is done, with the depth that would."""
+    """Raise LumigraphError where the noun would not fit into memory, all cells of all nodes written out and half as
+    much again while that is done, with the depth that would."""
     codes, levels = leaves.codes.long(), levels_of(leaves.codes.long())
     device, deepest = codes.device, int(levels.max()) if len(codes) else 1
     free, nodes, fits = free_on(device), 0, 0
@@ -223,4 +223,5 @@ def in_space(codes: Int[Tensor, " row"]) -> Int[Tensor, " row"]:
 
 def codes_of(place: Int[Tensor, "row 3"], depth: int) -> Int[Tensor, " row"]:
     """Codes of cells of one level, from their whole numbers along each axis."""
-    return code_of(*place.unbind(-1), depth)
+    x, y, z = place.unbind(-1)
+    return code_of(x, y, z, depth)

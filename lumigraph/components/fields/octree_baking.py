@@ -19,17 +19,16 @@ from ...camera import Camera
 from ...capabilities import HasDensity, HasLooks, can
 from ...errors import LumigraphError
 from ...kernels import composite, spherical_harmonics
-from ...kernels.octree_cells import DEEPEST
 from ...memory import free_on, gigabytes
 from ...rays import Rays
 from ...volume import weights_of
 from .leaves import Leaves, codes_of
 
-CELLS = 128  # along each axis of the lattice that a teacher's samples mark
-MARKS = 1 << 18  # rays that mark it
-CHUNK = 1 << 14  # rays asked at once
+CELLS = 128  # along each axis of the lattice that a teacher's samples mark, at most
+MARKS = 1 << 18  # rays that mark it, at most
+CHUNK = 1 << 13  # rays asked at once
 POINTS = 1 << 18  # points asked at once
-PER_CELL = 32  # rays that find weights, for each cell of one face of the cube
+PER_CELL = 32  # rays that look, for each cell of one face of the cube
 MOST_RAYS = 1 << 22
 VIEWS = 24  # directions in which a field's colour is asked, of each leaf
 RIDGE = 0.05  # how strongly harmonics that these directions do not tell stay 0, as a share of what all of them tell
@@ -71,7 +70,7 @@ def bake(
     Raises LumigraphError where nothing is seen, or where so deep an octree does not fit into memory.
     """
     density = density_of(teacher)
-    mask = met(teacher, cameras, generator) if can(teacher, HasLooks) else None
+    mask = met(teacher, cameras, numbers.depth, generator) if can(teacher, HasLooks) else None
     leaves.low, leaves.size = tight_cube(mask, leaves.low.device)
     codes = dense_cells(density, leaves, mask, numbers)
     fill(leaves, codes)
@@ -99,16 +98,17 @@ def random_rays(cameras: Camera, count: int, generator: torch.Generator) -> Rays
     return cameras.rays(pixels.to(cameras.pose), index.to(cameras.pose.device))
 
 
-def met(teacher: Any, cameras: Camera, generator: torch.Generator) -> Bool[Tensor, "x y z"]:
+def met(teacher: Any, cameras: Camera, depth: int, generator: torch.Generator) -> Bool[Tensor, "x y z"]:
     """Cells of a lattice over [-1, 1]^3 in which a teacher's samples weigh something, and those next to them."""
-    marks = torch.zeros(CELLS**3, dtype=torch.bool, device=teacher.device)
-    for _ in range(MARKS // CHUNK):
+    n = min(CELLS, 1 << depth)
+    marks = torch.zeros(n**3, dtype=torch.bool, device=teacher.device)
+    for _ in range(0, min(PER_CELL << 2 * depth, MARKS), CHUNK):
         rays = random_rays(cameras, CHUNK, generator).to(teacher.device)
         look = teacher.looks(rays)[-1]
         points = look.samples.along(rays)[0][weights_of(look.samples, look.density) > 1e-3]
-        x, y, z = ((points * 0.5 + 0.5) * CELLS).long().clamp(0, CELLS - 1).unbind(-1)
-        marks[(x * CELLS + y) * CELLS + z] = True
-    around = max_pool3d(marks.view(1, 1, CELLS, CELLS, CELLS).float(), 3, 1, 1)
+        x, y, z = ((points * 0.5 + 0.5) * n).long().clamp(0, n - 1).unbind(-1)
+        marks[(x * n + y) * n + z] = True
+    around = max_pool3d(marks.view(1, 1, n, n, n).float(), 3, 1, 1)
     return around[0, 0] > 0
 
 
@@ -118,8 +118,8 @@ def tight_cube(
     """Corner and side of the smallest cube around all marked cells; the whole where nothing is marked or known."""
     if mask is None or not mask.any():
         return torch.full((3,), -1.0, device=device), torch.tensor(2.0, device=device)
-    places = mask.nonzero()
-    low, high = places.amin(0) * (2 / CELLS) - 1, (places.amax(0) + 1) * (2 / CELLS) - 1
+    places, cell = mask.nonzero(), 2 / len(mask)
+    low, high = places.amin(0) * cell - 1, (places.amax(0) + 1) * cell - 1
     size = (high - low).max()
     return (low + high - size) / 2, size
 
@@ -147,9 +147,9 @@ def dense_cells(
 
 def overlapping(mask: Bool[Tensor, "x y z"], low: Float[Tensor, "cell 3"], side: float) -> Bool[Tensor, " cell"]:
     """Which cubes hold part of a marked cell."""
-    total = torch.nn.functional.pad(mask.int().cumsum(0).cumsum(1).cumsum(2), (1, 0, 1, 0, 1, 0))
-    first = ((low * 0.5 + 0.5) * CELLS + 1e-4).floor().long().clamp(0, CELLS)
-    last = (((low + side) * 0.5 + 0.5) * CELLS - 1e-4).ceil().long().clamp(0, CELLS)
+    n, total = len(mask), torch.nn.functional.pad(mask.int().cumsum(0).cumsum(1).cumsum(2), (1, 0, 1, 0, 1, 0))
+    first = ((low * 0.5 + 0.5) * n + 1e-4).floor().long().clamp(0, n)
+    last = (((low + side) * 0.5 + 0.5) * n - 1e-4).ceil().long().clamp(0, n)
     count = torch.zeros(len(low), dtype=total.dtype, device=low.device)
     for corner in range(8):
         bits = torch.tensor([corner >> 2 & 1, corner >> 1 & 1, corner & 1], device=low.device)
@@ -170,7 +170,6 @@ def ask_for_cells(cells: int, basis: int, depth: int, level: int, device: torch.
 
 def fill(leaves: Leaves, codes: Int[Tensor, " row"]) -> None:
     """Leaves of these codes, which hold nothing yet."""
-    assert len(codes) == 0 or int(codes.max()) < 8 ** (DEEPEST + 1)
     leaves.codes = codes.sort()[0].int()
     leaves.density = nn.Parameter(torch.zeros(len(codes), 1, device=codes.device))
     leaves.harmonics = nn.Parameter(torch.zeros(len(codes), 3 * leaves.basis, device=codes.device))
@@ -194,14 +193,14 @@ def averaged_density(leaves: Leaves, density: Density, count: int, generator: to
 
 def seen(leaves: Leaves, cameras: Camera, numbers: Baking, generator: torch.Generator) -> Bool[Tensor, " row"]:
     """Which leaves have enough weight somewhere in the pictures, from random rays of all of them."""
-    most, size = torch.zeros(len(leaves), device=leaves.codes.device), float(leaves.size)
+    most = torch.zeros(len(leaves), device=leaves.codes.device)
     for _ in range(0, min(PER_CELL << 2 * numbers.depth, MOST_RAYS), CHUNK):
         rays = random_rays(cameras, CHUNK, generator).to(most.device)
         found = leaves.crossed(rays, numbers.near, numbers.threshold)
         tau = leaves.density[found.rows, 0].relu() * (found.t_end - found.t_start)
         weights = composite(tau, tau[:, None], found.ray_starts)[2]
         most.scatter_reduce_(0, found.rows, weights, "amax")
-    return most > numbers.threshold if size else most > 0
+    return most > numbers.threshold
 
 
 def averaged_harmonics(leaves: Leaves, harmonics: Harmonics, count: int, generator: torch.Generator) -> None:

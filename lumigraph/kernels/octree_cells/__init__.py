@@ -148,10 +148,12 @@ def cases(generator: torch.Generator):
         (5, 6, 0.3, 0.0, 0.0),
     ]:
         tree = some_tree(depth, share, generator)
-        yield steady(*some_rays(rays, generator), tree, 6 * torch.rand(tree.count, generator=generator), near, stop)
+        origins, directions = some_rays(rays, generator)
+        yield steady(origins, directions, tree, 6 * torch.rand(tree.count, generator=generator), near, stop)
     tree = some_tree(3, 0.5, generator)
     part = tree.part(torch.arange(tree.count - 1, -1, -3))
-    yield steady(*some_rays(20, generator), part, torch.rand(part.count, generator=generator), 0.0, 0.0)
+    origins, directions = some_rays(20, generator)
+    yield steady(origins, directions, part, torch.rand(part.count, generator=generator), 0.0, 0.0)
 
 
 def benchmark_case(generator: torch.Generator, size: int = 2**18):

@@ -41,12 +41,8 @@ def run(
         t, alive = end, ((place >= 0) & (place < side)).all(-1) & (thickness <= most)
     if not found:
         return t[:0], t[:0], torch.zeros(len(rays) + 1, dtype=torch.int64, device=t.device), rays[:0]
-    return _by_ray(len(a), *(torch.cat(parts) for parts in zip(*found, strict=True)))
-
-
-def _by_ray(count: int, ray: Tensor, begin: Tensor, end: Tensor, row: Tensor) -> tuple[Tensor, ...]:
-    order = ray.argsort(stable=True)
-    counts = torch.bincount(ray, minlength=count)
+    ray, begin, end, row = (torch.cat(parts) for parts in zip(*found, strict=True))
+    order, counts = ray.argsort(stable=True), torch.bincount(ray, minlength=len(a))
     return begin[order], end[order], torch.nn.functional.pad(counts.cumsum(0), (1, 0)), row[order]
 
 

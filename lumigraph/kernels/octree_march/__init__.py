@@ -71,5 +71,6 @@ def benchmark_case(generator: torch.Generator, size: int = 2**18):
 
 def _inputs(tree: Tree, rays: int, bands: int, dense: float, near: float, stop: float, generator: torch.Generator):
     density = dense * torch.rand(tree.count, generator=generator)
-    origins, directions, *_ = steady(*some_rays(rays, generator), tree, density, near, stop)
+    origins, directions = some_rays(rays, generator)
+    origins, directions, *_ = steady(origins, directions, tree, density, near, stop)
     return origins, directions, tree, density, torch.randn(tree.count, bands**2, 3, generator=generator), near, stop

@@ -149,9 +149,9 @@ def _sum(firsts, order, rays, shares, bases, to_density, to_harmonics):
 class _OctreeMarch(torch.autograd.Function):
     @staticmethod
     def forward(ctx, origins, directions, tree, density, harmonics, near, stop):
-        rays = len(origins)
-        rgb, distance, opacity = empty(rays, 3), empty(rays), empty(rays)
-        starts = torch.zeros(rays + 1, dtype=torch.int64)
+        n = len(origins)
+        rgb, distance, opacity = empty(n, 3), empty(n), empty(n)
+        starts = torch.zeros(n + 1, dtype=torch.int64)
         ctx.numbers = math.isqrt(harmonics.shape[1]), tree.depth, np.float32(near)
         ctx.tree = tree.cells.numpy(), tree.named.numpy()
         rays = origins.detach().numpy(), directions.detach().numpy()
@@ -169,9 +169,8 @@ class _OctreeMarch(torch.autograd.Function):
         bases = np.zeros((len(origins), 16), np.float32)
         rows, rays, order = (np.empty(starts[-1], np.int32) for _ in range(3))
         shares = empty(int(starts[-1]), 4).numpy()
-        grads = (g.contiguous().numpy() for g in grads)
         given = origins, directions, *ctx.tree, density, harmonics, *ctx.numbers, *outputs
-        _share(*grads, *given, bases, rows, rays, shares)
+        _share(*(g.contiguous().numpy() for g in grads), *given, bases, rows, rays, shares)
         firsts = np.zeros(len(density) + 1, np.int64)
         _sorted(rows, firsts, order)
         to_density, to_harmonics = torch.zeros(density.shape), torch.zeros(harmonics.shape)

@@ -186,8 +186,8 @@ class _OctreeMarch(torch.autograd.Function):
         to_density, to_harmonics = torch.zeros_like(density), torch.zeros_like(harmonics)
         if rays := len(origins):
             given = origins, directions, *ctx.tree, density, harmonics, *out, to_density, to_harmonics
-            grid, grads = (triton.cdiv(rays, BLOCK),), [g.contiguous() for g in grads]
-            _backward[grid](*grads, *given, *ctx.numbers, **ctx.sizes)
+            grid, slopes = (triton.cdiv(rays, BLOCK),), [g.contiguous() for g in grads]
+            _backward[grid](*slopes, *given, *ctx.numbers, **ctx.sizes)
         return None, None, None, to_density, to_harmonics, None, None
 
 
