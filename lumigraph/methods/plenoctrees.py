@@ -320,6 +320,7 @@ class PlenOctrees(RayMethod):
         numbers = Baking(c.octree_depth, c.leaf_points, c.weight_threshold, self.frame.near)
         bake(self.leaves, teacher, cameras, numbers, self.random(-1), harmonics)
         self.teacher = self.occupancy = None
+        self.figures = {}
         self._optimizers[:] = self._of_leaves()  # in the list that the trainer holds
 
     def loss(self, batch: Batch, step: int) -> dict[str, Tensor]:
