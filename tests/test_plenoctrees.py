@@ -14,7 +14,7 @@ from lumigraph.cli import main
 from lumigraph.components.fields import leaves as leaves_module
 from lumigraph.components.fields.harmonic_field import colour
 from lumigraph.components.fields.leaves import Leaves, in_space, places_of
-from lumigraph.components.fields.octree_baking import Baking, bake, fill, overlapping, tight_cube
+from lumigraph.components.fields.octree_baking import Baking, bake, fill, fitted_harmonics, overlapping, tight_cube
 from lumigraph.errors import LumigraphError
 from lumigraph.export.octree import contents, parents
 from lumigraph.geometry import Similarity
@@ -165,11 +165,12 @@ def test_the_cube_is_tight():
 
 
 def test_harmonics_of_a_field_are_its_colours():
-    leaves = Leaves(4)
-    bake(leaves, Ball(), tiny.scene().cameras, Baking(3, 4, 1e-3, 0.1), torch.Generator().manual_seed(0))
+    leaves, cameras, chance = Leaves(4), tiny.scene().cameras, torch.Generator().manual_seed(0)
+    bake(leaves, Ball().density, None, cameras, Baking(3, 4, 1e-3, 0.1), chance)
+    fitted_harmonics(leaves, Ball(), cameras, chance)
     centres, _ = leaves.centres
     inside = centres.norm(dim=-1) < 0.45
-    directions = torch.nn.functional.normalize(centres - tiny.scene().cameras.position[2], dim=-1)
+    directions = torch.nn.functional.normalize(centres - cameras.position[2], dim=-1)
     shown = colour(leaves.harmonics.detach().view(-1, 4, 3), directions)
     expected = Ball().field(centres, directions)[1]
     assert (shown - expected)[inside].abs().mean() < 0.04

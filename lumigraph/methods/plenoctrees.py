@@ -13,11 +13,19 @@ from torch import Tensor
 
 from ..baked import Octree
 from ..camera import Camera
-from ..capabilities import HasField, needs
+from ..capabilities import HasField, HasLooks, can, needs
 from ..components.fields.harmonic_field import HarmonicHash, HarmonicNetwork, colour
 from ..components.fields.hash_field import check_levels
 from ..components.fields.leaves import Leaves, ask_for_octree
-from ..components.fields.octree_baking import Baking, bake, fill
+from ..components.fields.octree_baking import (
+    Baking,
+    averaged_harmonics,
+    bake,
+    density_of,
+    fill,
+    fitted_harmonics,
+    met,
+)
 from ..components.sampling.carving import visual_hull
 from ..components.sampling.coarse_to_fine import SAMPLES_OF_A_RAY, first_grid, keep_looking, lattice, stage
 from ..components.sampling.marching import FIRST_RAYS, rays_for, reached
@@ -96,7 +104,7 @@ class Config:
         check_levels(self)
 
 
-RAYS = 1 << 16  # at once, where pictures are measured
+RAYS = 1 << 16  # rendered at once, once there are leaves alone
 ROWS = 16  # leaves that are left of most scenes, for each cell of one face of the cube
 
 
@@ -300,27 +308,44 @@ class PlenOctrees(RayMethod):
     def batch(self, data: Scene, generator: torch.Generator) -> Batch:
         """Rays of a step. Here the field is baked when its share of the budget is over, for here cameras are known."""
         if not self.baked and self._progress >= self.config.teacher_share:
-            self._bake(self, data.cameras[data.splits["train"]], self.teacher)
+            self._bake(data.cameras[data.splits["train"]])
             self.begun.fill_(self._progress)
         rays = self.config.rays_per_step if self.baked else int(self.teacher_rays)
         return data.sample_rays(rays, generator).to(self.device)
 
     def from_field(self, teacher: Any, cameras: Camera) -> None:
         """Bake a teacher's density and colour as far as cameras see them; what is learnt from then on are leaves."""
-        self._bake(needs(teacher, HasField), cameras, None)
+        needs(teacher, HasField)
+        chance, numbers = self.random(-1), self._baking
+        mask = met(teacher, cameras, numbers, chance) if can(teacher, HasLooks) else None
+        bake(self.leaves, density_of(teacher), mask, cameras, numbers, chance)
+        fitted_harmonics(self.leaves, teacher, cameras, chance)
+        self._leave_field()
 
     def load_state_dict(self, state_dict: Mapping[str, Any], strict: bool = True, assign: bool = False) -> Any:
         """As of any module; where what was saved is baked, there is no field any more."""
         if not any(name.startswith("teacher.") for name in state_dict):
-            self.teacher = self.occupancy = None
+            self._leave_field()
         return super().load_state_dict(state_dict, strict, assign)
 
-    def _bake(self, teacher: Any, cameras: Camera, harmonics: Any) -> None:
+    def _bake(self, cameras: Camera) -> None:
+        """What was learnt becomes leaves, and is dropped."""
+        assert self.teacher is not None
+        chance, numbers = self.random(-1), self._baking
+        mask = met(self, cameras, numbers, chance)
+        bake(self.leaves, self.density, mask, cameras, numbers, chance)
+        averaged_harmonics(self.leaves, self.teacher, numbers.points, chance)
+        self._leave_field()
+
+    @property
+    def _baking(self) -> Baking:
         c = self.config
-        numbers = Baking(c.octree_depth, c.leaf_points, c.weight_threshold, self.frame.near)
-        bake(self.leaves, teacher, cameras, numbers, self.random(-1), harmonics)
+        return Baking(c.octree_depth, c.leaf_points, c.weight_threshold, self.frame.near)
+
+    def _leave_field(self) -> None:
+        """From here on there are leaves alone, which need little memory along rays."""
         self.teacher = self.occupancy = None
-        self.figures = {}
+        self.figures, self.rays_per_chunk = {}, RAYS
         self._optimizers[:] = self._of_leaves()  # in the list that the trainer holds
 
     def loss(self, batch: Batch, step: int) -> dict[str, Tensor]:

@@ -16,7 +16,7 @@ from torch import Tensor, nn
 from torch.nn.functional import max_pool3d
 
 from ...camera import Camera
-from ...capabilities import HasDensity, HasLooks, can
+from ...capabilities import HasDensity, can
 from ...errors import LumigraphError
 from ...kernels import composite, spherical_harmonics
 from ...memory import free_on, gigabytes
@@ -57,20 +57,18 @@ class Baking:
 @torch.no_grad()
 def bake(
     leaves: Leaves,
-    teacher: Any,
+    density: Density,
+    mask: Bool[Tensor, "x y z"] | None,
     cameras: Camera,
     numbers: Baking,
     generator: torch.Generator,
-    harmonics: Harmonics | None = None,
 ) -> None:
-    """Fill leaves with what a teacher holds, as far as cameras see it.
+    """Fill leaves with a field's density, as far as cameras see it; harmonics come after.
 
-    teacher:   has `field`, and `density` and `looks` where it can
-    harmonics: density and harmonics at points, where the teacher knows these; else they are fitted to its `field`
+    density: at points, per scene unit
+    mask:    cells of a lattice over [-1, 1]^3 that may hold something; all where None
     Raises LumigraphError where nothing is seen, or where so deep an octree does not fit into memory.
     """
-    density = density_of(teacher)
-    mask = met(teacher, cameras, numbers.depth, generator) if can(teacher, HasLooks) else None
     leaves.low, leaves.size = tight_cube(mask, leaves.low.device)
     codes = dense_cells(density, leaves, mask, numbers)
     fill(leaves, codes)
@@ -78,10 +76,6 @@ def bake(
     leaves.keep(seen(leaves, cameras, numbers, generator))
     if not len(leaves):
         raise LumigraphError("No camera sees anything dense in this field, so no octree can be made; train it longer")
-    if harmonics is None:
-        fitted_harmonics(leaves, teacher, cameras, generator)
-    else:
-        averaged_harmonics(leaves, harmonics, numbers.points, generator)
 
 
 def density_of(teacher: Any) -> Density:
@@ -98,14 +92,14 @@ def random_rays(cameras: Camera, count: int, generator: torch.Generator) -> Rays
     return cameras.rays(pixels.to(cameras.pose), index.to(cameras.pose.device))
 
 
-def met(teacher: Any, cameras: Camera, depth: int, generator: torch.Generator) -> Bool[Tensor, "x y z"]:
+def met(teacher: Any, cameras: Camera, numbers: Baking, generator: torch.Generator) -> Bool[Tensor, "x y z"]:
     """Cells of a lattice over [-1, 1]^3 in which a teacher's samples weigh something, and those next to them."""
-    n = min(CELLS, 1 << depth)
+    n = min(CELLS, 1 << numbers.depth)
     marks = torch.zeros(n**3, dtype=torch.bool, device=teacher.device)
-    for _ in range(0, min(PER_CELL << 2 * depth, MARKS), CHUNK):
+    for _ in range(0, min(PER_CELL << 2 * numbers.depth, MARKS), CHUNK):
         rays = random_rays(cameras, CHUNK, generator).to(teacher.device)
         look = teacher.looks(rays)[-1]
-        points = look.samples.along(rays)[0][weights_of(look.samples, look.density) > 1e-3]
+        points = look.samples.along(rays)[0][weights_of(look.samples, look.density) > numbers.threshold]
         x, y, z = ((points * 0.5 + 0.5) * n).long().clamp(0, n - 1).unbind(-1)
         marks[(x * n + y) * n + z] = True
     around = max_pool3d(marks.view(1, 1, n, n, n).float(), 3, 1, 1)

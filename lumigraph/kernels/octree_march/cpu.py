@@ -14,6 +14,15 @@ from ..spherical_harmonics.cpu import basis
 HALF = np.float32(0.5)
 
 
+def spread(rays):
+    """An order of chunks in which every thread, which takes a run of them, has some from all over a picture."""
+    count = (rays + CHUNK - 1) // CHUNK
+    stride = max(int(0.618 * count), 1)
+    while math.gcd(stride, count) > 1:
+        stride += 1
+    return np.arange(count) * stride % max(count, 1)
+
+
 @njit(inline="always")
 def _channel(harmonics, row, y, c):
     """A cell's colour along the direction whose basis is y: its sigmoid."""
@@ -24,10 +33,11 @@ def _channel(harmonics, row, y, c):
 
 
 @njit(parallel=True, fastmath=True, **FAST)
-def _forward(o, d, cells, named, density, harmonics, bands, depth, near, stop, rgb, distance, opacity, counts):
+def _forward(chunks, o, d, cells, named, density, harmonics, bands, depth, near, stop, rgb, distance, opacity, counts):
     n, side = len(o), np.int64(1) << depth
     per_cell = ONE / np.float32(side)
-    for chunk in prange((n + CHUNK - 1) // CHUNK):
+    for i in prange(len(chunks)):
+        chunk = chunks[i]
         path, y = np.zeros(depth + 1, np.int64), np.zeros(16, np.float32)
         for r in range(chunk * CHUNK, min(n, (chunk + 1) * CHUNK)):
             ox, oy, oz, dx, dy, dz = o[r, 0], o[r, 1], o[r, 2], d[r, 0], d[r, 1], d[r, 2]
@@ -66,7 +76,7 @@ def _forward(o, d, cells, named, density, harmonics, bands, depth, near, stop, r
 
 @njit(parallel=True, fastmath=True, **FAST)
 def _share(
-    g_rgb, g_distance, g_opacity, o, d, cells, named, density, harmonics, bands, depth, near,
+    chunks, g_rgb, g_distance, g_opacity, o, d, cells, named, density, harmonics, bands, depth, near,
     rgb, distance, opacity, starts, bases, rows, rays, shares,
 ):  # fmt: skip
     """Of each cell that each ray met: its row, and the loss's slope in its density and its three sums of harmonics.
@@ -76,7 +86,8 @@ def _share(
     """
     n, side = len(o), np.int64(1) << depth
     per_cell = ONE / np.float32(side)
-    for chunk in prange((n + CHUNK - 1) // CHUNK):
+    for j in prange(len(chunks)):
+        chunk = chunks[j]
         path = np.zeros(depth + 1, np.int64)
         for r in range(chunk * CHUNK, min(n, (chunk + 1) * CHUNK)):
             if starts[r] == starts[r + 1]:
@@ -157,7 +168,7 @@ class _OctreeMarch(torch.autograd.Function):
         rays = origins.detach().numpy(), directions.detach().numpy()
         tables = density.detach().numpy(), harmonics.detach().numpy()
         out = rgb.numpy(), distance.numpy(), opacity.numpy(), starts.numpy()[1:]
-        _forward(*rays, *ctx.tree, *tables, *ctx.numbers, np.float32(stop), *out)
+        _forward(spread(n), *rays, *ctx.tree, *tables, *ctx.numbers, np.float32(stop), *out)
         ctx.save_for_backward(origins, directions, density, harmonics, rgb, distance, opacity, starts.cumsum_(0))
         return rgb, distance, opacity
 
@@ -170,7 +181,7 @@ class _OctreeMarch(torch.autograd.Function):
         rows, rays, order = (np.empty(starts[-1], np.int32) for _ in range(3))
         shares = empty(int(starts[-1]), 4).numpy()
         given = origins, directions, *ctx.tree, density, harmonics, *ctx.numbers, *outputs
-        _share(*(g.contiguous().numpy() for g in grads), *given, bases, rows, rays, shares)
+        _share(spread(len(origins)), *(g.contiguous().numpy() for g in grads), *given, bases, rows, rays, shares)
         firsts = np.zeros(len(density) + 1, np.int64)
         _sorted(rows, firsts, order)
         to_density, to_harmonics = torch.zeros(density.shape), torch.zeros(harmonics.shape)
