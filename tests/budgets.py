@@ -75,7 +75,8 @@ GROUPS: dict[str, str] = {
     **dict.fromkeys("test_locks test_opened test_composed".split(), "runs, commands, benchmark"),
     **dict.fromkeys("test_progress test_charts test_multiscale test_verdict".split(), "runs, commands, benchmark"),
     **dict.fromkeys(
-        "test_coordinate_network test_density_control test_gaussians test_encodings test_nerf_w".split(), "methods"
+        "test_coordinate_network test_density_control test_gaussians test_encodings test_nerf_w test_plenoctrees".split(),
+        "methods",
     ),
     **dict.fromkeys("test_house test_budgets".split(), "house"),
 }  # the others are of nouns and capture
