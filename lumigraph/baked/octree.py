@@ -22,5 +22,5 @@ class Octree:
     child: Int[Tensor, "node 2 2 2"]
     density: Float[Tensor, "node 2 2 2"]
     harmonics: Float[Tensor, "node 2 2 2 basis 3"]
-    low: Float[Tensor, "3"]
+    low: Float[Tensor, 3]
     size: float

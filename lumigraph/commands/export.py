@@ -10,6 +10,7 @@ from tyro.conf import OmitArgPrefixes, OmitSubcommandPrefixes, subcommand
 from .exports.mesh import ExportMesh
 from .exports.panorama import ExportPanorama
 from .exports.points import ExportPoints
+from .exports.snerg import ExportSnerg
 from .exports.splats import ExportSplats
 from .exports.stereo import ExportStereo
 from .exports.web import ExportWeb
@@ -19,6 +20,7 @@ What = (
     Annotated[ExportMesh, subcommand("mesh")]
     | Annotated[ExportPanorama, subcommand("panorama")]
     | Annotated[ExportPoints, subcommand("points")]
+    | Annotated[ExportSnerg, subcommand("snerg")]
     | Annotated[ExportSplats, subcommand("splats")]
     | Annotated[ExportStereo, subcommand("stereo")]
     | Annotated[ExportWeb, subcommand("web")]

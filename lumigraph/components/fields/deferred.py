@@ -23,6 +23,7 @@ from .mlp import MLP
 FEATURES = 4
 OUTPUTS = 1 + 3 + FEATURES
 OCTAVES = 4  # at which the direction is encoded
+NOTHING = -100.0  # before the sigmoid
 DIM = -4.0  # before the sigmoid: what depends on direction begins as next to nothing
 
 
@@ -124,8 +125,12 @@ class ViewDependence(nn.Module):
         return ViewNetwork(weights, tuple(layer.bias.detach().cpu() for layer in (a, b, c)))
 
     @torch.no_grad()
-    def take(self, network: ViewNetwork) -> None:
-        """Be a network of the same width."""
+    def take(self, network: ViewNetwork | None) -> None:
+        """Be a network of the same width, or one that adds nothing."""
+        if network is None:
+            nn.init.zeros_(self.layers[-1].weight)
+            nn.init.constant_(self.layers[-1].bias, NOTHING)
+            return
         for layer, weight, bias in zip(self.layers, network.weights, network.biases, strict=True):
             layer.weight.copy_(weight.t())
             layer.bias.copy_(bias)
