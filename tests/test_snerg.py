@@ -171,7 +171,7 @@ def test_it_goes_through_its_stages_by_the_share_of_the_budget():
 
 
 def test_a_teacher_is_taken_over_as_far_as_cameras_see_it():
-    """A ball of diffuse colour looks like itself at once; one that shines differently from each side, after learning."""
+    """A ball of diffuse colour is itself at once, where light reaches."""
     scene = tiny.scene()
     method = SNeRG(scene.frame, replace(SNeRG.smallest(), least_alpha=0.0001))
     method.from_field(Ball(), scene.cameras)
@@ -198,8 +198,9 @@ def test_the_folder_holds_what_the_atlas_does(ball, folder):
     assert torch.equal(atlas.values[atlas.index[there]], back.values[back.index[there]])
     torch.testing.assert_close(back.low, atlas.low)
     assert back.voxel == pytest.approx(atlas.voxel) and back.block == atlas.block
-    for a, b in zip((*atlas.network.weights, *atlas.network.biases), (*back.network.weights, *back.network.biases)):
-        torch.testing.assert_close(a, b)
+    for name in ("weights", "biases"):
+        for a, b in zip(getattr(atlas.network, name), getattr(back.network, name), strict=True):
+            torch.testing.assert_close(a, b)
     said = json.loads((folder / "scene_params.json").read_text())
     slices = sorted(path.name for path in folder.glob("rgba_*.png"))
     assert slices[-1] == f"rgba_{said['num_slices'] - 1:03d}.png" and said["atlas_depth"] == 4 * said["num_slices"]
