@@ -39,6 +39,7 @@ WRITES: dict[str, tuple[str, tuple[str, ...]]] = {
     "clean": ("clean gs --output some.ply", ("some.ply", "some.ply.png")),
     "clean, to a run": ("clean gs --output fewer", ("fewer/",)),
     "compress": ("compress gs --output small", ("small/", "small")),
+    "convert": ("convert ball plenoxels --output other --steps 1 --distil", ("other/", "other")),
     "compose": ("compose gs gs --output two.json", ("two.json",)),
     "report": ("report ball", ("ball/report.html",)),
     "eval": ("eval ball --scene photographs", ("ball/eval.json", "ball/eval.png")),

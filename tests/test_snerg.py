@@ -12,7 +12,7 @@ import tiny
 import tiny_atlas
 import torch
 from PIL import Image
-from tiny_atlas import DENSITY, RADIUS, Ball
+from tiny_atlas import DENSITY, RADIUS
 
 from lumigraph import kernels
 from lumigraph.capabilities import HasAtlas, can
@@ -132,13 +132,13 @@ def test_looks_composite_to_the_picture(ball):
 def test_what_no_ray_sees_is_left_out():
     method = SNeRG(tiny.scene().frame, SNeRG.smallest())
     with pytest.raises(LumigraphError, match="no ray sees"):
-        method._bake(Ball().deferred)
+        method._bake(tiny_atlas.ball)
     n = method.sightings.resolution
     method.sightings.note(torch.tensor([[-0.9, 0.0, 0.0], [5.0, 0.0, 0.0]]), torch.tensor([0.5, 0.5]))
     cells = method.sightings.seen.nonzero()
     assert len(cells) == 2 * 3 * 3 or cells[:, 0].max() <= 2 < n
     method.sightings.note(torch.tensor([[-0.5, 0.0, 0.0]]), torch.tensor([0.5]))
-    method._bake(Ball().deferred)
+    method._bake(tiny_atlas.ball)
     centres = method.voxels.low + (method.voxels.places + 0.5) * method.voxels.edge
     assert len(centres) and (centres[:, 0] < 0).all()
 
@@ -170,22 +170,25 @@ def test_it_goes_through_its_stages_by_the_share_of_the_budget():
     )
 
 
-def test_a_teacher_is_taken_over_as_far_as_cameras_see_it():
-    """A ball of diffuse colour is itself at once, where light reaches."""
-    scene = tiny.scene()
-    method = SNeRG(scene.frame, replace(SNeRG.smallest(), least_alpha=0.0001))
-    method.from_field(Ball(), scene.cameras)
-    rays = through_the_middle(30)
-    points, ahead = torch.rand(300, 3) - 0.5, torch.tensor([0.0, 0.0, 1.0]).expand(300, 3)
-    with torch.no_grad():
-        density, rgb = method.field(points, ahead)
-        inside = points.norm(dim=-1) < RADIUS - 0.1
-        assert density[inside].median() == pytest.approx(DENSITY, rel=0.02)
-        assert psnr(rgb[inside], tiny_atlas.colour(points)[inside]) > 30
-        assert method.render_rays(rays, torch.ones(1, 3)).opacity.max() > 0.9
-    assert method.stage == VOXELS and method.began == 0
-    with pytest.raises(LumigraphError, match="no density and colour"):
-        method.from_field(object(), scene.cameras)
+class OnlySeen:
+    """A teacher that shows pictures, and knows nothing of points."""
+
+    def __init__(self, method):
+        self.render, self.frame, self.device = method.render, method.frame, method.device
+
+
+@pytest.mark.parametrize(("teacher", "like"), [("field", 27), ("pictures", 20)])
+def test_a_teacher_is_taken_over_as_far_as_cameras_see_it(teacher, like):
+    """It looks like a diffuse one at once, and is to learn features that nobody has told."""
+    scene, solid = tiny.scene(), tiny_atlas.baked(diffuse=True, density=10.0)
+    method = SNeRG(scene.frame, SNeRG.smallest())
+    method.from_field(solid if teacher == "field" else OnlySeen(solid), scene.cameras)
+    assert method.stage == VOXELS and method.of_another and len(method.voxels) < len(solid.voxels)
+    assert not method.tuned.values[:, ALPHA + 1 :].any()
+    seen = [each.eval().render(scene.cameras[4]) for each in (method, solid)]
+    assert psnr(seen[0].rgb, seen[1].rgb) > like
+    fit(method, scene, steps=10, show=False, rehearsal=False)
+    assert method.stage == ATLAS and method.voxels.levels[:, ALPHA + 1 :].any()
 
 
 # The viewer's folder

@@ -15,12 +15,12 @@ from torch import Tensor, nn
 from ..baked import Atlas
 from ..blending import over
 from ..camera import Camera
-from ..capabilities import HasDensity, HasField, can, needs
-from ..choice import evenly
+from ..capabilities import HasField, can
 from ..components.clouds.dense_points import compile_sweep
 from ..components.fields.baked_voxels import BakedVoxels, rounded
 from ..components.fields.deferred import Deferred, HashDeferred, NetworkDeferred, ViewDependence
 from ..components.fields.hash_field import check_levels
+from ..components.fields.taken_over import taken_over
 from ..components.sampling.carving import visual_hull
 from ..components.sampling.coarse_to_fine import SAMPLES_OF_A_RAY, first_grid, keep_looking, lattice, stage
 from ..components.sampling.marching import FIRST_RAYS, rays_for, reached
@@ -36,7 +36,9 @@ from ..components.training.photometric import backdrop, residuals
 from ..components.training.schedules import falling, held
 from ..components.training.sparsity import cauchy
 from ..errors import LumigraphError, LumigraphWarning
+from ..geometry import unit
 from ..kernels.block_march import ALPHA, CHANNELS
+from ..kernels.spherical_harmonics import K00
 from ..method import RayMethod
 from ..ranges import (
     BatchSize,
@@ -108,7 +110,6 @@ TAUGHT = 0.7  # share of the budget in which voxels learn at least, that were ma
 # features yet
 SLAB = 1 << 22  # voxels that are looked at together when baking
 PART = 1 << 18  # of them, that a field is asked about together
-LOOKS, VIEWS, SIDE = 4, 32, 160  # at another method: at its density in each cell, from how many cameras, pixels a side
 SOLID = 0.9  # opacity from which on a pixel of an open capture shows what is baked, rather than what lies beyond
 
 
@@ -149,6 +150,7 @@ class SNeRG(RayMethod):
     rays_per_step: Tensor
     stage: Tensor
     began: Tensor
+    of_another: Tensor
 
     def __init__(self, frame: Frame, config: Any = None):
         config = config or Config()
@@ -167,7 +169,8 @@ class SNeRG(RayMethod):
         first = rays_of(config.samples_per_step, config) if self.unbounded else FIRST_RAYS
         self.register_buffer("rays_per_step", torch.tensor(first))
         self.register_buffer("stage", torch.tensor(FIELD))
-        self.register_buffer("began", torch.tensor(0.0))  # share of the budget at which it was baked
+        self.register_buffer("began", torch.tensor(-1.0))  # share of the budget at which it was baked; -1 before
+        self.register_buffer("of_another", torch.tensor(False))  # whether it was made of another method
         self._lazy: LazyAdam | None = None
         self._adam: torch.optim.Adam | None = None
         if self.unbounded:
@@ -423,12 +426,11 @@ class SNeRG(RayMethod):
     @property
     def _voxel_share(self) -> float:
         """Of the budget after baking, in which voxels learn."""
-        of_another = self.stage > FIELD and self.began == 0
-        return max(self.config.voxel_share, TAUGHT) if of_another else self.config.voxel_share
+        return max(self.config.voxel_share, TAUGHT) if self.of_another else self.config.voxel_share
 
     def _spent(self, progress: float) -> float:
         """Share of the budget after baking that is spent."""
-        return 0.0 if self.stage == FIELD else (progress - float(self.began)) / max(1 - float(self.began), 1e-9)
+        return 0.0 if self.began < 0 else (progress - float(self.began)) / max(1 - float(self.began), 1e-9)
 
     def begin(self, scene: Scene, seconds: float = math.inf) -> None:
         if scene.images.has_alpha and self.frame.reach == 1:
@@ -445,6 +447,7 @@ class SNeRG(RayMethod):
         c = self.config
         if self.stage == FIELD and progress >= c.deferred_share:
             self._bake(self._deferred)
+        if self.stage > FIELD and self.began < 0:
             self.began.fill_(progress)
         if self.stage == VOXELS and self._spent(progress) >= self._voxel_share:
             self.voxels.settle(self.tuned.values.detach())
@@ -528,42 +531,30 @@ class SNeRG(RayMethod):
 
     @torch.no_grad()
     def from_field(self, teacher: Any, cameras: Camera) -> None:
-        """Take over what a teacher has where cameras see it: density, and as diffuse colour what is seen along the mean
-        of their directions. What depends on direction, features and network find out in what is learnt from then on.
+        """Take over density where cameras see a teacher's surfaces, and as diffuse colour what is seen there along the
+        mean of their directions. What depends on direction, features and network find out in what is learnt from then
+        on.
 
-        Raises LumigraphError for a teacher without a field.
+        Raises LumigraphError where cameras see nothing solid.
         """
-        of: HasField = needs(teacher, HasField)
-        ahead = torch.tensor([0.0, 0.0, 1.0], device=self.device)
-
-        def density_at(points: Float[Tensor, "point 3"]) -> Float[Tensor, " point"]:
-            return teacher.density(points) if can(teacher, HasDensity) else of.field(points, ahead.expand_as(points))[0]
-
-        n = self.sightings.resolution
-        grid = OccupancyGrid(1.0, n).to(self.device)
-        for look in range(LOOKS):
-            grid.update(density_at, self.config.occupancy_threshold, self.random(2 + look), 1.0)
+        known, n = taken_over(teacher, cameras), self.sightings.resolution
+        points, origins = (x.to(self.device) for x in (known.surface.points, known.surface.origins))
+        self.sightings.note(points, points.new_ones(len(points)))
+        inside = self.sightings.inside(points)
         ways = torch.zeros(n**3, 3, device=self.device)
-        for index in evenly(list(range(len(cameras))), VIEWS):
-            camera = cameras[index]
-            camera = camera.resized(min(1.0, SIDE / int(camera.size.max())))
-            rays = camera.rays(camera.pixels()).to(self.device)
-            found = grid.sample(rays, self.frame.near, 1 / n)
-            samples, _ = reached(rays, found, density_at, self.config.transmittance_threshold)
-            points, directions = samples.along(rays)
-            weights = weights_of(samples, density_at(points))
-            self.sightings.note(points, weights)
-            inside = self.sightings.inside(points)
-            ways.index_add_(0, self.sightings.cells(points[inside]), (weights[:, None] * directions)[inside])
+        ways.index_add_(0, self.sightings.cells(points[inside]), unit(points - origins)[inside])
         ways = smoothed(ways.view(n, n, n, 3)).reshape(-1, 3)
 
         def field(points: Float[Tensor, "point 3"]) -> Deferred:
-            way = nn.functional.normalize(ways[self.sightings.cells(points)] + 1e-9 * ahead, dim=-1)
-            density, rgb = of.field(points, way)
+            if can(teacher, HasField):
+                density, rgb = teacher.field(points, unit(ways[self.sightings.cells(points)]))
+            else:
+                density = known.density(points.cpu()).to(self.device)
+                rgb = K00 * known.harmonics(points.cpu(), 1, lambda rgb: rgb)[:, 0].to(self.device)
             return Deferred(density, rgb.clamp(0, 1), points.new_zeros(len(points), CHANNELS - 4))
 
         self._bake(field)
-        self.began.zero_()
+        self.of_another.fill_(True)
 
 
 BOUNDED = (
