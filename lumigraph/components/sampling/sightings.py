@@ -24,7 +24,7 @@ class Sightings(nn.Module):
 
     def __init__(self, resolution: int):
         super().__init__()
-        self.register_buffer("weight", torch.zeros(resolution, resolution, resolution))
+        self.register_buffer("weight", torch.zeros(1, resolution, resolution, resolution))
 
     @torch.no_grad()
     def note(self, points: Float[Tensor, "sample 3"], weights: Float[Tensor, " sample"]) -> None:
@@ -39,16 +39,16 @@ class Sightings(nn.Module):
 
     def release(self) -> None:
         """Hold nothing any more."""
-        self.weight = self.weight.new_zeros(1, 1, 1)
+        self.weight = self.weight.new_zeros(1, 1, 1, 1)
 
     @property
     def resolution(self) -> int:
-        return len(self.weight)
+        return self.weight.shape[-1]
 
     @property
     def seen(self) -> Bool[Tensor, "x y z"]:
         """Cells that rays see, and those around them."""
-        return max_pool3d((self.weight > LEAST).float()[None], 3, 1, 1)[0] > 0
+        return max_pool3d((self.weight > LEAST).float(), 3, 1, 1)[0] > 0
 
     def inside(self, points: Float[Tensor, "sample 3"]) -> Bool[Tensor, " sample"]:
         return (points.abs() < 1).all(-1)
