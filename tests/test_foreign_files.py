@@ -36,6 +36,7 @@ WRITES: dict[str, tuple[str, tuple[str, ...]]] = {
     "export points": ("export points ball p.ply", ("p.ply",)),
     "export splats": ("export splats gs s.spz", ("s.spz",)),
     "export splats, a folder": ("export splats gs open/meta.json", ("open/",)),
+    "export snerg": ("export snerg gs --output atlas", ("atlas/",)),
     "export mesh": ("export mesh ball m.glb", ("m.glb",)),
     "export panorama": ("export panorama ball sphere.png", ("sphere.png",)),
     "export stereo": ("export stereo ball eyes.jpg", ("eyes.jpg",)),

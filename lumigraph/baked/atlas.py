@@ -4,17 +4,25 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import torch
 from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 
 
 @dataclass(frozen=True)
 class ViewNetwork:
-    """What adds to a pixel's diffuse colour what depends on direction (section 4.2): three layers, ReLU between them and
-    a sigmoid at the end. Inputs are the direction encoded at four frequencies (27), diffuse colour (3), features (4)."""
+    """What adds to a pixel's diffuse colour what depends on direction (section 4.2): three layers, ReLU between them, a
+    sigmoid at the end. Inputs are the direction encoded at four frequencies (27), diffuse colour (3), features (4).
+
+        colour = diffuse + (1 - opacity) background + opacity network(gamma(d), diffuse, features)
+        gamma(d) = (d, sin d, sin 2d, sin 4d, sin 8d, cos d, cos 2d, cos 4d, cos 8d), each x, y, z
+
+    d is the ray's unit direction in the scene's frame; diffuse, features and opacity are summed along the ray, nothing
+    behind them: s_0 = 0, T_0 = 1, s_i = s_(i-1) + T_(i-1) v_i, T_i = T_(i-1) (1 - alpha_i), one voxel a step.
+    """
 
     weights: tuple[Float[Tensor, "in out"], Float[Tensor, "in2 out2"], Float[Tensor, "in3 3"]]
-    biases: tuple[Float[Tensor, " out"], Float[Tensor, " out2"], Float[Tensor, 3]]
+    biases: tuple[Float[Tensor, " out"], Float[Tensor, " out2"], Float[Tensor, " 3"]]
 
 
 @dataclass(frozen=True)
@@ -32,7 +40,16 @@ class Atlas:
 
     index: Int[Tensor, "x y z"]
     values: UInt8[Tensor, "block side side side 8"]
-    low: Float[Tensor, 3]
+    low: Float[Tensor, " 3"]
     voxel: float
     block: int
     network: ViewNetwork | None = None
+
+    def voxels(self) -> tuple[Int[Tensor, "voxel 3"], UInt8[Tensor, "voxel 8"]]:
+        """Where in the grid the voxels are that hold anything, and what they hold."""
+        inner = self.values[:, 1:-1, 1:-1, 1:-1]
+        number, *inside = inner.any(-1).nonzero().unbind(-1)
+        there = (self.index >= 0).nonzero()
+        corner = torch.zeros(len(inner), 3, dtype=torch.int64)
+        corner[self.index[tuple(there.unbind(-1))].long()] = there
+        return corner[number] * self.block + torch.stack(inside, -1), inner[number, *inside]

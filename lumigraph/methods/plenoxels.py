@@ -23,6 +23,7 @@ from ..components.training.corrections import Exposure
 from ..components.training.lazy_rmsprop import LazyRMSprop
 from ..components.training.photometric import backdrop, residuals
 from ..components.training.schedules import falling
+from ..components.training.sparsity import cauchy
 from ..controls import Control
 from ..errors import LumigraphError
 from ..kernels import total_variation
@@ -403,11 +404,6 @@ def cells_of(frame: Frame, resolution: int) -> Cells:
     if isinstance(space_of(frame), NDC):
         return resolution + resolution // 2, resolution + resolution // 2, resolution // 2
     return resolution, resolution, resolution
-
-
-def cauchy(density: Float[Tensor, " sample"], rays: int) -> Tensor:
-    """Mean over rays of the sum of log(1 + 2 sigma^2) along each (eq. 4)."""
-    return torch.log1p(2 * density.square()).sum() / max(rays, 1)
 
 
 def undecided(opacity: Float[Tensor, " ray"]) -> Tensor:
