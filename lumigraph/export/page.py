@@ -24,7 +24,9 @@ from PIL import Image
 from torch import Tensor
 
 from .. import __version__
+from ..baked.browser import Browsable
 from ..camera import Camera
+from ..errors import LumigraphError
 from ..exchange import spz
 from ..figures import to_bytes
 from ..files import write_bytes
@@ -44,6 +46,7 @@ ARC = 0.8  # of the arc that photographs cover is shown
 FINE = 2, 4  # of 1/128: steps of the harmonics, a quarter of those that .spz files have by custom
 CROP = 1.45  # times larger than fits, at most, is a picture without a plain background, to fill the window
 QUALITY = 90  # of the pictures, as WebP
+LARGEST = 100e6  # bytes of a page with a volume
 # How to move, with a mouse and with fingers.
 AROUND = "Drag to turn · scroll to zoom · right-drag to move", "Drag to turn · pinch to zoom"
 ON_THE_SPOT = "Drag to look around", "Drag to look around"
@@ -140,6 +143,20 @@ def mesh_page(path: Path, mesh: Mesh, opening: Opening) -> None:
     write_page(path, "mesh", settings, gzip.compress(data, 9, mtime=0))
 
 
+def volume_page(path: Path, volume: Browsable, opening: Opening) -> None:
+    """A baked volume in the scene's frame, which a browser's graphics look at along the ray of each pixel.
+
+    Raises LumigraphError if the page would have LARGEST bytes or more.
+    """
+    settings = asdict(opening) | {"webgl": True, "packed": True} | volume.settings
+    with counting(f"Packing {path.name}"):
+        packed = gzip.compress(volume.data, 9, mtime=0)
+    if len(packed) * 4 / 3 > LARGEST:
+        smaller = f"give --degree {volume.degree - 1}" if volume.degree else "bake it in larger voxels, or give --as views"
+        raise LumigraphError(f"The page would have {len(packed) * 4 / 3e6:.0f} MB, more than the {LARGEST / 1e6:.0f} that browsers open with ease; {smaller}")
+    write_page(path, "volumes", settings, packed)
+
+
 def views_page(path: Path, method: Method, cameras: Camera, opening: Opening, count: int, longest: int) -> None:
     """Pictures rendered here, from all around or along the arc that photographs cover; dragging turns them over.
 
@@ -202,6 +219,7 @@ def write_page(path: Path, program: str, settings: dict[str, Any], data: bytes) 
         "data": base64.b64encode(data).decode(),
         "program": base64.b64encode(gzip.compress(source, 9, mtime=0)).decode(),
     }
+    parts["size"] = f"{sum(map(len, parts.values())) / 1e6:.1f} MB"
     page = (WEB / "page.html").read_text("utf-8")
     pieces = page.split("@@")  # text, name, text, name, ..., text
     pieces[1::2] = [parts[name] for name in pieces[1::2]]
