@@ -11,7 +11,14 @@ from torch import Tensor
 @dataclass(frozen=True)
 class ViewNetwork:
     """What adds to a pixel's diffuse colour what depends on direction (section 4.2): three layers, ReLU between them and
-    a sigmoid at the end. Inputs are the direction encoded at four frequencies (27), diffuse colour (3), features (4)."""
+    a sigmoid at the end. Inputs are the direction encoded at four frequencies (27), diffuse colour (3), features (4).
+
+        colour = diffuse + (1 - opacity) background + opacity network(gamma(d), diffuse, features)
+        gamma(d) = (d, sin d, sin 2d, sin 4d, sin 8d, cos d, cos 2d, cos 4d, cos 8d), each x, y, z
+
+    d is the ray's unit direction in the scene's frame; diffuse, features and opacity are summed along the ray, nothing
+    behind them: s_0 = 0, T_0 = 1, s_i = s_(i-1) + T_(i-1) v_i, T_i = T_(i-1) (1 - alpha_i), one voxel a step.
+    """
 
     weights: tuple[Float[Tensor, "in out"], Float[Tensor, "in2 out2"], Float[Tensor, "in3 3"]]
     biases: tuple[Float[Tensor, " out"], Float[Tensor, " out2"], Float[Tensor, "3"]]
