@@ -72,6 +72,7 @@ GROUPS: dict[str, str] = {
         "exports, viewer, web",
     ),
     "test_browser": "exports, viewer, web",
+    "test_volumes": "exports, viewer, web",
     **dict.fromkeys("test_locks test_opened test_composed".split(), "runs, commands, benchmark"),
     **dict.fromkeys("test_progress test_charts test_multiscale test_verdict".split(), "runs, commands, benchmark"),
     **dict.fromkeys(

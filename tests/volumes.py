@@ -132,12 +132,13 @@ def dense(made: Atlas) -> torch.Tensor:
 
 
 def atlas_seen(made: Atlas, rays: Rays, near: float, background: torch.Tensor) -> torch.Tensor:
-    """Colours of rays: every step of one voxel from the near distance on, interpolated between eight voxels."""
+    """Colours of rays: every step of one voxel from where they enter, interpolated between eight voxels."""
     whole = dense(made)
     size = torch.tensor(whole.shape[1:])
-    steps = int((rays.origins.norm(dim=-1).max() + 2) / made.voxel)
-    t = near + (torch.arange(steps) + 0.5) * made.voxel
-    points = (rays.origins[:, None] + t[:, None] * rays.directions[:, None] - made.low) / made.voxel / size * 2 - 1
+    enter, leave = rays.through_box(torch.stack([made.low, made.low + size * made.voxel]))
+    steps = int((leave - enter).max() / made.voxel) + 1
+    t = enter.clamp_min(near)[:, None] + (torch.arange(steps) + 0.5) * made.voxel
+    points = (rays.origins[:, None] + t[..., None] * rays.directions[:, None] - made.low) / made.voxel / size * 2 - 1
     grid = points.flip(-1)[None, None]
     kept = ((points > -1) & (points < 1)).all(-1, keepdim=True)
     found = torch.nn.functional.grid_sample(whole[None], grid, align_corners=False)[0, :, 0].movedim(0, -1) * kept
@@ -145,15 +146,13 @@ def atlas_seen(made: Atlas, rays: Rays, near: float, background: torch.Tensor) -
     total = (light[:, :-1, None] * found).sum(1)
     colour, left = total[:, :3], light[:, -1:]
     if made.network:
-        more = network_of(made.network, rays.directions, colour + left * background, total[:, 4:])
-        colour = colour + more * (left < 1)
+        colour = colour + (1 - left) * network_of(made.network, rays.directions, colour, total[:, 4:])
     return colour + left * background
 
 
 def network_of(made: ViewNetwork, directions, colours, features) -> torch.Tensor:
-    octaves = 2.0 ** torch.arange(4)
-    angles = octaves[:, None] * directions[:, None]
-    x = torch.cat([directions, torch.stack([angles.sin(), angles.cos()], 2).flatten(1), colours, features], 1)
+    angles = (2.0 ** torch.arange(4)[:, None] * directions[:, None]).flatten(1)
+    x = torch.cat([directions, angles.sin(), angles.cos(), colours, features], 1)
     for i, (weights, biases) in enumerate(zip(made.weights, made.biases, strict=True)):
         x = x @ weights + biases
         x = x.relu() if i < 2 else x.sigmoid()

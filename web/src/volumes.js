@@ -16,7 +16,6 @@ export async function start(settings, data) {
     pose: new Matrix4(),
     slope: new Vector2(),
     near: settings.near,
-    background: new Vector3(...settings.background),
     low: new Vector3(...settings.low),
     ...made.uniforms,
   };

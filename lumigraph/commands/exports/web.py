@@ -17,24 +17,26 @@ from ..controls import Set, open_method
 from ..keeping import Keeping
 
 FACES = 300_000  # of a mesh in a page, at most: about 4 MB
-Kind = Literal["auto", "splats", "mesh", "views"]
+Kind = Literal["auto", "splats", "volume", "mesh", "views"]
 
 
 @dataclass(frozen=True)
 class ExportWeb:
     """One HTML file that opens from disk, in any browser, without a server or a network.
 
-    Gaussians are drawn as splats. Other methods become pictures rendered here from all around, which dragging turns
-    over, or a coloured mesh to move around freely: pictures look better, a mesh shows the scene from everywhere.
+    Gaussians are drawn as splats, and octrees and atlases ray by ray as the method renders them. Other methods become
+    pictures rendered here from all around, which dragging turns over, or a coloured mesh to move around freely:
+    pictures look better, a mesh shows the scene from everywhere.
     """
 
     source: Annotated[Positional[Path], needed("RUN_OR_FILE")]
     """Folder of a run, a splat file, or a composition."""
     output: Annotated[Positional[Path], needed("FILE.html")]
     """The page."""
-    kind: Annotated[Kind, arg(name="as", help_behavior_hint="(default: splats for Gaussians, views for the rest)")] = (
-        "auto"
-    )
+    kind: Annotated[
+        Kind,
+        arg(name="as", help_behavior_hint="(default: splats for Gaussians, volume for what is baked, views for the rest)"),
+    ] = "auto"
     """What the page holds."""
     title: Annotated[str | None, option("TEXT", "the scene's name")] = None
     """What the page is called."""
@@ -46,6 +48,8 @@ class ExportWeb:
     """Pictures in a page of views."""
     size: Annotated[int, between(16, 4096), option("PIXELS")] = 640
     """Longer side of these pictures."""
+    degree: Annotated[int, between(0, 3), option("N")] = 3
+    """Highest degree of an octree's harmonics; a lower one makes a smaller page, with weaker reflections."""
     overwrite: Overwrite = False
     part: OmitArgPrefixes[Keeping] = Keeping()
     told: Set = ()
@@ -88,16 +92,38 @@ class ExportWeb:
         if kind == "views":
             views_page(self.output, self.part.of_method(method), cameras, opening, self.views, self.size)
             return f"{self.views} views"
+        if kind == "volume":
+            return self._write_volume(method, opening)
         mesh = extract_mesh(self.part.without_floaters(method), cameras, crop=self.part.crop(method.frame), faces=FACES)
         mesh_page(self.output, mesh, opening)
         return f"{len(mesh.faces):,} triangles"
 
+    def _write_volume(self, method: Any, opening: Any) -> str:
+        """Write a page of an octree or an atlas, and say what it holds."""
+        from ...baked.browser import atlas_for_browser, octree_for_browser
+        from ...capabilities import HasAtlas, HasOctree, can, needs
+        from ...export.page import volume_page
+
+        if self.part.crops:
+            raise LumigraphError("A volume is shown as a whole; leave out --box and --sphere, or give --as views")
+        if can(method, HasOctree):
+            volume = octree_for_browser(method.octree(), self.degree)
+            holds = f"{volume.settings['leaves']:,} leaves of an octree, harmonics of degree {volume.degree}"
+        else:
+            volume = atlas_for_browser(needs(method, HasAtlas).atlas())
+            holds = f"{volume.settings['blocks']:,} blocks of {volume.settings['block']}^3 voxels"
+        volume_page(self.output, volume, opening)
+        return holds
+
     def _kind(self, method: Any) -> str:
-        from ...capabilities import HasGaussians, can
+        from ...capabilities import HasAtlas, HasGaussians, HasOctree, can
 
         if self.kind != "auto":
             return self.kind
-        return "splats" if can(method, HasGaussians) else "views"
+        if can(method, HasGaussians):
+            return "splats"
+        baked = can(method, HasOctree) or can(method, HasAtlas)
+        return "volume" if baked and not self.part.crops else "views"
 
     def _background(self) -> tuple[float, float, float] | None:
         from ...figures import hex_colour

@@ -3881,16 +3881,15 @@ void main() {
   vec3 direction = normalize(mat3(pose) * vec3(place * slope, -1.0));
   vec3 origin = (pose[3].xyz - low) / voxel, inverse = inverted(direction);
   vec2 range = through(origin, inverse, side * vec3(textureSize(blocks, 0)));
-  float first = near / voxel + 0.5, light = 1.0; // samples lie in the middle of steps from the near distance
-  float t = first + ceil(max(range.x - first, 0.0));
+  float t = max(range.x, near / voxel) + 0.5, light = 1.0;
   vec3 colour = vec3(0.0);
   vec4 feature = vec4(0.0);
   while (t < range.y && light > SPENT) {
     vec3 p = origin + t * direction;
-    vec3 place = floor(p / cell);
-    float far = float(texelFetch(clear, ivec3(place), 0).r);
+    vec3 here = floor(p / cell);
+    float far = float(texelFetch(clear, ivec3(here), 0).r);
     if (far > 0.0) {
-      t += max(ceil(leaving(origin, inverse, (place - far + 1.0) * cell, (place + far) * cell) - t), 1.0);
+      t += max(ceil(leaving(origin, inverse, (here - far + 1.0) * cell, (here + far) * cell) - t), 1.0);
       continue;
     }
     vec3 block = floor(p / side);
@@ -3908,7 +3907,7 @@ void main() {
     t += 1.0;
   }
 #ifdef WIDTHS
-  if (light < 1.0) colour += seen(direction, colour + light * background, feature);
+  if (light < 1.0) colour += (1.0 - light) * seen(direction, colour, feature);
 #endif
   picture = vec4(colour, 1.0 - light);
 }
@@ -3923,11 +3922,12 @@ void main() {
     float all[${4*Math.ceil(i/4)}];
     int n = 0;
     for (int k = 0; k < 3; k++) all[n++] = d[k];
-    for (int octave = 0; octave < 4; octave++) {
-      vec3 angle = d * exp2(float(octave));
-      for (int k = 0; k < 3; k++) { all[n + k] = sin(angle[k]); all[n + 3 + k] = cos(angle[k]); }
-      n += 6;
-    }
+    for (int octave = 0; octave < 4; octave++)
+      for (int k = 0; k < 3; k++, n++) {
+        all[n] = sin(d[k] * exp2(float(octave)));
+        all[n + 12] = cos(d[k] * exp2(float(octave)));
+      }
+    n += 12;
     for (int k = 0; k < 3; k++) all[n++] = colour[k];
     for (int k = 0; k < 4; k++) all[n++] = feature[k];
     for (int i = 0; i < ${i}; i++) x[i / 4][i % 4] = all[i];
@@ -4020,7 +4020,6 @@ precision highp usampler2DArray;
 uniform mat4 pose;        // camera to world, y up and z back
 uniform vec2 slope;       // of the rays at the picture's edges
 uniform float near;       // along the ray
-uniform vec3 background;
 uniform vec3 low;
 in vec2 place;            // in the picture, from -1 to 1
 out vec4 picture;         // multiplied by opacity
@@ -4044,5 +4043,5 @@ float leaving(vec3 origin, vec3 inverse, vec3 lower, vec3 upper) {
 vec3 inverted(vec3 direction) {
   return 1.0 / mix(direction, vec3(1e-9), lessThan(abs(direction), vec3(1e-9)));
 }
-`;async function Km(i,t){let e=new oa(i,{antialias:!1}),n=e.renderer.getContext(),s=n.getParameter(n.MAX_3D_TEXTURE_SIZE),r=i.volume==="octree"?Ac(i,t):Tc(i,t,s),a={pose:new ie,slope:new It,near:i.near,background:new U(...i.background),low:new U(...i.low),...r.uniforms},o=Object.fromEntries(Object.entries(a).map(([l,u])=>[l,{value:u}])),c=new da(e,o,[Cc,...r.fragment].join(`
+`;async function Km(i,t){let e=new oa(i,{antialias:!1}),n=e.renderer.getContext(),s=n.getParameter(n.MAX_3D_TEXTURE_SIZE),r=i.volume==="octree"?Ac(i,t):Tc(i,t,s),a={pose:new ie,slope:new It,near:i.near,low:new U(...i.low),...r.uniforms},o=Object.fromEntries(Object.entries(a).map(([l,u])=>[l,{value:u}])),c=new da(e,o,[Cc,...r.fragment].join(`
 `),()=>{let{camera:l}=e,u=Math.tan(on.degToRad(l.fov)/2);l.updateMatrixWorld(),a.pose.copy(l.matrixWorld),a.slope.set(u*l.aspect,u)});return e.paint=()=>c.paint(),e.redraw(),e}return Vc(jm);})();

@@ -11,8 +11,7 @@ void main() {
   vec3 direction = normalize(mat3(pose) * vec3(place * slope, -1.0));
   vec3 origin = (pose[3].xyz - low) / voxel, inverse = inverted(direction);
   vec2 range = through(origin, inverse, side * vec3(textureSize(blocks, 0)));
-  float first = near / voxel + 0.5, light = 1.0; // samples lie in the middle of steps from the near distance
-  float t = first + ceil(max(range.x - first, 0.0));
+  float t = max(range.x, near / voxel) + 0.5, light = 1.0;
   vec3 colour = vec3(0.0);
   vec4 feature = vec4(0.0);
   while (t < range.y && light > SPENT) {
@@ -38,7 +37,7 @@ void main() {
     t += 1.0;
   }
 #ifdef WIDTHS
-  if (light < 1.0) colour += seen(direction, colour + light * background, feature);
+  if (light < 1.0) colour += (1.0 - light) * seen(direction, colour, feature);
 #endif
   picture = vec4(colour, 1.0 - light);
 }

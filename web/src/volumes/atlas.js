@@ -74,11 +74,12 @@ function seen([inputs, first, second, last]) {
     float all[${4 * Math.ceil(inputs / 4)}];
     int n = 0;
     for (int k = 0; k < 3; k++) all[n++] = d[k];
-    for (int octave = 0; octave < 4; octave++) {
-      vec3 angle = d * exp2(float(octave));
-      for (int k = 0; k < 3; k++) { all[n + k] = sin(angle[k]); all[n + 3 + k] = cos(angle[k]); }
-      n += 6;
-    }
+    for (int octave = 0; octave < 4; octave++)
+      for (int k = 0; k < 3; k++, n++) {
+        all[n] = sin(d[k] * exp2(float(octave)));
+        all[n + 12] = cos(d[k] * exp2(float(octave)));
+      }
+    n += 12;
     for (int k = 0; k < 3; k++) all[n++] = colour[k];
     for (int k = 0; k < 4; k++) all[n++] = feature[k];
     for (int i = 0; i < ${inputs}; i++) x[i / 4][i % 4] = all[i];

@@ -10,7 +10,6 @@ precision highp usampler2DArray;
 uniform mat4 pose;        // camera to world, y up and z back
 uniform vec2 slope;       // of the rays at the picture's edges
 uniform float near;       // along the ray
-uniform vec3 background;
 uniform vec3 low;
 in vec2 place;            // in the picture, from -1 to 1
 out vec4 picture;         // multiplied by opacity

@@ -1,0 +1,157 @@
+"""Pages of baked volumes: octrees and atlases are seen in a browser as their rays say, whatever leaps are taken."""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+
+import numpy as np
+import pytest
+import torch
+import volumes
+from test_web import OPENING
+from windows import SIZE, psnr, some_camera
+
+from lumigraph.baked import Octree
+from lumigraph.baked.browser import atlas_for_browser, breadth_first, clearance, octree_for_browser
+from lumigraph.errors import LumigraphError
+from lumigraph.export import page as pages
+from lumigraph.export.page import volume_page
+
+GROUND = torch.tensor(OPENING.background)
+LEVELS = 5
+PHONE = {"viewport": {"width": 130, "height": 280}, "device_scale_factor": 2, "has_touch": True, "is_mobile": True}
+SLOW = """{
+  const { readPixels } = WebGL2RenderingContext.prototype;
+  WebGL2RenderingContext.prototype.readPixels = function (...all) {
+    readPixels.apply(this, all);
+    for (const end = performance.now() + 25; performance.now() < end; );
+  };
+  const { viewport } = WebGL2RenderingContext.prototype;
+  window.sizes = [];
+  WebGL2RenderingContext.prototype.viewport = function (...all) {
+    sizes.push(all[2]);
+    viewport.apply(this, all);
+  };
+}"""
+
+
+def squared(rgb: torch.Tensor) -> np.ndarray:
+    return rgb.clamp(0, 1).view(SIZE, SIZE, 3).numpy()
+
+
+def test_an_octree_is_seen_as_its_rays_say(tmp_path, window):
+    tree = volumes.octree(LEVELS)
+    volume_page(tmp_path / "page.html", octree_for_browser(tree), OPENING)
+    volume_page(tmp_path / "plain.html", octree_for_browser(tree, degree=0), OPENING)
+    opened = window(tmp_path / "page.html")
+    for index in (1, 4):
+        camera = some_camera(index)
+        ours = squared(volumes.octree_seen(tree, camera.rays(camera.pixels()), LEVELS, GROUND))
+        assert psnr(opened.look(camera), ours) > 50
+    assert psnr(window(tmp_path / "plain.html").look(camera), ours) < 35  # the harmonics are seen
+
+
+def test_from_inside_a_cell(tmp_path, window):
+    tree = volumes.octree(LEVELS)
+    volume_page(tmp_path / "page.html", octree_for_browser(tree), dataclasses.replace(OPENING, near=0.01))
+    pose = some_camera(2).pose.clone()
+    pose[0, :, 3] = torch.tensor([0.9, 0.9, 0.9])  # in the fog
+    camera = dataclasses.replace(some_camera(2), pose=pose)
+    rays = camera.rays(camera.pixels())
+    rays = dataclasses.replace(rays, origins=rays.origins + 0.01 * rays.directions)
+    ours = squared(volumes.octree_seen(tree, rays, LEVELS, GROUND))
+    assert psnr(window(tmp_path / "page.html").look(camera), ours) > 45
+
+
+@pytest.mark.parametrize("network", [False, True])
+def test_an_atlas_is_seen_as_its_rays_say(tmp_path, window, network):
+    made = volumes.atlas(network=network)
+    volume_page(tmp_path / "page.html", atlas_for_browser(made), OPENING)
+    opened = window(tmp_path / "page.html")
+    for index in (1, 4):
+        camera = some_camera(index)
+        rays = camera.rays(camera.pixels())
+        shown = opened.look(camera)
+        assert psnr(shown, squared(volumes.atlas_seen(made, rays, OPENING.near, GROUND))) > 50
+    other = dataclasses.replace(made, network=None if network else volumes.shades())
+    assert psnr(shown, squared(volumes.atlas_seen(other, rays, OPENING.near, GROUND))) < 30  # the network is seen
+
+
+def test_coarse_while_moving_and_sharp_at_rest(tmp_path, window, chromium):
+    volume_page(tmp_path / "page.html", octree_for_browser(volumes.octree(LEVELS)), OPENING)
+    quick = window(tmp_path / "page.html").settled()
+    (tmp_path / "slow.html").write_text(
+        (tmp_path / "page.html").read_text("utf-8").replace("<head>", f"<head><script>{SLOW}</script>"), "utf-8"
+    )
+    slow = window(tmp_path / "slow.html")
+    first = slow.settled()
+    assert psnr(first, quick) > 50
+    slow.page.evaluate("sizes.length = 0")
+    slow.drag(0.25)
+    turned = slow.settled()
+    sizes = slow.page.evaluate("sizes")
+    assert min(sizes) < SIZE / 2 and max(sizes) == SIZE
+    slow.page.keyboard.press("r")
+    assert psnr(slow.settled(), first) > 50 > 25 > psnr(turned, first)
+
+
+def test_a_phone(tmp_path, window):
+    volume_page(tmp_path / "page.html", atlas_for_browser(volumes.atlas()), OPENING)
+    opened = window(tmp_path / "page.html", **PHONE)
+    first = opened.settled()
+    assert first.shape == (560, 260, 3)
+    assert psnr(first, np.broadcast_to(OPENING.background, first.shape)) < 20
+    opened.drag(0.25)
+    assert psnr(opened.settled(), first) < 30
+
+
+@pytest.mark.parametrize(
+    ("lacking", "told"),
+    [
+        ("HTMLCanvasElement.prototype.getContext = () => null", "WebGL 2"),
+        ("WebGL2RenderingContext.prototype.getParameter = ((f) => function (name) { return name === "
+         "WebGL2RenderingContext.MAX_3D_TEXTURE_SIZE ? 16 : f.call(this, name) })"
+         "(WebGL2RenderingContext.prototype.getParameter)", "another one"),
+    ],
+    ids=["webgl", "large"],
+)  # fmt: skip
+def test_what_a_browser_lacks_is_a_sentence(tmp_path, page, faults, lacking, told):
+    volume_page(tmp_path / "page.html", atlas_for_browser(volumes.atlas()), OPENING)
+    page.add_init_script(lacking)
+    page.goto((tmp_path / "page.html").as_uri())
+    page.wait_for_selector("body.failed")
+    assert told in page.inner_text("#wait")
+    assert len(faults) == 1
+
+
+def test_a_page_says_its_size_and_has_a_limit(tmp_path, monkeypatch):
+    path = tmp_path / "page.html"
+    volume_page(path, octree_for_browser(volumes.octree(3)), OPENING)
+    size = re.search(r"Opening ([\d.]+) MB", path.read_text("utf-8"))
+    assert size and float(size[1]) == pytest.approx(path.stat().st_size / 1e6, abs=0.06)
+    path.unlink()
+    monkeypatch.setattr(pages, "LARGEST", 1000)
+    with pytest.raises(LumigraphError, match="--degree 1"):
+        volume_page(path, octree_for_browser(volumes.octree(4)), OPENING)
+    with pytest.raises(LumigraphError, match="--as views"):
+        volume_page(path, atlas_for_browser(volumes.atlas()), OPENING)
+    assert not path.exists()
+
+
+def test_nodes_in_any_order_come_level_by_level():
+    tree = volumes.octree(3, bands=1)
+    kinds, cells, levels = breadth_first(tree)
+    assert levels == 3 and len(kinds) == 8 * len(tree.child)
+    assert (tree.density.flatten()[cells] > 0).equal(kinds == 1)
+    assert (tree.child.flatten()[cells] != 0).equal(kinds == 2)
+    empty = Octree(torch.zeros(1, 2, 2, 2).int(), torch.zeros(1, 2, 2, 2), torch.zeros(1, 2, 2, 2, 1, 3), tree.low, 2.0)
+    assert octree_for_browser(empty).settings["leaves"] == 0
+
+
+def test_clearance_is_the_distance_of_chess():
+    occupied = torch.zeros(9, 7, 5, dtype=torch.bool)
+    occupied[2, 1, 4] = occupied[8, 6, 0] = True
+    places = torch.stack(torch.meshgrid(*map(torch.arange, occupied.shape), indexing="ij"), -1)
+    away = torch.stack([(places - place).abs().amax(-1) for place in occupied.nonzero()]).amin(0)
+    assert clearance(occupied).equal(away.to(torch.uint8))
