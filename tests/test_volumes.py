@@ -14,9 +14,11 @@ from windows import SIZE, psnr, some_camera
 
 from lumigraph.baked import Octree
 from lumigraph.baked.browser import atlas_for_browser, breadth_first, clearance, octree_for_browser
+from lumigraph.camera import Camera
 from lumigraph.errors import LumigraphError
 from lumigraph.export import page as pages
 from lumigraph.export.page import volume_page
+from lumigraph.rays import Rays
 
 GROUND = torch.tensor(OPENING.background)
 LEVELS = 5
@@ -36,8 +38,14 @@ SLOW = """{
 }"""
 
 
-def squared(rgb: torch.Tensor) -> np.ndarray:
-    return rgb.clamp(0, 1).view(SIZE, SIZE, 3).numpy()
+def some_rays(camera: Camera) -> Rays:
+    """Those of every eighth row."""
+    return camera.rays(camera.pixels()[8 * SIZE * torch.arange(SIZE // 8)[:, None] + torch.arange(SIZE)].flatten(0, 1))
+
+
+def agreement(shown: np.ndarray, rgb: torch.Tensor) -> float:
+    """PSNR between those rows of a picture and what their rays see."""
+    return psnr(shown[::8].reshape(-1, 3), rgb.clamp(0, 1).numpy())
 
 
 def test_an_octree_is_seen_as_its_rays_say(tmp_path, window):
@@ -47,9 +55,9 @@ def test_an_octree_is_seen_as_its_rays_say(tmp_path, window):
     opened = window(tmp_path / "page.html")
     for index in (1, 4):
         camera = some_camera(index)
-        ours = squared(volumes.octree_seen(tree, camera.rays(camera.pixels()), LEVELS, GROUND))
-        assert psnr(opened.look(camera), ours) > 50
-    assert psnr(window(tmp_path / "plain.html").look(camera), ours) < 35  # the harmonics are seen
+        ours = volumes.octree_seen(tree, some_rays(camera), LEVELS, GROUND)
+        assert agreement(opened.look(camera), ours) > 50
+    assert agreement(window(tmp_path / "plain.html").look(camera), ours) < 35  # the harmonics are seen
 
 
 def test_from_inside_a_cell(tmp_path, window):
@@ -58,10 +66,10 @@ def test_from_inside_a_cell(tmp_path, window):
     pose = some_camera(2).pose.clone()
     pose[0, :, 3] = torch.tensor([0.9, 0.9, 0.9])  # in the fog
     camera = dataclasses.replace(some_camera(2), pose=pose)
-    rays = camera.rays(camera.pixels())
+    rays = some_rays(camera)
     rays = dataclasses.replace(rays, origins=rays.origins + 0.01 * rays.directions)
-    ours = squared(volumes.octree_seen(tree, rays, LEVELS, GROUND))
-    assert psnr(window(tmp_path / "page.html").look(camera), ours) > 45
+    ours = volumes.octree_seen(tree, rays, LEVELS, GROUND)
+    assert agreement(window(tmp_path / "page.html").look(camera), ours) > 45
 
 
 @pytest.mark.parametrize("network", [False, True])
@@ -71,14 +79,13 @@ def test_an_atlas_is_seen_as_its_rays_say(tmp_path, window, network):
     opened = window(tmp_path / "page.html")
     for index in (1, 4):
         camera = some_camera(index)
-        rays = camera.rays(camera.pixels())
-        shown = opened.look(camera)
-        assert psnr(shown, squared(volumes.atlas_seen(made, rays, OPENING.near, GROUND))) > 50
+        shown, rays = opened.look(camera), some_rays(camera)
+        assert agreement(shown, volumes.atlas_seen(made, rays, OPENING.near, GROUND)) > 50
     other = dataclasses.replace(made, network=None if network else volumes.shades())
-    assert psnr(shown, squared(volumes.atlas_seen(other, rays, OPENING.near, GROUND))) < 30  # the network is seen
+    assert agreement(shown, volumes.atlas_seen(other, rays, OPENING.near, GROUND)) < 30  # the network is seen
 
 
-def test_coarse_while_moving_and_sharp_at_rest(tmp_path, window, chromium):
+def test_coarse_while_moving_and_sharp_at_rest(tmp_path, window):
     volume_page(tmp_path / "page.html", octree_for_browser(volumes.octree(LEVELS)), OPENING)
     quick = window(tmp_path / "page.html").settled()
     (tmp_path / "slow.html").write_text(
@@ -93,7 +100,7 @@ def test_coarse_while_moving_and_sharp_at_rest(tmp_path, window, chromium):
     sizes = slow.page.evaluate("sizes")
     assert min(sizes) < SIZE / 2 and max(sizes) == SIZE
     slow.page.keyboard.press("r")
-    assert psnr(slow.settled(), first) > 50 > 25 > psnr(turned, first)
+    assert psnr(slow.settled(), first) > 50 > 30 > psnr(turned, first)
 
 
 def test_a_phone(tmp_path, window):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 import torch
 from solids import Distance, ball, painted, together, torus
 
@@ -22,6 +24,7 @@ def centres(corner: torch.Tensor, side: float, count: int) -> torch.Tensor:
     return torch.stack(torch.meshgrid(*(low + steps for low in corner), indexing="ij"), -1)
 
 
+@cache
 def octree(levels: int = 5, bands: int = 3) -> Octree:
     """Divided wherever one of its finest cells has anything, and a fog in one large cell of the second level."""
     low, size, generator = torch.full((3,), -1.0), 2.0, torch.Generator().manual_seed(4)
@@ -90,6 +93,7 @@ def blended(tau: torch.Tensor, rgb: torch.Tensor, background: torch.Tensor) -> t
     return ((light[:, :-1] - light[:, 1:])[..., None] * rgb).sum(1) + light[:, -1:] * background
 
 
+@cache
 def atlas(count: int = 48, block: int = 8, network: bool = True) -> Atlas:
     """Blocks of a cube of voxels, those that hold anything."""
     low, side, voxel = torch.tensor([-0.9, -0.85, -0.95]), 1.8, 1.8 / count
