@@ -48,8 +48,9 @@ class FromField(Protocol):
 class HasOctree(Protocol):
     """Is an octree of density and harmonics, for browsers and files."""
 
-    def octree(self) -> Octree:
-        """The scene as an octree, in the scene's frame. Raises LumigraphError while there is none yet."""
+    def octree(self, depth: int | None = None) -> Octree:
+        """The scene as an octree, in the scene's frame, of so many levels at most. Raises LumigraphError while there is
+        none yet, and where it does not fit into memory, with the depth that does."""
 
 
 @runtime_checkable

@@ -6,6 +6,7 @@ import os
 import shutil
 from hashlib import sha256
 from pathlib import Path
+from typing import Any
 
 import pytest
 import tiny
@@ -18,7 +19,9 @@ from lumigraph.capture.motion.folder import WRITTEN, claim_results, copy_photogr
 from lumigraph.capture.photos import Photo
 from lumigraph.capture.photos.track import untracked
 from lumigraph.cli import COMMANDS, main
+from lumigraph.components.fields.octree_baking import fill
 from lumigraph.errors import LumigraphError
+from lumigraph.method import Method
 from lumigraph.paths.keyframes import CameraPath, Keyframe
 from lumigraph.run import Run, State, build
 
@@ -29,6 +32,7 @@ WRITES: dict[str, tuple[str, tuple[str, ...]]] = {
     "render, where films go": ("render ball --frames 2 --size 16", ("ball/renders/orbit.json", "ball/renders/orbit/")),
     "render, a run's own name": ("render ball --frames 2 --size 16 --output ball.gif", ("ball.gif", "ball.json")),
     "export web": ("export web gs page.html", ("page.html",)),
+    "export octree": ("export octree octree --output o.npz", ("o.npz",)),
     "export points": ("export points ball p.ply", ("p.ply",)),
     "export splats": ("export splats gs s.spz", ("s.spz",)),
     "export splats, a folder": ("export splats gs open/meta.json", ("open/",)),
@@ -61,19 +65,35 @@ WITHIN_RUNS = {"resume", "view"}  # see the tests of checkpoints and of what is 
 
 @pytest.fixture
 def home(ball_run, ball_folder, tmp_path, monkeypatch):
-    """A folder with two runs, photographs, a picture, and things that nobody may touch."""
+    """A folder with three runs, photographs, a picture, and things that nobody may touch."""
     shutil.copytree(ball_run.folder, tmp_path / "ball")
     shutil.copytree(ball_folder, tmp_path / "photographs")
     gs_run(tmp_path / "gs")
+    octree_run(tmp_path / "octree")
     Image.new("RGB", (16, 16)).save(tmp_path / "one.png")
     monkeypatch.chdir(tmp_path)
     return tmp_path
 
 
 def gs_run(folder: Path) -> Run:
-    scene, kind = tiny.scene(), methods.find("gaussian-splatting")
-    method = build(kind, scene.frame, kind.smallest(), torch.device("cpu"), 0)
-    run = Run.create(folder, method, scene)
+    return run_of(tiny_method("gaussian-splatting"), folder)
+
+
+def octree_run(folder: Path) -> Run:
+    """Eight leaves of nothing."""
+    method: Any = tiny_method("plenoctrees")
+    fill(method.leaves, torch.arange(8, 16))
+    method.teacher = method.occupancy = None
+    return run_of(method, folder)
+
+
+def tiny_method(name: str) -> Method:
+    kind = methods.find(name)
+    return build(kind, tiny.scene().frame, kind.smallest(), torch.device("cpu"), 0)
+
+
+def run_of(method: Method, folder: Path) -> Run:
+    run = Run.create(folder, method, tiny.scene())
     run.save(State(), method, method.optimizers(), torch.Generator())
     return run
 

@@ -8,6 +8,7 @@ from typing import Annotated
 from tyro.conf import OmitArgPrefixes, OmitSubcommandPrefixes, subcommand
 
 from .exports.mesh import ExportMesh
+from .exports.octree import ExportOctree
 from .exports.panorama import ExportPanorama
 from .exports.points import ExportPoints
 from .exports.splats import ExportSplats
@@ -17,6 +18,7 @@ from .exports.web import ExportWeb
 # One line for each thing that can be written; the files are in exports/.
 What = (
     Annotated[ExportMesh, subcommand("mesh")]
+    | Annotated[ExportOctree, subcommand("octree")]
     | Annotated[ExportPanorama, subcommand("panorama")]
     | Annotated[ExportPoints, subcommand("points")]
     | Annotated[ExportSplats, subcommand("splats")]

@@ -11,6 +11,9 @@ from .harmonic_grid import harmonic_grid as harmonic_grid
 from .hash_encode import HashLevels as HashLevels
 from .hash_encode import hash_encode as hash_encode
 from .march import march as march
+from .octree_cells import Tree as Tree
+from .octree_cells import octree_cells as octree_cells
+from .octree_march import octree_march as octree_march
 from .perceptron import perceptron as perceptron
 from .plane_sweep import plane_sweep as plane_sweep
 from .project import View as View

@@ -1,0 +1,227 @@
+"""Density and harmonics in the cells of an octree that hold something."""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor, nn
+from torch.nn.functional import embedding
+
+from ... import kernels
+from ...baked import Octree
+from ...errors import LumigraphError
+from ...kernels.octree_cells import Crossed, Tree, code_of, levels_of
+from ...kernels.octree_cells.reference import leaves
+from ...memory import free_on, gigabytes
+from ...rays import Rays, Rendering
+from .harmonic_field import colour
+
+
+class Leaves(nn.Module):
+    """The table of an octree's leaves. What a leaf holds is the same everywhere inside of it (Yu 2021, section 4).
+
+    codes:     of the leaves, rising in memory as they lie in space (see `kernels.Tree`)
+    density:   (row, 1) per scene unit; what is below 0 counts as 0
+    harmonics: (row, 3 basis), before the sigmoid, colours next to each other
+    low, size: corner and side of the cube that is divided, in the scene's frame
+    There are none at first.
+    """
+
+    grows: ClassVar[tuple[str, ...]] = ("codes", "density", "harmonics")
+    codes: Tensor
+    low: Tensor
+    size: Tensor
+    density: nn.Parameter
+    harmonics: nn.Parameter
+
+    def __init__(self, basis: int):
+        super().__init__()
+        self.basis = basis
+        self.register_buffer("codes", torch.zeros(0, dtype=torch.int32))
+        self.register_buffer("low", torch.full((3,), -1.0))
+        self.register_buffer("size", torch.tensor(2.0))
+        self.density = nn.Parameter(torch.zeros(0, 1), requires_grad=False)
+        self.harmonics = nn.Parameter(torch.zeros(0, 3 * basis), requires_grad=False)
+        self._made: tuple[Tensor, int, Tree] | None = None
+
+    def __len__(self) -> int:
+        return len(self.codes)
+
+    @staticmethod
+    def bytes_of(rows: int, basis: int, learning: bool) -> int:
+        """What so many leaves take with their tree; where they learn, twice more: their mean squares, and what a
+        step touches."""
+        return rows * (4 * (1 + 3 * basis) * (3 if learning else 1) + 64)
+
+    @property
+    def tree(self) -> Tree:
+        """Made when first asked for, and again where the codes were loaded or moved."""
+        made = self._made
+        if made is None or made[0] is not self.codes or made[1] != self.codes._version:
+            made = self._made = self.codes, self.codes._version, Tree.of(self.codes)
+        return made[2]
+
+    # Along rays
+
+    def crossed(self, rays: Rays, near: float, stop: float = 0.0) -> Crossed:
+        """The leaves that rays cross, from near to far, until they are spent; distances in scene units."""
+        found = kernels.octree_cells(*self._within(rays), self.tree, self._thickness.detach(), *self._ends(near, stop))
+        size = float(self.size)
+        return Crossed(found.t_start * size, found.t_end * size, found.ray_starts, found.rows)
+
+    def seen(
+        self, rays: Rays, near: float, stop: float, background: Float[Tensor, "#ray 3"], part: Part | None = None
+    ) -> Rendering:
+        """What rays see before a background colour. part: the rows through which gradients go; all by default"""
+        tree, density, harmonics = part or (self.tree, self.density, self.harmonics)
+        thickness = density[:, 0].relu() * float(self.size)
+        tables = thickness, harmonics.view(-1, self.basis, 3)
+        rgb, distance, opacity = kernels.octree_march(*self._within(rays), tree, *tables, *self._ends(near, stop))
+        rgb = rgb + (1 - opacity)[:, None] * background
+        hit = opacity > 1e-3
+        depth = torch.where(hit, distance * float(self.size) / opacity.clamp_min(1e-3), torch.inf)
+        return Rendering(rgb, depth, opacity)
+
+    @torch.no_grad()
+    def touched(self, rays: Rays, near: float, stop: float) -> Int[Tensor, " some"]:
+        """Rows that rays cross before they are spent, rising; on a GPU, where looking takes longer, all rows."""
+        if rays.origins.is_cuda:
+            return torch.arange(len(self), device=rays.origins.device)
+        marks = torch.zeros(len(self), dtype=torch.bool)
+        marks[self.crossed(rays, near, stop).rows] = True
+        return marks.nonzero()[:, 0]
+
+    def part(self, rows: Int[Tensor, " some"]) -> Part:
+        """A small table of some rows, through which a sparse gradient reaches them: what a step touches."""
+        density, harmonics = (embedding(rows, table, sparse=True) for table in (self.density, self.harmonics))
+        return self.tree.part(rows), density, harmonics
+
+    @property
+    def _thickness(self) -> Float[Tensor, " row"]:
+        """Density per side of the cube."""
+        return self.density[:, 0].relu() * float(self.size)
+
+    def _within(self, rays: Rays) -> tuple[Tensor, Tensor]:
+        return (rays.origins - self.low) / float(self.size), rays.directions
+
+    def _ends(self, near: float, stop: float) -> tuple[float, float]:
+        return near / float(self.size), stop
+
+    # At points
+
+    def rows_at(self, points: Float[Tensor, "point 3"]) -> Int[Tensor, " point"]:
+        """The row of the leaf that each point is in, -1 where there is none."""
+        tree = self.tree
+        place = ((points - self.low) * (2.0**tree.depth / float(self.size))).floor()
+        inside = ((place >= 0) & (place < 1 << tree.depth)).all(-1)
+        value, _ = leaves(tree, torch.where(inside[:, None], place, 0).long())
+        return torch.where(inside & (value < 0), -1 - value, -1)
+
+    def at(
+        self, points: Float[Tensor, "point 3"], directions: Float[Tensor, "point 3"]
+    ) -> tuple[Float[Tensor, " point"], Float[Tensor, "point 3"]]:
+        """Density per scene unit, and colour; grey where nothing is."""
+        rows = self.rows_at(points)
+        rgb = colour(self._rows(self.harmonics, rows).view(-1, self.basis, 3), directions)
+        return self._rows(self.density, rows)[:, 0].relu(), rgb
+
+    def density_at(self, points: Float[Tensor, "point 3"]) -> Float[Tensor, " point"]:
+        """Density per scene unit."""
+        return self._rows(self.density, self.rows_at(points))[:, 0].relu()
+
+    def _rows(self, table: Float[Tensor, "row value"], rows: Int[Tensor, " point"]) -> Float[Tensor, "point value"]:
+        found = table.new_zeros(len(rows), table.shape[1])
+        there = (rows >= 0).nonzero()[:, 0]
+        return found.index_copy(0, there, table[rows[there]])
+
+    # As a whole
+
+    @torch.no_grad()
+    def keep(self, rows: Bool[Tensor, " row"]) -> None:
+        """Leave some rows; where a leaf is gone, there is nothing."""
+        self.codes = self.codes[rows]
+        self.density, self.harmonics = nn.Parameter(self.density[rows]), nn.Parameter(self.harmonics[rows])
+
+    @property
+    def centres(self) -> tuple[Float[Tensor, "row 3"], Float[Tensor, " row"]]:
+        """The middle of each leaf, and its side, in the scene's frame."""
+        codes, levels = self.codes.long(), levels_of(self.codes.long())
+        place = places_of(codes, levels)
+        side = float(self.size) / 2.0**levels
+        return self.low + (place + 0.5) * side[:, None], side
+
+    @torch.no_grad()
+    def octree(self) -> Octree:
+        """The noun: every cell of every divided one, with what it holds."""
+        tree = self.tree
+        cells = tree.cells.view(-1, 2, 2, 2)
+        own = torch.arange(len(cells), dtype=torch.int32, device=cells.device)[:, None, None, None]
+        child = torch.where(cells > 0, cells - own, 0)
+        rows = torch.where(cells < 0, -1 - cells, -1).flatten().long()
+        density = self._rows(self.density, rows).relu().view(cells.shape)
+        harmonics = self._rows(self.harmonics, rows).view(*cells.shape, self.basis, 3)
+        return Octree(child, density, harmonics, self.low.clone(), float(self.size))
+
+    @torch.no_grad()
+    def coarser(self, depth: int) -> Leaves:
+        """The same with so many levels at most: a cell holds the mean density of what lies in it, and the harmonics
+        that it has on average where it is dense."""
+        codes, levels = self.codes.long(), levels_of(self.codes.long())
+        over = (levels - depth).clamp_min(0)
+        merged, which = torch.unique(codes >> 3 * over, return_inverse=True)
+        share = self.density.relu() / 8.0 ** over[:, None]
+        density = torch.zeros(len(merged), 1, device=share.device).index_add_(0, which, share)
+        harmonics = torch.zeros(len(merged), self.harmonics.shape[1], device=share.device)
+        harmonics.index_add_(0, which, share * self.harmonics)
+        found = Leaves(self.basis).to(share.device)
+        found.low, found.size = self.low.clone(), self.size.clone()
+        order = in_space(merged)
+        found.codes = merged[order].int()
+        found.density = nn.Parameter(density[order])
+        found.harmonics = nn.Parameter((harmonics / density.clamp_min(1e-9))[order])
+        return found
+
+
+def ask_for_octree(leaves: Leaves, depth: int | None = None) -> None:
+    """Raise LumigraphError where the noun would not fit into memory, all cells of all nodes written out and half as
+    much again while that is done, with the depth that would."""
+    codes, levels = leaves.codes.long(), levels_of(leaves.codes.long())
+    device, deepest = codes.device, int(levels.max()) if len(codes) else 1
+    free, nodes, fits = free_on(device), 0, 0
+    for level in range(min(depth or deepest, deepest)):
+        below = levels > level
+        nodes += len(torch.unique(codes[below] >> 3 * (levels[below] - level)))
+        needed = nodes * 8 * 4 * (2 + 3 * leaves.basis) * 3 // 2
+        fits = level + 1 if needed <= free else fits
+    if fits < min(depth or deepest, deepest):
+        less = f"give --depth {fits}, which fits" if fits else "end other programs"
+        raise LumigraphError(
+            f"An octree of depth {depth or deepest} has {nodes:,} nodes and would need {gigabytes(needed)} of memory, "
+            f"and {gigabytes(free)} are free; {less}"
+        )
+
+
+Part = tuple[Tree, Tensor, Tensor]  # a tree for some rows, and those rows of density and harmonics
+
+
+def places_of(codes: Int[Tensor, " row"], levels: Int[Tensor, " row"]) -> Int[Tensor, "row 3"]:
+    """Whole numbers of cells along each axis, among the cells of their level."""
+    place = torch.zeros(len(codes), 3, dtype=torch.int64, device=codes.device)
+    for k in range(int(levels.max()) if len(levels) else 0):
+        bits = torch.stack([codes >> 3 * k + 2, codes >> 3 * k + 1, codes >> 3 * k], -1) & 1
+        place += torch.where((k < levels)[:, None], bits << k, 0)
+    return place
+
+
+def in_space(codes: Int[Tensor, " row"]) -> Int[Tensor, " row"]:
+    """The order in which cells of any levels lie along the curve through the cube (Morton 1966)."""
+    levels = levels_of(codes)
+    return (codes << 3 * (levels.max() - levels if len(levels) else levels)).argsort()
+
+
+def codes_of(place: Int[Tensor, "row 3"], depth: int) -> Int[Tensor, " row"]:
+    """Codes of cells of one level, from their whole numbers along each axis."""
+    x, y, z = place.unbind(-1)
+    return code_of(x, y, z, depth)

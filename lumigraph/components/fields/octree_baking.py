@@ -1,0 +1,230 @@
+"""From a field to an octree: which cells cameras see, how dense they are, what they show (Yu 2021, section 4).
+
+A teacher is whatever gives density and colour at points. Where it marches along rays, what it meets there says which
+cells count: what a field holds where it never looks was never learnt.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor, nn
+from torch.nn.functional import max_pool3d
+
+from ...camera import Camera
+from ...capabilities import HasDensity, can
+from ...errors import LumigraphError
+from ...kernels import composite, spherical_harmonics
+from ...memory import free_on, gigabytes
+from ...rays import Rays
+from ...volume import weights_of
+from .leaves import Leaves, codes_of
+
+CELLS = 128  # along each axis of the lattice that a teacher's samples mark, at most
+MARKS = 1 << 18  # rays that mark it, at most
+CHUNK = 1 << 13  # rays asked at once
+POINTS = 1 << 18  # points asked at once
+PER_CELL = 32  # rays that look, for each cell of one face of the cube
+MOST_RAYS = 1 << 22
+VIEWS = 24  # directions in which a field's colour is asked, of each leaf
+RIDGE = 0.05  # how strongly harmonics that these directions do not tell stay 0, as a share of what all of them tell
+DARKEST = 0.005  # of colours whose logit is taken, and as far below white
+
+Density = Callable[[Float[Tensor, "point 3"]], Float[Tensor, " point"]]
+Harmonics = Callable[[Float[Tensor, "point 3"]], tuple[Float[Tensor, " point"], Float[Tensor, "point basis 3"]]]
+
+
+@dataclass(frozen=True)
+class Baking:
+    """How a field is baked.
+
+    depth:     levels of the octree
+    points:    random points of a leaf over which density and harmonics are averaged
+    threshold: compositing weight that a leaf must have in some view
+    near:      distance from a camera at which its rays begin
+    """
+
+    depth: int
+    points: int
+    threshold: float
+    near: float
+
+
+@torch.no_grad()
+def bake(
+    leaves: Leaves,
+    density: Density,
+    mask: Bool[Tensor, "x y z"] | None,
+    cameras: Camera,
+    numbers: Baking,
+    generator: torch.Generator,
+) -> None:
+    """Fill leaves with a field's density, as far as cameras see it; harmonics come after.
+
+    density: at points, per scene unit
+    mask:    cells of a lattice over [-1, 1]^3 that may hold something; all where None
+    Raises LumigraphError where nothing is seen, or where so deep an octree does not fit into memory.
+    """
+    leaves.low, leaves.size = tight_cube(mask, leaves.low.device)
+    codes = dense_cells(density, leaves, mask, numbers)
+    fill(leaves, codes)
+    averaged_density(leaves, density, numbers.points, generator)
+    leaves.keep(seen(leaves, cameras, numbers, generator))
+    if not len(leaves):
+        raise LumigraphError("No camera sees anything dense in this field, so no octree can be made; train it longer")
+
+
+def density_of(teacher: Any) -> Density:
+    """Density at points, of whatever has `field`."""
+    if can(teacher, HasDensity):
+        return teacher.density
+    return lambda points: teacher.field(points, torch.nn.functional.normalize(points + 1e-6, dim=-1))[0]
+
+
+def random_rays(cameras: Camera, count: int, generator: torch.Generator) -> Rays:
+    """Rays through random places on random pictures."""
+    index = torch.randint(len(cameras), (count,), generator=generator)
+    pixels = torch.rand(count, 2, generator=generator) * cameras.size.cpu()[index]
+    return cameras.rays(pixels.to(cameras.pose), index.to(cameras.pose.device))
+
+
+def met(teacher: Any, cameras: Camera, numbers: Baking, generator: torch.Generator) -> Bool[Tensor, "x y z"]:
+    """Cells of a lattice over [-1, 1]^3 in which a teacher's samples weigh something, and those next to them."""
+    n = min(CELLS, 1 << numbers.depth)
+    marks = torch.zeros(n**3, dtype=torch.bool, device=teacher.device)
+    for _ in range(0, min(PER_CELL << 2 * numbers.depth, MARKS), CHUNK):
+        rays = random_rays(cameras, CHUNK, generator).to(teacher.device)
+        look = teacher.looks(rays)[-1]
+        points = look.samples.along(rays)[0][weights_of(look.samples, look.density) > numbers.threshold]
+        x, y, z = ((points * 0.5 + 0.5) * n).long().clamp(0, n - 1).unbind(-1)
+        marks[(x * n + y) * n + z] = True
+    around = max_pool3d(marks.view(1, 1, n, n, n).float(), 3, 1, 1)
+    return around[0, 0] > 0
+
+
+def tight_cube(
+    mask: Bool[Tensor, "x y z"] | None, device: torch.device
+) -> tuple[Float[Tensor, " xyz"], Float[Tensor, ""]]:
+    """Corner and side of the smallest cube around all marked cells; the whole where nothing is marked or known."""
+    if mask is None or not mask.any():
+        return torch.full((3,), -1.0, device=device), torch.tensor(2.0, device=device)
+    places, cell = mask.nonzero(), 2 / len(mask)
+    low, high = places.amin(0) * cell - 1, (places.amax(0) + 1) * cell - 1
+    size = (high - low).max()
+    return (low + high - size) / 2, size
+
+
+def dense_cells(
+    density: Density, leaves: Leaves, mask: Bool[Tensor, "x y z"] | None, numbers: Baking
+) -> Int[Tensor, " cell"]:
+    """Codes of the smallest cells that a camera could see: where the mask says so, and one side of them stops as much
+    light as the threshold. Coarse cells are divided level by level."""
+    device, size = leaves.low.device, float(leaves.size)
+    place = torch.zeros(1, 3, dtype=torch.int64, device=device)
+    octants = torch.cartesian_prod(*[torch.arange(2, device=device)] * 3)
+    for level in range(1, numbers.depth + 1):
+        ask_for_cells(8 * len(place), leaves.basis, numbers.depth, level, device)
+        place = (2 * place[:, None] + octants).flatten(0, 1)
+        if mask is not None:
+            place = place[overlapping(mask, leaves.low + place * (size / 2**level), size / 2**level)]
+    side = size / 2**numbers.depth
+    found = []
+    for some in place.split(POINTS):
+        stopped = 1 - torch.exp(-density(leaves.low + (some + 0.5) * side) * side)
+        found.append(some[stopped > numbers.threshold])
+    return codes_of(torch.cat(found), numbers.depth)
+
+
+def overlapping(mask: Bool[Tensor, "x y z"], low: Float[Tensor, "cell 3"], side: float) -> Bool[Tensor, " cell"]:
+    """Which cubes hold part of a marked cell."""
+    n, total = len(mask), torch.nn.functional.pad(mask.int().cumsum(0).cumsum(1).cumsum(2), (1, 0, 1, 0, 1, 0))
+    first = ((low * 0.5 + 0.5) * n + 1e-4).floor().long().clamp(0, n)
+    last = (((low + side) * 0.5 + 0.5) * n - 1e-4).ceil().long().clamp(0, n)
+    count = torch.zeros(len(low), dtype=total.dtype, device=low.device)
+    for corner in range(8):
+        bits = torch.tensor([corner >> 2 & 1, corner >> 1 & 1, corner & 1], device=low.device)
+        x, y, z = torch.where(bits == 1, last, first).unbind(-1)
+        count += total[x, y, z] * (1 if int(bits.sum()) % 2 else -1)
+    return count > 0
+
+
+def ask_for_cells(cells: int, basis: int, depth: int, level: int, device: torch.device) -> None:
+    """Raise LumigraphError where so many cells of a level do not fit into memory, with the depth that does."""
+    needed = Leaves.bytes_of(cells, basis, learning=True)
+    if needed > (free := free_on(device)):
+        raise LumigraphError(
+            f"An octree of depth {depth} would need {gigabytes(needed)} of memory for its level {level} alone, and "
+            f"{gigabytes(free)} are free; give --octree-depth {max(level - 1, 1)}, which fits"
+        )
+
+
+def fill(leaves: Leaves, codes: Int[Tensor, " row"]) -> None:
+    """Leaves of these codes, which hold nothing yet."""
+    leaves.codes = codes.sort()[0].int()
+    leaves.density = nn.Parameter(torch.zeros(len(codes), 1, device=codes.device))
+    leaves.harmonics = nn.Parameter(torch.zeros(len(codes), 3 * leaves.basis, device=codes.device))
+
+
+def points_in(
+    centres: Float[Tensor, "row 3"], side: Float[Tensor, " row"], count: int, generator: torch.Generator
+) -> Float[Tensor, "row count 3"]:
+    """Random points of cells."""
+    shifts = torch.rand(len(centres), count, 3, generator=generator).to(centres) - 0.5
+    return centres[:, None] + shifts * side[:, None, None]
+
+
+def averaged_density(leaves: Leaves, density: Density, count: int, generator: torch.Generator) -> None:
+    """Each leaf's mean over random points."""
+    centres, side = leaves.centres
+    for rows in torch.arange(len(leaves), device=centres.device).split(max(POINTS // count, 1)):
+        points = points_in(centres[rows], side[rows], count, generator)
+        leaves.density.data[rows, 0] = density(points.flatten(0, 1)).view(len(rows), count).mean(1)
+
+
+def seen(leaves: Leaves, cameras: Camera, numbers: Baking, generator: torch.Generator) -> Bool[Tensor, " row"]:
+    """Which leaves have enough weight somewhere in the pictures, from random rays of all of them."""
+    most = torch.zeros(len(leaves), device=leaves.codes.device)
+    for _ in range(0, min(PER_CELL << 2 * numbers.depth, MOST_RAYS), CHUNK):
+        rays = random_rays(cameras, CHUNK, generator).to(most.device)
+        found = leaves.crossed(rays, numbers.near, numbers.threshold)
+        tau = leaves.density[found.rows, 0].relu() * (found.t_end - found.t_start)
+        weights = composite(tau, tau[:, None], found.ray_starts)[2]
+        most.scatter_reduce_(0, found.rows, weights, "amax")
+    return most > numbers.threshold
+
+
+def averaged_harmonics(leaves: Leaves, harmonics: Harmonics, count: int, generator: torch.Generator) -> None:
+    """Each leaf's mean over random points, where they are dense more than where they are not."""
+    centres, side = leaves.centres
+    for rows in torch.arange(len(leaves), device=centres.device).split(max(POINTS // count, 1)):
+        points = points_in(centres[rows], side[rows], count, generator)
+        density, found = harmonics(points.flatten(0, 1))
+        weights = (density.view(len(rows), count, 1) + 1e-6).double()
+        mean = (weights * found.view(len(rows), count, -1)).sum(1) / weights.sum(1)
+        leaves.harmonics.data[rows] = mean.float()
+
+
+def fitted_harmonics(leaves: Leaves, teacher: Any, cameras: Camera, generator: torch.Generator) -> None:
+    """Harmonics nearest to a field's colours, before the sigmoid, in the directions from which some cameras see each
+    leaf, at random points of it: least squares, in which what the directions do not tell stays small."""
+    centres, side = leaves.centres
+    bands, positions = round(leaves.basis**0.5), cameras.position.to(centres)
+    told = VIEWS / (4 * torch.pi)  # the sum of squares of one basis function over directions spread evenly
+    ridge = RIDGE * told * (torch.arange(leaves.basis, device=centres.device) > 0).diag_embed() + 1e-4 * torch.eye(
+        leaves.basis, device=centres.device
+    )
+    for rows in torch.arange(len(leaves), device=centres.device).split(POINTS // VIEWS):
+        points = points_in(centres[rows], side[rows], VIEWS, generator).flatten(0, 1)
+        chosen = torch.randint(len(positions), (len(points),), generator=generator).to(points.device)
+        directions = torch.nn.functional.normalize(points - positions[chosen], dim=-1)
+        density, rgb = teacher.field(points, directions)
+        weights = (density + 1e-3).view(len(rows), VIEWS, 1)
+        weights = weights / weights.mean(1, keepdim=True)
+        basis = spherical_harmonics(directions, bands).view(len(rows), VIEWS, -1)
+        wanted = rgb.clamp(DARKEST, 1 - DARKEST).logit().view(len(rows), VIEWS, 3)
+        weighted = (basis * weights).mT
+        leaves.harmonics.data[rows] = torch.linalg.solve(weighted @ basis + ridge, weighted @ wanted).flatten(1)

@@ -1,0 +1,128 @@
+"""Numba: each ray walks through the tree twice, to count its cells and to write them. A ray keeps the nodes that it is
+in, from the cube on, so that it goes up no further than to the one that holds the next cell too."""
+
+import math
+
+import numpy as np
+import torch
+from numba import njit, prange
+
+from .._dispatch import empty
+from . import SLOW as _SLOW
+
+ZERO, ONE, SLOW = np.float32(0), np.float32(1), np.float32(_SLOW)
+CHUNK = 64  # rays that share the memory for their nodes
+FAST = {"cache": True, "error_model": "numpy"}
+
+
+@njit(inline="always")
+def inverse_of(d):
+    """One over a direction's part along an axis."""
+    return ONE / (SLOW if abs(d) < SLOW else d)
+
+
+@njit(inline="always")
+def through_cube(ox, oy, oz, ix, iy, iz, near):
+    """Where a ray enters the unit cube and leaves it."""
+    a, b, c = -ox * ix, -oy * iy, -oz * iz
+    d, e, f = (ONE - ox) * ix, (ONE - oy) * iy, (ONE - oz) * iz
+    return max(min(a, d), min(b, e), min(c, f), near), min(max(a, d), max(b, e), max(c, f))
+
+
+@njit(inline="always")
+def cell_at(x, side):
+    """The whole number of the smallest cell at a coordinate."""
+    return min(max(np.int64(np.floor(x * np.float32(side))), 0), side - 1)
+
+
+@njit(inline="always")
+def leaf(cells, path, level, depth, x, y, z):
+    """What the undivided cell at a place holds, and its level. path: the nodes down to `level`, to which it adds"""
+    node = path[level]
+    while True:
+        shift = depth - level - 1
+        value = np.int64(cells[node, 4 * (x >> shift & 1) + 2 * (y >> shift & 1) + (z >> shift & 1)])
+        level += 1
+        if value <= 0:
+            return value, level
+        node = value
+        path[level] = node
+
+
+@njit(inline="always")
+def leave(x, y, z, shift, per_cell, ox, oy, oz, dx, dy, dz, ix, iy, iz, t):
+    """Where a ray leaves the cell of side 2^shift at a place, and the place beyond. per_cell: side of the smallest"""
+    size = np.int64(1) << shift
+    lx, ly, lz = x >> shift << shift, y >> shift << shift, z >> shift << shift
+    hx, hy, hz = lx + size, ly + size, lz + size
+    tx = (np.float32(hx if ix > ZERO else lx) * per_cell - ox) * ix
+    ty = (np.float32(hy if iy > ZERO else ly) * per_cell - oy) * iy
+    tz = (np.float32(hz if iz > ZERO else lz) * per_cell - oz) * iz
+    end = max(min(tx, ty, tz), t)
+    side = ONE / per_cell
+    u = min(max(np.int64(np.floor((ox + end * dx) * side)), lx), hx - 1)
+    v = min(max(np.int64(np.floor((oy + end * dy) * side)), ly), hy - 1)
+    w = min(max(np.int64(np.floor((oz + end * dz) * side)), lz), hz - 1)
+    if tx <= ty and tx <= tz:
+        u = hx if ix > ZERO else lx - 1
+    elif ty <= tz:
+        v = hy if iy > ZERO else ly - 1
+    else:
+        w = hz if iz > ZERO else lz - 1
+    return end, u, v, w
+
+
+@njit(inline="always")
+def shared(level, depth, differing):
+    """The deepest level, at most this one, whose node holds two places. differing: the bits in which they do"""
+    while differing >> (depth - level):
+        level -= 1
+    return level
+
+
+@njit(parallel=True, **FAST)
+def _walk(o, d, cells, named, density, depth, near, most, write, starts, t_start, t_end, rows):
+    """Count the cells of ray r into starts[r + 1], or write them from starts[r] on."""
+    n, side = len(o), np.int64(1) << depth
+    per_cell = ONE / np.float32(side)
+    for chunk in prange((n + CHUNK - 1) // CHUNK):
+        path = np.zeros(depth + 1, np.int64)
+        for r in range(chunk * CHUNK, min(n, (chunk + 1) * CHUNK)):
+            ox, oy, oz, dx, dy, dz = o[r, 0], o[r, 1], o[r, 2], d[r, 0], d[r, 1], d[r, 2]
+            ix, iy, iz = inverse_of(dx), inverse_of(dy), inverse_of(dz)
+            t, far = through_cube(ox, oy, oz, ix, iy, iz, near)
+            count, thickness, level = np.int64(0), ZERO, np.int64(0)
+            if t < far:
+                x, y, z = cell_at(ox + t * dx, side), cell_at(oy + t * dy, side), cell_at(oz + t * dz, side)
+                while True:
+                    value, level = leaf(cells, path, level, depth, x, y, z)
+                    end, u, v, w = leave(
+                        x, y, z, depth - level, per_cell, ox, oy, oz, dx, dy, dz, ix, iy, iz, t
+                    )  # fmt: skip
+                    if value < 0:
+                        row = np.int64(named[-1 - value])
+                        if row >= 0:
+                            if write:
+                                i = starts[r] + count
+                                t_start[i], t_end[i], rows[i] = t, end, row
+                            count += 1
+                            thickness += density[row] * (end - t)
+                    if u < 0 or v < 0 or w < 0 or u >= side or v >= side or w >= side or thickness > most:
+                        break
+                    level = shared(level - 1, depth, (x ^ u) | (y ^ v) | (z ^ w))
+                    x, y, z, t = u, v, w, end
+            if not write:
+                starts[r + 1] = count
+
+
+def run(origins, directions, tree, density, near, stop):
+    given = [x.detach().contiguous().numpy() for x in (origins, directions, tree.cells, tree.named, density)]
+    numbers = tree.depth, np.float32(near), np.float32(-math.log(stop) if stop > 0 else math.inf)
+    starts, nothing = torch.zeros(len(origins) + 1, dtype=torch.int64), empty(0)
+    rows = torch.empty(0, dtype=torch.int64)
+    _walk(*given, *numbers, False, starts.numpy(), nothing.numpy(), nothing.numpy(), rows.numpy())
+    starts.cumsum_(0)
+    t_start, t_end = empty(int(starts[-1])), empty(int(starts[-1]))
+    rows = torch.empty(int(starts[-1]), dtype=torch.int64)
+    _walk(*given, *numbers, True, starts.numpy(), t_start.numpy(), t_end.numpy(), rows.numpy())
+    return t_start, t_end, starts, rows

@@ -1,0 +1,166 @@
+"""Triton: one lane takes one ray, and goes down from the cube to each of its cells. The first pass counts them, the
+second writes them."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+import triton
+import triton.language as tl
+from torch import Tensor
+
+from .._dispatch import empty
+from . import SLOW as _SLOW
+from . import Tree
+
+SLOW = tl.constexpr(_SLOW)
+BLOCK = 32  # rays; they go together, so a program is as slow as its slowest
+
+
+@triton.jit
+def ray_of(origins, directions, r, here):
+    """Origins, directions and one over these, of a block of rays."""
+    ox = tl.load(origins + 3 * r, mask=here, other=0.0)
+    oy = tl.load(origins + 3 * r + 1, mask=here, other=0.0)
+    oz = tl.load(origins + 3 * r + 2, mask=here, other=0.0)
+    dx = tl.load(directions + 3 * r, mask=here, other=1.0)
+    dy = tl.load(directions + 3 * r + 1, mask=here, other=0.0)
+    dz = tl.load(directions + 3 * r + 2, mask=here, other=0.0)
+    ix = 1.0 / tl.where(tl.abs(dx) < SLOW, SLOW, dx)
+    iy = 1.0 / tl.where(tl.abs(dy) < SLOW, SLOW, dy)
+    iz = 1.0 / tl.where(tl.abs(dz) < SLOW, SLOW, dz)
+    return ox, oy, oz, dx, dy, dz, ix, iy, iz
+
+
+@triton.jit
+def through_cube(ox, oy, oz, ix, iy, iz, near):
+    """Where rays enter the unit cube and leave it."""
+    a, b, c = -ox * ix, -oy * iy, -oz * iz
+    d, e, f = (1.0 - ox) * ix, (1.0 - oy) * iy, (1.0 - oz) * iz
+    enter = tl.maximum(tl.maximum(tl.minimum(a, d), tl.minimum(b, e)), tl.minimum(c, f))
+    return tl.maximum(enter, near), tl.minimum(tl.minimum(tl.maximum(a, d), tl.maximum(b, e)), tl.maximum(c, f))
+
+
+@triton.jit
+def cell_at(x, low, high, side):
+    """The whole number of the smallest cell at a coordinate, from low to below high."""
+    inside = tl.minimum(tl.maximum(x * side, -1.0), side + 1.0)
+    return tl.minimum(tl.maximum(tl.floor(inside).to(tl.int32), low), high - 1)
+
+
+@triton.jit
+def leaf(cells, x, y, z, going, DEPTH: tl.constexpr):
+    """What the undivided cell at a place holds, and the logarithm of its side."""
+    node = tl.zeros_like(x)
+    value = tl.zeros_like(x)
+    shift = tl.zeros_like(x) + DEPTH
+    divided = going
+    for level in range(DEPTH):
+        s = DEPTH - 1 - level
+        octant = 4 * ((x >> s) & 1) + 2 * ((y >> s) & 1) + ((z >> s) & 1)
+        value = tl.where(divided, tl.load(cells + 8 * node + octant, mask=divided, other=0), value)
+        shift = tl.where(divided, s, shift)
+        divided = divided & (value > 0)
+        node = tl.where(divided, value, node)
+    return value, shift
+
+
+@triton.jit
+def leave(x, y, z, shift, ox, oy, oz, dx, dy, dz, ix, iy, iz, t, DEPTH: tl.constexpr):
+    """Where rays leave the cells of side 2^shift at their places, and the places beyond."""
+    side = 2.0**DEPTH
+    size = 1 << shift
+    lx, ly, lz = (x >> shift) << shift, (y >> shift) << shift, (z >> shift) << shift
+    hx = lx + size
+    hy = ly + size
+    hz = lz + size
+    tx = (tl.where(ix > 0, hx, lx).to(tl.float32) / side - ox) * ix
+    ty = (tl.where(iy > 0, hy, ly).to(tl.float32) / side - oy) * iy
+    tz = (tl.where(iz > 0, hz, lz).to(tl.float32) / side - oz) * iz
+    end = tl.maximum(tl.minimum(tl.minimum(tx, ty), tz), t)
+    through_x = (tx <= ty) & (tx <= tz)
+    through_y = (ty <= tz) & ~through_x
+    u = tl.where(through_x, tl.where(ix > 0, hx, lx - 1), cell_at(ox + end * dx, lx, hx, side))
+    v = tl.where(through_y, tl.where(iy > 0, hy, ly - 1), cell_at(oy + end * dy, ly, hy, side))
+    beyond = tl.where(iz > 0, hz, lz - 1)
+    w = tl.where(through_x | through_y, cell_at(oz + end * dz, lz, hz, side), beyond)
+    return end, u, v, w
+
+
+@triton.jit
+def inside(u, v, w, DEPTH: tl.constexpr):
+    """Whether places lie in the cube."""
+    side = 1 << DEPTH
+    return (u >= 0) & (v >= 0) & (w >= 0) & (u < side) & (v < side) & (w < side)
+
+
+@triton.jit
+def row_in(named, value, going):
+    """The row of a cell with a value of `Tree.cells`, -1 where it has none."""
+    there = going & (value < 0)
+    return tl.load(named + tl.where(there, -1 - value, 0), mask=there, other=-1)
+
+
+@triton.jit(do_not_specialize=["R", "near", "most"])
+def _walk(
+    origins, directions, cells, named, density, counts, ray_starts, t_start, t_end, rows, R, near, most,
+    DEPTH: tl.constexpr, WRITE: tl.constexpr, BLOCK: tl.constexpr,
+):  # fmt: skip
+    r = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
+    here = r < R
+    ox, oy, oz, dx, dy, dz, ix, iy, iz = ray_of(origins, directions, r, here)
+    t, far = through_cube(ox, oy, oz, ix, iy, iz, near)
+    going = here & (t < far)
+    side = 2.0**DEPTH
+    x = cell_at(ox + t * dx, 0, 1 << DEPTH, side)
+    y = cell_at(oy + t * dy, 0, 1 << DEPTH, side)
+    z = cell_at(oz + t * dz, 0, 1 << DEPTH, side)
+    count = tl.zeros([BLOCK], tl.int32)
+    thickness = tl.zeros([BLOCK], tl.float32)
+    if WRITE:
+        first = tl.load(ray_starts + r, mask=here, other=0)
+    while tl.max(going.to(tl.int32), 0) > 0:
+        value, shift = leaf(cells, x, y, z, going, DEPTH)
+        end, u, v, w = leave(x, y, z, shift, ox, oy, oz, dx, dy, dz, ix, iy, iz, t, DEPTH)
+        row = row_in(named, value, going)
+        held = row >= 0
+        if WRITE:
+            place = first + count
+            tl.store(t_start + place, t, mask=held)
+            tl.store(t_end + place, end, mask=held)
+            tl.store(rows + place, row.to(tl.int64), mask=held)
+        count += held.to(tl.int32)
+        thickness += tl.load(density + row, mask=held, other=0.0) * tl.where(held, end - t, 0.0)
+        going = going & inside(u, v, w, DEPTH) & (thickness <= most)
+        x, y, z, t = tl.where(going, u, 0), tl.where(going, v, 0), tl.where(going, w, 0), end
+    if not WRITE:
+        tl.store(counts + r, count, mask=here)
+
+
+@torch.no_grad()
+def run(
+    origins: Tensor, directions: Tensor, tree: Tree, density: Tensor, near: float, stop: float
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    count, device = len(origins), origins.device
+    given = [x.contiguous() for x in (origins, directions, tree.cells, tree.named, density)]
+    numbers = count, float(near), -math.log(stop) if stop > 0 else math.inf
+    options = {
+        "DEPTH": tree.depth,
+        "BLOCK": BLOCK,
+        "num_warps": 1,
+        "enable_fp_fusion": False,
+    }  # both passes round alike
+    counts = torch.zeros(count, dtype=torch.int32, device=device)
+    ray_starts = torch.zeros(count + 1, dtype=torch.int64, device=device)
+    rows = torch.empty(0, dtype=torch.int64, device=device)
+    t_start = t_end = empty(0, device=device)
+    if count:
+        grid = (triton.cdiv(count, BLOCK),)
+        _walk[grid](*given, counts, ray_starts, t_start, t_end, rows, *numbers, WRITE=False, **options)
+        torch.cumsum(counts, 0, out=ray_starts[1:])
+        total = int(ray_starts[-1])
+        t_start, t_end = empty(total, device=device), empty(total, device=device)
+        rows = torch.empty(total, dtype=torch.int64, device=device)
+        _walk[grid](*given, counts, ray_starts, t_start, t_end, rows, *numbers, WRITE=True, **options)
+    return t_start, t_end, ray_starts, rows

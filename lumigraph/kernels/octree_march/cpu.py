@@ -1,0 +1,194 @@
+"""Numba: a ray goes through the tree once, and on the way back once more. What each cell gets from each ray is noted,
+sorted by cells, and summed by one thread for each run of cells, so that no two add to one place."""
+
+import math
+
+import numpy as np
+import torch
+from numba import njit, prange
+
+from .._dispatch import empty
+from ..octree_cells.cpu import CHUNK, FAST, ONE, ZERO, cell_at, inverse_of, leaf, leave, shared, through_cube
+from ..spherical_harmonics.cpu import basis
+
+HALF = np.float32(0.5)
+
+
+def spread(rays):
+    """An order of chunks in which every thread, which takes a run of them, has some from all over a picture."""
+    count = (rays + CHUNK - 1) // CHUNK
+    stride = max(int(0.618 * count), 1)
+    while math.gcd(stride, count) > 1:
+        stride += 1
+    return np.arange(count) * stride % max(count, 1)
+
+
+@njit(inline="always")
+def _channel(harmonics, row, y, c):
+    """A cell's colour along the direction whose basis is y: its sigmoid."""
+    raw = ZERO
+    for k in range(harmonics.shape[1]):
+        raw += y[k] * harmonics[row, k, c]
+    return ONE / (ONE + np.exp(-raw))
+
+
+@njit(parallel=True, fastmath=True, **FAST)
+def _forward(chunks, o, d, cells, named, density, harmonics, bands, depth, near, stop, rgb, distance, opacity, counts):
+    n, side = len(o), np.int64(1) << depth
+    per_cell = ONE / np.float32(side)
+    for i in prange(len(chunks)):
+        chunk = chunks[i]
+        path, y = np.zeros(depth + 1, np.int64), np.zeros(16, np.float32)
+        for r in range(chunk * CHUNK, min(n, (chunk + 1) * CHUNK)):
+            ox, oy, oz, dx, dy, dz = o[r, 0], o[r, 1], o[r, 2], d[r, 0], d[r, 1], d[r, 2]
+            ix, iy, iz = inverse_of(dx), inverse_of(dy), inverse_of(dz)
+            t, far = through_cube(ox, oy, oz, ix, iy, iz, near)
+            red = green = blue = way = spent = ZERO
+            through, count, level = ONE, np.int64(0), np.int64(0)
+            if t < far:
+                basis(dx, dy, dz, bands, y)
+                u, v, w = cell_at(ox + t * dx, side), cell_at(oy + t * dy, side), cell_at(oz + t * dz, side)
+                while True:
+                    value, level = leaf(cells, path, level, depth, u, v, w)
+                    end, u2, v2, w2 = leave(
+                        u, v, w, depth - level, per_cell, ox, oy, oz, dx, dy, dz, ix, iy, iz, t
+                    )  # fmt: skip
+                    if value < 0:
+                        row = np.int64(named[-1 - value])
+                        if row >= 0:
+                            count += 1
+                            keep = np.exp(-density[row] * (end - t))
+                            weight = through * (ONE - keep)
+                            through *= keep
+                            if weight > ZERO:
+                                red += weight * _channel(harmonics, row, y, 0)
+                                green += weight * _channel(harmonics, row, y, 1)
+                                blue += weight * _channel(harmonics, row, y, 2)
+                                way += weight * HALF * (t + end)
+                                spent += weight
+                    if u2 < 0 or v2 < 0 or w2 < 0 or u2 >= side or v2 >= side or w2 >= side or through < stop:
+                        break
+                    level = shared(level - 1, depth, (u ^ u2) | (v ^ v2) | (w ^ w2))
+                    u, v, w, t = u2, v2, w2, end
+            rgb[r, 0], rgb[r, 1], rgb[r, 2] = red, green, blue
+            distance[r], opacity[r], counts[r] = way, spent, count
+
+
+@njit(parallel=True, fastmath=True, **FAST)
+def _share(
+    chunks, g_rgb, g_distance, g_opacity, o, d, cells, named, density, harmonics, bands, depth, near,
+    rgb, distance, opacity, starts, bases, rows, rays, shares,
+):  # fmt: skip
+    """Of each cell that each ray met: its row, and the loss's slope in its density and its three sums of harmonics.
+
+    dL/dtau_i = g_i T_{i+1} - sum_{j>i} g_j w_j, where g_i is what one unit of weight i is worth to the loss; the sum
+    over all of a ray is at hand, in its outputs.
+    """
+    n, side = len(o), np.int64(1) << depth
+    per_cell = ONE / np.float32(side)
+    for j in prange(len(chunks)):
+        chunk = chunks[j]
+        path = np.zeros(depth + 1, np.int64)
+        for r in range(chunk * CHUNK, min(n, (chunk + 1) * CHUNK)):
+            if starts[r] == starts[r + 1]:
+                continue
+            ox, oy, oz, dx, dy, dz = o[r, 0], o[r, 1], o[r, 2], d[r, 0], d[r, 1], d[r, 2]
+            ix, iy, iz = inverse_of(dx), inverse_of(dy), inverse_of(dz)
+            t, _ = through_cube(ox, oy, oz, ix, iy, iz, near)
+            y = bases[r]
+            basis(dx, dy, dz, bands, y)
+            behind = g_distance[r] * distance[r] + g_opacity[r] * opacity[r]
+            for c in range(3):
+                behind += g_rgb[r, c] * rgb[r, c]
+            through, i, level = ONE, starts[r], np.int64(0)
+            u, v, w = cell_at(ox + t * dx, side), cell_at(oy + t * dy, side), cell_at(oz + t * dz, side)
+            while True:
+                value, level = leaf(cells, path, level, depth, u, v, w)
+                end, u2, v2, w2 = leave(
+                    u, v, w, depth - level, per_cell, ox, oy, oz, dx, dy, dz, ix, iy, iz, t
+                )  # fmt: skip
+                if value < 0:
+                    row = np.int64(named[-1 - value])
+                    if row >= 0:
+                        length = end - t
+                        keep = np.exp(-density[row] * length)
+                        weight = through * (ONE - keep)
+                        through *= keep
+                        worth = g_opacity[r] + g_distance[r] * HALF * (t + end)
+                        for c in range(3):
+                            colour = _channel(harmonics, row, y, c)
+                            worth += g_rgb[r, c] * colour
+                            shares[i, 1 + c] = weight * g_rgb[r, c] * colour * (ONE - colour)
+                        behind -= worth * weight
+                        shares[i, 0] = (worth * through - behind) * length
+                        rows[i], rays[i] = row, r
+                        i += 1
+                        if i == starts[r + 1]:
+                            break
+                level = shared(level - 1, depth, (u ^ u2) | (v ^ v2) | (w ^ w2))
+                u, v, w, t = u2, v2, w2, end
+
+
+@njit(cache=True)
+def _sorted(rows, firsts, order):
+    """Where the shares of each row begin when they are sorted by rows, and which ones those are, in order of rays."""
+    for i in range(len(rows)):
+        firsts[rows[i] + 1] += 1
+    for row in range(len(firsts) - 1):
+        firsts[row + 1] += firsts[row]
+    for i in range(len(rows)):
+        row = rows[i]
+        order[firsts[row]] = i
+        firsts[row] += 1
+    for row in range(len(firsts) - 1, 0, -1):
+        firsts[row] = firsts[row - 1]
+    firsts[0] = 0
+
+
+@njit(parallel=True, fastmath=True, **FAST)
+def _sum(firsts, order, rays, shares, bases, to_density, to_harmonics):
+    for row in prange(len(to_density)):
+        for j in range(firsts[row], firsts[row + 1]):
+            i = order[j]
+            r = rays[i]
+            to_density[row] += shares[i, 0]
+            for k in range(to_harmonics.shape[1]):
+                for c in range(3):
+                    to_harmonics[row, k, c] += bases[r, k] * shares[i, 1 + c]
+
+
+class _OctreeMarch(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, origins, directions, tree, density, harmonics, near, stop):
+        n = len(origins)
+        rgb, distance, opacity = empty(n, 3), empty(n), empty(n)
+        starts = torch.zeros(n + 1, dtype=torch.int64)
+        ctx.numbers = math.isqrt(harmonics.shape[1]), tree.depth, np.float32(near)
+        ctx.tree = tree.cells.numpy(), tree.named.numpy()
+        rays = origins.detach().numpy(), directions.detach().numpy()
+        tables = density.detach().numpy(), harmonics.detach().numpy()
+        out = rgb.numpy(), distance.numpy(), opacity.numpy(), starts.numpy()[1:]
+        _forward(spread(n), *rays, *ctx.tree, *tables, *ctx.numbers, np.float32(stop), *out)
+        ctx.save_for_backward(origins, directions, density, harmonics, rgb, distance, opacity, starts.cumsum_(0))
+        return rgb, distance, opacity
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx, *grads):
+        origins, directions, density, harmonics, *outputs = (x.detach().numpy() for x in ctx.saved_tensors)
+        starts = outputs[-1]
+        bases = np.zeros((len(origins), 16), np.float32)
+        rows, rays, order = (np.empty(starts[-1], np.int32) for _ in range(3))
+        shares = empty(int(starts[-1]), 4).numpy()
+        given = origins, directions, *ctx.tree, density, harmonics, *ctx.numbers, *outputs
+        _share(spread(len(origins)), *(g.contiguous().numpy() for g in grads), *given, bases, rows, rays, shares)
+        firsts = np.zeros(len(density) + 1, np.int64)
+        _sorted(rows, firsts, order)
+        to_density, to_harmonics = torch.zeros(density.shape), torch.zeros(harmonics.shape)
+        _sum(firsts, order, rays, shares, bases, to_density.numpy(), to_harmonics.numpy())
+        return None, None, None, to_density, to_harmonics, None, None
+
+
+def run(origins, directions, tree, density, harmonics, near, stop):
+    given = origins.contiguous(), directions.contiguous(), tree, density.contiguous(), harmonics.contiguous()
+    return _OctreeMarch.apply(*given, near, stop)

@@ -1,0 +1,20 @@
+"""Faults that the tests write into a copy of an engine, one at a time, to see their comparison turn red.
+
+By name: the engine, the function, what stands there, and what is put in its place.
+"""
+
+FAULTS = {
+    "attenuation forgotten": ("cpu", "_share", "worth * through - behind", "worth * through"),
+    "slope of the sigmoid forgotten": ("cpu", "_share", "* colour * (ONE - colour)", ""),
+    "length forgotten": ("cpu", "_share", "- behind) * length", "- behind)"),
+    "another ray's direction": ("cpu", "_sum", "bases[r, k]", "bases[0, k]"),
+    "sign": ("gpu", "_backward", "through - behind", "through + behind"),
+    "opacity forgotten": ("gpu", "_backward", "worth = g_opacity +", "worth ="),
+    "coefficient of the next": ("gpu", "_backward", "row * (3 * BASIS) + 3 * k", "row * (3 * BASIS) + k"),
+    "distance to the far side": ("gpu", "_forward", "0.5 * (t + end)", "end"),
+}
+
+# These let an index leave its array.
+ASTRAY = {
+    "a share of the next ray": ("cpu", "_share", "rows[i], rays[i] = row, r", "rows[i], rays[i + 1] = row, r"),
+}
