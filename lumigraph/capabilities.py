@@ -140,9 +140,11 @@ LACKING = {
 
 
 def can(method: object, capability: type[Any]) -> bool:
-    """Whether a method has a capability. Its class must have the functions: a network may be called `field` too."""
+    """Whether a method, or all of a class, has a capability. Its class must have the functions: a network may be called
+    `field` too."""
+    kind = method if isinstance(method, type) else type(method)
     names = [name for name in vars(capability) if not name.startswith("_")]
-    return all(callable(getattr(type(method), name, None)) for name in names)
+    return all(callable(getattr(kind, name, None)) for name in names)
 
 
 def needs(method: object, capability: type[Any]) -> Any:

@@ -23,6 +23,7 @@ from .commands.clean import Clean
 from .commands.common import say
 from .commands.compose import Compose
 from .commands.compress import Compress
+from .commands.convert import Convert
 from .commands.demo import Demo
 from .commands.eval import Eval
 from .commands.explain import Explain
@@ -51,6 +52,7 @@ COMMANDS: dict[str, type] = {
     "clean": Clean,
     "compose": Compose,
     "compress": Compress,
+    "convert": Convert,
     "export": Export,
     "report": Report,
     "explain": Explain,
@@ -116,8 +118,9 @@ def refuse(sentence: str, code: int = 2) -> int:
 def parse(arguments: list[str]) -> Any:
     """The command with its options. Leaves with code 2 if they cannot be understood."""
     commands = dict(COMMANDS)
-    if arguments[:1] == ["train"]:
-        commands["train"] = train_command(arguments[1:])
+    for name in ("train", "convert"):
+        if arguments[:1] == [name]:
+            commands[name] = with_method(commands[name], arguments[1:])
     kinds = [
         Annotated[kind, tyro.conf.subcommand(name, description=None if arguments[:1] == [name] else brief(kind))]
         for name, kind in commands.items()
@@ -135,14 +138,14 @@ def brief(kind: type) -> str:
     return (kind.__doc__ or "").strip().partition("\n")[0]
 
 
-def train_command(arguments: list[str]) -> type[Train]:
-    """`train` with the options of the method that the arguments name, if they name one."""
+def with_method(command: type, arguments: list[str]) -> type:
+    """`train` or `convert` with the options of the method that the arguments name, if they name one."""
     there = methods.available()
     named = [x for x in arguments if x.replace("_", "-") in there]
     if not named:
-        return Train
+        return command
     device, preset = value_of("--device", arguments, "auto"), value_of("--preset", arguments, "auto")
-    return with_options_of(named[0], device, preset)
+    return with_options_of(named[0], device, preset, command)
 
 
 def value_of(name: str, arguments: list[str], default: str) -> str:

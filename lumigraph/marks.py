@@ -29,7 +29,7 @@ WHOLE = "."  # the name that stands for a folder which was written as one
 Sum = tuple[int, str]  # bytes, SHA-256
 Kind = Literal[
     "film", "film of depth", "pictures of a film", "cameras of a film", "camera path", "composition",
-    "page", "splats", "points", "mesh", "octree", "panorama", "comparison",
+    "page", "splats", "atlas", "points", "mesh", "octree", "panorama", "comparison",
     "evaluation", "rendering", "report", "figure", "benchmark", "capture", "masks", "file",
 ]  # fmt: skip
 

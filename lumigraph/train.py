@@ -99,7 +99,7 @@ def fit(
     check_kind(methods.name_of(method), method.learns_from, type(data), data.source)
     check_memory(type(method), method.frame, method.config, method.device, learning=True)
     with run.held() if run else contextlib.nullcontext(), Interrupt() as interrupt, TrainingDisplay(show) as display:
-        state = run.restore_weights(method) if run else State()
+        fresh, state = not (run and run.has_state), run.restore_weights(method) if run else State()
         display.begin(data)
         compile_seconds = state.compile_seconds + (rehearse(method, data, state.step) if rehearsal else 0.0)
         optimizers, generator = method.optimizers(), torch.Generator().manual_seed(seed)
@@ -109,7 +109,7 @@ def fit(
         method.train()
         share_seen, passes, losses = shares_seen(data), state.passes, list[float]()
         clock, step, watched = Clock(state.seconds), state.step, 0.0
-        if step == 0:
+        if fresh:
             with display.aside():
                 method.begin(data, budget.seconds or math.inf)
         display.ready(methods.name_of(method), method, budget, step, clock.seconds)

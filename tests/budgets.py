@@ -57,6 +57,7 @@ SHARES: dict[str, tuple[str, float]] = {
     "test_signals": ("runs, commands, benchmark", 15),
     "test_ranges": ("methods", 20),
     "test_compress": ("runs, commands, benchmark", 15),
+    "test_convert": ("runs, commands, benchmark", 15),
     "test_memory": ("runs, commands, benchmark", 12),
     "test_nerf": ("methods", 16),
     "test_tensorf": ("methods", 5),

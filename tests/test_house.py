@@ -31,7 +31,7 @@ FLOORS: list[set[str]] = [
     {"run"},
     {"evaluate"},
     {"train", "report", "compression"},
-    {"benchmark", "explain"},
+    {"benchmark", "conversion", "explain"},
     {"commands"},
     {"cli"},
     {"__main__"},

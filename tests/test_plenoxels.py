@@ -11,7 +11,8 @@ from lumigraph.components.fields.sparse_voxels import SparseVoxels
 from lumigraph.components.training.lazy_rmsprop import LazyRMSprop
 from lumigraph.errors import LumigraphError
 from lumigraph.kernels import Nodes
-from lumigraph.methods.plenoxels import Config, Plenoxels, cauchy, undecided
+from lumigraph.components.training.sparsity import cauchy
+from lumigraph.methods.plenoxels import Config, Plenoxels, undecided
 
 
 def random(*shape: int, seed: int = 0) -> torch.Tensor:

@@ -262,3 +262,11 @@ def test_a_frame_comes_back_from_json_and_older_ones_still_open(tmp_path: Path):
     del config["frame"]["forward"]
     files.write_json(run.folder / "config.json", config, ours=True)
     assert len(Run(run.folder).scene()) == len(scene)
+
+
+@each
+def test_coordinates_lead_back_to_their_points(space, generator):
+    points = some_points(200, generator)
+    torch.testing.assert_close(space.unwarp(space.warp(points)), points, atol=1e-6, rtol=1e-6)
+    beyond = space.unwarp(2 * torch.rand(100, 3, generator=generator, dtype=torch.float64) - 1)
+    assert beyond.isfinite().all()

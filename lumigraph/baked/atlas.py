@@ -10,8 +10,8 @@ from torch import Tensor
 
 @dataclass(frozen=True)
 class ViewNetwork:
-    """What adds to a pixel's diffuse colour what depends on direction (section 4.2): three layers, ReLU between them and
-    a sigmoid at the end. Inputs are the direction encoded at four frequencies (27), diffuse colour (3), features (4).
+    """What adds to a pixel's diffuse colour what depends on direction (section 4.2): three layers, ReLU between them, a
+    sigmoid at the end. Inputs are the direction encoded at four frequencies (27), diffuse colour (3), features (4).
 
         colour = diffuse + (1 - opacity) background + opacity network(gamma(d), diffuse, features)
         gamma(d) = (d, sin d, sin 2d, sin 4d, sin 8d, cos d, cos 2d, cos 4d, cos 8d), each x, y, z
@@ -21,7 +21,7 @@ class ViewNetwork:
     """
 
     weights: tuple[Float[Tensor, "in out"], Float[Tensor, "in2 out2"], Float[Tensor, "in3 3"]]
-    biases: tuple[Float[Tensor, " out"], Float[Tensor, " out2"], Float[Tensor, "3"]]
+    biases: tuple[Float[Tensor, " out"], Float[Tensor, " out2"], Float[Tensor, " 3"]]
 
 
 @dataclass(frozen=True)
@@ -39,7 +39,7 @@ class Atlas:
 
     index: Int[Tensor, "x y z"]
     values: UInt8[Tensor, "block side side side 8"]
-    low: Float[Tensor, "3"]
+    low: Float[Tensor, " 3"]
     voxel: float
     block: int
     network: ViewNetwork | None = None

@@ -11,6 +11,7 @@ from .exports.mesh import ExportMesh
 from .exports.octree import ExportOctree
 from .exports.panorama import ExportPanorama
 from .exports.points import ExportPoints
+from .exports.snerg import ExportSnerg
 from .exports.splats import ExportSplats
 from .exports.stereo import ExportStereo
 from .exports.web import ExportWeb
@@ -21,6 +22,7 @@ What = (
     | Annotated[ExportOctree, subcommand("octree")]
     | Annotated[ExportPanorama, subcommand("panorama")]
     | Annotated[ExportPoints, subcommand("points")]
+    | Annotated[ExportSnerg, subcommand("snerg")]
     | Annotated[ExportSplats, subcommand("splats")]
     | Annotated[ExportStereo, subcommand("stereo")]
     | Annotated[ExportWeb, subcommand("web")]

@@ -18,6 +18,7 @@ from ..metrics import scores_of
 from ..names import natural
 from ..run import Run
 from ..run.compressed import Compressed
+from ..run.converted import Converted
 from ..scene import Frame, Scene
 from ..shapes import Shapes
 from ..verdict import cameras_moved
@@ -46,6 +47,14 @@ def run_tree(run: Run) -> Tree:
     if made := Compressed.read(run.folder):
         smaller = f"{made.times:.1f} times smaller, {made.bytes_after / 1e6:.3g} MB of {made.bytes_before / 1e6:.3g} MB"
         branch(tree, "compressed", {"from": made.source, "model": smaller, "dB": f"{made.psnr_after:.2f}"})
+    if converted := Converted.read(run.folder):
+        like = f"{converted.psnr:.2f} dB, of {converted.views} held-out views against the source's"
+        told: dict[str, Any] = {
+            "from": f"{converted.source}, a {converted.teacher.method}",
+            "by": converted.how,
+            "alike": like,
+        }
+        branch(tree, "converted", told | {"then learnt from": converted.learnt_from})
     if evaluation := run.evaluation():
         figures: dict[str, Any] = {score.name: str(score) for score in scores_of(evaluation)}
         figures["seconds per view"] = evaluation.get("seconds_per_view")

@@ -119,20 +119,20 @@ def option_group(name: str) -> str:
     return methods.check(name).replace("-", "_")
 
 
-def with_options_of(name: str, device: str, preset: str) -> type[Train]:
-    """The command with a method's own numbers among its options."""
+def with_options_of(name: str, device: str, preset: str, command: type = Train) -> type[Any]:
+    """A command, `train` or one like it, with a method's own numbers among its options."""
     kind = methods.find(name)
     default = kind.preset(preset_device(device, preset))
     extra: list[Any] = [
         (option_group(name), Annotated[kind.Config, OmitArgPrefixes], dataclasses.field(default=default))
     ]
-    for common in dataclasses.fields(Train):  # where a method has a number of that name, it is the one to ask for
+    for common in dataclasses.fields(command):  # where a method has a number of that name, it is the one to ask for
         if common.name in {field.name for field in dataclasses.fields(kind.Config)}:
             extra.append((common.name, Annotated[Any, Fixed, Suppress], dataclasses.field(default=common.default)))
     asked = option("draft|good|best", "as long as --seconds", about_quality(kind))
     extra.append(("quality", Annotated[Quality | None, asked], dataclasses.field(default=None)))
-    made = dataclasses.make_dataclass("Train", extra, bases=(Train,), frozen=True)
-    made.__doc__ = Train.__doc__
+    made = dataclasses.make_dataclass(command.__name__, extra, bases=(command,), frozen=True)
+    made.__doc__ = command.__doc__
     return made
 
 

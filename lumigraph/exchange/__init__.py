@@ -92,7 +92,7 @@ def place_of(path: Path) -> Path:
 
 
 def size_of(path: Path | str) -> int:
-    """Bytes of a file of Gaussians, or of all files of a folder of SOG."""
+    """Bytes of a file of Gaussians, or of all files of a folder, such as one of SOG."""
     place = place_of(expanded(path))
     return sum(file.stat().st_size for file in (place.iterdir() if place.is_dir() else [place]))
 

@@ -2,6 +2,8 @@
 
 from ._dispatch import Engine as Engine
 from ._dispatch import using as using
+from .block_march import Blocks as Blocks
+from .block_march import block_march as block_march
 from .composite import composite as composite
 from .dense_grid import dense_grid as dense_grid
 from .distortion import distortion as distortion

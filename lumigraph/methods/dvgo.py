@@ -15,6 +15,7 @@ from ..camera import Camera
 from ..choice import evenly
 from ..components.clouds.dense_points import compile_sweep
 from ..components.fields.mlp import MLP
+from ..components.fields.taken_over import cells_of, logit, taken_over
 from ..components.fields.voxels import VoxelGrid, corners, tight_box
 from ..components.sampling.carving import visual_hull
 from ..components.sampling.importance import importance
@@ -26,6 +27,7 @@ from ..components.training.lazy_adam import LazyAdam
 from ..components.training.photometric import backdrop, residuals
 from ..components.training.schedules import falling
 from ..components.training.smoothness import variation
+from ..kernels.spherical_harmonics import K00
 from ..method import RayMethod
 from ..packing import Stored, most_important
 from ..ranges import Layers, LearningRate, NonNegative, PositiveShare, Seed, Share, Steps, Width, between
@@ -75,6 +77,7 @@ class Config(OpenNumbers):
 
 
 GONE = -5.0  # of density, where compression has taken a corner out: a softplus of less than 0.0001
+THIN = -3.0  # of density, where another method that is taken over holds nothing; it can still learn
 PROBES, LOOKS = 0.02, 4  # share of cells looked at again at random; cells at most for each sample of a step
 WARM = 0.5  # share of the coarse stage before anything counts as free: at first all density is alike
 SAMPLES_OF_A_RAY = 32  # that a ray needs, about, once free space is known
@@ -86,6 +89,11 @@ VIEWS, LATTICE = 24, 32  # photographs, and cells along an axis, that tell how m
 def shift_of(alpha: float) -> float:
     """b with softplus(b) = -log(1 - alpha): where a grid holds zero, a voxel stops a share alpha of light (eq. 9)."""
     return math.log(1 / (1 - alpha) - 1)
+
+
+def inverse_softplus(y: Float[Tensor, " corner"]) -> Float[Tensor, " corner"]:
+    """x with softplus(x) = y; -50 where y is nothing."""
+    return y + torch.log(-torch.expm1(-y)).clamp_min(-50)
 
 
 class DVGO(RayMethod):
@@ -330,6 +338,37 @@ class DVGO(RayMethod):
             for group in self._adam.param_groups:
                 group["rates"] = rates
 
+    @torch.no_grad()
+    def from_field(self, teacher: Any, cameras: Camera) -> None:
+        """Density and colour of the teacher at the fine grid's corners, where it holds something; its first three
+        features are colour, and the network adds nothing at first."""
+        known, c, chance = taken_over(teacher, cameras), self.config, self.random(3)
+        occupied = known.occupied(self.space, c.occupancy_resolution, c.occupancy_threshold, chance)
+        self.stage.fill_(1 + c.doublings)
+        box = self.density_grid.box.cpu()
+        if self.frame.reach <= 1:
+            self.occupancy.rule_out(occupied[None])
+            box = torch.stack([self.occupancy.box.cpu().max(box)[0], self.occupancy.box.cpu().min(box)[1]])
+        edge = float(((box[1] - box[0]).prod() / c.voxels) ** (1 / 3))
+        self.edge.fill_(edge)
+        for grid in (self.density_grid, self.feature_grid):
+            grid.rebuild(box.to(self.device), c.voxels, self._adam)
+        places = corners(box, self.density_grid.shape)
+        there = occupied[tuple(cells_of(places, len(occupied)).t())]
+        points = self.space.unwarp(places[there])
+        stretch = self.space.stretch(points) if self.frame.reach > 1 else points.new_ones(len(points))
+        thickness = known.density_around(points, edge / stretch, chance) / stretch * edge
+        raw, features = torch.full((len(places), 1), THIN), torch.zeros(len(places), c.feature_channels)
+        raw[there] = (inverse_softplus(thickness)[:, None] - self.shift).clamp_min(THIN)
+        features[there, :3] = known.harmonics(points, 1, logit)[:, 0] * K00
+        self.density_grid.replace(raw.to(self.device), self._adam)
+        self.feature_grid.replace(features.to(self.device), self._adam)
+        self.colour_network.weights[-1].zero_()
+        if self.unbounded:
+            self.unbounded.begin_at(known.surface.points, known.surface.origins)
+        else:
+            self._look(0, 1.0)
+
     def rehearse_begin(self) -> None:
         if self.unbounded:
             compile_sweep()
@@ -407,7 +446,7 @@ class DVGO(RayMethod):
         volume = float((box[1] - box[0]).prod())
         edge = (volume / c.voxels) ** (1 / 3)
         thickness = thickness * (edge / float(self.edge))
-        raw = thickness + torch.log(-torch.expm1(-thickness)).clamp_min(-50) - self._shift_in(1)
+        raw = inverse_softplus(thickness) - self._shift_in(1)
         grid.replace(raw.clamp_min(0)[:, None], self._adam)
         self.edge.fill_(edge)
         for each in (grid, self.feature_grid):

@@ -14,12 +14,14 @@ from torch import Tensor, nn
 from .. import kernels
 from ..blending import over
 from ..camera import Camera
+from ..components.clouds.at_surfaces import at_surfaces, of_cloud
 from ..components.clouds.cloud import Cloud, CloudAdam
 from ..components.clouds.dense_points import compile_sweep
 from ..components.clouds.density_control import AdaptiveDensity, MarkovChain
 from ..components.clouds.initial_cloud import Initialization, initial_cloud, random_cloud
 from ..components.clouds.seen_from import seen_from
 from ..components.clouds.smoothing import sampling_interval, smoothed
+from ..components.fields.taken_over import taken_over
 from ..components.training.pose_refinement import PoseRefinement
 from ..components.training.rhythm import Rhythm, haste, intervals
 from ..components.training.schedules import falling
@@ -90,6 +92,7 @@ ENOUGH = 2400  # steps, with which sizes and colours need not hurry
 RECOVERY = 3  # opacity_reset_intervals that must be left after opacities are reset, or the pictures stay dim
 GROWTH = 1.05  # of the number at each change, for mcmc (Kheradmand 2024, section 3.2)
 LAST_MOVE = 0.9  # share of the budget after which mcmc moves and adds no Gaussians, so that those there converge
+TAKEN = 0.5  # of max_gaussians: how many a cloud begins with at most, on the surfaces of another method
 BYTES = 4096  # that one more Gaussian needs while it learns: itself, its gradient and moments, its share of a picture
 
 
@@ -186,20 +189,33 @@ class GaussianSplatting(Method):
         if self.config.initialization == "dense":
             compile_sweep()
 
+    @torch.no_grad()
+    def from_field(self, teacher: Any, cameras: Camera) -> None:
+        """Gaussians on the teacher's surfaces; a cloud is taken as it is."""
+        config, most = self.config, max(2, math.ceil(TAKEN * self._most()))
+        found = of_cloud(teacher, self._most(), config.sh_degree)
+        if found is None:
+            found = at_surfaces(taken_over(teacher, cameras), most, config.sh_degree, self.random(3))
+        self._begin_with(found, cameras)
+
     def begin(self, scene: Scene, seconds: float = math.inf) -> None:
         config = self.config
         counts = min(config.initial_gaussians, self._most()), self._most()
         sweeping = SWEEPING * seconds
         found = initial_cloud(scene, config.initialization, *counts, config.sh_degree, self.random(1), sweeping)
+        self._begin_with(found, scene.cameras[scene.splits["train"]])
+        if self.poses:
+            self.poses.begin(scene.cameras, scene.frame)
+
+    def _begin_with(self, found: Gaussians, cameras: Camera) -> None:
+        """A first cloud, and what follows from the cameras that it will be learnt by."""
         self.cloud.replace(found, self._optimizer)
         self.density_control.begin(len(found))
         self.began.fill_(len(found))
-        if config.filter_3d:
-            self._cameras = scene.cameras[scene.splits["train"]]
+        if self.config.filter_3d:
+            self._cameras = cameras
             self.interval = sampling_interval(self.cloud.means, self._cameras, self._near)
-        if self.poses:
-            self.poses.begin(scene.cameras, scene.frame)
-        positions = scene.cameras.position[scene.splits["train"]]
+        positions = cameras.position
         self.extent.fill_(1.1 * float((positions - positions.mean(0)).norm(dim=-1).max()))
 
     def batch(self, scene: Scene, generator: torch.Generator) -> Photograph:

@@ -13,6 +13,7 @@ from torch import Tensor, nn
 from ..camera import Camera
 from ..components.clouds.dense_points import compile_sweep
 from ..components.fields.hash_field import HashField, bytes_kept, check_levels
+from ..components.fields.taken_over import taken_over
 from ..components.sampling.carving import visual_hull
 from ..components.sampling.coarse_to_fine import SAMPLES_OF_A_RAY, first_grid, keep_looking, lattice, stage
 from ..components.sampling.importance import importance
@@ -21,6 +22,7 @@ from ..components.sampling.occupancy import OccupancyGrid
 from ..components.sampling.spaces import Box, space_of
 from ..components.sampling.unbounded import RAYS, OpenNumbers, Unbounded, rays_of, unbounded
 from ..components.training.corrections import Exposure
+from ..components.training.distillation import distil
 from ..components.training.lazy_adam import LazyAdam
 from ..components.training.photometric import backdrop, residuals
 from ..components.training.pose_refinement import PoseRefinement
@@ -178,6 +180,23 @@ class InstantNGP(RayMethod):
             self.occupancy.rule_out(visual_hull(scene, self.config.occupancy_resolution)[None])
         if self.unbounded and not self.poses:
             self.unbounded.begin(scene, seconds, self.random(1))
+
+    def from_field(self, teacher: Any, cameras: Camera) -> None:
+        """Table and networks, taught at points by the teacher."""
+        known, c, chance = taken_over(teacher, cameras), self.config, self.random(3)
+        networks = [*self.network.density_network.parameters(), *self.network.colour_network.parameters()]
+        optimizers = [
+            LazyAdam([self.network.table], c.learning_rate),
+            torch.optim.Adam(networks, c.learning_rate, eps=1e-15),
+        ]
+        distil(self.field, known, self.space, optimizers, c.samples_per_step, chance, self.device)
+        if self.unbounded:
+            self.unbounded.begin_at(known.surface.points, known.surface.origins)
+            return
+        if self.frame.reach == 1:
+            occupied = known.occupied(self.space, c.occupancy_resolution, c.occupancy_threshold, chance)
+            self.occupancy.rule_out(occupied[None])
+        self.occupancy.update(self.density, c.occupancy_threshold, chance)
 
     def rehearse_begin(self) -> None:
         if self.unbounded:

@@ -15,10 +15,12 @@ from ..camera import Camera
 from ..components.fields.coordinate_network import CoordinateNetwork, bytes_kept
 from ..components.fields.dense import in_chunks
 from ..components.fields.encodings import FrequencyEncoding, IntegratedEncoding
+from ..components.fields.taken_over import taken_over
 from ..components.sampling.frustums import frustum_moments
 from ..components.sampling.occupancy_mask import OccupancyMask
 from ..components.sampling.sampling import inverse_transform, stratified
 from ..components.sampling.spaces import space_of
+from ..components.training.distillation import distil
 from ..components.training.pose_refinement import PoseRefinement
 from ..components.training.schedules import falling
 from ..method import RayMethod
@@ -53,6 +55,7 @@ class Config:
     seed: Seed = 0
 
 
+TAUGHT = 8  # points for each ray of a step, from which distillation learns
 PADDING = 0.001  # colours may reach so far beyond 0 and 1, so that both are within reach of the sigmoid
 
 
@@ -131,6 +134,15 @@ class MipNeRF(RayMethod):
             self.poses.begin(scene.cameras, scene.frame)
         else:  # silhouettes seen from wrong poses would carve what is there
             self.empty.begin(scene)
+
+    def from_field(self, teacher: Any, cameras: Camera) -> None:
+        """The network, taught at points by the teacher."""
+        known, c, chance = taken_over(teacher, cameras), self.config, self.random(3)
+        if c.occupancy_resolution:
+            occupied = known.occupied(self.space, c.occupancy_resolution, c.occupancy_threshold, chance)
+            self.empty.grid.rule_out(occupied[None])
+        optimizer = torch.optim.Adam(self.network.parameters(), c.learning_rate)
+        distil(self.field, known, self.space, [optimizer], TAUGHT * c.rays_per_step, chance, self.device)
 
     def loss(self, batch: Batch, step: int) -> dict[str, Tensor]:
         return super().loss(replace(batch, rays=self.poses(batch.rays)) if self.poses else batch, step)

@@ -14,9 +14,11 @@ from ..camera import Camera
 from ..components.fields.coordinate_network import CoordinateNetwork, bytes_kept
 from ..components.fields.dense import in_chunks
 from ..components.fields.encodings import FrequencyEncoding
+from ..components.fields.taken_over import taken_over
 from ..components.sampling.occupancy_mask import OccupancyMask
 from ..components.sampling.sampling import inverse_transform, midpoints, stratified
 from ..components.sampling.spaces import space_of
+from ..components.training.distillation import distil
 from ..components.training.pose_refinement import PoseRefinement
 from ..components.training.schedules import falling
 from ..errors import LumigraphError
@@ -73,6 +75,9 @@ class Config:
                 "The first of two networks learns from --coarse-loss-weight alone, so --networks 2 with "
                 "--coarse-loss-weight 0 cannot be; give --networks 1, or a weight above 0"
             )
+
+
+TAUGHT = 8  # points for each ray of a step, from which distillation learns
 
 
 class NeRF(RayMethod):
@@ -154,6 +159,17 @@ class NeRF(RayMethod):
             self.poses.begin(scene.cameras, scene.frame)
         else:  # silhouettes seen from wrong poses would carve what is there
             self.empty.begin(scene)
+
+    def from_field(self, teacher: Any, cameras: Camera) -> None:
+        """Both networks alike, taught at points by the teacher."""
+        known, c, chance = taken_over(teacher, cameras), self.config, self.random(3)
+        if c.occupancy_resolution:
+            occupied = known.occupied(self.space, c.occupancy_resolution, c.occupancy_threshold, chance)
+            self.empty.grid.rule_out(occupied[None])
+        optimizer = torch.optim.Adam(self.fine.parameters(), c.learning_rate, eps=1e-7)
+        distil(self.field, known, self.space, [optimizer], TAUGHT * c.rays_per_step, chance, self.device)
+        if self.coarse:
+            self.coarse.load_state_dict(self.fine.state_dict())
 
     def loss(self, batch: Batch, step: int) -> dict[str, Tensor]:
         return super().loss(replace(batch, rays=self.poses(batch.rays)) if self.poses else batch, step)

@@ -13,6 +13,7 @@ from torch import Tensor
 from ..camera import Camera
 from ..components.clouds.dense_points import compile_sweep
 from ..components.fields.sparse_voxels import Cells, Part, SparseVoxels
+from ..components.fields.taken_over import logit, taken_over
 from ..components.sampling.carving import visual_hull
 from ..components.sampling.importance import importance
 from ..components.sampling.occupancy import OccupancyGrid
@@ -22,9 +23,11 @@ from ..components.training.corrections import Exposure
 from ..components.training.lazy_rmsprop import LazyRMSprop
 from ..components.training.photometric import backdrop, residuals
 from ..components.training.schedules import falling
+from ..components.training.sparsity import cauchy
 from ..controls import Control
 from ..errors import LumigraphError
 from ..kernels import total_variation
+from ..kernels.harmonic_grid import BANDS
 from ..method import RayMethod
 from ..packing import Stored, most_important
 from ..ranges import BatchSize, LearningRate, NonNegative, Positive, PositiveShare, Seed, Share, Steps, between
@@ -90,6 +93,8 @@ class Config(OpenNumbers):
 DELAYED = 0.01  # what the density's learning rate begins with, as a share
 REMEMBERED = 0.9  # of a cell's density and a voxel's weight, from one look of the occupancy grid to the next
 NOTED = 4  # steps between those whose samples' weights are remembered for pruning
+KNOWN_CELLS = 128  # along each axis, in which something is looked for where another method is taken over
+LEAST = 1e-2  # density that a node then has at least: what is below 0 learns nothing
 EDGE = 1e-3  # opacities are kept so far from 0 and 1 in the beta loss
 
 
@@ -270,6 +275,26 @@ class Plenoxels(RayMethod):
         if self.unbounded:
             self.unbounded.begin(scene, seconds, self.random(1))
 
+    @torch.no_grad()
+    def from_field(self, teacher: Any, cameras: Camera) -> None:
+        """Density and harmonics of the teacher at the finest grid's nodes, where it holds something."""
+        known, c, chance = taken_over(teacher, cameras), self.config, self.random(3)
+        occupied = known.occupied(self.space, KNOWN_CELLS, c.occupancy_threshold, chance)
+        cells = cells_of(self.frame, c.resolutions(self.frame.reach > 1)[1])
+        self.voxels.rebuild(occupied.to(self.device), cells, self._table)
+        points = self.space.unwarp(self.voxels.places.cpu())
+        stretch = self.space.stretch(points)
+        density = known.density_around(points, 2 / max(cells) / stretch, chance) / stretch
+        self.voxels.density.copy_(density.clamp_min(LEAST)[:, None])
+        dense = self.voxels.dense(c.occupancy_threshold * max(cells) / 2)
+        self.voxels.rebuild(dense, cells, self._table)
+        points = self.space.unwarp(self.voxels.places.cpu())
+        self.voxels.harmonics.copy_(known.harmonics(points, BANDS, logit).flatten(1))
+        if self.unbounded:
+            self.unbounded.begin_at(known.surface.points, known.surface.origins)
+        else:
+            self.occupancy.update(self.density, c.occupancy_threshold, chance)
+
     def rehearse_begin(self) -> None:
         if self.unbounded:
             compile_sweep()
@@ -380,11 +405,6 @@ def cells_of(frame: Frame, resolution: int) -> Cells:
     if isinstance(space_of(frame), NDC):
         return resolution + resolution // 2, resolution + resolution // 2, resolution // 2
     return resolution, resolution, resolution
-
-
-def cauchy(density: Float[Tensor, " sample"], rays: int) -> Tensor:
-    """Mean over rays of the sum of log(1 + 2 sigma^2) along each (eq. 4)."""
-    return torch.log1p(2 * density.square()).sum() / max(rays, 1)
 
 
 def undecided(opacity: Float[Tensor, " ray"]) -> Tensor:

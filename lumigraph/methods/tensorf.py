@@ -15,6 +15,7 @@ from ..camera import Camera
 from ..components.clouds.dense_points import compile_sweep
 from ..components.fields.factorised import FactorGrid, nodes_in
 from ..components.fields.mlp import MLP
+from ..components.fields.taken_over import taken_over
 from ..components.fields.truncation import truncate
 from ..components.sampling.carving import visual_hull
 from ..components.sampling.importance import importance
@@ -22,6 +23,7 @@ from ..components.sampling.marching import FIRST_RAYS, rays_for, reached
 from ..components.sampling.occupancy import OccupancyGrid
 from ..components.sampling.spaces import Box, space_of
 from ..components.sampling.unbounded import OpenNumbers, Unbounded, unbounded
+from ..components.training.distillation import distil
 from ..components.training.exchange import exchange
 from ..components.training.lazy_adam import LazyAdam
 from ..components.training.photometric import backdrop, residuals
@@ -92,6 +94,7 @@ UPSAMPLINGS = (1 / 15, 1 / 10, 2 / 15, 11 / 60, 7 / 30)
 MASKS = ((0.0, 1 / 4), (0.03, 1 / 2), (0.1, 1))
 LOOKS = 1 << 18  # cells updated at most
 PROBES = 0.02  # share of all cells updated at random, in case something has grown there
+TAUGHT = 4  # samples of a step for each point that a step of distillation learns from
 SAMPLES_OF_A_RAY = 32  # that a ray meets, about, once empty space is known
 
 
@@ -250,6 +253,28 @@ class TensoRF(RayMethod):
             self._resample(self.config.initial_resolution, self.box, fresh=self.random(0))
         if self.unbounded:
             self.unbounded.begin(scene, seconds, self.random(1))
+
+    def from_field(self, teacher: Any, cameras: Camera) -> None:
+        """The finest grid, in a box around what the teacher holds, taught by it at points."""
+        known, c, chance = taken_over(teacher, cameras), self.config, self.random(3)
+        if self.frame.reach == 1:
+            occupied = known.occupied(self.space, c.occupancy_resolution, c.occupancy_threshold, chance)
+            self.occupancy.rule_out(occupied[None])
+            self._shrink()
+        self._resample(c.final_resolution, self.box, fresh=self.random(0))
+        self.stage.fill_(len(UPSAMPLINGS))
+        grids = [grid.table for grid in (self.network.density_grid, self.network.appearance_grid)]
+        tables = {id(x) for x in grids}
+        networks = [x for x in self.network.parameters() if id(x) not in tables]
+        optimizers = [
+            LazyAdam(grids, c.learning_rate, betas=(0.9, 0.99)),
+            torch.optim.Adam(networks, c.network_learning_rate, betas=(0.9, 0.99)),
+        ]
+        distil(self.field, known, self.space, optimizers, c.samples_per_step // TAUGHT, chance, self.device)
+        if self.unbounded:
+            self.unbounded.begin_at(known.surface.points, known.surface.origins)
+        else:
+            self.occupancy.update(self.density, c.occupancy_threshold, chance)
 
     def rehearse_begin(self) -> None:
         if self.unbounded:

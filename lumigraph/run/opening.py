@@ -5,16 +5,18 @@ from __future__ import annotations
 from pathlib import Path
 
 from ..errors import LumigraphError
-from ..exchange import is_splat_file, place_of
+from ..exchange import is_splat_file, place_of, snerg
 from ..files import is_file
 from .composition import Composition
 from .folder import Run
 from .opened import Opened
+from .snerg_folder import SnergFolder
 from .splat_file import SplatFile
 
 
 def open_any(path: Path | str, within: tuple[Path, ...] = ()) -> Opened:
-    """What lies at a path: a run's folder, a splat file (`exchange.SUFFIXES`, a folder of SOG), a composition (.json).
+    """What lies at a path: a run's folder, a splat file (`exchange.SUFFIXES`, a folder of SOG), a folder of SNeRG's
+    viewer, a composition (.json).
 
     within: compositions that it is opened as a part of
     Raises LumigraphError, in one sentence, for anything else.
@@ -26,4 +28,4 @@ def open_any(path: Path | str, within: tuple[Path, ...] = ()) -> Opened:
         return Composition(path, open_any, within)
     if is_file(path):
         raise LumigraphError(f"{path} is none of the files that open: a splat file, or a composition's JSON")
-    return Run(path)
+    return SnergFolder(path) if snerg.recognises(path) else Run(path)

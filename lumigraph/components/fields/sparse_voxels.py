@@ -68,6 +68,12 @@ class SparseVoxels(nn.Module):
             made = self._made = self.numbers, self.numbers._version, Nodes.of(self.numbers.long(), (x, y, z))
         return made[2]
 
+    @property
+    def places(self) -> Float[Tensor, "row 3"]:
+        """Coordinates of the nodes that have rows."""
+        x, y, z = torch.unravel_index(self.numbers.long(), tuple((self.cells + 1).tolist()))
+        return torch.stack([x, y, z], -1) * (2 / self.cells) - 1
+
     def density_at(self, places: Float[Tensor, "sample 3"]) -> Float[Tensor, " sample"]:
         """Density at coordinates, before activation."""
         return kernels.sparse_grid(places * 0.5 + 0.5, self.nodes, self.density)[:, 0]

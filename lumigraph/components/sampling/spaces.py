@@ -55,6 +55,11 @@ class Space(ABC):
         """Coordinates of points."""
 
     @abstractmethod
+    def unwarp(self, coordinates: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n 3"]:
+        """The points that have these coordinates: `warp` undone. Coordinates of [-1, 1]^3 that no point has give the
+        farthest one in about that direction."""
+
+    @abstractmethod
     def jacobian(self, points: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3 3"]:
         """Derivative of each coordinate (rows) by each axis of the scene (columns)."""
 
@@ -107,6 +112,9 @@ class Box(Space):
     def warp(self, points):
         return points
 
+    def unwarp(self, coordinates):
+        return coordinates
+
     def jacobian(self, points):
         return torch.eye(3, dtype=points.dtype, device=points.device).expand(len(points), 3, 3)
 
@@ -149,6 +157,12 @@ class NDC(Space):
         x, y, z = self._in_camera(points)
         (scale_x, scale_y), near = self.forward.scale, self.forward.near
         return torch.stack([scale_x * x / z, scale_y * y / z, 1 - 2 * near / z], -1)
+
+    def unwarp(self, coordinates):
+        u, v, w = coordinates.unbind(-1)
+        (scale_x, scale_y), pose = self.forward.scale, self._pose(coordinates)
+        z = 2 * self.forward.near / (1 - w).clamp(2 / INFINITY, 2)
+        return torch.stack([u / scale_x * z, v / scale_y * z, z], -1) @ pose[:, :3].T + pose[:, 3]
 
     def jacobian(self, points):
         x, y, z = self._in_camera(points)
@@ -205,6 +219,11 @@ class Contraction(Space):
             loops.contract(*rows, NOTHING)
             return coordinates
         return points * self._across(points)[..., None]
+
+    def unwarp(self, coordinates):
+        doubled = 2 * coordinates
+        radius = doubled.norm(dim=-1, keepdim=True).clamp_min(1)  # 2 - 1 / |x| outside
+        return doubled / radius / (2 - radius).clamp_min(1 / self.far)
 
     def jacobian(self, points):
         radial, across = self._radial(points), self._across(points)

@@ -85,6 +85,12 @@ class Unbounded(nn.Module):
         if len(places := torch.cat([self.seen, sparse])):
             self.proposal.begin(places)
 
+    def begin_at(self, points: Float[Tensor, "point 3"], origins: Float[Tensor, "point 3"]) -> None:
+        """Begin with places on surfaces that are known, and the camera that each is seen from."""
+        self.seen, self.seen_from = (x[:: max(1, len(x) // KEPT)].to(self.seen) for x in (points, origins))
+        if len(self.seen):
+            self.proposal.begin(self.seen)
+
     def before_step(self, progress: float) -> None:
         """progress: share of the budget spent, in [0, 1]"""
         self.progress = progress

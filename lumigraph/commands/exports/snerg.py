@@ -1,0 +1,43 @@
+"""`lumigraph export snerg`: a baked run as the folder that SNeRG's own viewer opens."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+from tyro.conf import Positional
+
+from ..common import needed, show
+
+
+@dataclass(frozen=True)
+class ExportSnerg:
+    """A baked run as the folder that SNeRG's own viewer opens: scene_params.json and slices of its atlas as PNG.
+
+    It lies in the scene's frame with +y up. A folder of that kind opens like a run, too.
+    """
+
+    source: Annotated[Positional[Path], needed("RUN_OR_FOLDER")]
+    """Folder of a baked run, or of such a scene."""
+    output: Annotated[Path, needed("FOLDER")]
+    """The new folder."""
+
+    def run(self) -> int:
+        from ...capabilities import HasAtlas, needs
+        from ...exchange import size_of, snerg
+        from ...files import claim_folder
+        from ...run import open_any
+
+        claim_folder(self.output, "atlas")
+        atlas = needs(open_any(self.source).method(), HasAtlas).atlas()
+        snerg.write(self.output, atlas)
+        x, y, z = (n * atlas.block for n in atlas.index.shape)
+        show(
+            {
+                "folder": str(self.output),
+                "voxels": f"{x} x {y} x {z}, in {len(atlas.values):,} of {atlas.index.numel():,} blocks",
+                "size": f"{size_of(self.output) / 1e6:.1f} MB",
+            }
+        )
+        return 0

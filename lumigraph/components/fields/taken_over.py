@@ -1,0 +1,212 @@
+"""What a method takes over from another one: density and colour at points, as far as cameras see them.
+
+A teacher that has a `field` is asked for it. One without, such as a cloud of Gaussians, shows pictures with depth, and
+these are fused into a shell of density around its surfaces (Curless and Levoy 1996). Of either nothing is taken where
+cameras see past it: a field may say anything of space that its own pictures never ask about.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Sequence
+from functools import cached_property
+from typing import Any
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from ...camera import Camera
+from ...capabilities import HasDensity, HasField, can
+from ...choice import evenly
+from ...errors import LumigraphError
+from ...geometry import unit
+from ...kernels import spherical_harmonics
+from ...progress import track
+from ..sampling.spaces import Space
+from ..sampling.surveyed import Sight, Surface, empty, surface, survey
+
+AT_ONCE = 1 << 17  # points
+ASKED = 12  # views whose directions tell how a colour depends on them
+UNSEEN = 0.02  # weight of a view that does not see a point, which then has some colour at least
+STIFFNESS = 0.3  # views that hold harmonics beyond the first at zero
+TRUNCATION = 0.015  # of the distance from a camera: half the thickness of a shell
+SPENT = 8.0  # optical thickness of half a shell, where it is solid
+COARSE, PROBES = 64, 8  # cells per axis that are looked at first, and places in each
+SPREAD = 0.01  # of its distance, by which places near a surface are scattered
+EDGE = 2e-3  # coordinates by which a place may miss its own and still be one
+
+
+def taken_over(teacher: Any, cameras: Camera) -> TakenOver:
+    """A teacher, looked at by cameras around it, ready to be taken over. Raises LumigraphError where they see nothing
+    solid."""
+    sights = survey(teacher, cameras)
+    if not any(sight.solid.any() for sight in sights):
+        raise LumigraphError("No camera sees anything solid, so there is nothing to take over; train for longer first")
+    return OfField(sights, teacher) if can(teacher, HasField) else OfSights(sights)
+
+
+class TakenOver(ABC):
+    """Density and colour of a teacher at points of the scene, on the CPU.
+
+    sights: what cameras see of it
+    """
+
+    def __init__(self, sights: Sequence[Sight]):
+        self.sights = sights
+
+    @abstractmethod
+    def _density(self, points: Float[Tensor, "point 3"]) -> Float[Tensor, " point"]:
+        """Density per scene unit, wherever it is."""
+
+    @abstractmethod
+    def glance(self, points: Float[Tensor, "point 3"], sight: Sight) -> Float[Tensor, "point 3"]:
+        """The colours that points have, sRGB-encoded, seen from where one camera is."""
+
+    @cached_property
+    def surface(self) -> Surface:
+        """Places on what cameras see."""
+        return surface(self.sights)
+
+    @torch.no_grad()
+    def density(self, points: Float[Tensor, "point 3"]) -> Float[Tensor, " point"]:
+        """Density per scene unit; none where cameras see past."""
+        found = []
+        for part in points.split(AT_ONCE):
+            there = (~empty(part, self.sights)).nonzero()[:, 0]
+            found.append(part.new_zeros(len(part)).index_copy(0, there, self._density(part[there])))
+        return torch.cat(found) if found else points.new_zeros(0)
+
+    @torch.no_grad()
+    def density_around(
+        self, points: Float[Tensor, "point 3"], size: Float[Tensor, " point"], chance: torch.Generator, count: int = 4
+    ) -> Float[Tensor, " point"]:
+        """Density per scene unit with which a cube of such a side stops as much light as the one around each point does
+        on average, asked at some random places in it."""
+        passed = torch.zeros(len(points))
+        for _ in track(range(count), "Taking over density", count):
+            moved = points + (torch.rand(points.shape, generator=chance) - 0.5) * size[:, None]
+            passed += torch.exp(-self.density(moved) * size) / count
+        return -passed.clamp_min(1e-6).log() / size
+
+    @torch.no_grad()
+    def harmonics(
+        self, points: Float[Tensor, "point 3"], bands: int, of: Callable[[Tensor], Tensor]
+    ) -> Float[Tensor, "point coefficient 3"]:
+        """Spherical harmonics of a function of each point's colour, by least squares over the directions of cameras
+        that see it; those beyond the first are held small where few do."""
+        chosen, width = evenly(self.sights, ASKED), bands**2
+        held = torch.cat([torch.tensor([1e-4]), torch.full((width - 1,), STIFFNESS)]).diag()
+        found = []
+        parts = points.split(AT_ONCE)
+        for part in track(parts, "Taking over colour", len(parts)):
+            squares, products = held.repeat(len(part), 1, 1), part.new_zeros(len(part), width, 3)
+            seen = torch.stack([sight.sees(part) for sight in chosen])
+            for i, sight in enumerate(chosen):
+                asked = (seen[i] | ~seen.any(0)).nonzero()[:, 0]  # what nobody sees is asked for all the same
+                basis = spherical_harmonics(unit(part[asked] - sight.camera.position), bands)
+                weight = torch.where(seen[i][asked], 1.0, UNSEEN)[:, None]
+                colour = of(self.glance(part[asked], sight))
+                squares.index_add_(0, asked, (weight * basis)[:, :, None] * basis[:, None])
+                products.index_add_(0, asked, (weight * basis)[:, :, None] * colour[:, None])
+            found.append(torch.linalg.solve(squares, products))
+        return torch.cat(found) if found else points.new_zeros(0, width, 3)
+
+    @torch.no_grad()
+    def occupied(
+        self, space: Space, cells: int, thickness: float, chance: torch.Generator
+    ) -> Bool[Tensor, "cell cell cell"]:
+        """Which cells of a space's [-1, 1]^3, so many along each axis, hold something, or are beside one that does:
+        looked at coarsely first, then half as large, and so on.
+
+        thickness: optical thickness across a cell from which on there is something in it
+        """
+        n = min(cells, COARSE)
+        held = torch.ones(n, n, n, dtype=torch.bool)
+        while True:
+            index = held.nonzero()
+            dense = torch.zeros(len(index), dtype=torch.bool)
+            for _ in range(PROBES if n == min(cells, COARSE) else PROBES // 2):
+                left = (~dense).nonzero()[:, 0]
+                places = (index[left] + torch.rand(len(left), 3, generator=chance)) * (2 / n) - 1
+                points = space.unwarp(places)
+                dense[left] = self.density(points) * (2 / n) > thickness * space.stretch(points)
+                dense[left] &= (space.warp(points) - places).abs().amax(-1) < EDGE
+            held = torch.zeros_like(held)
+            held[tuple(index[dense].t())] = True
+            held[tuple(cells_of(space.warp(self.surface.points), n).t())] = True
+            held = torch.nn.functional.max_pool3d(held[None].float(), 3, 1, 1)[0] > 0
+            if n >= cells:
+                return held
+            n *= 2
+            held = held.repeat_interleave(2, 0).repeat_interleave(2, 1).repeat_interleave(2, 2)
+
+    @torch.no_grad()
+    def places(self, space: Space, count: int, chance: torch.Generator) -> Float[Tensor, "point 3"]:
+        """Random points of the scene to learn from: half of them near surfaces, a quarter before these, as cameras see
+        them, and a quarter anywhere in the space's [-1, 1]^3."""
+        near, before = count // 2, count // 4
+        known = self.surface
+        if not len(known):
+            near = before = 0
+        chosen = torch.randint(max(len(known), 1), (near + before,), generator=chance)
+        ways = known.points[chosen] - known.origins[chosen]
+        shares = torch.cat(
+            [1 + SPREAD * torch.randn(near, generator=chance), torch.rand(before, generator=chance).sqrt()]
+        )
+        anywhere = 2 * torch.rand(count - near - before, 3, generator=chance) - 1
+        return torch.cat([known.origins[chosen] + shares[:, None] * ways, space.unwarp(anywhere)])
+
+
+class OfField(TakenOver):
+    """Of a teacher with a field."""
+
+    def __init__(self, sights: Sequence[Sight], teacher: Any):
+        super().__init__(sights)
+        self.teacher = teacher
+
+    def _density(self, points):
+        there = points.to(self.teacher.device)
+        if can(self.teacher, HasDensity):
+            return self.teacher.density(there).cpu().float()
+        return self.teacher.field(there, torch.nn.functional.normalize(there + 1e-6, dim=-1))[0].cpu().float()
+
+    def glance(self, points, sight):
+        there, directions = points, unit(points - sight.camera.position)
+        parts = zip(there.split(AT_ONCE), directions.split(AT_ONCE), strict=True)
+        device = self.teacher.device
+        found = [self.teacher.field(x.to(device), d.to(device))[1].cpu().float() for x, d in parts]
+        return torch.cat(found) if found else points
+
+
+class OfSights(TakenOver):
+    """Of pictures with depth: a shell around the surfaces that they show, solid from half its thickness on."""
+
+    def _density(self, points):
+        total, weight, thickness = (points.new_zeros(len(points)) for _ in range(3))
+        for sight in self.sights:
+            pixel, inside, away = sight.pixels(points)
+            depth, opacity = sight.depth.view(-1)[pixel], sight.opacity.view(-1)[pixel]
+            half = TRUNCATION * away
+            ahead = torch.where(opacity > 0.5, (depth - away) / half, 1.0)
+            share = torch.where(inside & (ahead > -1), 1 / away.square(), 0.0)
+            total += share * ahead.nan_to_num(1.0, 1.0, -1.0).clamp(-1, 1)
+            weight += share
+            thickness += share * half
+        known = weight > 0
+        inwards = (0.5 - total / weight.clamp_min(1e-12)).clamp(0, 1) * known
+        return inwards * SPENT * weight / thickness.clamp_min(1e-12)
+
+    def glance(self, points, sight):
+        pixel, inside, _ = sight.pixels(points)
+        return torch.where(inside[:, None], sight.rgb.view(-1, 3)[pixel], 0.5)
+
+
+def logit(rgb: Float[Tensor, "point 3"]) -> Float[Tensor, "point 3"]:
+    """What a sigmoid makes these colours of, kept from black and white, which it never reaches."""
+    return rgb.clamp(0.01, 0.99).logit()
+
+
+def cells_of(coordinates: Float[Tensor, "point 3"], n: int) -> Tensor:
+    """The cells, of n along each axis of [-1, 1]^3, that coordinates lie in."""
+    return ((coordinates + 1) * (n / 2)).long().clamp(0, n - 1)

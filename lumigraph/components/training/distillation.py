@@ -1,0 +1,83 @@
+"""Distillation on points: a field learns another one's density and colour at random places (as Reiser 2021, KiloNeRF,
+section 3.2), which is quicker than by pictures: every place is a lesson of its own."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from ...geometry import unit
+from ...progress import track
+from ..fields.taken_over import TakenOver
+from ..sampling.spaces import Space
+from .schedules import held
+
+STEPS = 240
+POOL = 16  # times as many places as a step learns from: the teacher is asked about these alone
+CELL = 1 / 64  # of the coordinates: a length over which densities are compared by what they stop
+FINAL = 0.1  # of the learning rates, at the end
+START = 0.3  # share of the steps before they fall
+
+Field = Callable[
+    [Float[Tensor, "point 3"], Float[Tensor, "point 3"]], tuple[Float[Tensor, " point"], Float[Tensor, "point 3"]]
+]
+
+
+def distil(
+    field: Field,
+    held_by: TakenOver,
+    space: Space,
+    optimizers: Sequence[torch.optim.Optimizer],
+    points: int,
+    chance: torch.Generator,
+    device: torch.device | str = "cpu",
+) -> None:
+    """Teach a field what another one holds.
+
+        L = mean (log(1 + sigma d) - log(1 + sigma' d))^2 + mean a' |c - c'|^2,    a' = 1 - exp(-sigma' d)
+
+    over places near surfaces, before them and anywhere, colours along the way from a camera that sees the place.
+    d is CELL of the coordinates; the optimizers go at the rates that they have, which fall.
+    points: that a step learns from
+    """
+    places = held_by.places(space, POOL * points, chance)
+    directions, rgb, seen = glances(held_by, places, chance)
+    length = CELL / space.stretch(places)
+    thickness = held_by.density(places) * length
+    lessons = [x.to(device) for x in (places, directions, rgb, seen, thickness, length)]
+    rates = [(group, group["lr"]) for optimizer in optimizers for group in optimizer.param_groups]
+    with torch.enable_grad():
+        for step in track(range(STEPS), "Teaching points", STEPS):
+            for group, rate in rates:
+                group["lr"] = rate * held(1.0, FINAL, step, step / STEPS, START)
+            chosen = torch.randint(len(places), (points,), generator=chance).to(device)
+            place, direction, colour, sees, wanted, d = (x[chosen] for x in lessons)
+            density, found = field(place, direction)
+            dense = (torch.log1p(density * d) - torch.log1p(wanted)).square().mean()
+            weight = sees * -torch.expm1(-wanted)
+            coloured = (weight[:, None] * (found - colour).square()).mean()
+            for optimizer in optimizers:
+                optimizer.zero_grad(set_to_none=True)
+            (dense + coloured).backward()
+            for optimizer in optimizers:
+                optimizer.step()
+    for optimizer in optimizers:
+        optimizer.zero_grad(set_to_none=True)
+
+
+@torch.no_grad()
+def glances(
+    held_by: TakenOver, places: Float[Tensor, "point 3"], chance: torch.Generator
+) -> tuple[Float[Tensor, "point 3"], Float[Tensor, "point 3"], Float[Tensor, " point"]]:
+    """For each place the direction from a random camera, the colour from there, and whether (0 or 1) it is seen."""
+    directions, rgb, seen = torch.zeros_like(places), torch.full_like(places, 0.5), torch.zeros(len(places))
+    camera = torch.randint(len(held_by.sights), (len(places),), generator=chance)
+    for i, sight in enumerate(track(held_by.sights, "Asking the teacher", len(held_by.sights))):
+        own = (camera == i).nonzero()[:, 0]
+        directions[own] = unit(places[own] - sight.camera.position)
+        own = own[sight.sees(places[own])]
+        seen[own], rgb[own] = 1.0, held_by.glance(places[own], sight)
+    return directions, rgb, seen

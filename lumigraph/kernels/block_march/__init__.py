@@ -1,0 +1,164 @@
+"""Marching through baked voxels in blocks, one voxel a step, and compositing what lies there (Hedman 2021)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float, Int, Int32
+from torch import Tensor
+
+from .._dispatch import implementation
+from .._doors import door, require
+from .._facts import Facts
+
+FACTS = Facts(unit="rays", outputs=2, differentiable=(5,), typical=4, compiled=5, smooth=(2, 3))
+
+CHANNELS = 8  # of a voxel: red, green, blue, alpha, four features
+ALPHA = 3
+FARTHEST = 6  # of an empty voxel's distance to what is not empty, that is told
+
+
+@dataclass(frozen=True)
+class Blocks:
+    """Which row of a table belongs to each voxel of a grid, most of which is empty; made by `of`.
+
+    Voxel (x, y, z) has its centre there. Block (a, b, c) holds voxels from (a, b, c) * block on, and one more on each
+    side, its apron, so that all that is blended at a place lies within one block.
+
+    index: each block's number, -1 where it and its apron are empty
+    rows:  of each voxel of each block: its row; or -d where it is empty, and all voxels within that block that are
+           fewer than d away along every axis are, too
+    count: of rows
+    """
+
+    index: Int32[Tensor, "x y z"]
+    rows: Int32[Tensor, "block side side side"]
+    count: int
+
+    @classmethod
+    def of(cls, places: Int[Tensor, "row 3"], shape: tuple[int, int, int], block: int) -> Blocks:
+        """Rows for voxels at these places, which all differ, of a grid of a shape. Raises ValueError for others."""
+        size = torch.tensor(shape, device=places.device)
+        require(bool(((places >= 0) & (places < size)).all()), f"places of voxels go from 0 below {shape}")
+        blocks = (size + block - 1) // block
+        require(block >= 1 and int(blocks.prod()) < 1 << 31, f"a grid cannot have {blocks.tolist()} blocks")
+        which, own = torch.arange(len(places), device=places.device), places.long() // block
+        for axis in range(3):  # a voxel at a block's side lies in its neighbour's apron too
+            inside = places[which, axis].long() - block * own[:, axis]
+            parts = [(which, own)]
+            for at, step in ((0, -1), (block - 1, 1)):
+                beyond = own[:, axis] + step
+                again = ((inside == at) & (beyond >= 0) & (beyond < blocks[axis])).nonzero()[:, 0]
+                moved = own[again]
+                moved[:, axis] += step
+                parts.append((which[again], moved))
+            which, own = (torch.cat(column) for column in zip(*parts, strict=True))
+        number = (own[:, 0] * blocks[1] + own[:, 1]) * blocks[2] + own[:, 2]
+        there, number = torch.unique(number, return_inverse=True)
+        index = torch.full((int(blocks.prod()),), -1, dtype=torch.int32, device=places.device)
+        index[there] = torch.arange(len(there), dtype=torch.int32, device=places.device)
+        side = block + 2
+        rows = torch.full((len(there), side, side, side), -1, dtype=torch.int32, device=places.device)
+        x, y, z = (places[which].long() - block * own + 1).unbind(-1)
+        rows[number, x, y, z] = which.int()
+        require(int((rows >= 0).sum()) == len(which), "two rows belong to one voxel")
+        return cls(index.view(*blocks.tolist()), _with_distances(rows), len(places))
+
+    @property
+    def block(self) -> int:
+        """Voxels along a block's side, without the apron."""
+        return self.rows.shape[1] - 2
+
+    def to(self, device: torch.device | str) -> Blocks:
+        return Blocks(self.index.to(device), self.rows.to(device), self.count)
+
+
+def _with_distances(rows: Int32[Tensor, "block side side side"]) -> Int32[Tensor, "block side side side"]:
+    """Rows whose empty voxels say how far what is not empty is; beyond the block may be anything."""
+    near = torch.nn.functional.pad(rows >= 0, (1,) * 6, value=True)
+    far = torch.full_like(near, FARTHEST, dtype=torch.int8)
+    for distance in range(1, FARTHEST):
+        for axis in (1, 2, 3):
+            wider, n = near.clone(), near.shape[axis]
+            wider.narrow(axis, 1, n - 1).logical_or_(near.narrow(axis, 0, n - 1))
+            wider.narrow(axis, 0, n - 1).logical_or_(near.narrow(axis, 1, n - 1))
+            near = wider
+        far[near & (far == FARTHEST)] = distance
+    return torch.where(rows >= 0, rows, -far[:, 1:-1, 1:-1, 1:-1].int())
+
+
+@door
+def block_march(
+    origins: Float[Tensor, "ray 3"],
+    directions: Float[Tensor, "ray 3"],
+    enter: Float[Tensor, " ray"],
+    leave: Float[Tensor, " ray"],
+    blocks: Blocks,
+    values: Float[Tensor, "row 8"],
+    stop: float = 0.0,
+) -> tuple[Float[Tensor, "ray 8"], Float[Tensor, " ray"]]:
+    """Accumulate premultiplied values front to back, one voxel a step (Hedman 2021, section 5.2).
+
+        t_i = enter + i, while t_i < leave      v_i: trilinear at o + t_i d, alpha_i one of its channels
+        T_i = prod_{j<i} (1 - alpha_j)          light that reaches step i; 0 once it is below `stop`
+
+    origins:      in voxels; the centre of voxel (x, y, z) is there
+    directions:   unit length
+    enter, leave: distances of the first step and of the end, in voxels
+    blocks:       which row each voxel has, 0 where it has none; trusted to be as its maker leaves it
+    values:       (blocks.count, 8): red, green, blue, alpha, four features, all but alpha multiplied by alpha
+
+    Returns sum_i T_i v_i (R, 8), of which alpha's channel is the opacity, and sum_i T_i alpha_i t_i (R,).
+    Both are differentiable in the values. A march of one step looks up what is at a point.
+    """
+    require(len(values) == blocks.count, f"{len(values)} rows of values, where blocks have {blocks.count}")
+    return implementation("block_march", origins)(origins, directions, enter, leave, blocks, values, stop)
+
+
+def cases(generator: torch.Generator):
+    """Inputs that every engine must agree on: none, haze, walls, several sizes of blocks, rays beside the grid."""
+    for rays, shape, block, share, most, stop in [
+        (0, (4, 4, 4), 2, 0.5, 0.5, 0.0),
+        (1, (2, 2, 2), 2, 1.0, 0.5, 0.0),
+        (5, (9, 5, 7), 3, 0.3, 0.3, 0.0),
+        (3, (6, 6, 6), 6, 0.1, 1.0, 0.0),
+        (35, (21, 11, 17), 5, 0.03, 0.7, 0.0),
+        (20, (13, 12, 11), 4, 0.4, 0.9, 0.05),
+        (3, (6, 6, 6), 4, 0.0, 0.9, 0.0),
+    ]:
+        yield _inputs(rays, shape, block, share, most, stop, generator)
+
+
+def benchmark_case(generator: torch.Generator, size: int = 2**14):
+    """Rays through a shell in a grid of 256 voxels an axis, in blocks of 30."""
+    place = torch.arange(256.0) - 127.5
+    radius = (place[:, None, None] ** 2 + place[:, None] ** 2 + place**2).sqrt()
+    places = ((radius > 90) & (radius < 94)).nonzero()
+    origins, directions, enter, leave = _rays(size, (256, 256, 256), generator)
+    values = 0.3 * torch.rand(len(places), CHANNELS, generator=generator)
+    return origins, directions, enter, leave, Blocks.of(places, (256, 256, 256), 30), values.requires_grad_(), 1e-3
+
+
+def _inputs(rays, shape, block, share, most, stop, generator):
+    total = shape[0] * shape[1] * shape[2]
+    numbers = torch.randperm(total, generator=generator)[: int(share * total)]
+    places = torch.stack(torch.unravel_index(numbers, shape), -1)
+    values = most * torch.rand(len(places), CHANNELS, generator=generator)
+    values[: len(places) // 8, ALPHA] = most
+    return *_rays(rays, shape, generator), Blocks.of(places, shape, block), values, stop
+
+
+def _rays(count, shape, generator):
+    """From around a grid through it; one along an axis, one beside the grid."""
+    size = torch.tensor(shape, dtype=torch.float32)
+    out = torch.nn.functional.normalize(torch.randn(count, 3, generator=generator), dim=-1)
+    target = size * (0.2 + 0.6 * torch.rand(count, 3, generator=generator)) - 0.5
+    length = float(size.norm())
+    directions = -out
+    directions[:1] = torch.tensor([0.0, 0.0, 1.0])
+    origins = target - length * directions
+    origins[1:2] += 3 * length
+    # Eighths and sixteenths, so that no engine's rounding decides how many steps there are.
+    enter = (torch.randint(0, 8, (count,), generator=generator)) / 8 + length // 3
+    return origins, directions, enter, enter + 2 * (length // 1) + 1 / 16

@@ -1,0 +1,21 @@
+"""Faults that the tests write into a copy of an engine, one at a time, to see their comparison turn red.
+
+By name: the engine, the function, what stands there, and what is put in its place.
+"""
+
+FAULTS = {
+    "a leap too far": ("cpu", "onward", "np.int64(-1 - row)", "np.int64(-row)"),
+    "what lies behind is not hidden": ("cpu", "_owed", "(g_distance[r] * t - hidden)", "g_distance[r] * t"),
+    "hidden by all but itself": ("cpu", "_owed", "(ONE - seen[A]) * hidden", "hidden"),
+    "gradient of another step": ("cpu", "_spread", "owed[s, c]", "owed[j, c]"),
+    "empty voxels as the first row": ("cpu", "corners", "count += row >= 0", "count += 1"),
+    "an apron too many": ("gpu", "_cell_of", "+ 1.0", "+ 2.0"),
+    "light behind its own alpha": ("gpu", "_march", "light *= 1 - alpha", "light *= alpha"),
+    "weight forgotten": ("gpu", "_backward", "weight[:, None] * owed", "owed"),
+    "what lies behind is not hidden there": ("gpu", "_backward", "g_along * t - hidden", "g_along * t"),
+}
+
+# These let an index leave its array.
+ASTRAY = {
+    "the block beyond the grid": ("cpu", "block_of", "ix < index.shape[0]", "ix <= index.shape[0]"),
+}

@@ -1,0 +1,250 @@
+"""Triton: one lane takes one ray. Gradients of the rows meet in atomic adds."""
+
+from __future__ import annotations
+
+import torch
+import triton
+import triton.language as tl
+from torch import Tensor
+
+from .._dispatch import empty
+from . import ALPHA, CHANNELS, Blocks
+
+BLOCK = 32  # rays; they march together, so a program is as slow as its slowest
+C, A = tl.constexpr(CHANNELS), tl.constexpr(ALPHA)
+
+
+@triton.jit
+def _block_of(x, y, z, index, here, X, Y, Z, B: tl.constexpr):
+    """The block's coordinates at each place, and its number; -1 beyond the grid and where there is none."""
+    bx = tl.floor((x + 0.5) / B).to(tl.int32)
+    by = tl.floor((y + 0.5) / B).to(tl.int32)
+    bz = tl.floor((z + 0.5) / B).to(tl.int32)
+    inside = here & (bx >= 0) & (by >= 0) & (bz >= 0) & (bx < X) & (by < Y) & (bz < Z)
+    return bx, by, bz, tl.load(index + (bx.to(tl.int64) * Y + by) * Z + bz, mask=inside, other=-1)
+
+
+@triton.jit
+def _to_side(x, d, b, B: tl.constexpr):
+    """Distance along the ray to where it leaves block b of one axis."""
+    still = tl.abs(d) < 1e-9
+    side = (B * (b + (d > 0).to(tl.int32))).to(tl.float32) - 0.5
+    return tl.where(still, 1e9, (side - x) / tl.where(still, 1.0, d))
+
+
+@triton.jit
+def _cell_of(x, b, B: tl.constexpr):
+    """Along one axis: the first of the two voxels around a place, counted in its block, and the place beyond it."""
+    place = x - (B * b).to(tl.float32) + 1.0
+    cell = tl.minimum(tl.maximum(place.to(tl.int32), 0), B)
+    return cell, place - cell.to(tl.float32)
+
+
+@triton.jit
+def _row_of(rows, number, x, y, z, there, B: tl.constexpr):
+    return tl.load(rows + ((number.to(tl.int64) * (B + 2) + x) * (B + 2) + y) * (B + 2) + z, mask=there, other=-1)
+
+
+@triton.jit
+def _share(fraction, side: tl.constexpr):
+    return fraction if side == 1 else 1 - fraction
+
+
+@triton.jit
+def _blended(rows, values, number, cx, fx, cy, fy, cz, fz, there, BLOCK: tl.constexpr, B: tl.constexpr):
+    """What is at each place, and whether any of the eight voxels around it has a row."""
+    c = tl.arange(0, C)
+    seen = tl.zeros([BLOCK, C], tl.float32)
+    some = tl.zeros([BLOCK], tl.int32)
+    for corner in tl.static_range(8):
+        weight = _share(fx, corner % 2) * _share(fy, corner // 2 % 2) * _share(fz, corner // 4)
+        row = _row_of(rows, number, cx + corner % 2, cy + corner // 2 % 2, cz + corner // 4, there, B).to(tl.int64)
+        full = row >= 0
+        some |= full.to(tl.int32)
+        seen += weight[:, None] * tl.load(values + row[:, None] * C + c[None, :], mask=full[:, None], other=0.0)
+    return seen, some > 0
+
+
+@triton.jit
+def _alpha(seen):
+    return tl.sum(tl.where(tl.arange(0, C)[None, :] == A, seen, 0.0), 1)
+
+
+@triton.jit(do_not_specialize=["R"])
+def _march(
+    origins,
+    directions,
+    enter,
+    leave,
+    index,
+    rows,
+    values,
+    totals,
+    distance,
+    lengths,
+    starts,
+    steps,
+    lights,
+    R,
+    X,
+    Y,
+    Z,
+    stop,
+    NOTE: tl.constexpr,
+    BLOCK: tl.constexpr,
+    B: tl.constexpr,
+):
+    """Composite along each ray; or NOTE its steps that meet something, and the light that reaches them."""
+    r = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
+    c = tl.arange(0, C)
+    here = r < R
+    ox = tl.load(origins + 3 * r, mask=here, other=0.0)
+    oy = tl.load(origins + 3 * r + 1, mask=here, other=0.0)
+    oz = tl.load(origins + 3 * r + 2, mask=here, other=0.0)
+    dx = tl.load(directions + 3 * r, mask=here, other=1.0)
+    dy = tl.load(directions + 3 * r + 1, mask=here, other=0.0)
+    dz = tl.load(directions + 3 * r + 2, mask=here, other=0.0)
+    begin = tl.load(enter + r, mask=here, other=0.0)
+    end = tl.load(leave + r, mask=here, other=0.0)
+    if NOTE:
+        first = tl.load(starts + r, mask=here, other=0)
+        last = tl.load(starts + r + 1, mask=here, other=0)
+    light = tl.full([BLOCK], 1.0, tl.float32)
+    along = tl.zeros([BLOCK], tl.float32)
+    total = tl.zeros([BLOCK, C], tl.float32)
+    met = tl.zeros([BLOCK], tl.int32)
+    i = tl.zeros([BLOCK], tl.int32)
+    alive = here & (begin < end) & (light >= stop)
+    while tl.max(alive.to(tl.int32), 0) > 0:
+        t = begin + i.to(tl.float32)
+        x, y, z = ox + t * dx, oy + t * dy, oz + t * dz
+        bx, by, bz, number = _block_of(x, y, z, index, alive, X, Y, Z, B)
+        there = number >= 0
+        cx, fx = _cell_of(x, bx, B)
+        cy, fy = _cell_of(y, by, B)
+        cz, fz = _cell_of(z, bz, B)
+        nearest = _row_of(rows, number, cx, cy, cz, there, B)
+        leap = tl.where(nearest < -1, -1 - nearest, 0)
+        there &= leap == 0
+        seen, some = _blended(rows, values, number, cx, fx, cy, fy, cz, fz, there, BLOCK, B)
+        alpha = _alpha(seen)
+        if NOTE:
+            place = first + met
+            tl.store(steps + place, i, mask=some & (place < last))
+            tl.store(lights + place, light, mask=some & (place < last))
+        total += light[:, None] * seen
+        along += light * alpha * t
+        light *= 1 - alpha
+        met += some.to(tl.int32)
+        away = tl.minimum(tl.minimum(_to_side(x, dx, bx, B), _to_side(y, dy, by, B)), _to_side(z, dz, bz, B))
+        out = tl.ceil(tl.minimum(away, 1e9)).to(tl.int32)
+        i += tl.maximum(tl.where(number < 0, out, leap), 1)
+        alive &= (begin + i.to(tl.float32) < end) & (light >= stop)
+    if not NOTE:
+        tl.store(totals + r[:, None] * C + c[None, :], total, mask=here[:, None])
+        tl.store(distance + r, along, mask=here)
+        tl.store(lengths + r, met, mask=here)
+
+
+@triton.jit(do_not_specialize=["R"])
+def _backward(
+    g_totals,
+    g_distance,
+    origins,
+    directions,
+    enter,
+    index,
+    rows,
+    values,
+    starts,
+    steps,
+    lights,
+    to_values,
+    R,
+    X,
+    Y,
+    Z,
+    BLOCK: tl.constexpr,
+    B: tl.constexpr,
+):
+    """From the back of each ray to its front: dL/dv = T g, and for alpha beside it what it hides of all behind it."""
+    r = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
+    c = tl.arange(0, C)
+    here = r < R
+    ox = tl.load(origins + 3 * r, mask=here, other=0.0)
+    oy = tl.load(origins + 3 * r + 1, mask=here, other=0.0)
+    oz = tl.load(origins + 3 * r + 2, mask=here, other=0.0)
+    dx = tl.load(directions + 3 * r, mask=here, other=1.0)
+    dy = tl.load(directions + 3 * r + 1, mask=here, other=0.0)
+    dz = tl.load(directions + 3 * r + 2, mask=here, other=0.0)
+    begin = tl.load(enter + r, mask=here, other=0.0)
+    g = tl.load(g_totals + r[:, None] * C + c[None, :], mask=here[:, None], other=0.0)
+    g_along = tl.load(g_distance + r, mask=here, other=0.0)
+    first = tl.load(starts + r, mask=here, other=0)
+    s = tl.load(starts + r + 1, mask=here, other=0) - 1
+    hidden = tl.zeros([BLOCK], tl.float32)
+    alive = here & (s >= first)
+    while tl.max(alive.to(tl.int32), 0) > 0:
+        t = begin + tl.load(steps + s, mask=alive, other=0).to(tl.float32)
+        light = tl.load(lights + s, mask=alive, other=0.0)
+        x, y, z = ox + t * dx, oy + t * dy, oz + t * dz
+        bx, by, bz, number = _block_of(x, y, z, index, alive, X, Y, Z, B)
+        there = number >= 0
+        cx, fx = _cell_of(x, bx, B)
+        cy, fy = _cell_of(y, by, B)
+        cz, fz = _cell_of(z, bz, B)
+        seen, _ = _blended(rows, values, number, cx, fx, cy, fy, cz, fz, there, BLOCK, B)
+        alpha = _alpha(seen)
+        owed = light[:, None] * (g + tl.where(c[None, :] == A, (g_along * t - hidden)[:, None], 0.0))
+        for corner in tl.static_range(8):
+            weight = _share(fx, corner % 2) * _share(fy, corner // 2 % 2) * _share(fz, corner // 4)
+            row = _row_of(rows, number, cx + corner % 2, cy + corner // 2 % 2, cz + corner // 4, there, B).to(tl.int64)
+            to = to_values + row[:, None] * C + c[None, :]
+            tl.atomic_add(to, weight[:, None] * owed, mask=(row >= 0)[:, None], sem="relaxed")
+        own = tl.sum(g * seen, 1) + g_along * alpha * t
+        hidden = tl.where(alive, own + (1 - alpha) * hidden, hidden)
+        s -= 1
+        alive &= s >= first
+
+
+class _BlockMarch(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, origins, directions, enter, leave, blocks: Blocks, values, stop: float):
+        device, rays = origins.device, len(origins)
+        ctx.given = blocks.index.contiguous(), blocks.rows.contiguous()
+        ctx.sizes = rays, *blocks.index.shape
+        ctx.options = {"BLOCK": BLOCK, "B": blocks.block, "num_warps": 1, "enable_fp_fusion": False}
+        ctx.stop = float(stop)
+        totals, distance = empty(rays, CHANNELS, device=device), empty(rays, device=device)
+        lengths = torch.zeros(rays, dtype=torch.int32, device=device)
+        if rays:
+            out = totals, distance, lengths, lengths, lengths, distance  # the last three are only noted into
+            rest = *out, *ctx.sizes, ctx.stop
+            _march[(triton.cdiv(rays, BLOCK),)](
+                origins, directions, enter, leave, *ctx.given, values, *rest, NOTE=False, **ctx.options
+            )
+        ctx.save_for_backward(origins, directions, enter, leave, values, totals, distance, lengths)
+        return totals, distance
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx, g_totals, g_distance):
+        origins, directions, enter, leave, values, totals, distance, lengths = ctx.saved_tensors
+        starts = torch.nn.functional.pad(lengths.long().cumsum(0), (1, 0))
+        steps = torch.zeros(int(starts[-1]), dtype=torch.int32, device=values.device)
+        lights, to_values = empty(len(steps), device=values.device), torch.zeros_like(values)
+        if len(steps):
+            grid = (triton.cdiv(len(origins), BLOCK),)
+            out = totals, distance, lengths, starts, steps, lights
+            rest = *out, *ctx.sizes, ctx.stop
+            _march[grid](origins, directions, enter, leave, *ctx.given, values, *rest, NOTE=True, **ctx.options)
+            grads = g_totals.contiguous(), g_distance.contiguous()
+            noted = starts, steps, lights, to_values
+            given = origins, directions, enter, *ctx.given, values
+            _backward[grid](*grads, *given, *noted, *ctx.sizes, **ctx.options)
+        return None, None, None, None, None, to_values, None
+
+
+def run(origins, directions, enter, leave, blocks: Blocks, values: Tensor, stop: float):
+    given = (x.contiguous() for x in (origins, directions, enter, leave))
+    return _BlockMarch.apply(*given, blocks, values.contiguous(), stop)

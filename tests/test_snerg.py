@@ -1,0 +1,343 @@
+"""SNeRG's equations, what is baked, and the folder that its own viewer opens."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import tiny
+import tiny_atlas
+import torch
+from PIL import Image
+from tiny_atlas import DENSITY, RADIUS
+
+from lumigraph import kernels
+from lumigraph.capabilities import HasAtlas, can
+from lumigraph.cli import main
+from lumigraph.components.fields.deferred import encoded
+from lumigraph.components.sampling.sightings import Sightings
+from lumigraph.errors import LumigraphError
+from lumigraph.exchange import snerg
+from lumigraph.kernels.block_march import ALPHA
+from lumigraph.methods.snerg import ATLAS, FIELD, VOXELS, SNeRG
+from lumigraph.metrics import psnr
+from lumigraph.rays import Rays
+from lumigraph.run import Run, State, open_any
+from lumigraph.train import fit
+
+
+@pytest.fixture(scope="module")
+def ball():
+    return tiny_atlas.baked()
+
+
+@pytest.fixture
+def folder(ball, tmp_path):
+    snerg.write(tmp_path / "scene", ball.atlas())
+    return tmp_path / "scene"
+
+
+def through_the_middle(count: int) -> Rays:
+    """Parallel rays along +z at growing distances from the axis."""
+    origins = torch.stack([torch.linspace(0, 0.5, count), torch.zeros(count), torch.full((count,), -3.0)], -1)
+    return Rays(origins, torch.tensor([0.0, 0.0, 1.0]).expand(count, 3), torch.full((count,), 0.01))
+
+
+# The kernel's equation
+
+
+def test_a_slab_dims_by_each_step():
+    """Through n voxels of one alpha passes (1 - alpha)^n, and what is beyond the first is seen through it."""
+    n, alpha = 8, 0.3
+    places = torch.cartesian_prod(*[torch.arange(n)] * 3)
+    values = torch.full((len(places), 8), 0.1)
+    values[:, ALPHA] = alpha
+    blocks = kernels.Blocks.of(places, (n, n, n), 3)
+    ray = torch.tensor([[3.0, 4.0, -5.0]]), torch.tensor([[0.0, 0.0, 1.0]])
+    totals, along = kernels.block_march(*ray, torch.tensor([5.0]), torch.tensor([5.0 + n]), blocks, values)
+    light = (1 - alpha) ** torch.arange(n)
+    assert float(totals[0, ALPHA]) == pytest.approx(1 - (1 - alpha) ** n, rel=1e-5)
+    assert float(totals[0, 0]) == pytest.approx(float(0.1 * light.sum()), rel=1e-5)
+    assert float(along) == pytest.approx(float((light * alpha * torch.arange(5, 5 + n)).sum()), rel=1e-5)
+
+
+def test_blocks_hold_their_neighbours_beside_them():
+    places = torch.cartesian_prod(*[torch.arange(3, 7)] * 3)
+    blocks = kernels.Blocks.of(places, (12, 12, 12), 4)
+    assert int((blocks.index >= 0).sum()) == 8  # of 27; the others touch nothing
+    for a, b, c in (blocks.index >= 0).nonzero().tolist():
+        rows = blocks.rows[blocks.index[a, b, c]]
+        for x, y, z in (rows >= 0).nonzero().tolist():
+            place = torch.tensor([a, b, c]) * 4 + torch.tensor([x, y, z]) - 1
+            assert torch.equal(places[rows[x, y, z]], place)
+    with pytest.raises(ValueError, match="two rows"):
+        kernels.Blocks.of(torch.tensor([[1, 1, 1], [1, 1, 1]]), (4, 4, 4), 4)
+
+
+def test_the_direction_is_encoded_as_the_viewer_does():
+    d = torch.nn.functional.normalize(torch.tensor([[0.3, -0.5, 0.8]]), dim=-1)
+    found = encoded(d)[0]
+    for index in range(27):
+        x = d[0, index % 3]
+        octave, shift = (index - 3) % 12 // 3, math.pi / 2 * (index - 3 >= 12)
+        expected = x if index < 3 else torch.sin(x * 2.0**octave + shift)
+        assert float(found[index]) == pytest.approx(float(expected), abs=1e-6)
+
+
+# Baking
+
+
+def test_baked_values_are_those_of_the_field(ball):
+    """alpha = 1 - exp(-density voxel), and the rest is multiplied by it (section 5.1)."""
+    voxels = ball.voxels
+    centres = voxels.low + (voxels.places + 0.5) * voxels.edge
+    inside = centres.norm(dim=-1) < RADIUS
+    assert inside.all() and len(centres) == pytest.approx(
+        4 / 3 * math.pi * (RADIUS / float(voxels.edge)) ** 3, rel=0.05
+    )
+    alpha = 1 - math.exp(-DENSITY * float(voxels.edge))
+    torch.testing.assert_close(ball.tuned.values[:, ALPHA], torch.full((len(centres),), alpha))
+    torch.testing.assert_close(ball.tuned.values[:, :3], alpha * tiny_atlas.colour(centres))
+    torch.testing.assert_close(ball.tuned.values[:, 4:], torch.full((len(centres), 4), 0.25 * alpha))
+    torch.testing.assert_close(ball.density(centres[:50]), torch.full((50,), DENSITY), rtol=1e-3, atol=1e-3)
+
+
+def test_a_ray_through_the_ball_is_dimmed_by_what_it_passes(ball):
+    rays = through_the_middle(20)
+    with torch.no_grad():
+        seen = ball._marched(rays)
+    length = 2 * (RADIUS**2 - rays.origins[:, 0] ** 2).sqrt()
+    torch.testing.assert_close(seen.opacity, 1 - torch.exp(-DENSITY * length), atol=0.03, rtol=0)
+    expected = ball.view(rays.directions, seen.diffuse, seen.features)
+    with torch.no_grad():
+        rgb = ball.render_rays(rays, torch.zeros(1, 3)).rgb
+    torch.testing.assert_close(rgb, seen.diffuse + seen.opacity[:, None] * expected)
+
+
+def test_looks_composite_to_the_picture(ball):
+    rays = through_the_middle(7)
+    with torch.no_grad():
+        (look,) = ball.looks(rays)
+        whole = ball.render_rays(rays, torch.zeros(1, 3))
+    from lumigraph.volume import composite
+
+    seen = composite(look.samples, look.density, look.rgb)
+    torch.testing.assert_close(seen.rgb, whole.rgb, atol=2e-3, rtol=0)
+    torch.testing.assert_close(seen.depth, whole.depth, atol=5e-3, rtol=0)
+
+
+def test_what_no_ray_sees_is_left_out():
+    method = SNeRG(tiny.scene().frame, SNeRG.smallest())
+    with pytest.raises(LumigraphError, match="no ray sees"):
+        method._bake(tiny_atlas.ball)
+    n = method.sightings.resolution
+    method.sightings.note(torch.tensor([[-0.9, 0.0, 0.0], [5.0, 0.0, 0.0]]), torch.tensor([0.5, 0.5]))
+    cells = method.sightings.seen.nonzero()
+    assert len(cells) == 2 * 3 * 3 or cells[:, 0].max() <= 2 < n
+    method.sightings.note(torch.tensor([[-0.5, 0.0, 0.0]]), torch.tensor([0.5]))
+    method._bake(tiny_atlas.ball)
+    centres = method.voxels.low + (method.voxels.places + 0.5) * method.voxels.edge
+    assert len(centres) and (centres[:, 0] < 0).all()
+
+
+def test_sightings_fade():
+    sightings = Sightings(8)
+    sightings.note(torch.zeros(1, 3), torch.tensor([0.02]))
+    assert sightings.seen.any()
+    for _ in range(20):
+        sightings.forget()
+    assert not sightings.seen.any()
+
+
+# Learning
+
+
+def test_it_goes_through_its_stages_by_the_share_of_the_budget():
+    method, stages = SNeRG(tiny.scene().frame, SNeRG.smallest()), []
+    before = method.before_step
+    method.before_step = lambda step, progress: (before(step, progress), stages.append(int(method.stage)))  # type: ignore
+    with pytest.raises(LumigraphError, match="not baked yet"):
+        method.atlas()
+    fit(method, tiny.scene(), steps=20, show=False, rehearsal=False)
+    assert stages == [FIELD] * 12 + [VOXELS] * 5 + [ATLAS] * 3
+    assert not len(method.network.table) and not len(method.tuned.values) and can(method, HasAtlas)
+    atlas = method.atlas()
+    assert torch.equal(
+        atlas.values.unique(), torch.cat([torch.zeros(1), method.voxels.levels.unique()]).unique().byte()
+    )
+
+
+class OnlySeen:
+    """A teacher that shows pictures, and knows nothing of points."""
+
+    def __init__(self, method):
+        self.render, self.frame, self.device = method.render, method.frame, method.device
+
+
+@pytest.mark.parametrize(("teacher", "like"), [("field", 27), ("pictures", 20)])
+def test_a_teacher_is_taken_over_as_far_as_cameras_see_it(teacher, like):
+    """It looks like a diffuse one at once, and is to learn features that nobody has told."""
+    scene, solid = tiny.scene(), tiny_atlas.baked(diffuse=True, density=10.0)
+    method = SNeRG(scene.frame, SNeRG.smallest())
+    method.from_field(solid if teacher == "field" else OnlySeen(solid), scene.cameras)
+    assert method.stage == VOXELS and method.of_another and len(method.voxels) < len(solid.voxels)
+    assert not method.tuned.values[:, ALPHA + 1 :].any()
+    seen = [each.eval().render(scene.cameras[4]) for each in (method, solid)]
+    assert psnr(seen[0].rgb, seen[1].rgb) > like
+    fit(method, scene, steps=10, show=False, rehearsal=False)
+    assert method.stage == ATLAS and method.voxels.levels[:, ALPHA + 1 :].any()
+
+
+# The viewer's folder
+
+
+def test_the_folder_holds_what_the_atlas_does(ball, folder):
+    atlas, back = ball.atlas(), snerg.read(folder)
+    assert torch.equal(atlas.index >= 0, back.index >= 0)
+    there = tuple((atlas.index >= 0).nonzero().unbind(-1))
+    assert torch.equal(atlas.values[atlas.index[there]], back.values[back.index[there]])
+    torch.testing.assert_close(back.low, atlas.low)
+    assert back.voxel == pytest.approx(atlas.voxel) and back.block == atlas.block
+    for name in ("weights", "biases"):
+        for a, b in zip(getattr(atlas.network, name), getattr(back.network, name), strict=True):
+            torch.testing.assert_close(a, b)
+    said = json.loads((folder / "scene_params.json").read_text())
+    slices = sorted(path.name for path in folder.glob("rgba_*.png"))
+    assert slices[-1] == f"rgba_{said['num_slices'] - 1:03d}.png" and said["atlas_depth"] == 4 * said["num_slices"]
+
+
+def as_its_viewer(folder, origin, direction):
+    """One ray's diffuse colour, features and opacity as the published shader finds them, in its own axes."""
+    said = json.loads((folder / "scene_params.json").read_text())
+    size, block = said["voxel_size"], said["block_size"]
+    low = np.array([said[f"min_{axis}"] for axis in "xyz"])
+    grid = np.array([said[f"grid_{name}"] for name in ("width", "height", "depth")])
+    planes = {}
+    for kind in ("rgba", "feature"):
+        pictures = [np.asarray(Image.open(folder / f"{kind}_{i:03d}.png")) for i in range(said["num_slices"])]
+        height = said["atlas_height"]
+        planes[kind] = np.concatenate([p.reshape(4, height, -1, 4) for p in pictures]) / 255  # (z, y, x, channel)
+    blocks = -(-grid // block)
+    index = np.asarray(Image.open(folder / "atlas_indices.png")).reshape(blocks[2], blocks[1], blocks[0], 3)
+    o = (origin - low) / size
+    with np.errstate(divide="ignore"):
+        a, b = (0 - o) / direction, (grid - o) / direction
+    t, end = np.minimum(a, b).max() + 0.5, np.maximum(a, b).min()
+    total, light = np.zeros(8), 1.0
+    while t < end:
+        place = o + t * direction
+        own = np.floor(place / block).astype(int)
+        at = index[own[2], own[1], own[0]].astype(int)
+        if at[0] != 255:
+            corner = place - own * block + at * (block + 2) + 1 - 0.5  # texels' centres lie at halves
+            first = np.floor(corner).astype(int)
+            seen = np.zeros(8)
+            for i in np.ndindex(2, 2, 2):
+                x, y, z = first + i
+                weight = np.prod(np.where(np.array(i) == 1, corner - first, 1 - (corner - first)))
+                seen += weight * np.concatenate([planes["rgba"][z, y, x], planes["feature"][z, y, x]])
+            total += light * seen
+            light *= 1 - seen[3]
+        t += 1
+    return total
+
+
+def test_the_published_viewer_finds_the_same_along_rays(ball, folder):
+    generator = torch.Generator().manual_seed(0)
+    out = torch.nn.functional.normalize(torch.randn(6, 3, generator=generator), dim=-1)
+    rays = Rays(2.5 * out + 0.2, -out, torch.full((6,), 0.01))
+    shown = open_any(folder).method()
+    with torch.no_grad():
+        seen = shown._marched(rays)
+    turn = np.array(json.loads((folder / "scene_params.json").read_text())["worldspace_T_opengl"])[:3, :3]
+    for i in range(6):
+        origin, direction = (x[i].double().numpy() @ turn for x in (rays.origins, rays.directions))
+        total = as_its_viewer(folder, origin, direction)
+        assert total[3] == pytest.approx(float(seen.opacity[i]), abs=0.01)
+        np.testing.assert_allclose(total[:3], seen.diffuse[i], atol=0.01)
+        np.testing.assert_allclose(total[4:], seen.features[i], atol=0.01)
+
+
+def test_a_folder_opens_like_a_run(ball, folder):
+    opened = open_any(folder)
+    camera = tiny.scene().cameras[4]
+    seen, expected = opened.method().render(camera), ball.render(camera)
+    assert psnr(seen.rgb, expected.rgb) > 40
+    assert len(opened.cameras()["train"]) and not opened.photographed
+
+
+def test_a_scene_of_another_size_is_brought_within_reach(ball, tmp_path):
+    atlas = ball.atlas()
+    snerg.write(tmp_path / "large", replace(atlas, low=atlas.low * 30 + 5, voxel=atlas.voxel * 30, network=None))
+    assert not list((tmp_path / "large").glob("feature_*.png"))
+    opened = open_any(tmp_path / "large")
+    origin = opened.frame.to_source.matrix[:3, 3].float()
+    box = opened.method().voxels.box
+    assert box.abs().max() <= 1.001
+    torch.testing.assert_close(box[0] * opened.frame.to_source.scale + origin, atlas.low * 30 + 5, atol=1e-3, rtol=1e-4)
+    with torch.no_grad():
+        added = opened.method().view(torch.eye(3), torch.rand(3, 3), torch.rand(3, 4))
+    assert float(added.max()) < 1e-6
+
+
+def test_the_command_writes_the_folder(ball, tmp_path, capsys):
+    scene = tiny.scene()
+    run = Run.create(tmp_path / "run", ball, scene)
+    run.save(State(), ball, ball.optimizers(), torch.Generator())
+    output = tmp_path / "out"
+    assert main(["export", "snerg", str(run.folder), "--output", str(output)]) == 0
+    assert "MB" in capsys.readouterr().out
+    assert torch.equal(snerg.read(output).index >= 0, ball.atlas().index >= 0)
+    assert main(["export", "snerg", str(output), "--output", str(tmp_path / "again")]) == 0
+    assert (tmp_path / "again" / "rgba_000.png").is_file()
+
+
+def test_a_run_that_is_not_baked_is_refused(tmp_path, capsys):
+    scene = tiny.scene()
+    method = SNeRG(scene.frame, SNeRG.smallest())
+    run = Run.create(tmp_path / "run", method, scene)
+    run.save(State(), method, method.optimizers(), torch.Generator())
+    assert main(["export", "snerg", str(run.folder), "--output", str(tmp_path / "out")]) == 2
+    assert "not baked yet" in capsys.readouterr().err and not (tmp_path / "out").exists()
+
+
+def said(folder, **changes):
+    path = folder / "scene_params.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | changes))
+
+
+FAULTS = {
+    "a slice is missing": (lambda f: (f / "rgba_001.png").unlink(), "lacks the file 'rgba_001.png'"),
+    "a slice is cut": (lambda f: cut(f / "feature_000.png"), "feature_000.png is damaged"),
+    "a slice is no picture": (lambda f: (f / "rgba_000.png").write_bytes(b"no"), "rgba_000.png is damaged"),
+    "a slice is of another size": (lambda f: Image.new("RGBA", (4, 4)).save(f / "rgba_000.png"), "should be"),
+    "no indices": (lambda f: (f / "atlas_indices.png").unlink(), "atlas_indices.png"),
+    "no parameters": (lambda f: (f / "scene_params.json").unlink(), "scene_params.json"),
+    "absurd counts": (
+        lambda f: said(f, atlas_blocks_x=250, atlas_width=2000, atlas_blocks_y=250, atlas_height=2000),
+        "to read|should be",
+    ),
+    "counts that disagree": (lambda f: said(f, num_slices=3), "does not hold"),
+    "normalised coordinates": (lambda f: said(f, ndc=True), "normalised device"),
+    "another format": (lambda f: said(f, format="webp"), "only png"),
+    "a layer too narrow": (lambda f: said(f, **{"1_bias": [0.0]}), "Layer 1|layer 1"),
+}
+
+
+def cut(path):
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+
+
+@pytest.mark.parametrize("name", FAULTS)
+def test_bad_input_is_told_in_a_sentence(name, folder, tmp_path, capsys):
+    spoil, sentence = FAULTS[name]
+    spoil(folder)
+    if name == "no parameters":
+        assert snerg.recognises(folder)
+    with pytest.raises(LumigraphError, match=sentence):
+        snerg.read(folder)
+    assert main(["export", "snerg", str(folder), "--output", str(tmp_path / "copy")]) == 2
+    assert capsys.readouterr().err.count("\n") == 1 and not (tmp_path / "copy").exists()
