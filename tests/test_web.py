@@ -209,7 +209,23 @@ def run(tmp_path):
 
 
 def test_the_command(run, tmp_path, capsys):
-    assert main(["export", "web", str(run.folder), str(tmp_path / "a.html"), "--as", "views", "--views", "3", "--size", "32"]) == 0
+    assert (
+        main(
+            [
+                "export",
+                "web",
+                str(run.folder),
+                str(tmp_path / "a.html"),
+                "--as",
+                "views",
+                "--views",
+                "3",
+                "--size",
+                "32",
+            ]
+        )
+        == 0
+    )
     assert "3 views" in capsys.readouterr().out
     page = (tmp_path / "a.html").read_text("utf-8")
     settings = json.loads(re.search(r'<script id="settings" type="application/json">(.*?)</script>', page)[1])

@@ -1,4 +1,4 @@
-"""Small baked volumes worked out from formulas, and what rays see of them, worked out without leaps and without levels."""
+"""Small baked volumes made by formulas, and what rays see of them, worked out without leaps and without levels."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Octrees and atlases as a browser's graphics take them: a few numbers and one row of bytes, read by web/src/volumes.js."""
+"""Octrees and atlases as a browser's graphics take them: a few numbers, and bytes that web/src/volumes.js reads."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Bool, UInt8
 from torch import Tensor
 from torch.nn.functional import max_pool3d
 
@@ -24,11 +24,16 @@ HALF = 65504.0  # the largest number that half precision has
 
 @dataclass(frozen=True)
 class Browsable:
-    """settings: what JSON can hold, by the names that web/src/volumes.js knows;  data: little-endian, not compressed."""
+    """What a page is given.
+
+    settings: what JSON can hold
+    data:     little-endian, not compressed
+    degree:   of harmonics, of which fewer would take less
+    """
 
     settings: dict[str, Any]
     data: bytes
-    degree: int = 0  # of harmonics, of which fewer would take less
+    degree: int = 0
 
 
 def octree_for_browser(octree: Octree, degree: int = 3) -> Browsable:
@@ -148,7 +153,7 @@ def plain(network: ViewNetwork) -> list[dict[str, Any]]:
     return [{"weights": rounded(weights), "biases": rounded(biases)} for weights, biases in layers]
 
 
-def rounded(values: Float[Tensor, "..."]) -> Any:
+def rounded(values: Tensor) -> Any:
     return np.round(values.detach().cpu().double().numpy(), 6).tolist()
 
 

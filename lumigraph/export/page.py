@@ -151,9 +151,12 @@ def volume_page(path: Path, volume: Browsable, opening: Opening) -> None:
     settings = asdict(opening) | {"webgl": True, "packed": True} | volume.settings
     with counting(f"Packing {path.name}"):
         packed = gzip.compress(volume.data, 9, mtime=0)
-    if len(packed) * 4 / 3 > LARGEST:
-        smaller = f"give --degree {volume.degree - 1}" if volume.degree else "bake it in larger voxels, or give --as views"
-        raise LumigraphError(f"The page would have {len(packed) * 4 / 3e6:.0f} MB, more than the {LARGEST / 1e6:.0f} that browsers open with ease; {smaller}")
+    if (size := len(packed) * 4 / 3) > LARGEST:
+        smaller = f"give --degree {volume.degree - 1}" if volume.degree else "bake larger voxels, or give --as views"
+        raise LumigraphError(
+            f"The page would have {size / 1e6:.0f} MB, more than the {LARGEST / 1e6:.0f} that browsers open with ease; "
+            f"{smaller}"
+        )
     write_page(path, "volumes", settings, packed)
 
 

@@ -1,4 +1,4 @@
-"""What a page of a volume holds: an octree or an atlas, or a field that `lumigraph convert` makes an octree of first."""
+"""What a page of a volume holds: an octree or an atlas, or a field that becomes an octree first."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def browsable(method: Any, degree: int) -> tuple[Any, str]:
 
 
 def can_be_baked(opened: Any, method: Any) -> bool:
-    """Whether a method's field can become an octree."""
+    """Whether a method's field can become an octree, which holds objects only."""
     from ...conversion.ways import check, way
     from ...methods import find
 
@@ -39,7 +39,7 @@ def can_be_baked(opened: Any, method: Any) -> bool:
         check(opened, find(INTO))
     except LumigraphError:
         return False
-    return way(type(method), find(INTO)) == "field"
+    return opened.frame.reach == 1 and way(type(method), find(INTO)) == "field"
 
 
 def converted(opened: Any, seconds: float, device: Any) -> tuple[Any, str]:

@@ -15,7 +15,7 @@ from ...ranges import Seconds, between
 from ..common import Overwrite, choose_device, needed, option, show
 from ..controls import Set, open_method
 from ..keeping import Keeping
-from .volumes import can_be_baked, converted, is_baked, browsable
+from .volumes import browsable, can_be_baked, converted, is_baked
 
 FACES = 300_000  # of a mesh in a page, at most: about 4 MB
 Kind = Literal["auto", "splats", "volume", "mesh", "views"]
@@ -25,9 +25,9 @@ Kind = Literal["auto", "splats", "volume", "mesh", "views"]
 class ExportWeb:
     """One HTML file that opens from disk, in any browser, without a server or a network.
 
-    Gaussians are drawn as splats, octrees and atlases ray by ray. What knows density and colour at points is converted
-    to an octree first; `lumigraph convert` keeps one. --as views and --as mesh need no conversion: pictures rendered
-    here from all around, which dragging turns over, or a coloured mesh.
+    Gaussians are drawn as splats, octrees and atlases ray by ray. Other fields of objects are converted to an octree
+    first; `lumigraph convert` keeps one. --as views and --as mesh need no conversion: pictures rendered here from all
+    around, which dragging turns over, or a coloured mesh.
     """
 
     source: Annotated[Positional[Path], needed("RUN_OR_FILE")]
@@ -36,7 +36,10 @@ class ExportWeb:
     """The page."""
     kind: Annotated[
         Kind,
-        arg(name="as", help_behavior_hint="(default: splats for Gaussians, volume for fields and what is baked, views for the rest)"),
+        arg(
+            name="as",
+            help_behavior_hint="(default: splats for Gaussians, volume for fields of objects, views for the rest)",
+        ),
     ] = "auto"
     """What the page holds."""
     title: Annotated[str | None, option("TEXT", "the scene's name")] = None
@@ -67,7 +70,8 @@ class ExportWeb:
             raise LumigraphError(f"{self.output} should end in .html, as pages do; rename it")
         claim(self.output, "page", self.overwrite, [self.source])
         opened, method, cameras = open_method(self.source, self.device, self.told)
-        kind, told = self._kind(opened, method), {}
+        kind = self._kind(opened, method)
+        told: dict[str, str] = {}
         if kind == "volume":
             method, told = self._baked(opened, method)
         behind = backdrop(method, cameras["train"]) if kind != "views" and not self.part.crops else None
