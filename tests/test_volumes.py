@@ -7,18 +7,26 @@ import re
 
 import numpy as np
 import pytest
+import tiny
 import torch
 import volumes
+from test_viewer import subject
 from test_web import OPENING
 from windows import SIZE, psnr, some_camera
 
+import lumigraph.conversion
+import lumigraph.methods
 from lumigraph.baked import Octree
 from lumigraph.baked.browser import atlas_for_browser, breadth_first, clearance, octree_for_browser
 from lumigraph.camera import Camera
+from lumigraph.cli import main
+from lumigraph.conversion import Aim, convert
 from lumigraph.errors import LumigraphError
 from lumigraph.export import page as pages
-from lumigraph.export.page import volume_page
+from lumigraph.export.page import volume_bytes, volume_page
 from lumigraph.rays import Rays
+from lumigraph.run import open_any
+from lumigraph.viewer import Viewer, choose_address
 
 GROUND = torch.tensor(OPENING.background)
 LEVELS = 5
@@ -83,6 +91,52 @@ def test_an_atlas_is_seen_as_its_rays_say(tmp_path, window, network):
         assert agreement(shown, volumes.atlas_seen(made, rays, OPENING.near, GROUND)) > 50
     other = dataclasses.replace(made, network=None if network else volumes.shades())
     assert agreement(shown, volumes.atlas_seen(other, rays, OPENING.near, GROUND)) < 30  # the network is seen
+
+
+@pytest.mark.parametrize(("name", "holds"), [("plenoctrees", "leaves of an octree"), ("snerg", "blocks of")])
+def test_a_baked_run_is_seen_as_it_renders(ball_run, tmp_path, window, capsys, name, holds):
+    aim = Aim(config=lumigraph.methods.find(name).smallest(), steps=24, views=1)
+    convert(open_any(ball_run.folder), name, tmp_path / "run", aim)
+    assert main(["export", "web", str(tmp_path / "run"), str(tmp_path / "page.html")]) == 0
+    assert holds in capsys.readouterr().out
+    opened, method = window(tmp_path / "page.html"), open_any(tmp_path / "run").method()
+    for index in (1, 4):
+        camera = some_camera(index)
+        ours = method.render(camera).rgb.clamp(0, 1).numpy()
+        assert psnr(ours, np.broadcast_to(method.frame.background, ours.shape)) < 30  # there is something
+        assert psnr(opened.look(camera), ours) > 40
+
+
+def test_a_field_becomes_an_octree_on_the_way(ball_run, tmp_path, capsys, monkeypatch):
+    small = Aim(config=lumigraph.methods.find("plenoctrees").smallest(), steps=4, views=1)
+    monkeypatch.setattr(lumigraph.conversion, "Aim", lambda seconds: small)
+    assert main(["export", "web", str(ball_run.folder), str(tmp_path / "page.html")]) == 0
+    told = capsys.readouterr().out
+    assert "leaves of an octree" in told and "--as views is quicker" in told and "dB to voxel-grid" in told
+    assert (tmp_path / "page.html").is_file()
+
+
+def test_a_volume_is_shown_whole(ball_run, tmp_path, capsys):
+    told = ["--as", "volume", "--box", "0", "0", "0", "1", "1", "1"]
+    assert main(["export", "web", str(ball_run.folder), str(tmp_path / "page.html"), *told]) == 2
+    assert "--as views" in capsys.readouterr().err
+    assert not (tmp_path / "page.html").exists()
+
+
+# A client may leave at any moment; viser warns of what was still on its way.
+@pytest.mark.filterwarnings("ignore:Queued a .* on a closed connection")
+def test_the_viewer_leads_to_a_page(tmp_path, page, faults):
+    made = octree_for_browser(volumes.octree(LEVELS))
+    about = dataclasses.replace(subject(tiny.scene(), tmp_path), page=lambda: volume_bytes(made, OPENING))
+    with Viewer(tiny.method(), about, choose_address(port=0)) as viewer:
+        page.goto(viewer.address.url)
+        link = page.get_by_role("link", name="Drawn by this browser")
+        with page.context.expect_page() as opened:
+            link.click()
+        opened.value.evaluate("lumigraph.ready")
+        opened.value.wait_for_selector("body.open canvas")
+        assert opened.value.url.startswith(viewer.address.url.partition("?")[0])
+    assert faults == []
 
 
 def test_coarse_while_moving_and_sharp_at_rest(tmp_path, window):

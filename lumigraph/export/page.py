@@ -148,16 +148,21 @@ def volume_page(path: Path, volume: Browsable, opening: Opening) -> None:
 
     Raises LumigraphError if the page would have LARGEST bytes or more.
     """
-    settings = asdict(opening) | {"webgl": True, "packed": True} | volume.settings
     with counting(f"Packing {path.name}"):
-        packed = gzip.compress(volume.data, 9, mtime=0)
+        page = volume_bytes(volume, opening)
+    write_bytes(path, page, "page")
+
+
+def volume_bytes(volume: Browsable, opening: Opening) -> bytes:
+    """What `volume_page` writes."""
+    packed = gzip.compress(volume.data, 6, mtime=0)
     if (size := len(packed) * 4 / 3) > LARGEST:
         smaller = f"give --degree {volume.degree - 1}" if volume.degree else "bake larger voxels, or give --as views"
         raise LumigraphError(
             f"The page would have {size / 1e6:.0f} MB, more than the {LARGEST / 1e6:.0f} that browsers open with ease; "
             f"{smaller}"
         )
-    write_page(path, "volumes", settings, packed)
+    return page_bytes("volumes", asdict(opening) | {"webgl": True, "packed": True} | volume.settings, packed)
 
 
 def views_page(path: Path, method: Method, cameras: Camera, opening: Opening, count: int, longest: int) -> None:
@@ -205,6 +210,11 @@ def webp(rgb: Float[Tensor, "height width 3"]) -> bytes:
 
 def write_page(path: Path, program: str, settings: dict[str, Any], data: bytes) -> None:
     """Put a program of web/, its settings and its data into the page."""
+    write_bytes(path, page_bytes(program, settings, data), "page")
+
+
+def page_bytes(program: str, settings: dict[str, Any], data: bytes) -> bytes:
+    """What `write_page` writes."""
     mouse, touch = AROUND if settings["inward"] else ON_THE_SPOT
     bright = float(np.dot(settings["background"], (0.299, 0.587, 0.114))) > 0.5
     ink, edge = ("#16181c", "#ffffff") if bright else ("#ffffff", "#000000")
@@ -226,4 +236,4 @@ def write_page(path: Path, program: str, settings: dict[str, Any], data: bytes) 
     page = (WEB / "page.html").read_text("utf-8")
     pieces = page.split("@@")  # text, name, text, name, ..., text
     pieces[1::2] = [parts[name] for name in pieces[1::2]]
-    write_bytes(path, "".join(pieces).encode(), "page")
+    return "".join(pieces).encode()

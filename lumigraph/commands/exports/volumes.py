@@ -18,7 +18,7 @@ def is_baked(method: Any) -> bool:
     return can(method, HasOctree) or can(method, HasAtlas)
 
 
-def browsable(method: Any, degree: int) -> tuple[Any, str]:
+def browsable(method: Any, degree: int = 3) -> tuple[Any, str]:
     """A baked method's volume for browsers, and in words what it holds. degree: of an octree's harmonics, at most"""
     from ...baked.browser import atlas_for_browser, octree_for_browser
     from ...capabilities import HasAtlas, HasOctree, can, needs
