@@ -156,5 +156,21 @@ def ball_run(tmp_path_factory: pytest.TempPathFactory) -> Any:
 
 
 @pytest.fixture
+def window(chromium: Any) -> Iterator[Any]:  # noqa: F811
+    """What opens a Window on a page from disk; at the end nothing was complained of."""
+    from windows import Window
+
+    opened: list[Window] = []
+
+    def open_(path: Path, **context: Any) -> Window:
+        opened.append(Window(chromium, path, **context))
+        return opened[-1]
+
+    yield open_
+    for each in opened:
+        each.close()
+
+
+@pytest.fixture
 def generator() -> torch.Generator:
     return torch.Generator().manual_seed(0)

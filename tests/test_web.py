@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import io
 import json
 import math
 import re
@@ -12,22 +11,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from browser import listen
-from PIL import Image
 from tiny import method as tiny_method
-from tiny import new_run, poses, scene
+from tiny import new_run, scene
+from windows import SIZE, psnr, some_camera
 
 from lumigraph.camera import Camera
 from lumigraph.cli import main
 from lumigraph.export.page import WEB, Opening, mesh_page, opening_of_scene, splats_page, views, views_page
 from lumigraph.gaussians import Gaussians
 from lumigraph.gaussians.splatting import render
-from lumigraph.lens import Pinhole
 from lumigraph.mesh import Mesh
 from lumigraph.paths import Surroundings
 from lumigraph.run import State
 
-SIZE = 256
 PACKAGES = Path(__file__).parent.parent / "web" / "package.json"
 OPENING = Opening(
     "A <test> & more", (0.9, 0.8, 0.6), (0.0, -3.0, 1.0), (0.0, 0.0, 0.0), 50.0, 0.05, 100, 0.3, 9, 110, True
@@ -47,73 +43,6 @@ def cloud(count: int = 400, antialiased: bool = False) -> Gaussians:
         harmonics,
         antialiased,
     )
-
-
-def some_camera(index: int = 1, angle: float = 45.0) -> Camera:
-    focal = SIZE / 2 / math.tan(math.radians(angle) / 2)
-    lens = Pinhole(torch.tensor([[focal, focal]]), torch.tensor([[SIZE / 2, SIZE / 2]]))
-    return Camera(poses()[index : index + 1], lens, torch.tensor([[SIZE, SIZE]]))
-
-
-def psnr(a: np.ndarray, b: np.ndarray) -> float:
-    return -10 * math.log10(max(float(np.square(a - b).mean()), 1e-10))
-
-
-class Window:
-    """A browser's window on a page from disk, with the network cut and everything it asks for written down."""
-
-    def __init__(self, chromium, path: Path, **context):
-        context = {"viewport": {"width": SIZE, "height": SIZE}} | context
-        self.context = chromium.new_context(offline=True, reduced_motion="reduce", **context)  # no swinging out
-        self.page = self.context.new_page()
-        self.faults = listen(self.page)
-        self.requests: list[str] = []
-        self.page.on("request", lambda request: self.requests.append(request.url))
-        self.page.goto(path.as_uri())
-        self.page.evaluate("lumigraph.ready")
-        self.page.wait_for_function("document.body.classList.contains('open')")
-        self.page.add_style_tag(
-            content="#caption, #buttons, #wait { display: none !important } * { transition: none !important }"
-        )
-
-    def look(self, camera: Camera, angle: float = 45.0) -> np.ndarray:
-        self.page.evaluate("([pose, angle]) => lumigraph.setCamera(pose, angle)", [camera.pose[0].tolist(), angle])
-        return self.picture()
-
-    def picture(self) -> np.ndarray:
-        return np.asarray(Image.open(io.BytesIO(self.page.screenshot())).convert("RGB")) / 255
-
-    def settled(self) -> np.ndarray:
-        """The picture once it has stopped moving."""
-        self.page.evaluate("lumigraph.rest()")
-        return self.picture()
-
-    def drag(self, by: float) -> None:
-        """From the middle to the right, by a share of the window's width."""
-        width, height = (self.page.viewport_size[side] for side in ("width", "height"))
-        self.page.mouse.move(width / 2, height / 2)
-        self.page.mouse.down()
-        self.page.mouse.move((0.5 + by) * width, height / 2, steps=3)
-        self.page.mouse.up()
-
-    def close(self) -> None:
-        """At the end nothing was complained of, and nothing asked of a network."""
-        self.context.close()
-        assert self.faults == []
-        assert {url.partition(":")[0] for url in self.requests} <= {"file", "blob", "data"}
-
-
-@pytest.fixture
-def window(chromium):
-    opened: list[Window] = []
-
-    def open_(path: Path, **context) -> Window:
-        opened.append(Window(chromium, path, **context))
-        return opened[-1]
-
-    yield open_
-    for each in opened:
-        each.close()
 
 
 @pytest.mark.parametrize("antialiased", [False, True])
@@ -280,7 +209,23 @@ def run(tmp_path):
 
 
 def test_the_command(run, tmp_path, capsys):
-    assert main(["export", "web", str(run.folder), str(tmp_path / "a.html"), "--views", "3", "--size", "32"]) == 0
+    assert (
+        main(
+            [
+                "export",
+                "web",
+                str(run.folder),
+                str(tmp_path / "a.html"),
+                "--as",
+                "views",
+                "--views",
+                "3",
+                "--size",
+                "32",
+            ]
+        )
+        == 0
+    )
     assert "3 views" in capsys.readouterr().out
     page = (tmp_path / "a.html").read_text("utf-8")
     settings = json.loads(re.search(r'<script id="settings" type="application/json">(.*?)</script>', page)[1])
@@ -314,7 +259,12 @@ def test_titles_cannot_break_a_page(tmp_path):
 def test_programs_name_the_versions_that_are_pinned():
     pinned = json.loads(PACKAGES.read_text("utf-8"))["dependencies"]
     assert all(re.fullmatch(r"\d+\.\d+\.\d+", version) for version in pinned.values())
-    for program, names in {"splats": ["three", "@sparkjsdev/spark"], "mesh": ["three"], "views": []}.items():
+    for program, names in {
+        "splats": ["three", "@sparkjsdev/spark"],
+        "mesh": ["three"],
+        "volumes": ["three"],
+        "views": [],
+    }.items():
         heading = (WEB / f"{program}.js").read_text("utf-8")[:20_000]
         for name in names:
             assert f"{name} {pinned[name]}" in heading

@@ -1,4 +1,4 @@
-// Bundles src/{splats,mesh,views}.js into lumigraph/export/web/, each with its parts' versions and licences on top.
+// Bundles src/{splats,mesh,volumes,views}.js into lumigraph/export/web/, each with its parts' versions and licences on top.
 
 import { build } from "esbuild";
 import { readFile } from "node:fs/promises";
@@ -23,6 +23,7 @@ async function notice(name) {
 for (const [page, parts] of [
   ["splats", ["three", "@sparkjsdev/spark", "fflate"]],
   ["mesh", ["three"]],
+  ["volumes", ["three"]],
   ["views", []],
 ]) {
   const pinned = parts.filter((name) => own.dependencies[name]).map((name) => `${name} ${own.dependencies[name]}`);
@@ -38,6 +39,7 @@ for (const [page, parts] of [
     globalName: "lumigraphProgram",
     target: "es2022",
     charset: "utf8",
+    loader: { ".glsl": "text" },
     legalComments: "none",
     banner: { js: `/*\n${[heading, shown, ...notices].join("\n\n")}\n*/` },
   });

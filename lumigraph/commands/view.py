@@ -40,7 +40,7 @@ class ViewCommand:
         from ..viewer import Viewer, choose_address
 
         opened, method, cameras = open_method(self.source, self.device, self.told)
-        subject = subject_of(opened, cameras)
+        subject = subject_of(opened, cameras, page=page_of(opened, method, cameras))
         address = choose_address(self.host, self.port)
         with until_interrupted(), Viewer(method, subject, address) as viewer:
             tell(viewer)
@@ -48,11 +48,28 @@ class ViewCommand:
         return 0
 
 
-def subject_of(opened: Any, cameras: Any = None, finished: bool = True) -> Any:
+def page_of(opened: Any, method: Any, cameras: Any) -> Any:
+    """What makes a page that draws a baked method in the browser; None for any other, and while it is not baked yet."""
+    from .exports.volumes import browsable, is_baked
+
+    def page() -> bytes:
+        from ..export.page import opening_of_scene, volume_bytes
+
+        return volume_bytes(volume, opening_of_scene(opened.title, cameras["train"], opened.frame))
+
+    try:
+        volume = browsable(method)[0] if is_baked(method) else None
+    except LumigraphError:
+        return None
+    return page if volume else None
+
+
+def subject_of(opened: Any, cameras: Any = None, finished: bool = True, page: Any = None) -> Any:
     """Something Opened, as the viewer wants it.
 
     cameras:  by split, where the method sees them otherwise
     finished: whether what is opened is what is shown, so that part of it can be saved
+    page:     makes a page on which the browser draws it, where it can
     """
     from ..viewer import Subject
 
@@ -65,6 +82,7 @@ def subject_of(opened: Any, cameras: Any = None, finished: bool = True) -> Any:
         opened.open_scene,
         opened.metrics(),
         saver(opened) if finished else None,
+        page,
     )
 
 

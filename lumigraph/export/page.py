@@ -24,7 +24,9 @@ from PIL import Image
 from torch import Tensor
 
 from .. import __version__
+from ..baked.browser import Browsable
 from ..camera import Camera
+from ..errors import LumigraphError
 from ..exchange import spz
 from ..figures import to_bytes
 from ..files import write_bytes
@@ -44,6 +46,7 @@ ARC = 0.8  # of the arc that photographs cover is shown
 FINE = 2, 4  # of 1/128: steps of the harmonics, a quarter of those that .spz files have by custom
 CROP = 1.45  # times larger than fits, at most, is a picture without a plain background, to fill the window
 QUALITY = 90  # of the pictures, as WebP
+LARGEST = 100e6  # bytes of a page with a volume
 # How to move, with a mouse and with fingers.
 AROUND = "Drag to turn · scroll to zoom · right-drag to move", "Drag to turn · pinch to zoom"
 ON_THE_SPOT = "Drag to look around", "Drag to look around"
@@ -140,6 +143,28 @@ def mesh_page(path: Path, mesh: Mesh, opening: Opening) -> None:
     write_page(path, "mesh", settings, gzip.compress(data, 9, mtime=0))
 
 
+def volume_page(path: Path, volume: Browsable, opening: Opening) -> None:
+    """A baked volume in the scene's frame, which a browser's graphics look at along the ray of each pixel.
+
+    Raises LumigraphError if the page would have LARGEST bytes or more.
+    """
+    with counting(f"Packing {path.name}"):
+        page = volume_bytes(volume, opening)
+    write_bytes(path, page, "page")
+
+
+def volume_bytes(volume: Browsable, opening: Opening) -> bytes:
+    """What `volume_page` writes."""
+    packed = gzip.compress(volume.data, 6, mtime=0)
+    if (size := len(packed) * 4 / 3) > LARGEST:
+        smaller = f"give --degree {volume.degree - 1}" if volume.degree else "bake larger voxels, or give --as views"
+        raise LumigraphError(
+            f"The page would have {size / 1e6:.0f} MB, more than the {LARGEST / 1e6:.0f} that browsers open with ease; "
+            f"{smaller}"
+        )
+    return page_bytes("volumes", asdict(opening) | {"webgl": True, "packed": True} | volume.settings, packed)
+
+
 def views_page(path: Path, method: Method, cameras: Camera, opening: Opening, count: int, longest: int) -> None:
     """Pictures rendered here, from all around or along the arc that photographs cover; dragging turns them over.
 
@@ -185,6 +210,11 @@ def webp(rgb: Float[Tensor, "height width 3"]) -> bytes:
 
 def write_page(path: Path, program: str, settings: dict[str, Any], data: bytes) -> None:
     """Put a program of web/, its settings and its data into the page."""
+    write_bytes(path, page_bytes(program, settings, data), "page")
+
+
+def page_bytes(program: str, settings: dict[str, Any], data: bytes) -> bytes:
+    """What `write_page` writes."""
     mouse, touch = AROUND if settings["inward"] else ON_THE_SPOT
     bright = float(np.dot(settings["background"], (0.299, 0.587, 0.114))) > 0.5
     ink, edge = ("#16181c", "#ffffff") if bright else ("#ffffff", "#000000")
@@ -202,7 +232,8 @@ def write_page(path: Path, program: str, settings: dict[str, Any], data: bytes) 
         "data": base64.b64encode(data).decode(),
         "program": base64.b64encode(gzip.compress(source, 9, mtime=0)).decode(),
     }
+    parts["size"] = f"{sum(map(len, parts.values())) / 1e6:.1f} MB"
     page = (WEB / "page.html").read_text("utf-8")
     pieces = page.split("@@")  # text, name, text, name, ..., text
     pieces[1::2] = [parts[name] for name in pieces[1::2]]
-    write_bytes(path, "".join(pieces).encode(), "page")
+    return "".join(pieces).encode()

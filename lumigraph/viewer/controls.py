@@ -9,8 +9,10 @@ from typing import Any
 from ..scene import Frame, Vector
 from .modes import MODES
 from .scenery import CAMERAS, POINTS
+from .serving import PAGE
 
 SHARPEST = 1024  # pixels along the longer side, unless the client wants another
+DRAWN_THERE = f'<a href="{PAGE}" target="_blank">Drawn by this browser, in a tab of its own</a>'
 NARROWEST, WIDEST = 10.0, 120.0  # degrees
 
 
@@ -21,9 +23,12 @@ class Controls:
     tab:     viser's, which holds them
     changed: called when anything that is drawn changes
     cloud:   whether the method is a cloud of Gaussians, which the browser can draw
+    page:    whether there is a page on which the browser draws the scene itself
     """
 
-    def __init__(self, client: Any, tab: Any, frame: Frame, cloud: bool, changed: Callable[[], None]):
+    def __init__(
+        self, client: Any, tab: Any, frame: Frame, cloud: bool, changed: Callable[[], None], page: bool = False
+    ):
         self._client, self._frame, self._changed = client, frame, changed
         self._modes = {mode.capitalize(): mode for mode in MODES}  # by how the dropdown names them
         gui = client.gui
@@ -41,6 +46,8 @@ class Controls:
             self._background = gui.add_rgb("Background", to_bytes(frame.background))
             self._cameras = gui.add_checkbox("Cameras", True, hint="Click on one to fly there")
             self._points = gui.add_checkbox("Sparse points", False, visible=False)
+            if page:
+                gui.add_html(DRAWN_THERE)
             self.status = gui.add_markdown("")
         for drawn in (self._mode, self._exact, self._sharpest, self._background):
             drawn.on_update(lambda _: self._update())

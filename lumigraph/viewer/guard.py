@@ -12,7 +12,7 @@ from __future__ import annotations
 import hmac
 import ipaddress
 import socket
-from collections.abc import Callable, Iterable
+from collections.abc import Awaitable, Callable, Iterable
 from http import HTTPStatus
 from http.cookies import CookieError, SimpleCookie
 from typing import Any
@@ -34,7 +34,8 @@ ALOOF = {
 }
 
 
-Answers = Callable[[Any, Request], Response | None]  # of a server: to a connection and its request
+# Of a server: to a connection and its request.
+Answers = Callable[[Any, Request], Response | None | Awaitable[Response | None]]
 
 
 class Guard:
@@ -77,10 +78,11 @@ class Guard:
     def answering(self, answer: Answers) -> Answers:
         """Another server's answers, for those who may have them; 403 for the rest."""
 
-        def guarded(connection: Any, request: Request) -> Response | None:
+        async def guarded(connection: Any, request: Request) -> Response | None:
             if why := self.refusal(request):
                 return refused(why)
-            response = answer(connection, request)
+            given = answer(connection, request)
+            response = await given if isinstance(given, Awaitable) else given
             if response is not None:
                 response.headers.update(ALOOF)
                 if self.token:

@@ -4,27 +4,36 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import functools
 import logging
 import os
 import threading
-from collections.abc import Iterator
+from collections.abc import Awaitable, Callable, Iterator
+from http import HTTPStatus
 from typing import Any
+from urllib.parse import urlsplit
 
 import rich
 import viser
 import websockets.asyncio.server
+from websockets.datastructures import Headers
+from websockets.http11 import Request, Response
 
 from ..errors import LumigraphError
 from .address import Address
 from .frames import LARGEST, understood
-from .guard import Guard
+from .guard import Answers, Guard
 
+PAGE = "scene.html"  # where a scene that browsers draw by themselves is
 _patching = threading.Lock()
 
 
-def start_server(address: Address, title: str) -> Any:
-    """viser's server, at this address and nowhere else. Raises LumigraphError if the port has just been taken."""
-    door = Door(address)
+def start_server(address: Address, title: str, page: Callable[[], bytes] | None = None) -> Any:
+    """viser's server, at this address and nowhere else. Raises LumigraphError if the port has just been taken.
+
+    page: makes what is answered at PAGE
+    """
+    door = Door(address, page)
     with quiet(), door.built_in():
         server = viser.ViserServer(address.host, address.port, label=title, verbose=False)
     door.server = server
@@ -39,8 +48,8 @@ def start_server(address: Address, title: str) -> Any:
 class Door:
     """What stands between the network and viser, which has no place of its own for it."""
 
-    def __init__(self, address: Address):
-        self._guard = Guard(address)
+    def __init__(self, address: Address, page: Callable[[], bytes] | None = None):
+        self._guard, self._page = Guard(address), page
         self.server: Any = None
 
     @contextlib.contextmanager
@@ -53,7 +62,7 @@ class Door:
             built.append(True)
             asyncio.get_running_loop().set_exception_handler(self._swallow)
             options |= {"max_size": LARGEST, "logger": silent_logger()}
-            answer = self._guard.answering(process_request)
+            answer = self._guard.answering(beside(process_request, self._page))
             return begin(self._hearing(handler), host, port, process_request=answer, **options)
 
         with _patching:
@@ -96,6 +105,23 @@ class Door:
         """What goes wrong with one client is not printed, unless somebody looks for it."""
         if os.environ.get("LUMIGRAPH_DEBUG"):
             loop.default_exception_handler(fault)
+
+
+def beside(answer: Answers, page: Callable[[], bytes] | None) -> Answers:
+    """viser's answers, and at PAGE a page that is made when it is first asked for."""
+    if page is None:
+        return answer
+    once = functools.cache(page)
+
+    async def shown() -> Response:
+        body = await asyncio.to_thread(once)
+        about = {"Content-Type": "text/html; charset=utf-8", "Content-Length": str(len(body)), "Connection": "close"}
+        return Response(HTTPStatus.OK, "OK", Headers(about), body)
+
+    def answered(connection: Any, request: Request) -> Response | None | Awaitable[Response | None]:
+        return shown() if urlsplit(request.path).path == f"/{PAGE}" else answer(connection, request)
+
+    return answered
 
 
 def silent_logger() -> logging.Logger:

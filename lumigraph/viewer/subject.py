@@ -31,6 +31,7 @@ class Subject:
     rows:           of metrics.jsonl, as far as the method has been trained
     keep:           saves what a crop and cleaning leave of the cloud under a name, and says where; None where nothing
                     can be saved
+    page:           makes a page (HTML) that draws the scene in the browser; None where only we can render it
     """
 
     title: str
@@ -41,6 +42,7 @@ class Subject:
     open_scene: Callable[[], Scene] | None = None
     rows: list[dict[str, Any]] = field(default_factory=list)
     keep: Keep | None = None
+    page: Callable[[], bytes] | None = None
 
     @cached_property
     def around(self) -> Surroundings:

@@ -37,7 +37,7 @@ class Viewer:
         self._lock = threading.Lock()  # around the visitors
         self._welcoming = threading.Lock()  # one at a time fills the tabs
         is_cloud = can(method, HasGaussians)
-        self._server = start_server(address, subject.title)
+        self._server = start_server(address, subject.title, subject.page)
         self._aim()
         tabs = self._server.gui.add_tab_group()
         own_tabs = tabs.add_tab("View"), tabs.add_tab("Crop"), tabs.add_tab("Path")

@@ -57,7 +57,14 @@ class Visitor:
         self.painter = Painter(self._draw, shared.turns, self._tell_fault, lambda: shared.step)
         self.flight = Flight(client)
         view_tab, crop_tab, path_tab = shared.tabs
-        self.controls = Controls(client, view_tab, shared.subject.frame, shared.is_cloud, self.painter.ask)
+        self.controls = Controls(
+            client,
+            view_tab,
+            shared.subject.frame,
+            shared.is_cloud,
+            self.painter.ask,
+            shared.subject.page is not None,
+        )
         self.method_controls = MethodControls(client, view_tab, shared.method, self.painter.ask)
         self.crop = CropPanel(
             client,

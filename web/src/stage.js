@@ -23,6 +23,7 @@ export class Stage {
     this.paint = () => this.renderer.render(this.scene, this.camera);
     this.arranged = async () => {}; // to await: what must be put in order before a camera's picture is right
     this.sorted = async () => {}; // and what of that is under way
+    this.sharpening = null; // while a coarse picture is shown, and a better one being drawn
 
     const canvas = this.renderer.domElement;
     canvas.tabIndex = 0;
@@ -137,7 +138,7 @@ export class Stage {
     this.lens();
     await this.arranged();
     this.paint();
-    await shown();
+    await this.rest();
   }
 
   // Until the picture no longer changes.
@@ -145,7 +146,7 @@ export class Stage {
     do {
       await this.sorted();
       await shown();
-    } while (this.asked);
+    } while (this.asked || this.sharpening);
   }
 }
 

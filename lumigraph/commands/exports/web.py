@@ -11,30 +11,36 @@ from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from ...errors import LumigraphError
 from ...files import claim
-from ...ranges import between
-from ..common import Overwrite, needed, option, show
+from ...ranges import Seconds, between
+from ..common import Overwrite, choose_device, needed, option, show
 from ..controls import Set, open_method
 from ..keeping import Keeping
+from .volumes import browsable, can_be_baked, converted, is_baked
 
 FACES = 300_000  # of a mesh in a page, at most: about 4 MB
-Kind = Literal["auto", "splats", "mesh", "views"]
+Kind = Literal["auto", "splats", "volume", "mesh", "views"]
 
 
 @dataclass(frozen=True)
 class ExportWeb:
     """One HTML file that opens from disk, in any browser, without a server or a network.
 
-    Gaussians are drawn as splats. Other methods become pictures rendered here from all around, which dragging turns
-    over, or a coloured mesh to move around freely: pictures look better, a mesh shows the scene from everywhere.
+    Gaussians are drawn as splats, octrees and atlases ray by ray. Other fields of objects are converted to an octree
+    first; `lumigraph convert` keeps one. --as views and --as mesh need no conversion: pictures rendered here from all
+    around, which dragging turns over, or a coloured mesh.
     """
 
     source: Annotated[Positional[Path], needed("RUN_OR_FILE")]
     """Folder of a run, a splat file, or a composition."""
     output: Annotated[Positional[Path], needed("FILE.html")]
     """The page."""
-    kind: Annotated[Kind, arg(name="as", help_behavior_hint="(default: splats for Gaussians, views for the rest)")] = (
-        "auto"
-    )
+    kind: Annotated[
+        Kind,
+        arg(
+            name="as",
+            help_behavior_hint="(default: splats for Gaussians, volume for fields of objects, views for the rest)",
+        ),
+    ] = "auto"
     """What the page holds."""
     title: Annotated[str | None, option("TEXT", "the scene's name")] = None
     """What the page is called."""
@@ -46,6 +52,10 @@ class ExportWeb:
     """Pictures in a page of views."""
     size: Annotated[int, between(16, 4096), option("PIXELS")] = 640
     """Longer side of these pictures."""
+    degree: Annotated[int, between(0, 3), option("N")] = 3
+    """Highest degree of an octree's harmonics; a lower one makes a smaller page, with weaker reflections."""
+    seconds: Annotated[Seconds, option("S")] = 30.0
+    """How long an octree learns on that a field is converted to first."""
     overwrite: Overwrite = False
     part: OmitArgPrefixes[Keeping] = Keeping()
     told: Set = ()
@@ -60,31 +70,32 @@ class ExportWeb:
             raise LumigraphError(f"{self.output} should end in .html, as pages do; rename it")
         claim(self.output, "page", self.overwrite, [self.source])
         opened, method, cameras = open_method(self.source, self.device, self.told)
-        whole = self._kind(method) != "views" and not self.part.crops
-        behind = backdrop(method, cameras["train"]) if whole else None
+        kind = self._kind(opened, method)
+        told: dict[str, str] = {}
+        if kind == "volume":
+            method, told = self._baked(opened, method)
+        behind = backdrop(method, cameras["train"]) if kind != "views" and not self.part.crops else None
         title = self.title or opened.title
         opening = opening_of_scene(title, cameras["train"], opened.frame, self._background(), behind)
-        held = self._write(method, cameras["train"], opening)
-        show(
-            {
-                "page": str(self.output),
-                "holds": held,
-                "size": f"{self.output.stat().st_size / 1e6:.1f} MB",
-            }
-        )
+        held = self._write(kind, method, cameras["train"], opening)
+        size = f"{self.output.stat().st_size / 1e6:.1f} MB"
+        show(told | {"page": str(self.output), "holds": held, "size": size})
         return 0
 
-    def _write(self, method: Any, cameras: Any, opening: Any) -> str:
+    def _write(self, kind: str, method: Any, cameras: Any, opening: Any) -> str:
         """Write the page, and say what it holds."""
         from ...capabilities import HasGaussians, needs
         from ...export.mesh import extract_mesh
-        from ...export.page import mesh_page, splats_page, views_page
+        from ...export.page import mesh_page, splats_page, views_page, volume_page
 
-        kind = self._kind(method)
         if kind == "splats":
             gaussians = self.part.of_gaussians(needs(method, HasGaussians).gaussians(), self.part.crop(method.frame))
             splats_page(self.output, gaussians, opening)
             return f"{len(gaussians):,} Gaussians, harmonics of degree {gaussians.degree}"
+        if kind == "volume":
+            volume, held = browsable(method, self.degree)
+            volume_page(self.output, volume, opening)
+            return held
         if kind == "views":
             views_page(self.output, self.part.of_method(method), cameras, opening, self.views, self.size)
             return f"{self.views} views"
@@ -92,12 +103,29 @@ class ExportWeb:
         mesh_page(self.output, mesh, opening)
         return f"{len(mesh.faces):,} triangles"
 
-    def _kind(self, method: Any) -> str:
+    def _kind(self, opened: Any, method: Any) -> str:
         from ...capabilities import HasGaussians, can
 
         if self.kind != "auto":
             return self.kind
-        return "splats" if can(method, HasGaussians) else "views"
+        if can(method, HasGaussians):
+            return "splats"
+        if self.part.crops:
+            return "views"
+        return "volume" if is_baked(method) or (not self.told and can_be_baked(opened, method)) else "views"
+
+    def _baked(self, opened: Any, method: Any) -> tuple[Any, dict[str, str]]:
+        """What can be shown as a volume, and what it took to make."""
+        if self.part.crops:
+            raise LumigraphError("A volume is shown as a whole; leave out --box and --sphere, or give --as views")
+        if is_baked(method):
+            return method, {}
+        if self.told:
+            raise LumigraphError("What is converted is told nothing; leave out --set, or give --as views")
+        about = f"to an octree, which then learns on for {self.seconds:.0f} s; --as views is quicker"
+        show({"converts": about})
+        made, took = converted(opened, self.seconds, choose_device(self.device))
+        return made, {"converted": took}
 
     def _background(self) -> tuple[float, float, float] | None:
         from ...figures import hex_colour

@@ -80,8 +80,9 @@ class BakedVoxels(nn.Module):
 
     @property
     def box(self) -> Float[Tensor, "2 3"]:
-        """The grid's corners, in the scene's frame."""
-        return torch.stack([self.low, self.low + self.edge * self.size])
+        """The grid's corners, in the scene's frame; it is made of whole blocks, as its atlas is."""
+        whole = (self.size + self.block - 1) // self.block * self.block
+        return torch.stack([self.low, self.low + self.edge * whole])
 
     def march(
         self, rays: Rays, values: Float[Tensor, "voxel 8"], near: float, stop: float

@@ -1,0 +1,54 @@
+"""What a page of a volume holds: an octree or an atlas, or a field that becomes an octree first."""
+
+from __future__ import annotations
+
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+from ...errors import LumigraphError
+
+INTO = "plenoctrees"
+
+
+def is_baked(method: Any) -> bool:
+    from ...capabilities import HasAtlas, HasOctree, can
+
+    return can(method, HasOctree) or can(method, HasAtlas)
+
+
+def browsable(method: Any, degree: int = 3) -> tuple[Any, str]:
+    """A baked method's volume for browsers, and in words what it holds. degree: of an octree's harmonics, at most"""
+    from ...baked.browser import atlas_for_browser, octree_for_browser
+    from ...capabilities import HasAtlas, HasOctree, can, needs
+
+    if can(method, HasOctree):
+        volume = octree_for_browser(method.octree(), degree)
+        return volume, f"{volume.settings['leaves']:,} leaves of an octree, harmonics of degree {volume.degree}"
+    volume = atlas_for_browser(needs(method, HasAtlas).atlas())
+    return volume, f"{volume.settings['blocks']:,} blocks of {volume.settings['block']}^3 voxels"
+
+
+def can_be_baked(opened: Any, method: Any) -> bool:
+    """Whether a method's field can become an octree, which holds objects only."""
+    from ...conversion.ways import check, way
+    from ...methods import find
+
+    try:
+        check(opened, find(INTO))
+    except LumigraphError:
+        return False
+    return opened.frame.reach == 1 and way(type(method), find(INTO)) == "field"
+
+
+def converted(opened: Any, seconds: float, device: Any) -> tuple[Any, str]:
+    """An octree's method made of what was opened, and in words what that took. seconds: of learning on"""
+    from ...conversion import Aim, convert
+    from ...run import open_any
+
+    begin = time.monotonic()
+    with tempfile.TemporaryDirectory(prefix="lumigraph-") as folder:
+        made = convert(opened, INTO, Path(folder) / INTO, Aim(seconds=seconds), device, show=True)
+        method = open_any(Path(folder) / INTO).method(device)
+    return method, f"{time.monotonic() - begin:.0f} s, {made.psnr:.1f} dB to {made.teacher.method}"
