@@ -80,7 +80,7 @@ def contract(points, coordinates, stretch):
 def shrunk(x, y, z):
     """1 / |x|, at most 1, and what a point is multiplied with to be in the contraction's ball."""
     one = np.float32(1)
-    inverse = one / max(math.sqrt(x * x + y * y + z * z), one)
+    inverse = one / np.float32(max(math.sqrt(x * x + y * y + z * z), one))
     return inverse, np.float32(0.5) * (one + one - inverse) * inverse
 
 

@@ -508,8 +508,9 @@ class GaussianSplatting(Method):
     def given(self, *evidence: Any, **controls: Value) -> Method:
         """The same cloud, told its controls, or in the light of a photograph, found from the pixels that are to be
         trusted."""
-        photographs = [piece for piece in evidence if isinstance(piece, self.accepts)]
-        told = super().given(*(piece for piece in evidence if not isinstance(piece, self.accepts)), **controls)
+        photographs = [piece for piece in evidence if self.appearance and isinstance(piece, Photograph)]
+        others = (piece for piece in evidence if not (self.appearance and isinstance(piece, Photograph)))
+        told = super().given(*others, **controls)
         assert isinstance(told, GaussianSplatting)
         for photograph in photographs:
             told.found = self._found(photograph)

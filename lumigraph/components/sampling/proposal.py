@@ -86,13 +86,14 @@ class Proposal(nn.Module):
         """The intervals of `sample` for a field, without jitter."""
         if not (isinstance(self.space, Contraction | NDC) and looped(rays.origins)):
             return self.sample(rays).samples
-        ends, lines, device = self.space.interval(rays), (rays.origins, rays.directions), []
+        ends, numbers = self.space.interval(rays), list[float]()
+        lines = rays.origins, rays.directions
         if isinstance(self.space, NDC):
-            lines, device = self.space.in_device(rays)
+            lines, numbers = self.space.in_device(rays)
         tensors = [x.detach().contiguous().numpy() for x in (*lines, *ends, self.grid.values[:, 0])]
-        numbers = (np.array(x, np.float32) for x in (device, (2 * LIMIT, self.sharpness, SPARE, FAINT)))
+        limits = 2 * LIMIT, self.sharpness, SPARE, FAINT
         t = rays.origins.new_empty(len(rays), self.count + 1)
-        loops.propose(BLOCK, self.bins, *tensors, self.grid.size.numpy(), *numbers, t.numpy())
+        loops.propose(BLOCK, self.bins, *tensors, self.grid.size.numpy(), *map(np.float32, (numbers, limits)), t.numpy())
         return Samples.rows(t[:, :-1], t[:, -1])
 
     @torch.no_grad()
