@@ -12,7 +12,7 @@ from torch import Tensor, nn
 
 from ..camera import Camera
 from ..components.clouds.dense_points import compile_sweep
-from ..components.fields.hash_field import HashField, bytes_kept, check_levels
+from ..components.fields.hash_field import CALM, HashField, bytes_kept, check_levels
 from ..components.fields.taken_over import taken_over
 from ..components.sampling.carving import visual_hull
 from ..components.sampling.coarse_to_fine import SAMPLES_OF_A_RAY, first_grid, keep_looking, lattice, stage
@@ -243,7 +243,7 @@ class InstantNGP(RayMethod):
 
     def optimizers(self) -> list[torch.optim.Optimizer]:
         networks = [*self.network.density_network.parameters(), *self.network.colour_network.parameters()]
-        groups: list[dict[str, Any]] = [{"params": networks, "scale": 1.0}]
+        groups: list[dict[str, Any]] = [{"params": networks, "scale": CALM if self.unbounded else 1.0}]
         older = self.poses if self.poses and not self.poses.whitened else None
         groups += [{"params": [*x.parameters()], "scale": 0.05} for x in (self.exposure, older) if x]
         common = {"lr": self.config.learning_rate, "betas": (0.9, 0.99), "eps": 1e-15}

@@ -14,6 +14,7 @@ from ..sampling.spaces import Box, Space
 from .activations import truncated_exp
 from .mlp import MLP
 
+CALM = 0.5  # of the table's rate, that of networks in the open: at all of it one seed in three never learns a hue
 WITHIN = 2  # times as fine as asked for, where coordinates are contracted: the box of interest is half as wide in them
 
 

@@ -19,7 +19,7 @@ from ..sampling.unbounded import RAYS, rays_of, unbounded
 from ..training.fog import scaled_by_distance
 from ..training.lazy_adam import LazyAdam
 from .activations import truncated_exp
-from .hash_field import HashField, side_by_side
+from .hash_field import CALM, HashField, side_by_side
 from .mlp import MLP
 from .wild_field import Passing, Places, WildField
 
@@ -117,6 +117,6 @@ class WildHash(WildField):
         common: dict[str, Any] = {"lr": self.config.learning_rate, "betas": (0.9, 0.99), "eps": 1e-15}
         own = "scene.table", "unbounded.proposal.grid.values"
         networks = [weight for name, weight in self.named_parameters() if name not in own]
-        groups = [{"params": networks, "scale": 1.0}, {"params": codes, "scale": CODES_RATE}]
+        groups = [{"params": networks, "scale": CALM}, {"params": codes, "scale": CODES_RATE}]
         optimizers = [LazyAdam([self.scene.table], **common), torch.optim.Adam(groups, foreach=True, **common)]
         return [*optimizers, self.unbounded.optimizer()] if self.unbounded else optimizers
