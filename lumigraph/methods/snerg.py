@@ -366,6 +366,7 @@ class SNeRG(RayMethod):
             seen, terms = self._learn(batch, generator)
         else:
             background, seen, terms = backdrop(batch, self.background, generator), self._marched(batch.rays), {}
+            self.figures = {"rays": len(batch)}
         rendering = self._pixel(seen, batch.rays.directions, background)
         residual, self.figures["mse"] = residuals(rendering, batch, background)
         if self.unbounded and self.stage > FIELD:  # what lies beyond the box is not there to be learnt
