@@ -307,10 +307,11 @@ class SNeRG(RayMethod):
         self, seen: Summed, directions: Float[Tensor, "ray 3"], background: Float[Tensor, "#ray 3"]
     ) -> Rendering:
         """Diffuse colour, and what the network adds for a direction (eq. 6); see `baked.ViewNetwork`."""
-        added = self.view(directions, seen.diffuse, seen.features)
+        hit = (seen.opacity > 0).nonzero()[:, 0]  # elsewhere the network need not be asked
+        said = self.view(directions[hit], seen.diffuse[hit], seen.features[hit])
+        added = torch.zeros_like(seen.diffuse).index_copy(0, hit, said)
         rgb = over(seen.diffuse + seen.opacity[:, None] * added, seen.opacity, background)
-        hit = seen.opacity > 1e-3
-        depth = torch.where(hit, seen.distance / seen.opacity.clamp_min(1e-3), torch.inf)
+        depth = torch.where(seen.opacity > 1e-3, seen.distance / seen.opacity.clamp_min(1e-3), torch.inf)
         return Rendering(rgb, depth, seen.opacity)
 
     def render_rays(self, rays: Rays, background: Float[Tensor, "#ray 3"]) -> Rendering:
@@ -366,6 +367,7 @@ class SNeRG(RayMethod):
             seen, terms = self._learn(batch, generator)
         else:
             background, seen, terms = backdrop(batch, self.background, generator), self._marched(batch.rays), {}
+            self.figures = {"rays": len(batch)}
         rendering = self._pixel(seen, batch.rays.directions, background)
         residual, self.figures["mse"] = residuals(rendering, batch, background)
         if self.unbounded and self.stage > FIELD:  # what lies beyond the box is not there to be learnt
