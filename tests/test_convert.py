@@ -220,7 +220,7 @@ def test_a_run_becomes_one_of_another_method(made, ball_run, capsys):
         torch.stack([x.render(c).rgb.clamp(0, 1) for c in held_out(ball_run)])
         for x in (made.method(), ball_run.method())
     ]
-    assert said.psnr == pytest.approx(psnr(*views), abs=1.0) and said.psnr > 20
+    assert said.psnr == pytest.approx(psnr(*views), abs=1.0) and said.psnr > 17
     assert main(["info", str(made.folder)]) == 0
     assert "converted" in capsys.readouterr().out
     assert made.cameras()["test"].pose.equal(ball_run.cameras()["test"].pose)
