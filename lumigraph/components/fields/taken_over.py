@@ -29,7 +29,7 @@ from ..sampling.surveyed import Sight, Surface, empty, surface, survey
 AT_ONCE = 1 << 17  # points
 ASKED = 12  # views whose directions tell how a colour depends on them
 UNSEEN = 0.02  # weight of a view that does not see a point, which then has some colour at least
-STIFFNESS = 0.3  # views that hold harmonics beyond the first at zero
+STIFFNESS = 0.1  # views that hold harmonics beyond the first at zero
 TRUNCATION = 0.015  # of the distance from a camera: half the thickness of a shell
 SPENT = 8.0  # optical thickness of half a shell, where it is solid
 COARSE, PROBES = 64, 8  # cells per axis that are looked at first, and places in each
