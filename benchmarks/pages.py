@@ -4,9 +4,9 @@
     python benchmarks/pages.py RUN scene.html --output pages
 
 Opens the page in a headless Chromium, which draws in software unless --webgl gives other switches. For some of the
-run's cameras, at 400x400 pixels: PSNR of a screenshot against `Method.render`, and the milliseconds that a picture takes to
-draw in full, all its bands together. Writes both pictures beside each other with four times their difference, and
-what the page shows at first at a desktop's and at a phone's size.
+run's cameras, at 400x400 pixels: PSNR of a screenshot against `Method.render`, and the milliseconds that a picture
+takes to draw in full, all its bands together. Writes both pictures beside each other with four times their
+difference, and what the page shows at first at a desktop's and at a phone's size.
 """
 
 from __future__ import annotations
