@@ -47,7 +47,7 @@ class ExportWeb:
     background: Annotated[
         str | None, option("#RRGGBB", "the one it was trained with; outdoors the colours of its sky and ground")
     ] = None
-    """Colour behind splats or the mesh."""
+    """Colour behind splats, a volume or the mesh."""
     views: Annotated[int, between(2, 1000), option("N")] = 72
     """Pictures in a page of views."""
     size: Annotated[int, between(16, 4096), option("PIXELS")] = 640
