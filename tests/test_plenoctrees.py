@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -45,8 +46,8 @@ class Ball:
 
 
 def method(**config) -> PlenOctrees:
-    frame = tiny.scene().frame
-    return build(PlenOctrees, frame, PlenOctrees.smallest(), torch.device("cpu"), 0)
+    numbers = replace(PlenOctrees.smallest(), **config)
+    return build(PlenOctrees, tiny.scene().frame, numbers, torch.device("cpu"), 0)
 
 
 def some_leaves(codes: torch.Tensor, basis: int = 4) -> Leaves:
@@ -186,6 +187,20 @@ def test_nothing_to_bake_is_said():
         method().from_field(Air(), tiny.scene().cameras)
 
 
+def test_the_papers_network_learns_too_and_is_baked():
+    made = method(field="network", depth=3, hidden_width=16, skip_layer=1, position_frequencies=4, learning_rate=5e-3)
+    scene, chance = tiny.scene(), torch.Generator().manual_seed(0)
+    made.begin(scene)
+    made.before_step(0, 0.0)
+    terms = made.loss(made.batch(scene, chance), 0)
+    terms["colour"].backward()
+    assert terms["sparsity"] > 0
+    assert all(p.grad is not None and p.grad.any() for p in made.teacher.parameters())
+    made.before_step(1, made.config.teacher_share)
+    made.batch(scene, chance)
+    assert made.baked and len(made.leaves) and made.leaves.harmonics.isfinite().all()
+
+
 def test_sparsity_is_the_equation():
     made = method()
     points = 2 * torch.rand(made.config.sparsity_points, 3, generator=torch.Generator().manual_seed(3)) - 1
@@ -314,7 +329,7 @@ def test_the_file_lies_in_its_frame():
     assert arrays["invradius3"].tolist() == [0.25] * 3
     corner = moved.points(leaves.low.double()).numpy() * arrays["invradius3"] + arrays["offset"]
     np.testing.assert_allclose(corner, 0, atol=1e-6)
-    np.testing.assert_allclose(arrays["data"][..., -1].max(), float(leaves.density.max()) / 2, rtol=1e-3)
+    np.testing.assert_allclose(arrays["data"][..., -1].max(), float(leaves.density.detach().max()) / 2, rtol=1e-3)
     assert parents(arrays["child"])[1:].tolist() == [[place, 1] for place in range(8)]
 
 

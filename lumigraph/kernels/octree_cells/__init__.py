@@ -45,7 +45,7 @@ class Tree:
         codes = codes.long()
         levels = levels_of(codes)
         depth = int(levels.max()) if len(codes) else 1
-        sound = len(codes) == 0 or (int(codes.min()) >= 8 and depth <= DEEPEST)
+        sound = len(codes) == 0 or (int(codes.min()) >= 8 and int(codes.max()) < 8 ** (DEEPEST + 1))
         require(sound, f"codes of cells have 1 to {DEEPEST} levels")
         divided = [codes.new_ones(1)]  # codes of the nodes, level by level
         for level in range(1, depth):

@@ -16,23 +16,23 @@ FAST = {"cache": True, "error_model": "numpy"}
 
 
 @njit(inline="always")
-def inverse_of(d):
-    """One over a direction's part along an axis."""
-    return ONE / (SLOW if abs(d) < SLOW else d)
+def inverse_of(d, side):
+    """One over the smallest cells that a ray passes along an axis in a unit of its length."""
+    return ONE / ((SLOW if abs(d) < SLOW else d) * side)
 
 
 @njit(inline="always")
-def through_cube(ox, oy, oz, ix, iy, iz, near):
-    """Where a ray enters the unit cube and leaves it."""
+def through_cube(ox, oy, oz, ix, iy, iz, side, near):
+    """Where a ray enters the cube and leaves it."""
     a, b, c = -ox * ix, -oy * iy, -oz * iz
-    d, e, f = (ONE - ox) * ix, (ONE - oy) * iy, (ONE - oz) * iz
+    d, e, f = (side - ox) * ix, (side - oy) * iy, (side - oz) * iz
     return max(min(a, d), min(b, e), min(c, f), near), min(max(a, d), max(b, e), max(c, f))
 
 
 @njit(inline="always")
-def cell_at(x, side):
-    """The whole number of the smallest cell at a coordinate."""
-    return min(max(np.int64(np.floor(x * np.float32(side))), 0), side - 1)
+def cell_at(x, low, high):
+    """The whole number of the smallest cell at a coordinate, from low to below high."""
+    return min(max(np.int64(x), low), high - 1)
 
 
 @njit(inline="always")
@@ -50,19 +50,17 @@ def leaf(cells, path, level, depth, x, y, z):
 
 
 @njit(inline="always")
-def leave(x, y, z, shift, per_cell, ox, oy, oz, dx, dy, dz, ix, iy, iz, t):
-    """Where a ray leaves the cell of side 2^shift at a place, and the place beyond. per_cell: side of the smallest"""
+def leave(x, y, z, shift, ox, oy, oz, dx, dy, dz, ix, iy, iz, t):
+    """Where a ray leaves the cell of side 2^shift at a place, and the place beyond. Origin, direction and one over it
+    are in smallest cells."""
     size = np.int64(1) << shift
     lx, ly, lz = x >> shift << shift, y >> shift << shift, z >> shift << shift
     hx, hy, hz = lx + size, ly + size, lz + size
-    tx = (np.float32(hx if ix > ZERO else lx) * per_cell - ox) * ix
-    ty = (np.float32(hy if iy > ZERO else ly) * per_cell - oy) * iy
-    tz = (np.float32(hz if iz > ZERO else lz) * per_cell - oz) * iz
+    tx = (np.float32(hx if ix > ZERO else lx) - ox) * ix
+    ty = (np.float32(hy if iy > ZERO else ly) - oy) * iy
+    tz = (np.float32(hz if iz > ZERO else lz) - oz) * iz
     end = max(min(tx, ty, tz), t)
-    side = ONE / per_cell
-    u = min(max(np.int64(np.floor((ox + end * dx) * side)), lx), hx - 1)
-    v = min(max(np.int64(np.floor((oy + end * dy) * side)), ly), hy - 1)
-    w = min(max(np.int64(np.floor((oz + end * dz) * side)), lz), hz - 1)
+    u, v, w = cell_at(ox + end * dx, lx, hx), cell_at(oy + end * dy, ly, hy), cell_at(oz + end * dz, lz, hz)
     if tx <= ty and tx <= tz:
         u = hx if ix > ZERO else lx - 1
     elif ty <= tz:
@@ -84,21 +82,24 @@ def shared(level, depth, differing):
 def _walk(o, d, cells, named, density, depth, near, most, write, starts, t_start, t_end, rows):
     """Count the cells of ray r into starts[r + 1], or write them from starts[r] on."""
     n, side = len(o), np.int64(1) << depth
-    per_cell = ONE / np.float32(side)
+    across = np.float32(side)
     for chunk in prange((n + CHUNK - 1) // CHUNK):
         path = np.zeros(depth + 1, np.int64)
         for r in range(chunk * CHUNK, min(n, (chunk + 1) * CHUNK)):
-            ox, oy, oz, dx, dy, dz = o[r, 0], o[r, 1], o[r, 2], d[r, 0], d[r, 1], d[r, 2]
-            ix, iy, iz = inverse_of(dx), inverse_of(dy), inverse_of(dz)
-            t, far = through_cube(ox, oy, oz, ix, iy, iz, near)
+            ox, oy, oz = o[r, 0] * across, o[r, 1] * across, o[r, 2] * across
+            dx, dy, dz = d[r, 0] * across, d[r, 1] * across, d[r, 2] * across
+            ix, iy, iz = (
+                inverse_of(d[r, 0], across),
+                inverse_of(d[r, 1], across),
+                inverse_of(d[r, 2], across),
+            )
+            t, far = through_cube(ox, oy, oz, ix, iy, iz, across, near)
             count, thickness, level = np.int64(0), ZERO, np.int64(0)
             if t < far:
-                x, y, z = cell_at(ox + t * dx, side), cell_at(oy + t * dy, side), cell_at(oz + t * dz, side)
+                x, y, z = cell_at(ox + t * dx, 0, side), cell_at(oy + t * dy, 0, side), cell_at(oz + t * dz, 0, side)
                 while True:
                     value, level = leaf(cells, path, level, depth, x, y, z)
-                    end, u, v, w = leave(
-                        x, y, z, depth - level, per_cell, ox, oy, oz, dx, dy, dz, ix, iy, iz, t
-                    )  # fmt: skip
+                    end, u, v, w = leave(x, y, z, depth - level, ox, oy, oz, dx, dy, dz, ix, iy, iz, t)
                     if value < 0:
                         row = np.int64(named[-1 - value])
                         if row >= 0:

@@ -24,35 +24,40 @@ def spread(rays):
 
 
 @njit(inline="always")
-def _channel(harmonics, row, y, c):
-    """A cell's colour along the direction whose basis is y: its sigmoid."""
-    raw = ZERO
+def _colour(harmonics, row, y):
+    """What a cell shows along the direction whose basis is y."""
+    red = green = blue = ZERO
     for k in range(harmonics.shape[1]):
-        raw += y[k] * harmonics[row, k, c]
-    return ONE / (ONE + np.exp(-raw))
+        red += y[k] * harmonics[row, k, 0]
+        green += y[k] * harmonics[row, k, 1]
+        blue += y[k] * harmonics[row, k, 2]
+    return ONE / (ONE + np.exp(-red)), ONE / (ONE + np.exp(-green)), ONE / (ONE + np.exp(-blue))
 
 
 @njit(parallel=True, fastmath=True, **FAST)
 def _forward(chunks, o, d, cells, named, density, harmonics, bands, depth, near, stop, rgb, distance, opacity, counts):
     n, side = len(o), np.int64(1) << depth
-    per_cell = ONE / np.float32(side)
+    across = np.float32(side)
     for i in prange(len(chunks)):
         chunk = chunks[i]
         path, y = np.zeros(depth + 1, np.int64), np.zeros(16, np.float32)
         for r in range(chunk * CHUNK, min(n, (chunk + 1) * CHUNK)):
-            ox, oy, oz, dx, dy, dz = o[r, 0], o[r, 1], o[r, 2], d[r, 0], d[r, 1], d[r, 2]
-            ix, iy, iz = inverse_of(dx), inverse_of(dy), inverse_of(dz)
-            t, far = through_cube(ox, oy, oz, ix, iy, iz, near)
+            ox, oy, oz = o[r, 0] * across, o[r, 1] * across, o[r, 2] * across
+            dx, dy, dz = d[r, 0] * across, d[r, 1] * across, d[r, 2] * across
+            ix, iy, iz = (
+                inverse_of(d[r, 0], across),
+                inverse_of(d[r, 1], across),
+                inverse_of(d[r, 2], across),
+            )
+            t, far = through_cube(ox, oy, oz, ix, iy, iz, across, near)
             red = green = blue = way = spent = ZERO
             through, count, level = ONE, np.int64(0), np.int64(0)
             if t < far:
-                basis(dx, dy, dz, bands, y)
-                u, v, w = cell_at(ox + t * dx, side), cell_at(oy + t * dy, side), cell_at(oz + t * dz, side)
+                basis(d[r, 0], d[r, 1], d[r, 2], bands, y)
+                u, v, w = cell_at(ox + t * dx, 0, side), cell_at(oy + t * dy, 0, side), cell_at(oz + t * dz, 0, side)
                 while True:
                     value, level = leaf(cells, path, level, depth, u, v, w)
-                    end, u2, v2, w2 = leave(
-                        u, v, w, depth - level, per_cell, ox, oy, oz, dx, dy, dz, ix, iy, iz, t
-                    )  # fmt: skip
+                    end, u2, v2, w2 = leave(u, v, w, depth - level, ox, oy, oz, dx, dy, dz, ix, iy, iz, t)
                     if value < 0:
                         row = np.int64(named[-1 - value])
                         if row >= 0:
@@ -61,9 +66,10 @@ def _forward(chunks, o, d, cells, named, density, harmonics, bands, depth, near,
                             weight = through * (ONE - keep)
                             through *= keep
                             if weight > ZERO:
-                                red += weight * _channel(harmonics, row, y, 0)
-                                green += weight * _channel(harmonics, row, y, 1)
-                                blue += weight * _channel(harmonics, row, y, 2)
+                                r_, g_, b_ = _colour(harmonics, row, y)
+                                red += weight * r_
+                                green += weight * g_
+                                blue += weight * b_
                                 way += weight * HALF * (t + end)
                                 spent += weight
                     if u2 < 0 or v2 < 0 or w2 < 0 or u2 >= side or v2 >= side or w2 >= side or through < stop:
@@ -85,28 +91,31 @@ def _share(
     over all of a ray is at hand, in its outputs.
     """
     n, side = len(o), np.int64(1) << depth
-    per_cell = ONE / np.float32(side)
+    across = np.float32(side)
     for j in prange(len(chunks)):
         chunk = chunks[j]
         path = np.zeros(depth + 1, np.int64)
         for r in range(chunk * CHUNK, min(n, (chunk + 1) * CHUNK)):
             if starts[r] == starts[r + 1]:
                 continue
-            ox, oy, oz, dx, dy, dz = o[r, 0], o[r, 1], o[r, 2], d[r, 0], d[r, 1], d[r, 2]
-            ix, iy, iz = inverse_of(dx), inverse_of(dy), inverse_of(dz)
-            t, _ = through_cube(ox, oy, oz, ix, iy, iz, near)
+            ox, oy, oz = o[r, 0] * across, o[r, 1] * across, o[r, 2] * across
+            dx, dy, dz = d[r, 0] * across, d[r, 1] * across, d[r, 2] * across
+            ix, iy, iz = (
+                inverse_of(d[r, 0], across),
+                inverse_of(d[r, 1], across),
+                inverse_of(d[r, 2], across),
+            )
+            t, _ = through_cube(ox, oy, oz, ix, iy, iz, across, near)
             y = bases[r]
-            basis(dx, dy, dz, bands, y)
+            basis(d[r, 0], d[r, 1], d[r, 2], bands, y)
             behind = g_distance[r] * distance[r] + g_opacity[r] * opacity[r]
             for c in range(3):
                 behind += g_rgb[r, c] * rgb[r, c]
             through, i, level = ONE, starts[r], np.int64(0)
-            u, v, w = cell_at(ox + t * dx, side), cell_at(oy + t * dy, side), cell_at(oz + t * dz, side)
+            u, v, w = cell_at(ox + t * dx, 0, side), cell_at(oy + t * dy, 0, side), cell_at(oz + t * dz, 0, side)
             while True:
                 value, level = leaf(cells, path, level, depth, u, v, w)
-                end, u2, v2, w2 = leave(
-                    u, v, w, depth - level, per_cell, ox, oy, oz, dx, dy, dz, ix, iy, iz, t
-                )  # fmt: skip
+                end, u2, v2, w2 = leave(u, v, w, depth - level, ox, oy, oz, dx, dy, dz, ix, iy, iz, t)
                 if value < 0:
                     row = np.int64(named[-1 - value])
                     if row >= 0:
@@ -115,8 +124,9 @@ def _share(
                         weight = through * (ONE - keep)
                         through *= keep
                         worth = g_opacity[r] + g_distance[r] * HALF * (t + end)
+                        colours = _colour(harmonics, row, y)
                         for c in range(3):
-                            colour = _channel(harmonics, row, y, c)
+                            colour = colours[c]
                             worth += g_rgb[r, c] * colour
                             shares[i, 1 + c] = weight * g_rgb[r, c] * colour * (ONE - colour)
                         behind -= worth * weight
