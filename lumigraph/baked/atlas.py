@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import torch
 from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 
@@ -43,3 +44,12 @@ class Atlas:
     voxel: float
     block: int
     network: ViewNetwork | None = None
+
+    def voxels(self) -> tuple[Int[Tensor, "voxel 3"], UInt8[Tensor, "voxel 8"]]:
+        """Where in the grid the voxels are that hold anything, and what they hold."""
+        inner = self.values[:, 1:-1, 1:-1, 1:-1]
+        number, *inside = inner.any(-1).nonzero().unbind(-1)
+        there = (self.index >= 0).nonzero()
+        corner = torch.zeros(len(inner), 3, dtype=torch.int64)
+        corner[self.index[tuple(there.unbind(-1))].long()] = there
+        return corner[number] * self.block + torch.stack(inside, -1), inner[number, *inside]

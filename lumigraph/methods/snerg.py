@@ -293,16 +293,10 @@ class SNeRG(RayMethod):
     @torch.no_grad()
     def take(self, atlas: Atlas) -> None:
         """Be an atlas, whose blocks and network are of one's own sizes, and nothing else."""
-        block, inner = atlas.block, slice(1, -1)
-        own = atlas.values[:, inner, inner, inner]
-        number, *inside = own.any(-1).nonzero().unbind(-1)
-        of = torch.full((max(1, len(own)), 3), 0)
-        there = (atlas.index >= 0).nonzero()
-        of[atlas.index[tuple(there.unbind(-1))]] = there
-        places = of[number] * block + torch.stack(inside, -1)
-        size = block * torch.tensor(atlas.index.shape)
-        self.voxels.hold(places.to(self.device), atlas.low.to(self.device), atlas.voxel, size.to(self.device))
-        self.voxels.levels = own[number, *inside].to(self.device)
+        places, levels = (x.to(self.device) for x in atlas.voxels())
+        size = atlas.block * torch.tensor(atlas.index.shape, device=self.device)
+        self.voxels.hold(places, atlas.low.to(self.device), atlas.voxel, size)
+        self.voxels.levels = levels
         self.view.take(atlas.network)
         self.stage.fill_(ATLAS)
         self._release()
@@ -372,6 +366,7 @@ class SNeRG(RayMethod):
             seen, terms = self._learn(batch, generator)
         else:
             background, seen, terms = backdrop(batch, self.background, generator), self._marched(batch.rays), {}
+            self.figures = {"rays": len(batch)}
         rendering = self._pixel(seen, batch.rays.directions, background)
         residual, self.figures["mse"] = residuals(rendering, batch, background)
         if self.unbounded and self.stage > FIELD:  # what lies beyond the box is not there to be learnt

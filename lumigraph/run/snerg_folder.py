@@ -6,9 +6,10 @@ from dataclasses import replace
 from pathlib import Path
 
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
 from .. import methods
-from ..baked import Atlas
 from ..camera import Camera, ring
 from ..errors import LumigraphError
 from ..exchange import snerg
@@ -17,6 +18,7 @@ from ..method import Method
 from ..scene import Frame
 from .opened import Opened
 
+SLACK = 0.02  # beyond [-1, 1]^3, that a voxel may reach
 WHITE = (1.0, 1.0, 1.0)  # is behind everything in that viewer
 
 
@@ -25,15 +27,18 @@ class SnergFolder(Opened):
 
     def __init__(self, path: Path | str):
         self.path = Path(path)
-        self.atlas, to_source = within_reach(snerg.read(self.path))
-        if not len(self.atlas.values):
+        atlas = snerg.read(self.path)
+        places, _ = atlas.voxels()
+        if not len(places):
             raise LumigraphError(f"{self.path} holds no voxels, so there is nothing to show")
+        corners = atlas.low + atlas.voxel * torch.stack([places.amin(0), places.amax(0) + 1])
+        to_source = within_reach(corners)
+        scale, shift = to_source.inverse.scale, to_source.inverse.matrix[:3, 3].float()
+        self.atlas = replace(atlas, low=scale * atlas.low + shift, voxel=scale * atlas.voxel)
         if (network := self.atlas.network) and len(network.biases[0]) != len(network.biases[1]):
             raise LumigraphError(f"{self.path} has a network of two widths, of which one is read; export it anew")
-        low = self.atlas.low
-        high = low + self.atlas.voxel * self.atlas.block * torch.tensor(self.atlas.index.shape)
-        bounds = tuple(tuple(corner.clamp(-1, 1).tolist()) for corner in (low, high))
-        self.frame = Frame(bounds, near=0.01, background=WHITE, source_from_scene=to_source.rows)  # type: ignore[arg-type]
+        low, high = ((scale * corner + shift).clamp(-1, 1).tolist() for corner in corners)
+        self.frame = Frame((tuple(low), tuple(high)), near=0.01, background=WHITE, source_from_scene=to_source.rows)  # type: ignore[arg-type]
 
     def method(self, device: torch.device | str = "cpu") -> Method:
         """The atlas, ready to render."""
@@ -49,11 +54,9 @@ class SnergFolder(Opened):
         return {"train": ring(self.frame.bounds)}
 
 
-def within_reach(atlas: Atlas) -> tuple[Atlas, Similarity]:
-    """An atlas moved and shrunk into [-1, 1]^3 where it is not there already, and the way back."""
-    size = atlas.voxel * atlas.block * torch.tensor(atlas.index.shape)
-    if bool((atlas.low >= -1.01).all() and (atlas.low + size <= 1.01).all()):
-        return atlas, Similarity.make(1.0)
-    scale, middle = 2 / float(size.max()), atlas.low + size / 2
-    moved = replace(atlas, low=(atlas.low - middle) * scale, voxel=atlas.voxel * scale)
-    return moved, Similarity.make(1 / scale, torch.eye(3, dtype=torch.float64), middle.double())
+def within_reach(corners: Float[Tensor, "2 3"]) -> Similarity:
+    """The way back from where a box lies in [-1, 1]^3: as it is if it lies there, else shrunk and moved."""
+    low, high = corners.double()
+    if float(corners.abs().max()) <= 1 + SLACK:
+        return Similarity.make(1.0)
+    return Similarity.make(float((high - low).max()) / 2, torch.eye(3, dtype=torch.float64), (low + high) / 2)

@@ -13,6 +13,7 @@ from . import ALPHA, CHANNELS, Blocks
 def run(
     origins: Tensor, directions: Tensor, enter: Tensor, leave: Tensor, blocks: Blocks, values: Tensor, stop: float
 ) -> tuple[Tensor, Tensor]:
+    origins, directions, enter, leave = (x.detach() for x in (origins, directions, enter, leave))
     rays = len(origins)
     steps = torch.arange(int((leave - enter).ceil().clamp_min(0).amax()) if rays else 0, device=origins.device)
     t = enter[:, None] + steps
