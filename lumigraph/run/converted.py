@@ -32,7 +32,7 @@ class Converted:
     """Teacher and student.
 
     source:  the run or file that was converted
-    how:     by the teacher's field, by the depth that it shows, or by its pictures alone
+    how:     by the teacher's field, its Gaussians, the depth that it shows, or its pictures alone
     learnt_from: what the student went on learning from
     psnr:    of the student's held-out views against the teacher's, in dB
     views:   how many
@@ -41,7 +41,7 @@ class Converted:
     """
 
     source: str
-    how: Literal["field", "depth", "pictures"]
+    how: Literal["field", "gaussians", "depth", "pictures"]
     learnt_from: Literal["photographs", "renderings of the source"]
     teacher: Held
     student: Held
