@@ -57,7 +57,7 @@ COMMANDS: dict[str, list[str]] = {
     "export points": ["export", "points", CLOUD, "out/new.ply", "--size", "16", "--views", "2"],
     "export splats": ["export", "splats", CLOUD, "out/new.spz"],
     "export stereo": ["export", "stereo", CLOUD, "out/new.png", "--size", "64"],
-    "export web": ["export", "web", GRID, "out/new.html", "--views", "2", "--size", "16"],
+    "export web": ["export", "web", GRID, "out/new.html", "--as", "views", "--views", "2", "--size", "16"],
     "explain ray": ["explain", "ray", GRID, "--output", "out/new.svg"],
     "explain encodings": [
         "explain",

@@ -1,7 +1,7 @@
 """A page to share: one HTML file that opens from disk, with the scene and the program that draws it inside.
 
 The programs in web/ are built from the folder `web` of the repository (three.js and Spark for clouds, three.js for
-meshes, neither for pictures). They are compressed into the page, and so is what they show.
+meshes and volumes, neither for pictures). They are compressed into the page, and so is what they show.
 """
 
 from __future__ import annotations

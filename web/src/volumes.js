@@ -26,6 +26,7 @@ export async function start(settings, data) {
     values.pose.copy(camera.matrixWorld);
     values.slope.set(half * camera.aspect, half);
   });
+  patience.begin();
   stage.paint = () => patience.paint();
   stage.redraw();
   return stage;

@@ -47,7 +47,7 @@ class ExportWeb:
     background: Annotated[
         str | None, option("#RRGGBB", "the one it was trained with; outdoors the colours of its sky and ground")
     ] = None
-    """Colour behind splats or the mesh."""
+    """Colour behind splats, a volume or the mesh."""
     views: Annotated[int, between(2, 1000), option("N")] = 72
     """Pictures in a page of views."""
     size: Annotated[int, between(16, 4096), option("PIXELS")] = 640
@@ -68,6 +68,7 @@ class ExportWeb:
 
         if self.output.suffix.lower() not in (".html", ".htm"):
             raise LumigraphError(f"{self.output} should end in .html, as pages do; rename it")
+        background = self._background()
         claim(self.output, "page", self.overwrite, [self.source])
         opened, method, cameras = open_method(self.source, self.device, self.told)
         kind = self._kind(opened, method)
@@ -76,7 +77,7 @@ class ExportWeb:
             method, told = self._baked(opened, method)
         behind = backdrop(method, cameras["train"]) if kind != "views" and not self.part.crops else None
         title = self.title or opened.title
-        opening = opening_of_scene(title, cameras["train"], opened.frame, self._background(), behind)
+        opening = opening_of_scene(title, cameras["train"], opened.frame, background, behind)
         held = self._write(kind, method, cameras["train"], opening)
         size = f"{self.output.stat().st_size / 1e6:.1f} MB"
         show(told | {"page": str(self.output), "holds": held, "size": size})

@@ -26,6 +26,13 @@ export class Patience {
     stage.scene.add(this.shown);
   }
 
+  // Once, so that compiling and sending textures count for no picture.
+  begin() {
+    this.update();
+    this.draw(this.rough, 0, 1);
+    this.rate = null;
+  }
+
   paint() {
     const size = this.stage.renderer.getDrawingBufferSize(new Vector2());
     const pixels = size.x * size.y, allowed = this.rate ? Math.max(this.rate * MOVING, FEWEST) : FIRST;

@@ -17,6 +17,7 @@ const KINDS = {
 function made(texture, kind, smooth = false) {
   const [, format, type, internalFormat] = KINDS[kind];
   Object.assign(texture, { format, type, internalFormat, unpackAlignment: 1, needsUpdate: true });
+  texture.onUpdate = () => (texture.image.data = null); // the graphics have it now
   if (smooth) texture.minFilter = texture.magFilter = LinearFilter;
   return texture;
 }
