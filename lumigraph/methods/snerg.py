@@ -396,16 +396,16 @@ class SNeRG(RayMethod):
         c, tables = self.config, self.network.tables
         own = {id(table) for table in tables}
         layers = [x for x in self.network.parameters() if id(x) not in own]
-        common: dict[str, Any] = {"betas": (0.9, 0.99), "eps": 1e-15}
+        common: dict[str, Any] = {"lr": c.learning_rate, "betas": (0.9, 0.99), "eps": 1e-15}
         decay = c.hash_weight_decay if self.frame.reach == 1 else 0.0
-        groups = [
-            {"params": tables, "name": "field", "weight_decay": decay},
-            {"params": [self.tuned.values], "name": "voxels"},
+        field = [{"params": tables, "name": "field", "weight_decay": decay}] if tables else []
+        self._lazy = LazyAdam([*field, {"params": [self.tuned.values], "name": "voxels"}], **common)
+        groups: list[dict[str, Any]] = [
+            {"params": layers, "name": "field"},
+            {"params": [*self.view.parameters()], "name": "view"},
         ]
-        self._lazy = LazyAdam([group for group in groups if group["params"]], c.learning_rate, **common)
-        groups = [{"params": layers, "name": "field"}, {"params": [*self.view.parameters()], "name": "view"}]
-        self._adam = torch.optim.Adam(groups, lr=c.learning_rate, foreach=True, **common)
-        optimizers = [self._lazy, self._adam]
+        self._adam = torch.optim.Adam(groups, foreach=True, **common)
+        optimizers: list[torch.optim.Optimizer] = [self._lazy, self._adam]
         return [*optimizers, self.unbounded.optimizer()] if self.unbounded else optimizers
 
     def learning_rate(self, step: int, progress: float) -> dict[str, float]:
