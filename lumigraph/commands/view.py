@@ -52,16 +52,19 @@ def page_of(opened: Any, method: Any, cameras: Any) -> Any:
     """What makes a page that draws a baked method in the browser; None for any other, and while it is not baked yet."""
     from .exports.volumes import browsable, is_baked
 
+    if not is_baked(method):
+        return None
+    try:
+        volume, _ = browsable(method)
+    except LumigraphError:
+        return None
+
     def page() -> bytes:
         from ..export.page import opening_of_scene, volume_bytes
 
         return volume_bytes(volume, opening_of_scene(opened.title, cameras["train"], opened.frame))
 
-    try:
-        volume = browsable(method)[0] if is_baked(method) else None
-    except LumigraphError:
-        return None
-    return page if volume else None
+    return page
 
 
 def subject_of(opened: Any, cameras: Any = None, finished: bool = True, page: Any = None) -> Any:
