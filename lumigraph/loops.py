@@ -79,8 +79,8 @@ def contract(points, coordinates, stretch):
 @njit(inline="always")
 def shrunk(x, y, z):
     """1 / |x|, at most 1, and what a point is multiplied with to be in the contraction's ball."""
-    one = np.float32(1)
-    inverse = one / np.float32(max(math.sqrt(x * x + y * y + z * z), one))
+    one, radius = np.float32(1), np.float32(math.sqrt(x * x + y * y + z * z))
+    inverse = one / radius if radius > one else one
     return inverse, np.float32(0.5) * (one + one - inverse) * inverse
 
 

@@ -141,6 +141,7 @@ class GaussianSplatting(Method):
     grows: ClassVar[tuple[str, ...]] = ("interval",)
     extent: Tensor
     drawn: Tensor
+    differ: Tensor
     began: Tensor
     interval: Tensor
 
@@ -154,7 +155,8 @@ class GaussianSplatting(Method):
         self.exploration = MarkovChain()
         refining, rate = config.refine_cameras, config.pose_learning_rate
         self.poses = PoseRefinement(frame.image_count, rate) if refining else None
-        self.lights = PhotographCodes(frame.image_count, NUMBERS) if config.appearance != "no" else None
+        photographs, told_apart = frame.image_count, config.appearance != "no"
+        self.lights: PhotographCodes | None = PhotographCodes(photographs, NUMBERS) if told_apart else None
         self.found: Tensor | None = None  # the light of a photograph that was given
         self.trimming = Trimming() if config.robust != "no" else None
         self.rhythm = Rhythm(config.refine_every, config.refine_every_share)

@@ -51,6 +51,7 @@ class Config(OpenNumbers):
     appearance_components: Components = 48  # of each factor: 3 x 48 of 192, section 5
     initial_resolution: Resolution = 128  # section 5
     final_resolution: Resolution = 300  # section 5
+    open_final_resolution: Resolution = 640  # where there is no bound, the code's for forward-facing captures
     appearance_features: Annotated[int, between(1, 256)] = 27  # P, that the basis matrix B gives, section 5
     shading: Literal["mlp", "sh"] = "mlp"  # features become colours by a network, or are harmonics, section 4.1
     sh_bands: Annotated[int, between(1, 4)] = 3  # of harmonics, where they are colours
@@ -81,11 +82,15 @@ class Config(OpenNumbers):
 
     def check(self) -> None:
         """Raises LumigraphError for numbers that contradict each other."""
-        if self.initial_resolution > self.final_resolution:
+        if self.initial_resolution > min(self.final_resolution, self.open_final_resolution):
             raise LumigraphError(
                 f"A grid only becomes finer: --initial-resolution {self.initial_resolution:,} is above "
-                f"--final-resolution {self.final_resolution:,}"
+                f"--final-resolution {self.final_resolution:,} or --open-final-resolution {self.open_final_resolution:,}"
             )
+
+    def finest(self, unbounded: bool) -> int:
+        """Nodes per axis in the end, as a cube's."""
+        return self.open_final_resolution if unbounded else self.final_resolution
 
 
 # Shares of the budget at which the grid becomes finer: steps 2000, 3000, 4000, 5500 and 7000 of 30 000, section 5.
@@ -185,6 +190,7 @@ class TensoRF(RayMethod):
             appearance_components=16,
             initial_resolution=96,
             final_resolution=200,
+            open_final_resolution=320,
             hidden_width=64,
             feature_frequencies=0,
             rays_per_step=4096,
@@ -208,6 +214,7 @@ class TensoRF(RayMethod):
             appearance_components=6,
             initial_resolution=8,
             final_resolution=16,
+            open_final_resolution=16,
             appearance_features=8,
             hidden_width=16,
             feature_frequencies=1,
@@ -226,9 +233,8 @@ class TensoRF(RayMethod):
     def further_bytes(cls, frame: Frame, config: Any, learning: bool) -> int:
         """What the factors grow by, the occupancy grid, and what a step keeps of its samples."""
         box = torch.tensor(frame.bounds if frame.reach <= 1 else ((-1.0,) * 3, (1.0,) * 3), device="cpu")
-        first, last = (
-            Factors(config.factors, nodes_in(box, n)).rows for n in (config.initial_resolution, config.final_resolution)
-        )
+        resolutions = config.initial_resolution, config.finest(frame.reach > 1)
+        first, last = (Factors(config.factors, nodes_in(box, n)).rows for n in resolutions)
         width = config.density_components + config.appearance_components
         step = 4 * config.samples_per_step * 32
         grown = 4 * (last - first) * width * (4 if learning else 1)
@@ -261,7 +267,7 @@ class TensoRF(RayMethod):
             occupied = known.occupied(self.space, c.occupancy_resolution, c.occupancy_threshold, chance)
             self.occupancy.rule_out(occupied[None])
             self._shrink()
-        self._resample(c.final_resolution, self.box, fresh=self.random(0))
+        self._resample(c.finest(self.unbounded is not None), self.box, fresh=self.random(0))
         self.stage.fill_(len(UPSAMPLINGS))
         grids = [grid.table for grid in (self.network.density_grid, self.network.appearance_grid)]
         tables = {id(x) for x in grids}
@@ -430,7 +436,7 @@ class TensoRF(RayMethod):
 
     def _resolution(self, stage: int) -> int:
         """Evenly in the logarithm from the first resolution to the last (section 5)."""
-        first, last = self.config.initial_resolution, self.config.final_resolution
+        first, last = self.config.initial_resolution, self.config.finest(self.unbounded is not None)
         return round(first * (last / first) ** (stage / len(UPSAMPLINGS)))
 
     def _shrink(self) -> None:

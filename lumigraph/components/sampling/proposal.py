@@ -91,9 +91,10 @@ class Proposal(nn.Module):
         if isinstance(self.space, NDC):
             lines, numbers = self.space.in_device(rays)
         tensors = [x.detach().contiguous().numpy() for x in (*lines, *ends, self.grid.values[:, 0])]
-        limits = 2 * LIMIT, self.sharpness, SPARE, FAINT
         t = rays.origins.new_empty(len(rays), self.count + 1)
-        loops.propose(BLOCK, self.bins, *tensors, self.grid.size.numpy(), *map(np.float32, (numbers, limits)), t.numpy())
+        limits = np.array((2 * LIMIT, self.sharpness, SPARE, FAINT), np.float32)
+        size, device = self.grid.size.numpy(), np.array(numbers, np.float32)
+        loops.propose(BLOCK, self.bins, *tensors, size, device, limits, t.numpy())
         return Samples.rows(t[:, :-1], t[:, -1])
 
     @torch.no_grad()
