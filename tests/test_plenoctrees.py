@@ -287,7 +287,7 @@ def marched(file, origin: np.ndarray, direction: np.ndarray, step: float = 1e-3)
 
 def test_the_file_shows_what_the_run_shows(run, ball, tmp_path, capsys):
     path = tmp_path / "ball.npz"
-    assert main(["export", "octree", str(run.folder), "--output", str(path)]) == 0
+    assert main(["export", "octree", str(run.folder), str(path)]) == 0
     assert "of the photographs" in capsys.readouterr().out
     file = np.load(path)
     assert file["data_format"].item() == "SH4" and file["data"].dtype == np.float16 and file["child"].dtype == np.int32
@@ -302,7 +302,7 @@ def test_the_file_shows_what_the_run_shows(run, ball, tmp_path, capsys):
 def test_a_smaller_file_of_fewer_levels(run, tmp_path):
     for depth in (2, 3):
         path = tmp_path / f"{depth}.npz"
-        assert main(["export", "octree", str(run.folder), "--output", str(path), "--depth", str(depth)]) == 0
+        assert main(["export", "octree", str(run.folder), str(path), "--depth", str(depth)]) == 0
         file = np.load(path)
         assert file["parent_depth"][:, 1].max() == depth - 1
 
@@ -312,12 +312,12 @@ def test_what_cannot_be_written_is_said(run, tmp_path, capsys, monkeypatch):
     other.save(State(), voxels, voxels.optimizers(), torch.Generator())
     for words, fault in [
         ([str(run.folder), "--output", str(tmp_path / "ball.ply")], "should end in .npz"),
-        ([str(other.folder), "--output", str(path)], "is no octree"),
+        ([str(other.folder), str(path)], "is no octree"),
     ]:
         assert main(["export", "octree", *words]) == 2
         assert fault in capsys.readouterr().err
     monkeypatch.setattr(leaves_module, "free_on", lambda device: 1000)
-    assert main(["export", "octree", str(run.folder), "--output", str(path)]) == 2
+    assert main(["export", "octree", str(run.folder), str(path)]) == 2
     assert "and 0.0 GB are free" in capsys.readouterr().err and not path.exists()
     assert memory.gigabytes(1000) == "0.0 GB"
 

@@ -288,10 +288,10 @@ def test_the_command_writes_the_folder(ball, tmp_path, capsys):
     run = Run.create(tmp_path / "run", ball, scene)
     run.save(State(), ball, ball.optimizers(), torch.Generator())
     output = tmp_path / "out"
-    assert main(["export", "snerg", str(run.folder), "--output", str(output)]) == 0
+    assert main(["export", "snerg", str(run.folder), str(output)]) == 0
     assert "MB" in capsys.readouterr().out
     assert torch.equal(snerg.read(output).index >= 0, ball.atlas().index >= 0)
-    assert main(["export", "snerg", str(output), "--output", str(tmp_path / "again")]) == 0
+    assert main(["export", "snerg", str(output), str(tmp_path / "again")]) == 0
     assert (tmp_path / "again" / "rgba_000.png").is_file()
 
 
@@ -300,7 +300,7 @@ def test_a_run_that_is_not_baked_is_refused(tmp_path, capsys):
     method = SNeRG(scene.frame, SNeRG.smallest())
     run = Run.create(tmp_path / "run", method, scene)
     run.save(State(), method, method.optimizers(), torch.Generator())
-    assert main(["export", "snerg", str(run.folder), "--output", str(tmp_path / "out")]) == 2
+    assert main(["export", "snerg", str(run.folder), str(tmp_path / "out")]) == 2
     assert "not baked yet" in capsys.readouterr().err and not (tmp_path / "out").exists()
 
 
@@ -339,5 +339,5 @@ def test_bad_input_is_told_in_a_sentence(name, folder, tmp_path, capsys):
         assert snerg.recognises(folder)
     with pytest.raises(LumigraphError, match=sentence):
         snerg.read(folder)
-    assert main(["export", "snerg", str(folder), "--output", str(tmp_path / "copy")]) == 2
+    assert main(["export", "snerg", str(folder), str(tmp_path / "copy")]) == 2
     assert capsys.readouterr().err.count("\n") == 1 and not (tmp_path / "copy").exists()

@@ -25,7 +25,7 @@ class ExportOctree:
 
     source: Annotated[Positional[Path], needed("RUN")]
     """Folder of a run."""
-    output: Annotated[Path, option("FILE.npz")]
+    output: Annotated[Positional[Path], needed("FILE.npz")]
     """The new file."""
     depth: Annotated[Annotated[int, between(1, 10)] | None, option("N", "all there are")] = None
     """Levels of the octree at most; what lies deeper is averaged, for a smaller file."""

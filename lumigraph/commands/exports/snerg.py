@@ -20,7 +20,7 @@ class ExportSnerg:
 
     source: Annotated[Positional[Path], needed("RUN_OR_FOLDER")]
     """Folder of a baked run, or of such a scene."""
-    output: Annotated[Path, needed("FOLDER")]
+    output: Annotated[Positional[Path], needed("FOLDER")]
     """The new folder."""
 
     def run(self) -> int:
