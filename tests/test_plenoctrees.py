@@ -311,7 +311,7 @@ def test_what_cannot_be_written_is_said(run, tmp_path, capsys, monkeypatch):
     path, other, voxels = tmp_path / "ball.npz", tiny.new_run(tmp_path / "voxels"), tiny.method()
     other.save(State(), voxels, voxels.optimizers(), torch.Generator())
     for words, fault in [
-        ([str(run.folder), "--output", str(tmp_path / "ball.ply")], "should end in .npz"),
+        ([str(run.folder), str(tmp_path / "ball.ply")], "should end in .npz"),
         ([str(other.folder), str(path)], "is no octree"),
     ]:
         assert main(["export", "octree", *words]) == 2
