@@ -25,7 +25,7 @@ from ...volume import weights_of
 from .leaves import Leaves, codes_of
 
 CELLS = 128  # along each axis of the lattice that a teacher's samples mark, at most
-MARKS = 1 << 18  # rays that mark it, at most
+MARKS = 1 << 17  # rays that mark it, at most
 CHUNK = 1 << 13  # rays asked at once
 POINTS = 1 << 18  # points asked at once
 PER_CELL = 32  # rays that look, for each cell of one face of the cube
