@@ -307,10 +307,11 @@ class SNeRG(RayMethod):
         self, seen: Summed, directions: Float[Tensor, "ray 3"], background: Float[Tensor, "#ray 3"]
     ) -> Rendering:
         """Diffuse colour, and what the network adds for a direction (eq. 6); see `baked.ViewNetwork`."""
-        added = self.view(directions, seen.diffuse, seen.features)
+        hit = (seen.opacity > 0).nonzero()[:, 0]  # elsewhere the network need not be asked
+        said = self.view(directions[hit], seen.diffuse[hit], seen.features[hit])
+        added = torch.zeros_like(seen.diffuse).index_copy(0, hit, said)
         rgb = over(seen.diffuse + seen.opacity[:, None] * added, seen.opacity, background)
-        hit = seen.opacity > 1e-3
-        depth = torch.where(hit, seen.distance / seen.opacity.clamp_min(1e-3), torch.inf)
+        depth = torch.where(seen.opacity > 1e-3, seen.distance / seen.opacity.clamp_min(1e-3), torch.inf)
         return Rendering(rgb, depth, seen.opacity)
 
     def render_rays(self, rays: Rays, background: Float[Tensor, "#ray 3"]) -> Rendering:
@@ -395,16 +396,16 @@ class SNeRG(RayMethod):
         c, tables = self.config, self.network.tables
         own = {id(table) for table in tables}
         layers = [x for x in self.network.parameters() if id(x) not in own]
-        common: dict[str, Any] = {"betas": (0.9, 0.99), "eps": 1e-15}
+        common: dict[str, Any] = {"lr": c.learning_rate, "betas": (0.9, 0.99), "eps": 1e-15}
         decay = c.hash_weight_decay if self.frame.reach == 1 else 0.0
-        groups = [
-            {"params": tables, "name": "field", "weight_decay": decay},
-            {"params": [self.tuned.values], "name": "voxels"},
+        field = [{"params": tables, "name": "field", "weight_decay": decay}] if tables else []
+        self._lazy = LazyAdam([*field, {"params": [self.tuned.values], "name": "voxels"}], **common)
+        groups: list[dict[str, Any]] = [
+            {"params": layers, "name": "field"},
+            {"params": [*self.view.parameters()], "name": "view"},
         ]
-        self._lazy = LazyAdam([group for group in groups if group["params"]], c.learning_rate, **common)
-        groups = [{"params": layers, "name": "field"}, {"params": [*self.view.parameters()], "name": "view"}]
-        self._adam = torch.optim.Adam(groups, lr=c.learning_rate, foreach=True, **common)
-        optimizers = [self._lazy, self._adam]
+        self._adam = torch.optim.Adam(groups, foreach=True, **common)
+        optimizers: list[torch.optim.Optimizer] = [self._lazy, self._adam]
         return [*optimizers, self.unbounded.optimizer()] if self.unbounded else optimizers
 
     def learning_rate(self, step: int, progress: float) -> dict[str, float]:

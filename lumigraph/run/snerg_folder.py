@@ -38,7 +38,7 @@ class SnergFolder(Opened):
         if (network := self.atlas.network) and len(network.biases[0]) != len(network.biases[1]):
             raise LumigraphError(f"{self.path} has a network of two widths, of which one is read; export it anew")
         low, high = ((scale * corner + shift).clamp(-1, 1).tolist() for corner in corners)
-        self.frame = Frame((tuple(low), tuple(high)), near=0.01, background=WHITE, source_from_scene=to_source.rows)  # type: ignore[arg-type]
+        self.frame = Frame((tuple(low), tuple(high)), near=0.01, background=WHITE, source_from_scene=to_source.rows)
 
     def method(self, device: torch.device | str = "cpu") -> Method:
         """The atlas, ready to render."""

@@ -68,6 +68,12 @@ class HashDeferred(nn.Module):
         return Deferred.of(self.layers(encoded))
 
 
+class Released(Dense):
+    """A layer whose weights may be let go of, and are then of no rows."""
+
+    grows = ("weight", "bias")
+
+
 class NetworkDeferred(nn.Module):
     """All of it by the paper's network, that of Mildenhall 2020 without its layers for direction."""
 
@@ -78,13 +84,10 @@ class NetworkDeferred(nn.Module):
         skip = min(config.skip_layer, config.hidden_layers - 1)
 
         def layers(first: int, count: int) -> nn.Sequential:
-            return nn.Sequential(*(Dense(width if i else first, width, True) for i in range(count)))
+            return nn.Sequential(*(Released(width if i else first, width, True) for i in range(count)))
 
         self.before, self.after = layers(inputs, skip), layers(width + inputs, config.hidden_layers - skip)
-        self.last = Dense(width, OUTPUTS)
-        for layer in self.modules():
-            if isinstance(layer, Dense):
-                layer.grows = "weight", "bias"
+        self.last = Released(width, OUTPUTS)
 
     @property
     def tables(self) -> list[nn.Parameter]:
@@ -105,33 +108,34 @@ class ViewDependence(nn.Module):
 
     def __init__(self, width: int):
         super().__init__()
-        inputs = 3 * (1 + 2 * OCTAVES) + 3 + FEATURES
-        self.layers = nn.ModuleList(nn.Linear(a, b) for a, b in ((inputs, width), (width, width), (width, 3)))
-        nn.init.constant_(self.layers[-1].bias, DIM)
+        self.first, self.second = nn.Linear(3 * (1 + 2 * OCTAVES) + 3 + FEATURES, width), nn.Linear(width, width)
+        self.last = nn.Linear(width, 3)
+        nn.init.constant_(self.last.bias, DIM)
 
     def forward(
         self, directions: Float[Tensor, "ray 3"], diffuse: Float[Tensor, "ray 3"], features: Float[Tensor, "ray 4"]
     ) -> Float[Tensor, "ray 3"]:
         """The colour that is added, in [0, 1]. directions: unit length"""
-        h = torch.cat([encoded(directions), diffuse, features], -1)
-        for layer in self.layers[:-1]:
-            h = torch.relu(layer(h))
-        return torch.sigmoid(self.layers[-1](h))
+        h = torch.relu(self.first(torch.cat([encoded(directions), diffuse, features], -1)))
+        return torch.sigmoid(self.last(torch.relu(self.second(h))))
 
+    @torch.no_grad()
     def baked(self) -> ViewNetwork:
         """The same for browsers and files."""
-        a, b, c = self.layers
-        weights = tuple(layer.weight.detach().t().contiguous().cpu() for layer in (a, b, c))
-        return ViewNetwork(weights, tuple(layer.bias.detach().cpu() for layer in (a, b, c)))
+        a, b, c = self.first, self.second, self.last
+        weights = (a.weight.t(), b.weight.t(), c.weight.t())
+        one, two, three = (weight.contiguous().cpu().clone() for weight in weights)
+        return ViewNetwork((one, two, three), (a.bias.cpu().clone(), b.bias.cpu().clone(), c.bias.cpu().clone()))
 
     @torch.no_grad()
     def take(self, network: ViewNetwork | None) -> None:
         """Be a network of the same width, or one that adds nothing."""
         if network is None:
-            nn.init.zeros_(self.layers[-1].weight)
-            nn.init.constant_(self.layers[-1].bias, NOTHING)
+            nn.init.zeros_(self.last.weight)
+            nn.init.constant_(self.last.bias, NOTHING)
             return
-        for layer, weight, bias in zip(self.layers, network.weights, network.biases, strict=True):
+        layers = self.first, self.second, self.last
+        for layer, weight, bias in zip(layers, network.weights, network.biases, strict=True):
             layer.weight.copy_(weight.t())
             layer.bias.copy_(bias)
 
