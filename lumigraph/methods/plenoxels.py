@@ -129,7 +129,7 @@ class Plenoxels(RayMethod):
             base_resolution=128,
             max_resolution=192,
             open_base_resolution=64,
-            open_max_resolution=128,
+            open_max_resolution=192,
             occupancy_resolution=128,
             rays_per_step=4096,
             samples_per_step=1 << 16,
