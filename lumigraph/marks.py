@@ -29,11 +29,7 @@ WHOLE = "."  # the name that stands for a folder which was written as one
 Sum = tuple[int, str]  # bytes, SHA-256
 Kind = Literal[
     "film", "film of depth", "pictures of a film", "cameras of a film", "camera path", "composition",
-<<<<<<< HEAD
     "page", "splats", "octree", "atlas", "points", "mesh", "panorama", "comparison",
-=======
-    "page", "splats", "atlas", "points", "mesh", "octree", "panorama", "comparison",
->>>>>>> volumes
     "evaluation", "rendering", "report", "figure", "benchmark", "capture", "masks", "file",
 ]  # fmt: skip
 
