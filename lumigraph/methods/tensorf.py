@@ -84,8 +84,9 @@ class Config(OpenNumbers):
         """Raises LumigraphError for numbers that contradict each other."""
         if self.initial_resolution > min(self.final_resolution, self.open_final_resolution):
             raise LumigraphError(
-                f"A grid only becomes finer: --initial-resolution {self.initial_resolution:,} is above --final-resolution "
-                f"{self.final_resolution:,} or --open-final-resolution {self.open_final_resolution:,}"
+                f"A grid only becomes finer: --initial-resolution {self.initial_resolution:,} is above "
+                f"--final-resolution {self.final_resolution:,} or "
+                f"--open-final-resolution {self.open_final_resolution:,}"
             )
 
     def finest(self, unbounded: bool) -> int:
