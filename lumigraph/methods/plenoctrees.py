@@ -13,7 +13,7 @@ from torch import Tensor
 
 from ..baked import Octree
 from ..camera import Camera
-from ..capabilities import HasField, HasLooks, can, needs
+from ..capabilities import HasField, HasLooks, can
 from ..components.fields.harmonic_field import HarmonicHash, HarmonicNetwork, colour
 from ..components.fields.hash_field import check_levels
 from ..components.fields.leaves import Leaves, ask_for_octree
@@ -26,6 +26,7 @@ from ..components.fields.octree_baking import (
     fitted_harmonics,
     met,
 )
+from ..components.fields.taken_over import taken_over
 from ..components.sampling.carving import visual_hull
 from ..components.sampling.coarse_to_fine import SAMPLES_OF_A_RAY, first_grid, keep_looking, lattice, stage
 from ..components.sampling.marching import FIRST_RAYS, rays_for, reached
@@ -315,7 +316,8 @@ class PlenOctrees(RayMethod):
 
     def from_field(self, teacher: Any, cameras: Camera) -> None:
         """Bake a teacher's density and colour as far as cameras see them; what is learnt from then on are leaves."""
-        needs(teacher, HasField)
+        if not can(teacher, HasField):
+            teacher = taken_over(teacher, cameras)
         chance, numbers = self.random(-1), self._baking
         mask = met(teacher, cameras, numbers, chance) if can(teacher, HasLooks) else None
         bake(self.leaves, density_of(teacher), mask, cameras, numbers, chance)

@@ -45,7 +45,7 @@ def neighbours(cameras: Camera) -> Int[Tensor, " camera"]:
     return unlike.fill_diagonal_(torch.inf).argmin(-1)
 
 
-def brighter(points: Float[Tensor, "point 3"], one: FlatView, other: FlatView) -> Float[Tensor, 3] | None:
+def brighter(points: Float[Tensor, "point 3"], one: FlatView, other: FlatView) -> Float[Tensor, " 3"] | None:
     """Stops by which one picture shows points brighter than another, for each channel; None if they share too few."""
     colours, known = [], torch.ones(len(points), dtype=torch.bool)
     for view in (one, other):
