@@ -48,6 +48,7 @@ COMMANDS: dict[str, list[str]] = {
     "clean": ["clean", "given/cloud.ply", "--output", "out/new.ply"],
     "compose": ["compose", CLOUD, "given/cloud.ply", "--output", "out/new.json"],
     "compress": ["compress", CLOUD, "--output", "out/new", "--steps", "1", "--views", "1"],
+    "convert": ["convert", CLOUD, "gaussian-splatting", "--output", "out/new", "--steps", "1", "--views", "1"],
     "report": ["report", CLOUD],
     "capture": ["capture", "given/photographs", "--output", "out/new"],
     "demo": ["demo", "--seconds", "0", "--output", "out/new", "--scene", SCENE],

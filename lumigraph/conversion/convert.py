@@ -20,7 +20,7 @@ from ..exchange import size_of
 from ..method import Method
 from ..quality import Quality
 from ..run import Opened, Run, State, build, check_new
-from ..run.converted import Converted, Held
+from ..run.converted import Begun, Converted, Held, LearntFrom
 from ..scene import Scene
 from ..signals import go_on_unless
 from ..train import fit
@@ -30,7 +30,8 @@ from .ways import check, way
 
 SHARE = 0.5  # of a training that is over once a field has been taken over: schedules go on from there
 RENDERING = 0.5  # of the seconds to learn for, that rendering what to learn from may take beside
-RENDERINGS = "renderings of the source"
+PHOTOGRAPHS: LearntFrom = "photographs"
+RENDERINGS: LearntFrom = "renderings of the source"
 VIEWS = 8  # held-out views that are compared
 
 
@@ -65,39 +66,43 @@ def convert(
     show:   whether training is shown
     Raises LumigraphError for what cannot be converted, and Stopped after Ctrl-C, with the state saved.
     """
-    if (begun := unfinished(source, name, output)) is None:
+    if (going_on := unfinished(source, name, output)) is None:
         check_new(output)
     kind, device = methods.find(name), torch.device(device)
     check(source, kind)
     scene, cameras, teacher = photographs(source, aim.source), source.cameras(), source.method(device)
     how = way(type(teacher), kind)
     assert how is not None  # for `check` has asked
-    student = begun.new_method(device) if begun else new_student(kind, teacher, aim, device)
+    student = going_on[0].new_method(device) if going_on else new_student(kind, teacher, aim, device)
     around = teacher.refined(source.survey(cameras["train"]))
-    if scene is None or aim.distil:
+    distil = going_on[1].learnt_from == RENDERINGS if going_on else aim.distil
+    if scene is None or distil:
         allowed = math.inf if aim.seconds is None else RENDERING * aim.seconds
         learnt_from, data = RENDERINGS, rendered_scene(teacher, around, str(source.path), allowed)
     else:
-        learnt_from, data = "photographs", seen_as(teacher, student, scene)
-    if begun is None:
-        seconds = take_over(teacher, student, data, around, as_taken=learnt_from == "photographs")
-        said = {"source": str(source.path.resolve()), "learnt_from": learnt_from, "taking_over": round(seconds, 3)}
-        begun = created(source, student, scene or data, output, budget_of(student, data, aim), aim.seed, said)
-    run, said = begun, begun.settings.said["converted"]
+        learnt_from, data = PHOTOGRAPHS, seen_as(teacher, student, scene)
+    if going_on is None:
+        seconds = take_over(teacher, student, data, around, as_taken=learnt_from == PHOTOGRAPHS)
+        begun = Begun(str(source.path.resolve()), learnt_from, round(seconds, 3))
+        going_on = (
+            created(source, student, scene or data, output, budget_of(student, data, aim), aim.seed, begun),
+            begun,
+        )
+    run, begun = going_on
     budget = Budget.from_json(run.settings.budget)
     outcome = fit(student, data, run, budget=budget, seed=run.settings.seed, show=show)
     go_on_unless(outcome.signal)
     held_out = cameras["test"] if len(cameras.get("test", ())) else cameras["train"]
     seen = [shown(method, scene, held_out, aim.views) for method in (teacher, student)]
     made = Converted(
-        source=said["source"],
+        source=begun.source,
         how=how,
-        learnt_from=said["learnt_from"],
+        learnt_from=begun.learnt_from,
         teacher=Held(methods.name_of(teacher), bytes_in(source), seen[0].seconds, seen[0].psnr),
         student=Held(name, run.model_bytes, seen[1].seconds, seen[1].psnr),
         psnr=likeness(*seen),
         views=len(seen[0].views),
-        taking_over=said["taking_over"],
+        taking_over=begun.taking_over,
         steps=outcome.state.step,
         seconds=outcome.state.seconds,
     )
@@ -136,13 +141,10 @@ def budget_of(student: Method, data: Scene, aim: Aim) -> Budget:
     return Budget(steps, aim.seconds, aim.quality, (0.0, share) if share else None)
 
 
-def created(
-    source: Opened, student: Method, data: Scene, output: Path, budget: Budget, seed: int, said: dict[str, Any]
-) -> Run:
+def created(source: Opened, student: Method, data: Scene, output: Path, budget: Budget, seed: int, begun: Begun) -> Run:
     """A run of the student as it begins, with the cameras and photographs of what it is made of.
 
     data: the photographs, or what stands in for them
-    said: of the conversion, for config.json
     """
     options = None
     if isinstance(source, Run):
@@ -153,21 +155,22 @@ def created(
     if isinstance(source, Run):
         files.write_bytes(output / "cameras.json", (source.folder / "cameras.json").read_bytes(), ours=True)
         run.settings = replace(run.settings, splits=source.settings.splits)
-    run.settings = replace(run.settings, said=run.settings.said | {"converted": said})
+    run.settings = begun.within(run.settings)
     run.settings.write(output / "config.json")
     if can(student, FromField):  # so that it does not begin from the photographs
         run.save(State(), student, student.optimizers(), torch.Generator().manual_seed(seed))
     return run
 
 
-def unfinished(source: Opened, name: str, output: Path) -> Run | None:
+def unfinished(source: Opened, name: str, output: Path) -> tuple[Run, Begun] | None:
     """The run of the same conversion that was interrupted there; None if there is none."""
     if not files.is_file(output / "config.json"):
         return None
     run = Run(output)
-    told = run.settings.said.get("converted")
-    same = isinstance(told, dict) and told.get("source") == str(source.path.resolve()) and run.method_name == name
-    return run if same and Converted.read(output) is None else None
+    begun = Begun.of(run.settings, output / "config.json")
+    if begun is None or (begun.source, run.method_name) != (str(source.path.resolve()), name):
+        return None
+    return (run, begun) if Converted.read(output) is None else None
 
 
 def photographs(source: Opened, where: str | None) -> Scene | None:

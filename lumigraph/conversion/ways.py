@@ -13,16 +13,18 @@ from ..run import Opened, Run
 from ..run.composition import Composition
 from ..scene import Scene
 
-Way = Literal["field", "depth", "pictures"]
+Way = Literal["field", "gaussians", "depth", "pictures"]
 SPATIAL = FromField, HasField, HasDensity, HasLooks, HasGaussians  # what holds a scene can do one of these
 
 
 def way(teacher: type[Method], student: type[Method]) -> Way | None:
-    """How a student can be made of a teacher: by the teacher's field at points, by the depth of what it renders, or by
-    learning from its pictures alone; None if not at all."""
+    """How a student can be made of a teacher: by the teacher's field at points, by its Gaussians as they are, by the
+    depth of what it renders, or by learning from its pictures alone; None if not at all."""
     if not all(issubclass(Scene, kind.learns_from) for kind in (teacher, student)):
         return None
     if can(student, FromField):
+        if can(teacher, HasGaussians) and can(student, HasGaussians):
+            return "gaussians"
         return "field" if can(teacher, HasField) else "depth"
     return "pictures" if any(can(student, capability) for capability in SPATIAL) else None
 

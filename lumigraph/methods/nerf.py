@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Annotated, Any, ClassVar
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
+from torch.nn.functional import softplus
 
 from ..camera import Camera
 from ..components.fields.coordinate_network import CoordinateNetwork, bytes_kept
@@ -167,7 +170,8 @@ class NeRF(RayMethod):
             occupied = known.occupied(self.space, c.occupancy_resolution, c.occupancy_threshold, chance)
             self.empty.grid.rule_out(occupied[None])
         optimizer = torch.optim.Adam(self.fine.parameters(), c.learning_rate, eps=1e-7)
-        distil(self.field, known, self.space, [optimizer], TAUGHT * c.rays_per_step, chance, self.device)
+        field = partial(self._field, activation=softplus)  # for what is below 0 must learn as well
+        distil(field, known, self.space, [optimizer], TAUGHT * c.rays_per_step, chance, self.device)
         if self.coarse:
             self.coarse.load_state_dict(self.fine.state_dict())
 
@@ -243,10 +247,17 @@ class NeRF(RayMethod):
         self, points: Float[Tensor, "point 3"], directions: Float[Tensor, "point 3"]
     ) -> tuple[Float[Tensor, " point"], Float[Tensor, "point 3"]]:
         """Density per scene unit, and sRGB-encoded colour seen along unit directions."""
+        return self._field(points, directions, torch.relu)
 
+    def _field(
+        self,
+        points: Float[Tensor, "point 3"],
+        directions: Float[Tensor, "point 3"],
+        activation: Callable[[Tensor], Tensor],
+    ) -> tuple[Float[Tensor, " point"], Float[Tensor, "point 3"]]:
         def answer(x: Tensor, direction: Tensor) -> tuple[Tensor, Tensor]:
             raw, rgb = self.fine(self._encoded(x), self.encode_direction(direction))
-            return raw.relu(), rgb.sigmoid()
+            return activation(raw), rgb.sigmoid()
 
         density, rgb = in_chunks(answer, self.space.warp(points), directions)
         return density * self.space.stretch(points), rgb

@@ -93,8 +93,7 @@ class Config(OpenNumbers):
 DELAYED = 0.01  # what the density's learning rate begins with, as a share
 REMEMBERED = 0.9  # of a cell's density and a voxel's weight, from one look of the occupancy grid to the next
 NOTED = 4  # steps between those whose samples' weights are remembered for pruning
-KNOWN_CELLS = 128  # along each axis, in which something is looked for where another method is taken over
-LEAST = 1e-2  # density that a node then has at least: what is below 0 learns nothing
+LEAST = 1e-2  # density of a node at least, where another method is taken over: what is not above 0 learns nothing
 EDGE = 1e-3  # opacities are kept so far from 0 and 1 in the beta loss
 
 
@@ -279,7 +278,7 @@ class Plenoxels(RayMethod):
     def from_field(self, teacher: Any, cameras: Camera) -> None:
         """Density and harmonics of the teacher at the finest grid's nodes, where it holds something."""
         known, c, chance = taken_over(teacher, cameras), self.config, self.random(3)
-        occupied = known.occupied(self.space, KNOWN_CELLS, c.occupancy_threshold, chance)
+        occupied = known.occupied(self.space, c.occupancy_resolution, c.occupancy_threshold, chance)
         cells = cells_of(self.frame, c.resolutions(self.frame.reach > 1)[1])
         self.voxels.rebuild(occupied.to(self.device), cells, self._table)
         points = self.space.unwarp(self.voxels.places.cpu())

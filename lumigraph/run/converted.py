@@ -1,15 +1,41 @@
-"""convert.json: what making one method's run of another's came to."""
+"""convert.json: what making one method's run of another's came to; and what config.json says of it until then."""
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Literal
 
 from .. import files
-from ..ranges import Count, Lasted, Name, Tally
+from ..ranges import Count, Lasted, Name, Tally, typed
+from .settings import Settings
 
 NAME = "convert.json"
+LearntFrom = Literal["photographs", "renderings of the source"]
+
+
+@dataclass(frozen=True)
+class Begun:
+    """A conversion that is under way, as `converted` in config.json.
+
+    source:      the run or file that is converted
+    learnt_from: what the student goes on learning from
+    taking_over: seconds that beginning as the teacher took
+    """
+
+    source: str
+    learnt_from: LearntFrom
+    taking_over: Lasted
+
+    def within(self, settings: Settings) -> Settings:
+        """Settings that say so."""
+        return replace(settings, said=settings.said | {"converted": asdict(self)})
+
+    @staticmethod
+    def of(settings: Settings, file: Path) -> Begun | None:
+        """What settings say; None of a run that was trained from its beginning. file: to name what is damaged in it"""
+        told = settings.said.get("converted")
+        return None if told is None else typed(Begun, told, f"{file}: converted")
 
 
 @dataclass(frozen=True)
@@ -32,7 +58,7 @@ class Converted:
     """Teacher and student.
 
     source:  the run or file that was converted
-    how:     by the teacher's field, by the depth that it shows, or by its pictures alone
+    how:     by the teacher's field, its Gaussians, the depth that it shows, or its pictures alone
     learnt_from: what the student went on learning from
     psnr:    of the student's held-out views against the teacher's, in dB
     views:   how many
@@ -41,8 +67,8 @@ class Converted:
     """
 
     source: str
-    how: Literal["field", "depth", "pictures"]
-    learnt_from: Literal["photographs", "renderings of the source"]
+    how: Literal["field", "gaussians", "depth", "pictures"]
+    learnt_from: LearntFrom
     teacher: Held
     student: Held
     psnr: float

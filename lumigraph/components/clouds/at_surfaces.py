@@ -13,19 +13,20 @@ from ..fields.taken_over import TakenOver
 from .initial_cloud import nearest_distance
 
 OPACITY = 0.8  # of each Gaussian at first
+WIDTH = 0.6  # deviation of a disc, in distances to its nearest neighbours
 FLATNESS = 0.2  # of a disc's thickness to its width
 
 
 def at_surfaces(held: TakenOver, most: int, degree: int, generator: torch.Generator) -> Gaussians:
-    """At most so many Gaussians on what cameras see: as wide as the nearest ones are far, across the surface's normal,
-    and of the colours that cameras see them in. Raises LumigraphError where there is no surface."""
+    """At most so many Gaussians on what cameras see: discs across the surface's normal that reach one another, of the
+    colours that cameras see them in. Raises LumigraphError where there is no surface."""
     seen = held.surface
     seen = seen[torch.randperm(len(seen), generator=generator)[:most]]
     if len(seen) < 2:
         raise LumigraphError(
             "Cameras agree on no surface, so there are no places for Gaussians; train for longer first"
         )
-    wide = nearest_distance(seen.points).clamp_min(1e-4)
+    wide = WIDTH * nearest_distance(seen.points).clamp_min(1e-4)
     scales = torch.stack([wide, wide, FLATNESS * wide], -1)
     harmonics = held.harmonics(seen.points, degree + 1, lambda rgb: rgb - 0.5)
     opacities = torch.full((len(seen),), OPACITY).logit()

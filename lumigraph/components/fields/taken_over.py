@@ -29,7 +29,7 @@ from ..sampling.surveyed import Sight, Surface, empty, surface, survey
 AT_ONCE = 1 << 17  # points
 ASKED = 12  # views whose directions tell how a colour depends on them
 UNSEEN = 0.02  # weight of a view that does not see a point, which then has some colour at least
-STIFFNESS = 0.3  # views that hold harmonics beyond the first at zero
+STIFFNESS = 0.1  # views that hold harmonics beyond the first at zero
 TRUNCATION = 0.015  # of the distance from a camera: half the thickness of a shell
 SPENT = 8.0  # optical thickness of half a shell, where it is solid
 COARSE, PROBES = 64, 8  # cells per axis that are looked at first, and places in each
@@ -180,7 +180,12 @@ class OfField(TakenOver):
 
 
 class OfSights(TakenOver):
-    """Of pictures with depth: a shell around the surfaces that they show, solid from half its thickness on."""
+    """Of pictures with depth: a shell around the surfaces that they show, solid from half its thickness on.
+
+    It has a `field` itself, so it can stand for its teacher wherever one is needed that has.
+    """
+
+    device = torch.device("cpu")
 
     def _density(self, points):
         total, weight, thickness = (points.new_zeros(len(points)) for _ in range(3))
@@ -196,6 +201,18 @@ class OfSights(TakenOver):
         known = weight > 0
         inwards = (0.5 - total / weight.clamp_min(1e-12)).clamp(0, 1) * known
         return inwards * SPENT * weight / thickness.clamp_min(1e-12)
+
+    @torch.no_grad()
+    def field(
+        self, points: Float[Tensor, "point 3"], directions: Float[Tensor, "point 3"]
+    ) -> tuple[Float[Tensor, " point"], Float[Tensor, "point 3"]]:
+        """Density per scene unit, and the colour in that picture which sees the point most nearly along a direction."""
+        best, rgb = torch.full((len(points),), -2.0), torch.full_like(points, 0.5)
+        for sight in self.sights:
+            along = (unit(points - sight.camera.position) * directions).sum(-1)
+            nearer = ((along > best) & sight.sees(points)).nonzero()[:, 0]
+            best[nearer], rgb[nearer] = along[nearer], self.glance(points[nearer], sight)
+        return self.density(points), rgb
 
     def glance(self, points, sight):
         pixel, inside, _ = sight.pixels(points)

@@ -19,8 +19,8 @@ from ...progress import track
 
 VIEWS, LONGEST = 24, 128  # cameras asked at most, and pixels of the longer side of what they see
 SOLID, CLEAR = 0.5, 0.02  # opacity from which on a pixel shows a surface, and up to which it shows none
-MARGIN = 0.03  # of the distance from the camera: how exactly rendered depth says where a surface is
-AROUND = 5  # pixels: of these the nearest surface counts, so that thin things are not seen past
+MARGIN = 0.02  # of the distance from the camera: how exactly rendered depth says where a surface is
+AROUND = 3  # pixels: of these the nearest surface counts, so that thin things are not seen past
 WITNESSES = 2  # cameras that must see past a place for it to be empty
 
 

@@ -17,7 +17,10 @@ from .schedules import held
 
 STEPS = 240
 POOL = 16  # times as many places as a step learns from: the teacher is asked about these alone
-CELL = 1 / 64  # of the coordinates: a length over which densities are compared by what they stop
+CELL = 1 / 16  # of the coordinates: a length over which densities are compared by what they stop
+CLEAR = 1 / 2  # the same where the teacher holds nothing: a little fog there is much along a ray
+NOTHING = 0.01  # optical thickness of CELL up to which that is so
+SOLID = 8.0  # and from which on all is solid alike
 FINAL = 0.1  # of the learning rates, at the end
 START = 0.3  # share of the steps before they fall
 
@@ -40,13 +43,15 @@ def distil(
         L = mean (log(1 + sigma d) - log(1 + sigma' d))^2 + mean a' |c - c'|^2,    a' = 1 - exp(-sigma' d)
 
     over places near surfaces, before them and anywhere, colours along the way from a camera that sees the place.
-    d is CELL of the coordinates; the optimizers go at the rates that they have, which fall.
+    d is CELL of the coordinates, or CLEAR where the teacher holds nothing; where it is solid, it is enough to be solid
+    too. The optimizers go at the rates that they have, which fall.
     points: that a step learns from
     """
     places = held_by.places(space, POOL * points, chance)
     directions, rgb, seen = glances(held_by, places, chance)
     length = CELL / space.stretch(places)
-    thickness = held_by.density(places) * length
+    thickness = (held_by.density(places) * length).clamp_max(SOLID)
+    length = torch.where(thickness > NOTHING, length, length * (CLEAR / CELL))
     lessons = [x.to(device) for x in (places, directions, rgb, seen, thickness, length)]
     rates = [(group, group["lr"]) for optimizer in optimizers for group in optimizer.param_groups]
     with torch.enable_grad():
@@ -56,7 +61,8 @@ def distil(
             chosen = torch.randint(len(places), (points,), generator=chance).to(device)
             place, direction, colour, sees, wanted, d = (x[chosen] for x in lessons)
             density, found = field(place, direction)
-            dense = (torch.log1p(density * d) - torch.log1p(wanted)).square().mean()
+            off = torch.log1p(density * d) - torch.log1p(wanted)
+            dense = torch.where(wanted < SOLID, off, off.clamp_max(0)).square().mean()
             weight = sees * -torch.expm1(-wanted)
             coloured = (weight[:, None] * (found - colour).square()).mean()
             for optimizer in optimizers:
