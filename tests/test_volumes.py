@@ -93,10 +93,21 @@ def test_an_atlas_is_seen_as_its_rays_say(tmp_path, window, network):
     assert agreement(shown, volumes.atlas_seen(other, rays, OPENING.near, GROUND)) < 30  # the network is seen
 
 
+@pytest.fixture(scope="module")
+def grid(ball_run, tmp_path_factory):
+    """The folder of a run that knows density and colour at points."""
+    folder = tmp_path_factory.mktemp("grid") / "run"
+    convert(open_any(ball_run.folder), "plenoxels", folder, small("plenoxels"))
+    return folder
+
+
+def small(name: str, steps: int = 24) -> Aim:
+    return Aim(config=lumigraph.methods.find(name).smallest(), steps=steps, views=1)
+
+
 @pytest.mark.parametrize(("name", "holds"), [("plenoctrees", "leaves of an octree"), ("snerg", "blocks of")])
-def test_a_baked_run_is_seen_as_it_renders(ball_run, tmp_path, window, capsys, name, holds):
-    aim = Aim(config=lumigraph.methods.find(name).smallest(), steps=24, views=1)
-    convert(open_any(ball_run.folder), name, tmp_path / "run", aim)
+def test_a_baked_run_is_seen_as_it_renders(grid, tmp_path, window, capsys, name, holds):
+    convert(open_any(grid), name, tmp_path / "run", small(name))
     assert main(["export", "web", str(tmp_path / "run"), str(tmp_path / "page.html")]) == 0
     assert holds in capsys.readouterr().out
     opened, method = window(tmp_path / "page.html"), open_any(tmp_path / "run").method()
@@ -107,12 +118,9 @@ def test_a_baked_run_is_seen_as_it_renders(ball_run, tmp_path, window, capsys, n
         assert psnr(opened.look(camera), ours) > 40
 
 
-def test_a_field_becomes_an_octree_on_the_way(ball_run, tmp_path, capsys, monkeypatch):
-    grid = Aim(config=lumigraph.methods.find("plenoxels").smallest(), steps=4, views=1)
-    convert(open_any(ball_run.folder), "plenoxels", tmp_path / "run", grid)
-    small = Aim(config=lumigraph.methods.find("plenoctrees").smallest(), steps=4, views=1)
-    monkeypatch.setattr(lumigraph.conversion, "Aim", lambda seconds: small)
-    assert main(["export", "web", str(tmp_path / "run"), str(tmp_path / "page.html")]) == 0
+def test_a_field_becomes_an_octree_on_the_way(grid, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(lumigraph.conversion, "Aim", lambda seconds: small("plenoctrees", 4))
+    assert main(["export", "web", str(grid), str(tmp_path / "page.html")]) == 0
     told = capsys.readouterr().out
     assert "leaves of an octree" in told and "--as views is quicker" in told and "dB to plenoxels" in told
     assert (tmp_path / "page.html").is_file()
