@@ -9,7 +9,7 @@ from jaxtyping import Float, Int, Int32
 from torch import Tensor
 
 from ...rays import Samples
-from .._dispatch import implementation
+from .._dispatch import implementation, using
 from .._doors import door, require
 from .._facts import Facts
 
@@ -214,12 +214,12 @@ def code_of(x: Tensor, y: Tensor, z: Tensor, depth: int) -> Int[Tensor, " cell"]
 
 def steady(origins: Tensor, directions: Tensor, tree: Tree, density: Tensor, near: float, stop: float):
     """Only the rays that cross the same cells when they are nudged by more than float32 rounds."""
-    from .reference import run
 
     def rows(nudge: float) -> tuple[Tensor, ...]:
         moved = origins.double() + nudge * torch.tensor([1.0, -0.7, 0.4])
-        *_, ray_starts, rows = run(moved, directions.double(), tree, density.double(), near, stop * (1 + 9 * nudge))
-        return rows.split(ray_starts.diff().tolist())
+        with using("reference"):
+            found = octree_cells(moved, directions.double(), tree, density.double(), near, stop * (1 + 9 * nudge))
+        return found.rows.split(found.ray_starts.diff().tolist())
 
     nudged = zip(*(rows(nudge) for nudge in (-1e-5, 0.0, 1e-5)), strict=True)
     keep = torch.tensor([torch.equal(a, b) and torch.equal(b, c) for a, b, c in nudged], dtype=torch.bool)
