@@ -9,9 +9,9 @@ import torch
 from lumigraph import kernels
 from lumigraph.components.fields.sparse_voxels import SparseVoxels
 from lumigraph.components.training.lazy_rmsprop import LazyRMSprop
+from lumigraph.components.training.sparsity import cauchy
 from lumigraph.errors import LumigraphError
 from lumigraph.kernels import Nodes
-from lumigraph.components.training.sparsity import cauchy
 from lumigraph.methods.plenoxels import Config, Plenoxels, undecided
 
 

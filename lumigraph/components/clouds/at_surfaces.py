@@ -13,6 +13,7 @@ from ..fields.taken_over import TakenOver
 from .initial_cloud import nearest_distance
 
 OPACITY = 0.8  # of each Gaussian at first
+BANDS = 2  # of harmonics that begin as what cameras see; more would be guessed between their few directions
 WIDTH = 0.6  # deviation of a disc, in distances to its nearest neighbours
 FLATNESS = 0.2  # of a disc's thickness to its width
 
@@ -28,7 +29,9 @@ def at_surfaces(held: TakenOver, most: int, degree: int, generator: torch.Genera
         )
     wide = WIDTH * nearest_distance(seen.points).clamp_min(1e-4)
     scales = torch.stack([wide, wide, FLATNESS * wide], -1)
-    harmonics = held.harmonics(seen.points, degree + 1, lambda rgb: rgb - 0.5)
+    harmonics = torch.zeros(len(seen), (degree + 1) ** 2, 3)
+    bands = min(degree + 1, BANDS)
+    harmonics[:, : bands**2] = held.harmonics(seen.points, bands, lambda rgb: rgb - 0.5)
     opacities = torch.full((len(seen),), OPACITY).logit()
     return Gaussians(seen.points, facing(seen.normals), scales.log(), opacities, harmonics)
 
