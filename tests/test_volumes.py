@@ -173,8 +173,8 @@ def test_a_phone(tmp_path, window):
     first = opened.settled()
     assert first.shape == (560, 260, 3)
     assert psnr(first, np.broadcast_to(OPENING.background, first.shape)) < 25
-    opened.drag(0.25)
-    assert psnr(opened.settled(), first) < 30
+    opened.drag(0.4)
+    assert psnr(opened.settled(), first) < 40
 
 
 @pytest.mark.parametrize(
