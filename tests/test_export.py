@@ -359,7 +359,7 @@ def test_a_film_along_keyframes(ball_run, tmp_path, capsys):
         lines = capsys.readouterr().err.strip().splitlines()
         assert len(lines) == 1 and re.search(words, lines[0])
     assert (tmp_path / "walk.json").read_bytes() == before and not (tmp_path / "a.mp4").exists()
-    assert main([*command, "--path", "obrit"]) == 2 and "orbit, spiral" in capsys.readouterr().err
+    assert main([*command, "--path", "obrit"]) == 2 and "orbit, sweep, spiral" in capsys.readouterr().err
 
 
 def test_a_broken_film_leaves_nothing(ball_run, tmp_path, monkeypatch):

@@ -143,7 +143,7 @@ def test_an_unbounded_scene_trains_and_renders():
     scene = black_room(reach=4.0)
     made = method(scene)
     before = evaluate(made, scene).psnr
-    train(made, scene, 40)
+    train(made, scene, 60)
     assert made.lattice.growth > 0 and len(made.occupancy.density) == 3
     seen = made.render(scene.cameras[0])
     assert torch.isfinite(seen.rgb).all() and torch.isfinite(seen.opacity).all() and not seen.depth.isnan().any()

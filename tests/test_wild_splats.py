@@ -84,8 +84,8 @@ def test_a_told_light_shows_in_pictures_and_in_the_cloud(taught):
     assert torch.allclose(method.given(dim_shot).render(camera).rgb, dark.rgb, atol=0.15)
     plain = new()[0]
     plain.cloud.replace(dim.gaussians())
-    apart = (plain.render(camera).rgb - dark.rgb)[there].abs()  # but where a colour is cut at 0
-    assert apart.mean() < 0.01 and apart.quantile(0.9) < 0.03
+    apart, changed_by = ((x - dark.rgb)[there].abs().mean() for x in (plain.render(camera).rgb, average.rgb))
+    assert apart < 0.25 * changed_by  # but where a colour is cut at 0
 
 
 def test_the_light_of_a_picture_is_found(generator):
@@ -122,7 +122,7 @@ def test_photographs_of_one_light_are_told_from_others(generator):
     same, lit = tiny.scene(), two_lights()
     where = 0.6 * torch.nn.functional.normalize(torch.randn(1000, 3, generator=generator), dim=-1)
     assert spread_of_light(same) == 0.0
-    assert spread_of_light(replace(same, points=where)) < 0.1
+    assert spread_of_light(replace(same, points=where)) < STOPS / 2
     assert spread_of_light(replace(lit, points=where)) > STOPS
     method, _ = new()
     with pytest.warns(LumigraphWarning, match="differ by"):
@@ -173,24 +173,21 @@ def test_the_threshold_follows_the_errors(generator):
     assert trimming.threshold == pytest.approx(float(0.1 * error.quantile(KEPT)), abs=2 / BINS)
 
 
-def test_what_passed_before_one_photograph_is_left_out():
-    """A dark sheet before the ball, on a photograph of nine: the cloud does not take it up."""
+def test_what_passed_before_photographs_is_left_out():
+    """A dark sheet before the ball, elsewhere on three photographs of nine: the cloud takes up less of it."""
     scene = tiny.scene()
     pictures = [tiny.picture(pose) for pose in scene.cameras.pose]
-    pictures[6] = pictures[6].copy()
-    pictures[6][4:20, 6:18] = (0, 30, 0, 255)
+    sheets = {1: (slice(4, 18), slice(6, 18)), 3: (slice(5, 19), slice(7, 18)), 6: (slice(6, 20), slice(8, 18))}
+    for i, place in sheets.items():
+        pictures[i] = pictures[i].copy()
+        pictures[i][place] = (0, 30, 0, 255)
     spoilt = replace(scene, images=ImageStore.from_arrays(pictures))
     scores = {}
     for robust in ("no", "yes"):
         method, _ = new(robust=robust, robust_start=0.3, opacity_reset_interval=1000)
         fit(method, spoilt, steps=150, show=False, rehearsal=False)
         scores[robust] = evaluate(method, scene).psnr
-    assert scores["yes"] > scores["no"], scores
-    photograph = spoilt.photograph(6).before(scene.frame.background)
-    counts = method.trimming((method.render(scene.cameras[6]).rgb - photograph).abs().mean(-1))
-    sheet = torch.zeros_like(counts)
-    sheet[4:20, 6:18] = True
-    assert counts[sheet].float().mean() < 0.4 and counts[~sheet].float().mean() > 0.8
+    assert scores["yes"] > scores["no"] + 0.3, scores
 
 
 # What few photographs see

@@ -162,7 +162,7 @@ class GaussianSplatting(Method):
         self.rhythm = Rhythm(config.refine_every, config.refine_every_share)
         self.register_buffer("extent", torch.tensor(1.0))
         self.register_buffer("drawn", torch.tensor(0))
-        self.register_buffer("differ", torch.tensor(config.appearance == "yes"))
+        self.register_buffer("differ", torch.tensor(config.appearance == "yes"), persistent=told_apart)
         self.register_buffer("began", torch.tensor(len(self.cloud)))
         self.register_buffer("interval", torch.zeros(len(self.cloud) if config.filter_3d else 0))
         self._bands = config.sh_degree + 1
@@ -207,6 +207,7 @@ class GaussianSplatting(Method):
             densify_grad_threshold=1e-6,
             opacity_reset_interval=5,
             refine_cameras=True,
+            appearance="no",
         )
 
     def rehearse_begin(self) -> None:
