@@ -44,7 +44,7 @@ SHARES: dict[str, tuple[str, float]] = {
     "test_fuzz": ("nouns, capture", 10),
     "test_mesh": ("exports, viewer, web", 25),
     "test_web": ("exports, viewer, web", 15),
-    "test_volumes": ("exports, viewer, web", 25),
+    "test_volumes": ("exports, viewer, web", 30),
     "test_viewer_page": ("exports, viewer, web", 20),
     "test_viewer": ("exports, viewer, web", 10),
     "test_viewer_guard": ("exports, viewer, web", 5),
