@@ -64,7 +64,7 @@ SHARES: dict[str, tuple[str, float]] = {
     "test_instant_ngp": ("methods", 10),
     "test_gaussian_splatting": ("methods", 10),
     "test_dvgo": ("methods", 8),
-    "test_snerg": ("methods", 8),
+    "test_snerg": ("methods", 12),
     "test_fourier_features": ("methods", 12),
 }
 A_METHOD = 6.0  # by contract, of each method, beside what its own file takes
