@@ -233,7 +233,7 @@ class _BlockMarch(torch.autograd.Function):
         starts = torch.nn.functional.pad(lengths.long().cumsum(0), (1, 0))
         steps = torch.zeros(int(starts[-1]), dtype=torch.int32, device=values.device)
         lights, to_values = empty(len(steps), device=values.device), torch.zeros_like(values)
-        if len(steps):
+        if len(origins):
             grid = (triton.cdiv(len(origins), BLOCK),)
             out = totals, distance, lengths, starts, steps, lights
             rest = *out, *ctx.sizes, ctx.stop
