@@ -23,10 +23,9 @@ from ..components.fields.octree_baking import (
     bake,
     density_of,
     fill,
-    fitted_harmonics,
     met,
 )
-from ..components.fields.taken_over import taken_over
+from ..components.fields.taken_over import logit, taken_over
 from ..components.sampling.carving import visual_hull
 from ..components.sampling.coarse_to_fine import SAMPLES_OF_A_RAY, first_grid, keep_looking, lattice, stage
 from ..components.sampling.marching import FIRST_RAYS, rays_for, reached
@@ -316,12 +315,13 @@ class PlenOctrees(RayMethod):
 
     def from_field(self, teacher: Any, cameras: Camera) -> None:
         """Bake a teacher's density and colour as far as cameras see them; what is learnt from then on are leaves."""
-        if not can(teacher, HasField):
-            teacher = taken_over(teacher, cameras)
-        chance, numbers = self.random(-1), self._baking
+        known, chance, numbers = taken_over(teacher, cameras), self.random(-1), self._baking
         mask = met(teacher, cameras, numbers, chance) if can(teacher, HasLooks) else None
-        bake(self.leaves, density_of(teacher), mask, cameras, numbers, chance)
-        fitted_harmonics(self.leaves, teacher, cameras, chance)
+        density = density_of(teacher) if can(teacher, HasField) else known.density
+        bake(self.leaves, density, mask, cameras, numbers, chance)
+        centres, _ = self.leaves.centres
+        harmonics = known.harmonics(centres.cpu(), self.config.sh_bands, logit)
+        self.leaves.harmonics.data.copy_(harmonics.flatten(1))
         self._leave_field()
 
     def load_state_dict(self, state_dict: Mapping[str, Any], strict: bool = True, assign: bool = False) -> Any:

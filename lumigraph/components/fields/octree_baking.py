@@ -18,7 +18,7 @@ from torch.nn.functional import max_pool3d
 from ...camera import Camera
 from ...capabilities import HasDensity, can
 from ...errors import LumigraphError
-from ...kernels import composite, spherical_harmonics
+from ...kernels import composite
 from ...memory import free_on, gigabytes
 from ...rays import Rays
 from ...volume import weights_of
@@ -30,9 +30,6 @@ CHUNK = 1 << 13  # rays asked at once
 POINTS = 1 << 18  # points asked at once
 PER_CELL = 32  # rays that look, for each cell of one face of the cube
 MOST_RAYS = 1 << 22
-VIEWS = 24  # directions in which a field's colour is asked, of each leaf
-RIDGE = 0.05  # how strongly harmonics that these directions do not tell stay 0, as a share of what all of them tell
-DARKEST = 0.005  # of colours whose logit is taken, and as far below white
 
 Density = Callable[[Float[Tensor, "point 3"]], Float[Tensor, " point"]]
 Harmonics = Callable[[Float[Tensor, "point 3"]], tuple[Float[Tensor, " point"], Float[Tensor, "point basis 3"]]]
@@ -206,25 +203,3 @@ def averaged_harmonics(leaves: Leaves, harmonics: Harmonics, count: int, generat
         weights = (density.view(len(rows), count, 1) + 1e-6).double()
         mean = (weights * found.view(len(rows), count, -1)).sum(1) / weights.sum(1)
         leaves.harmonics.data[rows] = mean.float()
-
-
-def fitted_harmonics(leaves: Leaves, teacher: Any, cameras: Camera, generator: torch.Generator) -> None:
-    """Harmonics nearest to a field's colours, before the sigmoid, in the directions from which some cameras see each
-    leaf, at random points of it: least squares, in which what the directions do not tell stays small."""
-    centres, side = leaves.centres
-    bands, positions = round(leaves.basis**0.5), cameras.position.to(centres)
-    told = VIEWS / (4 * torch.pi)  # the sum of squares of one basis function over directions spread evenly
-    ridge = RIDGE * told * (torch.arange(leaves.basis, device=centres.device) > 0).diag_embed() + 1e-4 * torch.eye(
-        leaves.basis, device=centres.device
-    )
-    for rows in torch.arange(len(leaves), device=centres.device).split(POINTS // VIEWS):
-        points = points_in(centres[rows], side[rows], VIEWS, generator).flatten(0, 1)
-        chosen = torch.randint(len(positions), (len(points),), generator=generator).to(points.device)
-        directions = torch.nn.functional.normalize(points - positions[chosen], dim=-1)
-        density, rgb = teacher.field(points, directions)
-        weights = (density + 1e-3).view(len(rows), VIEWS, 1)
-        weights = weights / weights.mean(1, keepdim=True)
-        basis = spherical_harmonics(directions, bands).view(len(rows), VIEWS, -1)
-        wanted = rgb.clamp(DARKEST, 1 - DARKEST).logit().view(len(rows), VIEWS, 3)
-        weighted = (basis * weights).mT
-        leaves.harmonics.data[rows] = torch.linalg.solve(weighted @ basis + ridge, weighted @ wanted).flatten(1)
