@@ -10,7 +10,7 @@ goes on where it was interrupted.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -40,6 +40,7 @@ class Options:
     output: Path
     steps: int = 6000  # of all stages
     views: int = 25  # held-out views to compare
+    octree_depth: int | None = None  # of plenoctrees, where it shall not be the preset's
     downscale: int | None = None
     device: str = "cpu"
 
@@ -49,6 +50,8 @@ def main(options: Options) -> None:
     scene = open_scene(options.scene, downscale=options.downscale)
     kind = methods.find(options.method)
     config = kind.preset(device)
+    if options.octree_depth is not None:
+        config = replace(config, octree_depth=options.octree_depth)
     folder, budget = options.output / "run", Budget(options.steps, None)
     if not is_file(folder / "config.json"):
         method = build(kind, scene.frame, config, device, 0, learning=True)
