@@ -105,7 +105,8 @@ class Collection:
         return next(self.members())[1]
 
     def _numbers(self, split: str) -> list[int]:
-        if not len(there := self.splits.get(split, ())):
+        there = self.splits.get(split)
+        if there is None or not len(there):
             kinds = ", ".join(f"{name} ({len(index)} members)" for name, index in self.splits.items() if len(index))
             raise LumigraphError(f"{self.source} has no members in the split {split!r}; there are: {kinds or 'none'}")
         return there.tolist()

@@ -211,7 +211,7 @@ class PixelNeRF(RayMethod):
     def steps_per_pass(self, data: Collection) -> float:
         return len(data.splits["train"]) / self.config.members_per_step
 
-    def batch(self, data: Collection, generator: torch.Generator) -> Lesson:
+    def batch(self, data: Collection, generator: torch.Generator) -> Lesson:  # type: ignore[override]
         """Random members; of each as many random photographs to look at, and rays through some others."""
         c = self.config
         views = 1 + chance(c.source_views, generator)
@@ -240,7 +240,7 @@ class PixelNeRF(RayMethod):
         rays = Rays(*(torch.cat([getattr(r, name) for r, _ in parts]) for name in ("origins", "directions", "radius")))
         return Batch(rays, torch.cat([rgb for _, rgb in parts]))
 
-    def loss(self, batch: Lesson, step: int) -> dict[str, Tensor]:
+    def loss(self, batch: Lesson, step: int) -> dict[str, Tensor]:  # type: ignore[override]
         """The squared error of both looks, over all members (section 4.2)."""
         terms: dict[str, Tensor] = {}
         generator, share = self.random(step), 1 / len(batch.batches)

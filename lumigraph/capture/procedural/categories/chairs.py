@@ -34,8 +34,8 @@ def objects(random: np.random.Generator) -> Iterator[Object]:
         yield part(Cylinder(0.75 * wide, 0.025, rounding=0.01), frame, 0, 0, 0.025)
     else:
         straight = random.uniform() < 0.5
-        for x in (-1, 1):
-            for y in (-1, 1):
+        for x in (-1.0, 1.0):
+            for y in (-1.0, 1.0):
                 shape = Box((leg, leg, under), 0.008) if straight else Cylinder(leg, under)
                 yield part(shape, frame, x * (inset * wide - leg), y * (inset * deep - leg), under)
     lean, kind = random.uniform(0, 10), random.uniform()
@@ -44,7 +44,7 @@ def objects(random: np.random.Generator) -> Iterator[Object]:
     if kind < 0.4:
         yield part(Box((0.9 * wide, 0.03, 0.5 * back), 0.02), cloth, 0, shift, middle, tilt=-lean)
     else:
-        for x in (-1, 1):
+        for x in (-1.0, 1.0):
             yield part(Box((leg, 0.03, 0.5 * back), 0.008), frame, x * (0.85 * wide), shift, middle, tilt=-lean)
         count = int(random.integers(2, 5))
         for i in range(count):
