@@ -15,7 +15,8 @@ from lumigraph import methods
 from lumigraph.camera import Camera
 from lumigraph.collection import Collection
 from lumigraph.components.fields.kept_photographs import KeptPhotographs, padded
-from lumigraph.components.fields.picture_encoder import PictureEncoder, finer, look_up
+from lumigraph.components.fields.picture_encoder import PictureEncoder, finer
+from lumigraph.components.fields.picture_lookup import look_up
 from lumigraph.components.fields.residual_network import ResidualNetwork
 from lumigraph.errors import LumigraphError
 from lumigraph.lens import Fisheye
@@ -45,7 +46,7 @@ def test_the_encoder_is_torchvisions_cut_short():
     assert not any(name.startswith(("layer3.6", "layer4", "fc")) for name in shapes)
     # the stem and three stages of resnet34 have 8,170,304 numbers that are learnt
     assert sum(p.numel() for p in encoder.parameters()) == 8_170_304
-    assert encoder(torch.rand(1, 3, 32, 48)).shape == (1, 512, 16, 24)
+    assert encoder(torch.rand(1, 3, 32, 48)).shape == (1, 16, 24, 512)
 
 
 @pytest.mark.parametrize("pool", [True, False])
@@ -58,19 +59,33 @@ def test_cells_of_every_stage_lie_where_they_are_said_to(pool):
             layer.weight.data = 0.5 * (layer.weight.data + layer.weight.data.flip(-1))
     picture = torch.rand(1, 3, 33, 33)
     features = encoder(picture)
-    assert features.shape[2:] == (17, 17)  # cell 8 of the stem, 1 of the third stage, lies on pixel 16
-    torch.testing.assert_close(encoder(picture.flip(-1)), features.flip(-1), atol=1e-4, rtol=1e-4)
+    assert features.shape[1:3] == (17, 17)  # cell 8 of the stem, 1 of the third stage, lies on pixel 16
+    torch.testing.assert_close(encoder(picture.flip(-1)), features.flip(2), atol=1e-4, rtol=1e-4)
 
 
 def test_looking_up_a_ramp_gives_where_one_looked():
     """Cell j of half the resolution is centred on pixel 2 j, whose middle is at 2 j + 0.5."""
     rows, columns = torch.meshgrid(torch.arange(9.0), torch.arange(13.0), indexing="ij")
     ramp = torch.stack([2 * columns + 0.5, 2 * rows + 0.5])[None]
+    cells = ramp.permute(0, 2, 3, 1)
     pixels = torch.tensor([[[0.5, 0.5], [7.3, 4.9], [24.5, 16.5]]])
-    torch.testing.assert_close(look_up(ramp, pixels, torch.tensor([[25.0, 17.0]])), pixels)
-    outside = look_up(ramp, torch.tensor([[[-50.0, 99.0]]]), torch.tensor([[25.0, 17.0]]))
+    torch.testing.assert_close(look_up(cells, pixels, torch.tensor([[25.0, 17.0]])), pixels)
+    outside = look_up(cells, torch.tensor([[[-50.0, 99.0]]]), torch.tensor([[25.0, 17.0]]))
     torch.testing.assert_close(outside, torch.tensor([[[0.5, 16.5]]]))
     torch.testing.assert_close(finer(ramp[:, :, ::2, ::2], 2, ramp.shape[2:]), ramp)
+
+
+@pytest.mark.parametrize("size", [(1, 1), (1, 5), (4, 6)])
+def test_looking_up_is_grid_sample(size, generator):
+    cells = torch.randn(3, *size, 7, generator=generator, requires_grad=True)
+    sizes = 2.0 * torch.tensor([size[::-1]]).expand(3, 2) - 1
+    pixels = torch.rand(3, 50, 2, generator=generator) * (sizes[:1] + 4) - 2
+    grid = 2 * (pixels - 0.5) / (sizes - 1)[:, None].clamp_min(1) - 1
+    expected = F.grid_sample(cells.permute(0, 3, 1, 2), grid[:, None], "bilinear", "border", align_corners=True)
+    found, weights = look_up(cells, pixels, sizes), torch.randn(3, 50, 7, generator=generator)
+    torch.testing.assert_close(found, expected[:, :, 0].mT)
+    one, other = (torch.autograd.grad((x * weights).sum(), cells)[0] for x in (found, expected[:, :, 0].mT))
+    torch.testing.assert_close(one, other, atol=1e-5, rtol=1e-5)
 
 
 def test_weights_of_others_are_taken_from_a_file(tmp_path):
@@ -104,7 +119,7 @@ def test_the_network_is_the_papers():
     network = ResidualNetwork(5, 7, 16, blocks=3, joined=2, exact=True)
     for block in network.blocks:
         torch.nn.init.normal_(block.outer.weight, std=0.2)
-    points, features = torch.randn(2, 11, 5), torch.randn(2, 7, 4, 6)
+    points, features = torch.randn(2, 11, 5), torch.randn(2, 4, 6, 7)
     pixels, sizes = torch.rand(2, 11, 2) * torch.tensor([11.0, 7.0]), torch.tensor([[11.0, 7.0]]).expand(2, 2)
     found = network(points, look_up(network.prepared(features), pixels, sizes))
 
@@ -113,7 +128,7 @@ def test_the_network_is_the_papers():
         return x + F.linear(F.linear(x.relu(), inner.weight, inner.bias).relu(), outer.weight, outer.bias)
 
     w = look_up(features, pixels, sizes)
-    join = network.join.weight[:, :, 0, 0].chunk(2), network.join.bias.chunk(2)
+    join = network.join.weight.chunk(2), network.join.bias.chunk(2)
     x = F.linear(points, network.first.weight, network.first.bias)
     for k in range(2):
         x = block(x + w @ join[0][k].T + join[1][k], k)

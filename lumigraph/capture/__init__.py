@@ -25,7 +25,6 @@ from .capture import Shot as Shot
 from .fewer import with_fewer_views
 from .masks import with_masks
 from .multiscale import multiscale as multiscale
-from .photos import is_bare
 from .pictures import list_images
 from .raw import with_raw
 
@@ -136,12 +135,6 @@ def open_scene(
     if views is not None:
         scene = with_fewer_views(scene, views)
     return multiscale(scene, scales, memory, cache)
-
-
-def without_poses(source: str | Path) -> bool:
-    """Whether a source is photographs, a single picture or a video of which nobody knows where they were taken from."""
-    path = expanded(source)
-    return requested(source) is None and (single_image.recognises(path) or is_bare(path))
 
 
 def choose_reader(folder: Path, name: str | None = None) -> ModuleType:

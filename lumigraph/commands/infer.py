@@ -37,7 +37,8 @@ class Infer:
     """auto, cpu, cuda, cuda:1."""
 
     def run(self) -> int:
-        from ..capture import open_dataset, without_poses
+        from ..capture import PROCEDURAL, open_dataset, single_image
+        from ..capture.photos import is_bare
         from ..dataset import check_kind
         from ..prior import Prior
         from ..run import Run, check_new
@@ -50,7 +51,8 @@ class Infer:
         name = made_by.method_name
         output = self.output or next_free(f"runs/{scene_name(self.scene)}-{name}")
         check_new(output)
-        if without_poses(self.scene):
+        path = Path(self.scene).expanduser()
+        if not self.scene.startswith(PROCEDURAL) and (single_image.recognises(path) or is_bare(path)):
             raise LumigraphError(
                 f"{self.scene} holds no poses, and {name} must know where photographs were taken from; "
                 f"find them first: lumigraph capture {self.scene}"

@@ -19,7 +19,8 @@ from ..collection import Collection
 from ..components.fields.dense import in_chunks
 from ..components.fields.encodings import FrequencyEncoding
 from ..components.fields.kept_photographs import KeptPhotographs, padded
-from ..components.fields.picture_encoder import STRIDE, PictureEncoder, look_up
+from ..components.fields.picture_encoder import STRIDE, PictureEncoder
+from ..components.fields.picture_lookup import look_up
 from ..components.fields.residual_network import ResidualNetwork
 from ..components.sampling.sampling import inverse_transform, midpoints, stratified
 from ..components.sampling.spaces import space_of
@@ -106,7 +107,7 @@ class Sources:
     """
 
     cameras: Camera
-    maps: tuple[Float[Tensor, "view joins _ _"], ...]
+    maps: tuple[Float[Tensor, "view row column joins"], ...]
     frame: Frame
 
 
@@ -291,7 +292,7 @@ class PixelNeRF(RayMethod):
             told.told.pop("views", None)
             told.kept = told._keeping(scene, len(scene.splits["train"])).to(self.device)
             with torch.no_grad():
-                told.kept.found.rows = told._features(told.kept.pictures()).permute(0, 2, 3, 1).flatten(0, 2)
+                told.kept.found.rows = told._features(told.kept.pictures()).flatten(0, 2)
         return told
 
     def evidence_bytes(self, scene: Scene) -> int:
@@ -317,7 +318,7 @@ class PixelNeRF(RayMethod):
             with torch.no_grad():
                 if len(rows := self.kept.found.rows):
                     height, width = (-(-int(n) // STRIDE) for n in cameras.size.amax(0).flip(0))
-                    features = rows.view(len(cameras), height, width, -1).permute(0, 3, 1, 2)
+                    features = rows.view(len(cameras), height, width, -1)
                 else:
                     features = self._features(self.kept.pictures())
                 count = int(float(self.told.get("views", len(cameras))))
@@ -332,11 +333,11 @@ class PixelNeRF(RayMethod):
         features = self._features(pictures).split([len(x) for x in cameras])
         return [self._prepared(*of_one) for of_one in zip(features, cameras, lesson.frames, strict=True)]
 
-    def _features(self, pictures: list[Float[Tensor, "_ _ 3"]]) -> Float[Tensor, "view feature _ _"]:
+    def _features(self, pictures: list[Float[Tensor, "_ _ 3"]]) -> Float[Tensor, "view row column feature"]:
         return self.encoder(padded(pictures).to(self.device))
 
-    def _prepared(self, features: Float[Tensor, "view feature _ _"], cameras: Camera, frame: Frame) -> Sources:
-        maps = tuple(network.prepared(features.contiguous()) for network in self.networks)  # type: ignore[operator]
+    def _prepared(self, features: Float[Tensor, "view row column feature"], cameras: Camera, frame: Frame) -> Sources:
+        maps = tuple(network.prepared(features) for network in self.networks)  # type: ignore[operator]
         return Sources(cameras, maps, frame)
 
     # Along rays

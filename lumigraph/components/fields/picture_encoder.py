@@ -21,7 +21,7 @@ GROUPS = 8  # of channels that are normalised together, where statistics are eac
 
 
 class PictureEncoder(nn.Module):
-    """Pictures (view, 3, height, width) in [0, 1] become features (view, `width`, height / 2, width / 2).
+    """Pictures (view, 3, height, width) in [0, 1] become features (view, height / 2, width / 2, `width`).
 
     widths: channels of the stem and of the three stages
     blocks: of each stage
@@ -52,7 +52,7 @@ class PictureEncoder(nn.Module):
             setattr(self, f"layer{i}", nn.Sequential(*stage))
             before = width
 
-    def forward(self, pictures: Float[Tensor, "view 3 height width"]) -> Float[Tensor, "view feature _ _"]:
+    def forward(self, pictures: Float[Tensor, "view 3 height width"]) -> Float[Tensor, "view row column feature"]:
         x = F.relu(self.bn1(self.conv1(2 * pictures - 1)))
         levels, size = [x], x.shape[2:]
         if self.pool:
@@ -60,7 +60,7 @@ class PictureEncoder(nn.Module):
         for i, times in enumerate((2, 4, 8), 1):
             x = getattr(self, f"layer{i}")(x)
             levels.append(finer(x, times, size))
-        return torch.cat(levels, 1)
+        return torch.cat([level.permute(0, 2, 3, 1) for level in levels], -1)
 
     def load(self, path: Path) -> None:
         """Take the weights of torchvision's resnet34, from a file. Raises LumigraphError where they do not fit."""
@@ -120,18 +120,3 @@ def finer(x: Float[Tensor, "view channel _ _"], times: int, size: torch.Size) ->
     height, width = ((n - 1) * times + 1 for n in x.shape[2:])
     x = F.interpolate(x, (height, width), mode="bilinear", align_corners=True)
     return x[:, :, : size[0], : size[1]]
-
-
-def look_up(
-    features: Float[Tensor, "view channel _ _"], pixels: Float[Tensor, "view point 2"], sizes: Float[Tensor, "view 2"]
-) -> Float[Tensor, "view point channel"]:
-    """Features at places (x, y) on pictures, bilinearly; outside of a picture those at its border.
-
-    pixels: pixels' centres lie at +0.5, so that cell (i, j) lies at (2 j + 0.5, 2 i + 0.5)
-    sizes:  width and height of each picture, where pictures are padded to one size
-    """
-    cells = features.new_tensor(features.shape[:1:-1])  # columns, rows
-    inside = torch.minimum(pixels.clamp_min(0.5), sizes[:, None] - 0.5)
-    grid = (2 / STRIDE) * (inside - 0.5) / (cells - 1).clamp_min(1) - 1
-    found = F.grid_sample(features, grid[:, None], "bilinear", "border", align_corners=True)
-    return found[:, :, 0].mT

@@ -26,18 +26,16 @@ class ResidualNetwork(nn.Module):
     ):
         super().__init__()
         self.first = Dense(inputs, width, exact=exact)
-        self.join = nn.Conv2d(features, joined * width, 1)
+        self.join = Dense(features, joined * width, exact=exact)
         self.blocks = nn.ModuleList(ResidualBlock(width, exact) for _ in range(blocks))
         self.last = Dense(width, 4, exact=exact)
         self.joined = joined
         for layer in (self.first, self.join):
             nn.init.kaiming_normal_(layer.weight)
-            assert layer.bias is not None
-            nn.init.zeros_(layer.bias)
 
-    def prepared(self, features: Float[Tensor, "view feature _ _"]) -> Float[Tensor, "view joins _ _"]:
+    def prepared(self, features: Float[Tensor, "view row column feature"]) -> Float[Tensor, "view row column joins"]:
         """What each cell's features add to the inputs of the first blocks, end to end."""
-        return self.join(features)
+        return self.join(features.flatten(0, 2)).float().unflatten(0, features.shape[:3])
 
     def forward(
         self, points: Float[Tensor, "view point input"], joins: Float[Tensor, "view point joins"]
