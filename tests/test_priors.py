@@ -7,6 +7,7 @@ import shutil
 import pytest
 import tiny
 import tiny_collection
+import tiny_shapes
 import torch
 from PIL import Image
 
@@ -162,6 +163,26 @@ def test_objects_keep_within_their_category_and_differ(name):
     assert len({repr(stage.world) for stage in stages}) == 60
     assert categories.stage(name, 7, 16, 2, 0).world == stages[7].world
     assert categories.stage(name, 7, 16, 2, 1).world != stages[7].world
+
+
+def test_meshes_are_photographed(tmp_path):
+    tiny_shapes.write(tmp_path / "meshes")
+    asked = f"procedural:{tmp_path / 'meshes'},size=24,views=3"
+    assert kind_of(asked) is Collection and kind_of(f"procedural:{tmp_path / 'meshes' / 'ball.obj'}") is Scene
+    data = open_dataset(asked)
+    assert data.names == ["ball", "box", "cloud"] and data.splits["test"].tolist() == [0]
+    box = data["box"]
+    shot = box.photograph(int(box.splits["train"][0]))
+    assert 0.02 < float((shot.alpha > 0.5).float().mean()) < 0.5 and box.frame.reach == 1
+    (tmp_path / "none").mkdir()
+    with (
+        pytest.warns(LumigraphWarning, match="cloud cannot be read"),
+        pytest.raises(LumigraphError, match="no surface"),
+    ):
+        assert [name for name, _ in data.members()] == ["box"]
+        data["cloud"]
+    with pytest.raises(LumigraphError, match="holds no meshes to photograph"):
+        open_dataset(f"procedural:{tmp_path / 'none'}")
 
 
 @pytest.mark.parametrize("asked", ["toys,count=0", "toys,colour=3", "toys,member=x", "toys,count=3,member=1"])

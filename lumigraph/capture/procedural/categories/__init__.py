@@ -10,7 +10,7 @@ import numpy as np
 
 from ..cameras import dome, pinhole, spiral
 from ..stage import Stage
-from ..world import Lamp, Sky, World
+from ..world import Lamp, Object, Sky, Vector, World
 
 DISTANCE, ANGLE = 3.2, 34.0  # of cameras from the middle, scene units; of view, degrees
 LOWEST, HIGHEST = 8.0, 60.0  # that cameras stand above the horizon, degrees
@@ -31,10 +31,17 @@ def stage(name: str, member: int, size: int, views: int, seed: int) -> Stage:
     """
     category = importlib.import_module(f".{name.replace('-', '_')}", __name__)
     random = np.random.default_rng((seed, member))
-    world = World(tuple(category.objects(random)), (KEY, FILL), SKY)
+    return surrounded(tuple(category.objects(random)), category.BOUNDS, size, views, random)
+
+
+def surrounded(
+    objects: tuple[Object, ...], bounds: tuple[Vector, Vector], size: int, views: int, random: np.random.Generator
+) -> Stage:
+    """Objects in the light of all categories, seen from a dome; held-out views climb around them."""
+    world = World(objects, (KEY, FILL), SKY)
     cameras = {
         "train": pinhole(dome(views, DISTANCE, random, LOWEST, HIGHEST), size, ANGLE),
         "test": pinhole(spiral(max(views * 2 // 5, 1), DISTANCE, random, LOWEST, HIGHEST), size, ANGLE),
     }
-    reach = max(abs(x) for corner in category.BOUNDS for x in corner)
-    return Stage(world, cameras, category.BOUNDS, reach=reach, near=1.5)
+    reach = max(abs(x) for corner in bounds for x in corner)
+    return Stage(world, cameras, bounds, reach=reach, near=1.5)
