@@ -25,7 +25,7 @@ class Prior:
         learnt_from: what it learnt from, in the words of `Dataset.kind`
         Raises LumigraphError, naming `where`, for a method that is none.
         """
-        if learnt_from != Collection.kind or not {Scene, Collection} <= {method.learns_from, *method.accepts}:
+        if learnt_from != Collection.kind or Scene not in method.accepts:
             raise LumigraphError(
                 f"{where} is no prior, for it learnt from {learnt_from}, and priors learn from a collection; "
                 "name one that did, or train it: lumigraph train pixelnerf procedural:toys"
