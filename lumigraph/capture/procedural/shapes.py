@@ -150,13 +150,13 @@ def triangle_of(corners: np.ndarray, thickness: float) -> tuple[Triangle, np.nda
     """The plate between three points (corner, 3), with its rotation and position; None for points on a line."""
     sides = np.roll(corners, -1, 0) - corners
     a, b, c = np.roll(corners, -int(np.argmax(np.linalg.norm(sides, axis=1))), 0)
-    long = np.linalg.norm(b - a)
+    long = float(np.linalg.norm(b - a))
     normal = np.cross(b - a, c - a)
     if np.linalg.norm(normal) < TINY:
         return None
     x, z = (b - a) / long, normal / np.linalg.norm(normal)
     y = np.cross(z, x)
-    along_x, up = (c - a) @ x, (c - a) @ y
+    along_x, up = float((c - a) @ x), float((c - a) @ y)
     shape = Triangle(0.5 * long, along_x - 0.5 * long, 0.5 * up, 0.5 * thickness)
     return shape, np.stack([x, y, z], 1), a + 0.5 * long * x + 0.5 * up * y
 
