@@ -14,7 +14,7 @@ from .categories import surrounded
 from .shapes import triangle_of
 from .stage import Stage
 from .textures import Plain
-from .world import Material, Object, Pose, Vector
+from .world import Material, Object, Pose, Vector, nested
 
 RADIUS = 0.85  # of the ball around a mesh, about its middle
 THICKNESS = 4e-3  # of its triangles
@@ -42,6 +42,5 @@ def plates(path: Path) -> Iterator[Object]:
         if (plate := triangle_of(points[face].astype(float), THICKNESS)) is not None:
             shape, rotation, position = plate
             red, green, blue = (mesh.colours[face].mean(0) / 255).round(3).tolist()
-            rows = tuple(tuple(row) for row in rotation.tolist())
             paint = Material(Plain((red, green, blue)), gloss=0.3, roughness=0.5)
-            yield Object(shape, paint, Pose(tuple(position.tolist()), rows), path.stem)
+            yield Object(shape, paint, Pose(tuple(position.tolist()), nested(rotation)), path.stem)
