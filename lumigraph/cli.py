@@ -28,6 +28,7 @@ from .commands.demo import Demo
 from .commands.eval import Eval
 from .commands.explain import Explain
 from .commands.export import Export
+from .commands.infer import Infer
 from .commands.info import Info
 from .commands.methods import Methods
 from .commands.options import RULES, held
@@ -46,6 +47,7 @@ COMMANDS: dict[str, type] = {
     "capture": CaptureCommand,
     "train": Train,
     "resume": Resume,
+    "infer": Infer,
     "eval": Eval,
     "render": Render,
     "view": ViewCommand,

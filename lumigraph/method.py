@@ -161,6 +161,15 @@ class Method(nn.Module, ABC):
         """What a user may turn, beside the camera."""
         return ()
 
+    @property
+    def evidence_views(self) -> int | None:
+        """How many photographs of a scene it is given where nobody says; None for all there are to learn from."""
+        return None
+
+    def evidence_bytes(self, scene: Scene) -> int:
+        """Bytes at least that being given a scene takes."""
+        return 0
+
     def given(self, *evidence: Any, **controls: Value) -> Method:
         """The same weights, told something: evidence (photographs, points, a light ...) or values of `controls`.
 

@@ -10,6 +10,7 @@ from typing import Any
 
 import pytest
 import tiny
+import tiny_collection
 import torch
 from listing import names
 from PIL import Image
@@ -57,6 +58,7 @@ WRITES: dict[str, tuple[str, tuple[str, ...]]] = {
         ("bench/results.json", "bench/results.md", "bench/settings.json", "bench/views.png", "bench/lock.json")
         + ("bench/runs/photographs-voxel-grid-1steps-seed0.log",),
     ),
+    "infer": ("infer prior photographs --output found", ("found/", "found", "found/lock.json")),
     "train": ("train voxel-grid photographs --steps 1 --output learnt", ("learnt/", "learnt", "learnt/lock.json")),
     "demo": ("demo --seconds 1 --output shown", ("shown/", "shown")),
     "capture": ("capture photographs --output placed", ("placed/",)),
@@ -72,6 +74,7 @@ def home(ball_run, ball_folder, tmp_path, monkeypatch):
     shutil.copytree(ball_folder, tmp_path / "photographs")
     gs_run(tmp_path / "gs")
     octree_run(tmp_path / "octree")
+    prior_run(tmp_path / "prior")
     Image.new("RGB", (16, 16)).save(tmp_path / "one.png")
     monkeypatch.chdir(tmp_path)
     return tmp_path
@@ -89,13 +92,17 @@ def octree_run(folder: Path) -> Run:
     return run_of(method, folder)
 
 
+def prior_run(folder: Path) -> Run:
+    return run_of(tiny_method("tinted-grid"), folder, tiny_collection.collection())
+
+
 def tiny_method(name: str) -> Method:
     kind = methods.find(name)
     return build(kind, tiny.scene().frame, kind.smallest(), torch.device("cpu"), 0)
 
 
-def run_of(method: Method, folder: Path) -> Run:
-    run = Run.create(folder, method, tiny.scene())
+def run_of(method: Method, folder: Path, data: Any = None) -> Run:
+    run = Run.create(folder, method, data or tiny.scene())
     run.save(State(), method, method.optimizers(), torch.Generator())
     return run
 

@@ -26,7 +26,7 @@ FLOORS: list[set[str]] = [
     {"alignment", "baked", "dataset", "gaussians", "mesh"},
     {"capabilities", "collection", "shapes"},
     {"announce", "components", "capture", "exchange", "method", "paths"},
-    {"composition", "display", "verdict"},
+    {"composition", "display", "prior", "verdict"},
     {"methods", "export", "viewer"},
     {"run"},
     {"evaluate"},

@@ -14,7 +14,18 @@ from lumigraph.capture import open_scene, procedural
 from lumigraph.capture.procedural import Lamp, Material, Object, Pose, Sky, Sun, World, scenes
 from lumigraph.capture.procedural.cameras import look_at, pinhole
 from lumigraph.capture.procedural.rendering import photograph, render, signed_distance, trace
-from lumigraph.capture.procedural.shapes import Arch, Box, Cone, Cylinder, Plane, Shape, Sphere, Torus
+from lumigraph.capture.procedural.shapes import (
+    Arch,
+    Box,
+    Cone,
+    Cylinder,
+    Plane,
+    Shape,
+    Sphere,
+    Torus,
+    Triangle,
+    triangle_of,
+)
 from lumigraph.capture.procedural.textures import Bricks, Checker, Marble, Mottle, Plain, Rings, Sectors, Stripes, Wood
 from lumigraph.errors import LumigraphError
 from lumigraph.lens import Equirectangular, Fisheye
@@ -32,6 +43,7 @@ SHAPES = [
     Arch((0.5, 0.3, 0.4), 0.3, spring=0.2),
     Arch((0.5, 0.3, 0.4), 0.25, spring=0.2, rounding=0.04),
     Plane(),
+    Triangle(0.5, 0.2, 0.35, rounding=0.05),
 ]
 LEANING = Pose.at(0.1, -0.2, 0.05, turn=25, tilt=35)
 CHALK = Material(Plain((0.7, 0.6, 0.5)))
@@ -75,6 +87,23 @@ def in_frame(pose: Pose, points: np.ndarray, vectors: bool = False) -> np.ndarra
 @pytest.fixture(scope="module")
 def still_life():
     return scenes.stage("still-life", size=64, views=8, seed=0)
+
+
+def test_a_plate_lies_between_its_corners():
+    random = np.random.default_rng(0)
+    for corners in random.uniform(-0.8, 0.8, (20, 3, 3)):
+        shape, rotation, position = triangle_of(corners, thickness=0.02)
+        pose = Pose(tuple(position.tolist()), tuple(map(tuple, rotation.tolist())))
+        assert np.linalg.det(rotation) == pytest.approx(1) and abs(shape.apex) <= shape.base
+        world = World((Object(shape, CHALK, pose),))
+        shares = random.dirichlet((1, 1, 1), 30)
+        aside = 0.3 * random.uniform(-1, 1, (30, 1)) * rotation[:, 2]
+        there = signed_distance(world, torch.from_numpy(shares @ corners + aside))
+        np.testing.assert_allclose(there, np.linalg.norm(aside, axis=1) - 0.01, atol=1e-9)
+        beyond = signed_distance(world, torch.from_numpy(corners + 0.5 * (corners - corners.mean(0))))
+        assert (beyond > 0).all()
+        assert (signed_distance(world, torch.from_numpy(corners)) + 0.01).abs().max() < 1e-9
+    assert triangle_of(np.array([[0.0, 0, 0], [1, 1, 1], [2, 2, 2]]), 0.1) is None
 
 
 def test_depth_of_a_sphere_and_a_box_is_the_analytic_one():

@@ -41,6 +41,11 @@ def open_dataset(source: str | Path, wanted: type[Any] | None = None, **options:
     Raises LumigraphError for anything that keeps the source from becoming a dataset.
     """
     kind, path = kind_of(source, wanted), expanded(source)
+    if kind is Collection and (request := requested(source)) is not None:
+        from . import procedural
+
+        many = {name: f"{PROCEDURAL}{one}" for name, one in procedural.members_of(request).items()}
+        return Collection.of({name: partial(open_dataset, one, **options) for name, one in many.items()}, str(source))
     if kind is Collection:
         return Collection.of(
             {name: partial(open_dataset, place, **options) for name, place in members_of(path).items()}, str(source)
@@ -57,12 +62,14 @@ def kind_of(source: str | Path, wanted: type[Any] | None = None) -> type[Any]:
     """What `open_dataset` makes of a source, without opening it.
 
     A mesh, and a folder of meshes, are Shapes. A folder of several scenes or shapes is a Collection where it is no
-    scene itself, or where one is wanted. Everything else is left to the readers of photographs. Raises LumigraphError
-    for a path that does not exist.
+    scene itself, or where one is wanted; so is a procedural category of objects. Everything else is left to the readers
+    of photographs. Raises LumigraphError for a path that does not exist.
     """
     path = expanded(source)
-    if str(source).startswith(PROCEDURAL):
-        return Scene
+    if (request := requested(source)) is not None:
+        from . import procedural
+
+        return Collection if procedural.is_collection(request) else Scene
     if not exists(path):
         raise LumigraphError(f"{path} does not exist; check the path")
     if wanted is Collection and members_of(path):
@@ -72,6 +79,11 @@ def kind_of(source: str | Path, wanted: type[Any] | None = None) -> type[Any]:
     if meshes.recognises(path) or (wanted is Shapes and any(map(meshes.is_mesh, path.rglob("*")))):
         return Shapes
     return Collection if len(members_of(path)) > 1 else Scene
+
+
+def requested(source: str | Path) -> str | None:
+    """What is asked for after "procedural:"; None of a path."""
+    return str(source).removeprefix(PROCEDURAL) if str(source).startswith(PROCEDURAL) else None
 
 
 def members_of(folder: Path) -> dict[str, Path]:
@@ -110,10 +122,11 @@ def open_scene(
     before:    how they were opened for a run; see `Before`
     Raises LumigraphError for anything that keeps the photographs from becoming a scene.
     """
-    if str(source).startswith(PROCEDURAL):
+    if (request := requested(source)) is not None:
         from . import procedural
 
-        capture = procedural.read(str(source).removeprefix(PROCEDURAL))
+        capture = procedural.read(request)
+        memory = 0 if memory is None and procedural.is_category(request) else memory  # so that its pictures are kept
     elif single_image.recognises(path := expanded(source)):
         capture, downscale = single_image.read(path, downscale), 1  # it is reduced by now
     else:

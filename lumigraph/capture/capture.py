@@ -58,6 +58,7 @@ class Shot:
     depths: (near, far) of what this camera saw, in the source's units
     planes: what else is known of each pixel, by the layer's name
     about: what else is known of the photograph, by name: numbers or arrays of them
+    identity: says all that the pixels depend on, where `image` is a function, so that they can be kept; None otherwise
     """
 
     name: str
@@ -72,6 +73,7 @@ class Shot:
     depths: tuple[float, float] | None = None
     planes: dict[str, Plane] = field(default_factory=dict)
     about: dict[str, Any] = field(default_factory=dict)
+    identity: str | None = None
 
 
 @dataclass(frozen=True)

@@ -117,7 +117,8 @@ def choose(shot: Shot, downscale: int | None) -> Chosen:
         made = pixels if isinstance(pixels, np.ndarray) else pixels()
         return made if size == own else np.asarray(Image.fromarray(made).resize(size, Image.Resampling.BOX))
 
-    return Chosen(ImageSource(size, masked(make, shot, size, False)), calibrated, wanted)
+    identity = shot.identity if shot.mask is None and shot.alpha is None else None
+    return Chosen(ImageSource(size, masked(make, shot, size, False), identity), calibrated, wanted)
 
 
 def choose_file(shot: Shot, files: dict[int, Path], downscale: int | None) -> Chosen:

@@ -19,6 +19,7 @@ from ..names import natural
 from ..run import Run
 from ..run.compressed import Compressed
 from ..run.converted import Converted
+from ..run.inferred import Inferred
 from ..scene import Frame, Scene
 from ..shapes import Shapes
 from ..verdict import cameras_moved
@@ -47,6 +48,8 @@ def run_tree(run: Run) -> Tree:
     if made := Compressed.read(run.folder):
         smaller = f"{made.times:.1f} times smaller, {made.bytes_after / 1e6:.3g} MB of {made.bytes_before / 1e6:.3g} MB"
         branch(tree, "compressed", {"from": made.source, "model": smaller, "dB": f"{made.psnr_after:.2f}"})
+    if inferred := Inferred.of(said, run.folder / "config.json"):
+        branch(tree, "inferred", {"by": inferred.prior, "of": f"{inferred.views} photographs"})
     if converted := Converted.read(run.folder):
         like = f"{converted.psnr:.2f} dB, of {converted.views} held-out views against the source's"
         told: dict[str, Any] = {

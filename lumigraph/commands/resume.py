@@ -12,7 +12,7 @@ from ..budget import Budget
 from ..errors import LumigraphError
 from ..quality import Quality
 from ..ranges import Port, Seconds, Steps
-from .common import choose_device, exit_code, needed, option, quality_budget, told_budget
+from .common import choose_device, exit_code, needed, option, quality_budget, told_budget, typed
 
 
 @dataclass(frozen=True)
@@ -52,12 +52,18 @@ class Resume:
             return self._go_on(run)
 
     def _go_on(self, run: Any) -> int:
+        from ..run.inferred import Inferred
         from ..train import fit
         from .outcome import tell_outcome
         from .view import keep_showing, watching
 
         if run.compressed:
             raise LumigraphError(f"{run.folder} was compressed and cannot be resumed; resume the run it was made of")
+        if made := Inferred.of(run.settings, run.folder / "config.json"):
+            raise LumigraphError(
+                f"{run.folder} was made by a prior and learns nothing itself; go on with the prior: "
+                + typed("resume", made.prior)
+            )
         told = told_budget(self.steps, self.seconds, self.quality)
         if self.quality is None:
             budget = budget_from_now(run, told)

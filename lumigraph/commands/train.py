@@ -34,9 +34,9 @@ class Train:
     """Learn a scene from its photographs.
 
     The scene is a folder of photographs, a video, a single picture, or procedural:NAME. Methods that learn from shapes
-    take a mesh or a folder of meshes, those that learn from a collection a folder of scenes. Where photographs have no
-    poses, `lumigraph capture` finds them first. `lumigraph train METHOD --help` adds the method's own options,
-    `lumigraph methods` lists the methods. Ctrl-C saves; `lumigraph resume` goes on.
+    take a mesh or a folder of meshes, those that learn from a collection a folder of scenes, or procedural:toys. Where
+    photographs have no poses, `lumigraph capture` finds them first. `lumigraph train METHOD --help` adds the method's
+    own options, `lumigraph methods` lists the methods. Ctrl-C saves; `lumigraph resume` goes on.
     """
 
     method: Annotated[Positional[str], needed("METHOD")]

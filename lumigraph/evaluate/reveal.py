@@ -4,15 +4,19 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+from ..capture.fewer import with_fewer_views
 from ..dataset import Dataset
 from ..method import Method
 from ..scene import Scene
 
 
 def reveal(method: Method, data: Dataset) -> Method:
-    """The method, told of a dataset if it accepts that kind: of photographs those to learn from, none held out."""
+    """The method, told of a dataset if it accepts that kind: of photographs those to learn from, none held out,
+    and no more than `Method.evidence_views`."""
     if not isinstance(data, tuple(method.accepts)):
         return method
     if isinstance(data, Scene):
-        return method.given(replace(data, splits={"train": data.splits["train"]}))
+        there = len(data.splits["train"])
+        fewer = with_fewer_views(data, min(method.evidence_views or there, there))
+        return method.given(replace(fewer, splits={"train": fewer.splits["train"]}))
     return method.given(data)

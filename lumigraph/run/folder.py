@@ -120,7 +120,7 @@ class Run(Opened):
     def title(self) -> str:
         """The scene's name."""
         source = self.settings.scene.source
-        return source.partition(":")[2] if source.startswith("procedural:") else Path(source).name
+        return Path(source.partition(":")[2]).name if source.startswith("procedural:") else Path(source).name
 
     @property
     def renders(self) -> Path:

@@ -8,26 +8,33 @@
     render(stage.world_of(camera), camera)                the same, of a scene that moves: `swing`
     write_blender(stage, folder)                          the same for other tools
 
-A new scene is a new file in `scenes/`; nothing is compiled for it.
+    open_dataset("procedural:toys,count=200")             a Collection of objects, see `members`
+
+A new scene is a new file in `scenes/`, a new category of objects one in `categories/`; nothing is compiled for it.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from functools import partial
 from typing import Annotated, Any
 
 import numpy as np
 
 from ...camera import Camera
-from ...errors import LumigraphError
-from ...ranges import Seed, between, typed
+from ...ranges import Seed, between
 from ..capture import Capture, Plane, Shot
 from ..raw import RawPhoto, facts, planes
+from . import categories as categories
 from . import scenes as scenes
 from .blender_folder import write_blender as write_blender
 from .jitter import jittered as jittered
+from .members import is_category as is_category
+from .members import is_collection as is_collection
+from .members import member_stage
+from .members import members_of as members_of
+from .options import told
 from .rendering import eight_bits, photograph, radiance
 from .rendering import render as render
 from .rendering import signed_distance as signed_distance
@@ -42,7 +49,7 @@ from .world import Sun as Sun
 from .world import World as World
 
 TRUE_POSE = "true_pose"  # of `Scene.about`: camera-to-world in the source's frame
-DIGITS = 20  # of a number, at most
+TRACER = 1  # of the pictures that are kept: another number traces them anew
 
 
 @dataclass(frozen=True)
@@ -61,28 +68,19 @@ def read(request: str) -> Capture:
 
     Pictures are traced when somebody reads them. Raises LumigraphError for a name or an option that does not exist.
     """
-    name, *rest = request.split(",")
-    options = typed(Options, dict(parse(request, text) for text in rest), f"procedural:{request}")
+    if is_category(request):
+        return capture(member_stage(request), f"procedural:{request}", kept=True)
+    name, options = told(Options, request)
     stage = scenes.stage(name, options.size, options.views, options.seed)
     off = jittered(stage, options.jitter_poses, options.seed) if options.jitter_poses else None
     return capture(stage, f"procedural:{request}", off)
 
 
-def parse(request: str, text: str) -> tuple[str, int]:
-    """One option, "size=400"."""
-    name, _, value = text.strip().partition("=")
-    known = [field.name for field in fields(Options)]
-    if name not in known:
-        raise LumigraphError(f"procedural:{request}: there is no option {name!r}; there are {', '.join(known)}")
-    if not value.isdecimal() or len(value) > DIGITS:
-        raise LumigraphError(f"procedural:{request}: {name} must be a whole number, as in {name}=20; got {value!r}")
-    return name, int(value)
-
-
-def capture(stage: Stage, source: str, found: dict[str, Camera] | None = None) -> Capture:
+def capture(stage: Stage, source: str, found: dict[str, Camera] | None = None, kept: bool = False) -> Capture:
     """A stage as photographs with known poses.
 
     found: the cameras as they are said to be, where that differs; `about` has each `true_pose` then
+    kept:  whether pictures may be kept once they are traced
     """
     visible = stage.world.sky.visible
     said = found or stage.cameras
@@ -97,12 +95,18 @@ def capture(stage: Stage, source: str, found: dict[str, Camera] | None = None) -
             planes=known_planes(stage, cameras[i]),
             time=None if cameras.time is None else float(cameras.time[i]),
             about=known_facts(stage, cameras[i], jittered=found is not None),
+            identity=identity(stage, cameras[i]) if kept else None,
         )
         for split, cameras in stage.cameras.items()
         for i in range(len(cameras))
     ]
     background = (0.0, 0.0, 0.0) if visible else (1.0, 1.0, 1.0)
     return Capture(source, shots, bounds=stage.bounds, reach=stage.reach, near=stage.near, background=background)
+
+
+def identity(stage: Stage, camera: Camera) -> str:
+    """All that a picture of a world that stands still depends on."""
+    return f"traced {TRACER} {stage.world!r} {camera.pose.tolist()} {camera.lens.to_json()} {camera.size.tolist()}"
 
 
 def known_planes(stage: Stage, camera: Camera) -> dict[str, Plane]:

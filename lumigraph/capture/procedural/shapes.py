@@ -14,7 +14,7 @@ from numba import njit
 
 from .vector import INNER, along, dot, unit
 
-SPHERE, BOX, CYLINDER, CONE, TORUS, ARCH, PLANE = range(7)
+SPHERE, BOX, CYLINDER, CONE, TORUS, ARCH, PLANE, TRIANGLE = range(8)
 INFINITY = math.inf
 TINY = 1e-12  # a direction's component below this counts as this: no division by zero
 ON_SURFACE = 1e-7  # where a march along the ray ends, scene units
@@ -131,6 +131,44 @@ class Plane(Shape):
         return np.full(3, INFINITY)
 
 
+@dataclass(frozen=True)
+class Triangle(Shape):
+    """A plate, of twice `rounding` thick and rounded all around: (-base, -height), (base, -height) and (apex, height)
+    before rounding, in the plane z = 0. The longest side lies along x, so that |apex| <= base; see `triangle_of`."""
+
+    base: float
+    apex: float
+    height: float
+    rounding: float
+
+    def describe(self):
+        r = self.rounding
+        return TRIANGLE, (self.base, self.apex, self.height), r, (self.base + r, self.height + r, r)
+
+
+def triangle_of(corners: np.ndarray, thickness: float) -> tuple[Triangle, np.ndarray, np.ndarray] | None:
+    """The plate between three points (corner, 3), with its rotation and position; None for points on a line."""
+    sides = np.roll(corners, -1, 0) - corners
+    a, b, c = np.roll(corners, -int(np.argmax(np.linalg.norm(sides, axis=1))), 0)
+    long = float(np.linalg.norm(b - a))
+    normal = np.cross(b - a, c - a)
+    if np.linalg.norm(normal) < TINY:
+        return None
+    x, z = (b - a) / long, normal / np.linalg.norm(normal)
+    y = np.cross(z, x)
+    along_x, up = float((c - a) @ x), float((c - a) @ y)
+    shape = Triangle(0.5 * long, along_x - 0.5 * long, 0.5 * up, 0.5 * thickness)
+    return shape, np.stack([x, y, z], 1), a + 0.5 * long * x + 0.5 * up * y
+
+
+@njit(**INNER)
+def beside_segment(x, y, ax, ay, bx, by):
+    """Squared distance to a segment in the plane; and on which side, positive to its left."""
+    dx, dy, px, py = bx - ax, by - ay, x - ax, y - ay
+    s = min(max((px * dx + py * dy) / (dx * dx + dy * dy), 0.0), 1.0)
+    return (px - s * dx) ** 2 + (py - s * dy) ** 2, dx * py - dy * px
+
+
 @njit(**INNER)
 def hollow(kind):
     """Whether a ray that leaves the shape can meet it again: it is not convex."""
@@ -189,6 +227,12 @@ def distance(kind, size, p):
         squared = min(cap_x * cap_x + cap_z * cap_z, off_x * off_x + off_z * off_z)
         inside = off_x < 0.0 and cap_z < 0.0
         return (-math.sqrt(squared) if inside else math.sqrt(squared)) - size[5]
+    if kind == TRIANGLE:
+        first, below = beside_segment(x, y, -size[0], -size[2], size[0], -size[2])
+        second, right = beside_segment(x, y, size[0], -size[2], size[1], size[2])
+        third, left = beside_segment(x, y, size[1], size[2], -size[0], -size[2])
+        flat = 0.0 if min(below, min(right, left)) >= 0.0 else min(first, min(second, third))
+        return math.sqrt(flat + z * z) - size[5]
     return z  # a plane
 
 

@@ -78,17 +78,17 @@ class Pose:
     def at(x: float, y: float, z: float, turn: float = 0.0, tilt: float = 0.0) -> Pose:
         """The pose at a place, leaning by `tilt` degrees (about x), then turned by `turn` degrees (about z)."""
         rotation = rotation_about((0, 0, 1), turn) @ rotation_about((1, 0, 0), tilt)
-        return Pose((x, y, z), _nested(rotation))
+        return Pose((x, y, z), nested(rotation))
 
     @staticmethod
     def about(axis: Vector, degrees: float) -> Pose:
-        return Pose(rotation=_nested(rotation_about(axis, degrees)))
+        return Pose(rotation=nested(rotation_about(axis, degrees)))
 
     def __matmul__(self, inner: Pose) -> Pose:
         """The pose that moves by `inner` first, then by this one."""
         rotation, position = np.array(self.rotation), np.array(self.position)
         moved = rotation @ np.array(inner.position) + position
-        return Pose(tuple(moved.tolist()), _nested(rotation @ np.array(inner.rotation)))
+        return Pose(tuple(moved.tolist()), nested(rotation @ np.array(inner.rotation)))
 
 
 @dataclass(frozen=True)
@@ -259,5 +259,6 @@ def _linear(colour: Colour) -> np.ndarray:
     return linear_from_srgb(colour)
 
 
-def _nested(matrix: np.ndarray):
+def nested(matrix: np.ndarray):
+    """The rows of a matrix, as `Pose.rotation` has them."""
     return tuple(tuple(row) for row in matrix.tolist())

@@ -1,0 +1,47 @@
+"""Categories: procedural objects of one kind, as many as one likes, each with proportions, colours and materials of its
+own. One file each, found by its name, with `objects(random)` and the `BOUNDS` that all of them keep to."""
+
+from __future__ import annotations
+
+import importlib
+import pkgutil
+
+import numpy as np
+
+from ..cameras import dome, pinhole, spiral
+from ..stage import Stage
+from ..world import Lamp, Object, Sky, Vector, World
+
+DISTANCE, ANGLE = 3.2, 34.0  # of cameras from the middle, scene units; of view, degrees
+LOWEST, HIGHEST = 8.0, 60.0  # that cameras stand above the horizon, degrees
+KEY = Lamp((-2.8, -1.5, 3.2), radius=0.42, power=16.0, colour=(1.0, 0.95, 0.87))
+FILL = Lamp((3.0, 0.6, 2.2), radius=0.8, power=4.0, colour=(0.86, 0.93, 1.0))
+SKY = Sky((0.84, 0.91, 1.0), (0.95, 0.94, 0.92), (0.70, 0.62, 0.54), light=0.45)
+
+
+def available() -> list[str]:
+    return sorted(module.name.replace("_", "-") for module in pkgutil.iter_modules(__path__) if module.name != "parts")
+
+
+def stage(name: str, member: int, size: int, views: int, seed: int) -> Stage:
+    """One object of a category, seen from a dome; held-out views climb around it. The same seed and member always give
+    the same object, however many there are.
+
+    size: of the square pictures, pixels; views: to learn from
+    """
+    category = importlib.import_module(f".{name.replace('-', '_')}", __name__)
+    random = np.random.default_rng((seed, member))
+    return surrounded(tuple(category.objects(random)), category.BOUNDS, size, views, random)
+
+
+def surrounded(
+    objects: tuple[Object, ...], bounds: tuple[Vector, Vector], size: int, views: int, random: np.random.Generator
+) -> Stage:
+    """Objects in the light of all categories, seen from a dome; held-out views climb around them."""
+    world = World(objects, (KEY, FILL), SKY)
+    cameras = {
+        "train": pinhole(dome(views, DISTANCE, random, LOWEST, HIGHEST), size, ANGLE),
+        "test": pinhole(spiral(max(views * 2 // 5, 1), DISTANCE, random, LOWEST, HIGHEST), size, ANGLE),
+    }
+    reach = max(abs(x) for corner in bounds for x in corner)
+    return Stage(world, cameras, bounds, reach=reach, near=1.5)

@@ -1,0 +1,91 @@
+"""Photographs that a method keeps, as bytes among its tensors: so that a run opens where they are gone."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from ...camera import Camera
+from ...errors import LumigraphError
+from ...files import from_json
+from ...lens import Lens
+from ...ranges import Row, Side, typed
+from ...scene import Photograph, Vector
+
+WHERE = "what a checkpoint says of its photographs"
+
+
+@dataclass(frozen=True)
+class Taken:
+    """Where photographs were taken from, a row for each. lens: see `Lens.to_json`."""
+
+    pose: list[tuple[Row, Row, Row]]
+    lens: dict[str, Any]
+    size: list[tuple[Side, Side]]
+
+
+class Kept(nn.Module):
+    """Rows of which a saved one may have any number."""
+
+    grows: ClassVar[tuple[str, ...]] = ("rows",)
+    rows: Tensor
+
+    def __init__(self, rows: Tensor):
+        super().__init__()
+        self.register_buffer("rows", rows)
+
+
+class KeptPhotographs(nn.Module):
+    """Photographs and their cameras, and what was found in them: a row of features for each cell, if anything was.
+
+    features: numbers in a row
+    """
+
+    def __init__(self, features: int):
+        super().__init__()
+        nothing = torch.empty(0, dtype=torch.uint8)
+        self.pixels, self.taken = Kept(nothing), Kept(nothing.clone())
+        self.found = Kept(torch.empty(0, features))
+
+    def __bool__(self) -> bool:
+        return len(self.taken.rows) > 0
+
+    @staticmethod
+    def of(photographs: list[Photograph], background: Vector, features: int) -> KeptPhotographs:
+        """Their colours before a background, eight bits of each."""
+        kept = KeptPhotographs(features)
+        camera = Camera.cat([photograph.camera for photograph in photographs]).to("cpu")
+        said = {"pose": camera.pose.tolist(), "lens": camera.lens.to_json(), "size": camera.size.tolist()}
+        colours = [photograph.before(background).mul(255).round().byte().flatten() for photograph in photographs]
+        kept.pixels.rows = torch.cat(colours)
+        kept.taken.rows = torch.frombuffer(bytearray(json.dumps(said).encode()), dtype=torch.uint8)
+        return kept
+
+    def cameras(self) -> Camera:
+        """Where they were taken from, on the CPU. Raises LumigraphError for what are no cameras."""
+        said = typed(Taken, from_json(self.taken.rows.cpu().numpy().tobytes(), WHERE), WHERE)
+        lens, pose, size = Lens.from_json(said.lens, WHERE), torch.tensor(said.pose), torch.tensor(said.size)
+        if not len(lens) == len(pose) == len(size) or 3 * int(size.prod(-1).sum()) != len(self.pixels.rows):
+            raise LumigraphError(f"{WHERE} does not fit their pixels; restore it from a copy")
+        return Camera(pose, lens, size)
+
+    def pictures(self) -> list[Float[Tensor, "height width 3"]]:
+        sizes = self.cameras().size.tolist()
+        parts = self.pixels.rows.split([3 * width * height for width, height in sizes])
+        return [part.view(height, width, 3).float() / 255 for part, (width, height) in zip(parts, sizes, strict=True)]
+
+
+def padded(pictures: list[Float[Tensor, "_ _ 3"]]) -> Float[Tensor, "view 3 height width"]:
+    """Pictures of any sizes as one batch: smaller ones go on at their right and bottom with what is at the border."""
+    height, width = (max(picture.shape[axis] for picture in pictures) for axis in (0, 1))
+
+    def grown(picture: Tensor) -> Tensor:
+        rest = (0, width - picture.shape[1], 0, height - picture.shape[0])
+        return nn.functional.pad(picture.permute(2, 0, 1)[None], rest, mode="replicate")[0]
+
+    return torch.stack([grown(picture) for picture in pictures])

@@ -1,0 +1,451 @@
+"""pixelNeRF: a radiance field from one or few photographs, learnt across scenes (Yu et al. 2021, arXiv 2012.02190)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, ClassVar, Literal
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+from torch.nn.functional import softplus
+
+from ..camera import Camera
+from ..capture.fewer import spread_out
+from ..collection import Collection
+from ..components.fields.dense import in_chunks
+from ..components.fields.encodings import FrequencyEncoding
+from ..components.fields.kept_photographs import KeptPhotographs, padded
+from ..components.fields.picture_encoder import STRIDE, PictureEncoder
+from ..components.fields.picture_lookup import look_up
+from ..components.fields.residual_network import ResidualNetwork
+from ..components.sampling.sampling import inverse_transform, midpoints, stratified
+from ..components.sampling.spaces import space_of
+from ..components.training.schedules import falling
+from ..controls import Control, Value
+from ..dataset import Dataset
+from ..errors import LumigraphError
+from ..method import Method, RayMethod
+from ..quality import Effort, Efforts
+from ..ranges import (
+    BatchSize,
+    Layers,
+    LearningRate,
+    NonNegative,
+    Octaves,
+    Positive,
+    RaySamples,
+    Seed,
+    Share,
+    Width,
+    between,
+)
+from ..rays import Look, Rays, Samples
+from ..scene import Batch, Frame, Photograph, Scene
+from ..volume import composite, weights_of
+
+Views = Annotated[int, between(1, 64)]
+
+
+@dataclass(frozen=True)
+class Config:
+    """The paper's numbers (appendix B), with where its published code gives them; below them what saves time."""
+
+    hidden_width: Width = 512  # of the network's layers, appendix B.1
+    blocks: Annotated[int, between(1, 32)] = 5  # residual ones, appendix B.1
+    view_blocks: Annotated[int, between(1, 32)] = 3  # of them before the mean over views
+    encoder_widths: tuple[Width, Width, Width, Width] = (64, 64, 128, 256)  # of ResNet-34: its stem and three stages
+    encoder_blocks: tuple[Layers, Layers, Layers] = (3, 4, 6)  # of these stages
+    encoder_pool: bool = True  # halve the resolution after the stem
+    encoder_weights: str = ""  # a file of torchvision's resnet34 to begin with; without, the encoder begins at random
+    position_frequencies: Octaves = 6  # appendix B.1; the lowest turns by 1.5 radians a unit
+    centred: bool = (
+        True  # objects: positions turn with each camera about the middle; else they are seen from the camera
+    )
+    coarse_samples: RaySamples = 64  # of a ray, appendix B.2
+    fine_samples: RaySamples = 16  # drawn where the first found something
+    depth_samples: Annotated[int, between(0, 4096)] = 16  # drawn around the depth that the first found
+    depth_deviation: Positive = 0.01  # of those, as a share of the ray's length in the scene
+    networks: Annotated[int, between(1, 2)] = 2  # one for each look; 1 asks the same about all samples, once
+    coarse_loss_weight: NonNegative = 1.0  # of the first look's colours
+    density: Literal["relu", "softplus"] = "relu"
+    density_scale: Positive = 1.0  # density, per scene unit, of an output of 1
+    source_views: Views = 3  # at most, in a step; how many is drawn anew each time
+    members_per_step: Annotated[int, between(1, 1024)] = 4  # scenes
+    rays_per_member: BatchSize = 128
+    targets: Views = 4  # photographs of a member that its rays go through
+    boxed: Share = 0.75  # share of the budget in which rays go through boxes around what is opaque
+    learning_rate: LearningRate = 1e-4
+    final_learning_rate: LearningRate = 1e-4
+    warmup: Share = 0.0  # share of the budget in which the learning rate grows
+    empty_threshold: Share = 0.0  # opacity, as the first look found it, below which rays are not looked at again
+    bfloat16: bool = True  # multiply in bfloat16 where the machine is fast at it
+    seed: Seed = 0
+
+    def check(self) -> None:
+        """Raises LumigraphError for numbers that contradict each other."""
+        if self.view_blocks > self.blocks:
+            raise LumigraphError(
+                f"--view-blocks {self.view_blocks} are among all --blocks, which are {self.blocks}; give fewer"
+            )
+        if self.networks == 2 and not self.coarse_loss_weight:
+            raise LumigraphError(
+                "The first of two networks learns from --coarse-loss-weight alone, so it cannot be 0 with --networks 2"
+            )
+
+
+@dataclass(frozen=True)
+class Sources:
+    """Photographs of one scene as the networks see them.
+
+    cameras: where they were taken from
+    maps:    for each network, what each cell adds to its blocks; see `ResidualNetwork.prepared`
+    frame:   the scene's
+    """
+
+    cameras: Camera
+    maps: tuple[Float[Tensor, "view row column joins"], ...]
+    frame: Frame
+
+
+@dataclass(frozen=True)
+class Lesson:
+    """Of several scenes, in order: the photographs that are looked at, and rays through others."""
+
+    unit: ClassVar[str] = "rays"
+
+    sources: list[list[Photograph]]
+    batches: list[Batch]
+    frames: list[Frame]
+
+    def __len__(self) -> int:
+        return sum(map(len, self.batches))
+
+
+class PixelNeRF(RayMethod):
+    """A point is known by the features where each photograph would show it, and by where it is in that camera's frame.
+
+    Learns from a Collection; `given` a Scene, it is a field of that scene, seen by the photographs to learn from.
+    """
+
+    Config, learns_from, accepts = Config, Collection, (Scene,)
+    efforts: ClassVar[Efforts] = {"draft": Effort(10, 1000), "good": Effort(200, 20_000), "best": Effort(2000, 200_000)}
+
+    def __init__(self, frame: Frame, config: Any = None):
+        config = config or Config()
+        super().__init__(frame, config)
+        c = config
+        self.encode = FrequencyEncoding(3, c.position_frequencies, base=1.5)
+        self.encoder = PictureEncoder(c.encoder_widths, c.encoder_blocks, c.encoder_pool, bool(c.encoder_weights))
+        shape = (self.encode.width + 3, self.encoder.width, c.hidden_width, c.blocks, c.view_blocks, not c.bfloat16)
+        self.networks = torch.nn.ModuleList(ResidualNetwork(*shape) for _ in range(c.networks))
+        self.kept = KeptPhotographs(self.encoder.width)
+        self._sources: Sources | None = None  # found in what is kept, until a step changes the encoder
+        self._boxed = True
+
+    @classmethod
+    def preset(cls, device: torch.device) -> Any:
+        """On a GPU the paper's numbers. On a CPU a smaller encoder and network of the same design."""
+        if device.type == "cuda":
+            return Config()
+        return Config(
+            hidden_width=64,
+            encoder_widths=(32, 32, 64, 128),
+            encoder_blocks=(2, 2, 2),
+            encoder_pool=False,
+            coarse_samples=20,
+            fine_samples=12,
+            depth_samples=0,
+            networks=1,
+            coarse_loss_weight=0.1,
+            density="softplus",
+            density_scale=10.0,
+            members_per_step=3,
+            rays_per_member=128,
+            boxed=0.5,
+            learning_rate=1e-3,
+            final_learning_rate=1e-4,
+            warmup=0.02,
+            empty_threshold=1e-2,
+        )
+
+    @classmethod
+    def smallest(cls) -> Any:
+        return Config(
+            hidden_width=16,
+            blocks=2,
+            view_blocks=1,
+            encoder_widths=(8, 8, 8, 8),
+            encoder_blocks=(1, 1, 1),
+            encoder_pool=False,
+            coarse_samples=12,
+            fine_samples=4,
+            depth_samples=4,
+            density="softplus",
+            density_scale=5.0,
+            source_views=2,
+            members_per_step=1,
+            rays_per_member=96,
+            targets=2,
+            learning_rate=1e-2,
+            final_learning_rate=3e-3,
+        )
+
+    @classmethod
+    def further_bytes(cls, frame: Frame, config: Any, learning: bool) -> int:
+        """Activations that a step keeps for its gradients."""
+        c = config
+        samples = c.members_per_step * c.rays_per_member * (c.coarse_samples + c.fine_samples + c.depth_samples)
+        return 4 * samples * c.hidden_width * 3 * (c.source_views * c.view_blocks + c.blocks) if learning else 0
+
+    # Learning
+
+    def begin(self, data: Collection, seconds: float = math.inf) -> None:
+        if self.config.encoder_weights:
+            self.encoder.load(Path(self.config.encoder_weights).expanduser())
+        _, first = next(data.members())
+        self.kept = self._keeping(photographed(first), self.config.source_views)
+
+    def steps_per_pass(self, data: Collection) -> float:
+        return len(data.splits["train"]) / self.config.members_per_step
+
+    def batch(self, data: Collection, generator: torch.Generator) -> Lesson:  # type: ignore[override]
+        """Random members; of each as many random photographs to look at, and rays through some others."""
+        c = self.config
+        views = 1 + chance(c.source_views, generator)
+        lesson = Lesson([], [], [])
+        for _ in range(c.members_per_step):
+            scene = photographed(data.sample_member(generator)[1])
+            there = scene.splits["train"]
+            order = there[torch.randperm(len(there), generator=generator)].tolist()
+            lesson.sources.append([scene.photograph(i).to(self.device) for i in order[:views]])
+            seen = order[views:] or order
+            lesson.batches.append(self._rays_of(scene, seen[: c.targets], generator).to(self.device))
+            lesson.frames.append(scene.frame)
+        return lesson
+
+    def _rays_of(self, scene: Scene, images: Sequence[int], generator: torch.Generator) -> Batch:
+        """Random pixels of some photographs, at first within boxes around what is opaque (appendix B.2)."""
+        c, parts = self.config, []
+        counts = [len(x) for x in torch.arange(c.rays_per_member).tensor_split(len(images))]
+        for image, count in zip(images, counts, strict=True):
+            photograph = scene.photograph(image)
+            places = pixels_of(photograph, self._boxed)
+            x, y = places[torch.randint(len(places), (count,), generator=generator)].unbind(-1)
+            rays = photograph.camera.rays(torch.stack([x, y], -1) + 0.5)
+            rgb = photograph.before(scene.frame.background)[y, x]
+            parts.append((rays, rgb))
+        rays = Rays(*(torch.cat([getattr(r, name) for r, _ in parts]) for name in ("origins", "directions", "radius")))
+        return Batch(rays, torch.cat([rgb for _, rgb in parts]))
+
+    def loss(self, batch: Lesson, step: int) -> dict[str, Tensor]:  # type: ignore[override]
+        """The squared error of both looks, over all members (section 4.2)."""
+        terms: dict[str, Tensor] = {}
+        generator, share = self.random(step), 1 / len(batch.batches)
+        for sources, rays, frame in zip(self._seen(batch), batch.batches, batch.frames, strict=True):
+            background = torch.tensor([frame.background], device=self.device)
+            for look in self._looks(rays.rays, sources, generator):
+                if not (weight := self.pass_weights.get(look.name, 1.0)):
+                    continue
+                seen = composite(look.samples, look.density, look.rgb, background)
+                error = share * (seen.rgb - rays.rgb).square().mean()
+                terms[look.name] = terms.get(look.name, 0.0) + weight * error
+        self.figures |= {"mse": float(terms["fine"].detach()), "views": len(batch.sources[0])}
+        return terms
+
+    @property
+    def pass_weights(self) -> dict[str, float]:
+        return {"coarse": self.config.coarse_loss_weight}
+
+    def optimizers(self) -> list[torch.optim.Optimizer]:
+        return [torch.optim.Adam(self.parameters(), self.config.learning_rate)]
+
+    def learning_rate(self, step: int, progress: float) -> float:
+        return falling(self.config.learning_rate, self.config.final_learning_rate, progress, self.config.warmup)
+
+    def before_step(self, step: int, progress: float) -> None:
+        self._sources, self._boxed = None, progress < self.config.boxed
+
+    # One scene
+
+    @property
+    def controls(self) -> tuple[Control, ...]:
+        count = len(self.kept.cameras()) if self.kept else 0
+        about = "How many of the photographs that it was given are looked at."
+        return (Control("views", float(count), (1.0, float(count)), about=about),) if count > 1 else ()
+
+    @property
+    def evidence_views(self) -> int | None:
+        return int(float(self.control("views"))) if self.controls else 1
+
+    def given(self, *evidence: Any, **controls: Value) -> Method:
+        """A field of a scene, told its photographs to learn from; or the same one, seen by fewer of them."""
+        scenes = [piece for piece in evidence if isinstance(piece, Scene)]
+        told = super().given(*(piece for piece in evidence if not isinstance(piece, Scene)), **controls)
+        assert isinstance(told, PixelNeRF)
+        told._sources = None
+        for scene in scenes[-1:]:
+            told.frame = scene.frame
+            told.told.pop("views", None)
+            told.kept = told._keeping(scene, len(scene.splits["train"])).to(self.device)
+            with torch.no_grad():
+                told.kept.found.rows = told._features(told.kept.pictures()).flatten(0, 2)
+        return told
+
+    def evidence_bytes(self, scene: Scene) -> int:
+        """What is kept and found of its photographs."""
+        sizes = scene.cameras.size[scene.splits["train"]]
+        cells = len(sizes) * int(torch.ceil(sizes.amax(0) / STRIDE).prod())
+        numbers = self.encoder.width * 4 + len(self.networks) * self.config.view_blocks * self.config.hidden_width
+        return 4 * cells * numbers
+
+    def _keeping(self, scene: Scene, most: int) -> KeptPhotographs:
+        """So many of a scene's photographs to learn from, in an order whose every beginning is spread evenly."""
+        there = scene.splits["train"]
+        chosen = there[spread_out(scene.cameras[there])[:most]].tolist()
+        return KeptPhotographs.of([scene.photograph(i) for i in chosen], scene.frame.background, self.encoder.width)
+
+    @property
+    def sources(self) -> Sources:
+        """What it looks at. Raises LumigraphError where nothing was given."""
+        if self._sources is None:
+            if not self.kept:
+                raise LumigraphError("pixelnerf shows what it was given photographs of, and it was given none")
+            cameras = self.kept.cameras()
+            with torch.no_grad():
+                if len(rows := self.kept.found.rows):
+                    height, width = (-(-int(n) // STRIDE) for n in cameras.size.amax(0).flip(0))
+                    features = rows.view(len(cameras), height, width, -1)
+                else:
+                    features = self._features(self.kept.pictures())
+                count = int(float(self.told.get("views", len(cameras))))
+                self._sources = self._prepared(features[:count], cameras[slice(count)].to(self.device), self.frame)
+        return self._sources
+
+    def _seen(self, lesson: Lesson) -> list[Sources]:
+        """What the encoder finds in the photographs of each scene, of all at once."""
+        both = zip(lesson.sources, lesson.frames, strict=True)
+        pictures = [photograph.before(frame.background) for photographs, frame in both for photograph in photographs]
+        cameras = [Camera.cat([photograph.camera for photograph in photographs]) for photographs in lesson.sources]
+        features = self._features(pictures).split([len(x) for x in cameras])
+        return [self._prepared(*of_one) for of_one in zip(features, cameras, lesson.frames, strict=True)]
+
+    def _features(self, pictures: list[Float[Tensor, "_ _ 3"]]) -> Float[Tensor, "view row column feature"]:
+        return self.encoder(padded(pictures).to(self.device))
+
+    def _prepared(self, features: Float[Tensor, "view row column feature"], cameras: Camera, frame: Frame) -> Sources:
+        maps = tuple(network.prepared(features) for network in self.networks)  # type: ignore[operator]
+        return Sources(cameras, maps, frame)
+
+    # Along rays
+
+    def looks(self, rays: Rays, generator: torch.Generator | None = None) -> list[Look]:
+        return self._looks(rays, self.sources, generator)
+
+    def _looks(self, rays: Rays, sources: Sources, generator: torch.Generator | None) -> list[Look]:
+        """The coarse look and the fine one (section 4.1, appendix B.2)."""
+        c, count, device, space = self.config, len(rays), self.device, space_of(sources.frame)
+        near, far = space.interval(rays)
+
+        def ask(network: int, shares: Tensor, where: Tensor | None = None) -> tuple[Tensor, Tensor]:
+            t = space.distance(shares, rays, near, far)
+            points = rays.origins[:, None] + t[..., None] * rays.directions[:, None]
+            directions = rays.directions[:, None].expand_as(points)
+            asked = None if where is None else where[:, None].expand_as(shares).flatten()
+            density, rgb = self._ask(network, points.flatten(0, 1), directions.flatten(0, 1), sources, asked)
+            return density.view(shares.shape), rgb.view(*shares.shape, 3)
+
+        def look(name: str, shares: Tensor, density: Tensor, rgb: Tensor) -> Look:
+            samples = Samples.rows(space.distance(shares, rays, near, far), far)
+            return Look(name, samples, density.flatten(), rgb.flatten(0, 1))
+
+        shares = stratified(count, c.coarse_samples, generator, device)
+        coarse = look("coarse", shares, *(first := ask(0, shares)))
+        weights = weights_of(coarse.samples, coarse.density).view(count, -1).detach()
+        again = self._again(shares, weights, generator)
+        where = weights.sum(-1) > c.empty_threshold if generator is None and c.empty_threshold else None
+        self.figures |= {"rays": count, "samples": shares.numel() + again.numel()}
+        if c.networks == 1:  # the same network has answered for the coarse places
+            further = ask(0, again, where)
+            density, rgb = (torch.cat(pair, 1) for pair in zip(first, further, strict=True))
+            shares, order = torch.cat([shares, again], -1).sort(-1)
+            density, rgb = density.gather(1, order), rgb.gather(1, order[..., None].expand(-1, -1, 3))
+        else:
+            shares = torch.cat([shares, again], -1).sort(-1).values
+            density, rgb = ask(1, shares, where)
+        return [coarse, look("fine", shares, density, rgb)]
+
+    def _again(
+        self, shares: Float[Tensor, "ray sample"], weights: Float[Tensor, "ray sample"], generator: Any
+    ) -> Float[Tensor, "ray again"]:
+        """Where to look again: by the weights found, and around the depth found."""
+        c, count, device = self.config, len(shares), self.device
+        evenly = stratified(count, c.fine_samples, generator, device)
+        places = [inverse_transform(midpoints(shares), weights[:, 1:-1], evenly)]
+        if c.depth_samples:
+            total = weights.sum(-1, keepdim=True)
+            depth = torch.where(total > 0, (weights * shares).sum(-1, keepdim=True) / total.clamp_min(1e-9), 0.5)
+            spread = 2 * stratified(count, c.depth_samples, generator, device) - 1
+            places.append((depth + c.depth_deviation * 2**0.5 * torch.erfinv(spread.clamp(-0.999, 0.999))).clamp(0, 1))
+        return torch.cat(places, -1)
+
+    def _ask(
+        self,
+        network: int,
+        points: Float[Tensor, "point 3"],
+        directions: Float[Tensor, "point 3"],
+        sources: Sources,
+        where: Tensor | None = None,
+    ) -> tuple[Float[Tensor, " point"], Float[Tensor, "point 3"]]:
+        """Density per scene unit and colour of points seen along directions (section 4.2, eq. 4 to 6)."""
+        cameras, c = sources.cameras, self.config
+        turned = cameras.pose[:, :, :3].mT  # the world's axes in each camera's
+        middle = c.centred and sources.frame.reach <= 1
+        origins = torch.zeros_like(cameras.position) if middle else cameras.position
+
+        def answer(points: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
+            places = (points - origins[:, None]) @ turned.mT  # R^T (p - o), of each view
+            seen = [self.encode(places.flatten(0, 1)).unflatten(0, places.shape[:2]), directions @ turned.mT]
+            pixels = torch.stack([cameras[i].project(points)[0] for i in range(len(cameras))])
+            joins = look_up(sources.maps[network], pixels, cameras.size.to(pixels))
+            raw = self.networks[network](torch.cat(seen, -1), joins)
+            density = softplus(raw[:, 3]) if c.density == "softplus" else raw[:, 3].relu()
+            return c.density_scale * density, raw[:, :3].sigmoid()
+
+        density, rgb = in_chunks(answer, points, directions, where=where)
+        return density, rgb
+
+    def field(
+        self, points: Float[Tensor, "point 3"], directions: Float[Tensor, "point 3"]
+    ) -> tuple[Float[Tensor, " point"], Float[Tensor, "point 3"]]:
+        """Density per scene unit, and sRGB-encoded colour seen along unit directions. Both depend on the direction."""
+        return self._ask(len(self.networks) - 1, points, directions, self.sources)
+
+
+def photographed(member: Dataset) -> Scene:
+    """A member as photographs. Raises LumigraphError for any other kind."""
+    if not isinstance(member, Scene):
+        raise LumigraphError(
+            f"pixelnerf learns from collections of photographs, and {member.source} holds {member.kind}; "
+            "name a folder of scenes"
+        )
+    return member
+
+
+def pixels_of(photograph: Photograph, boxed: bool) -> Int[Tensor, "pixel 2"]:
+    """Pixels (x, y) to be trusted; boxed: within the box around what is opaque, where anything is."""
+    height, width = photograph.rgb.shape[:2]
+    there = torch.ones(height, width, dtype=torch.bool) if photograph.mask is None else photograph.mask.clone()
+    if boxed and photograph.alpha is not None and (opaque := photograph.alpha > 0.5).any():
+        rows, columns = opaque.any(1).nonzero(), opaque.any(0).nonzero()
+        box = torch.zeros_like(there)
+        box[int(rows.min()) : int(rows.max()) + 1, int(columns.min()) : int(columns.max()) + 1] = True
+        there = there & box if (there & box).any() else there
+    return there.nonzero().flip(-1)
+
+
+def chance(count: int, generator: torch.Generator) -> int:
+    return int(torch.randint(count, (), generator=generator))
