@@ -147,6 +147,9 @@ def test_the_light_of_a_photograph_is_found_on_its_left_half(taught):
     assert halves.psnr > average.psnr + 1
     assert "left half" in halves.protocol["halves"] and average.protocol["halves"] is None
     assert halves.compared == "right halves of 3 test views"
+    alone = evaluate(method.given(appearance="average"), scene, right_halves=True)
+    assert alone.compared == halves.compared and "nothing is told" in alone.protocol["halves"]
+    assert alone.psnr != average.psnr and halves.psnr > alone.psnr + 1
     shot = scene.photograph(0)
     found, again = (method.given(left_half(shot)) for _ in range(2))
     assert torch.equal(found.found, again.found) and method.found is None

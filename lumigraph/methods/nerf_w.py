@@ -197,7 +197,8 @@ class NeRFW(RayMethod):
         """Equations 13 and 14: the last pass with passers-by, the coarse one without them and without uncertainty."""
         c, rays, generator = self.config, batch.rays, self.random(step)
         assert rays.image_index is not None
-        background = backdrop(batch, self.background, generator)
+        opaque = c.field == "hash" and self.frame.reach > 1  # as in instant-ngp
+        background = backdrop(batch, self.background, generator, opaque)
         target = batch.before(background)
         appearance, transient = self.appearance(rays.image_index), self.transient(rays.image_index)
         *coarse, last = self.network.passes(rays, generator)
