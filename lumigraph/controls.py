@@ -44,8 +44,9 @@ class Control:
         if self.choices:
             if str(value) in self.choices or (self.blends and self._is_blend(str(value))):
                 return str(value)
+            names = ", photographs' names" if self.of_photographs else ""
             between = ", and A:B:0.5 for halfway between two" if self.blends else ""
-            raise LumigraphError(f"{self.name}={value} is no choice; there are: {self.domain}{between}")
+            raise LumigraphError(f"{self.name}={value} is no choice; there are: {self.domain}{names}{between}")
         assert self.range is not None
         try:
             number = float(value)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import struct
 import warnings
 from dataclasses import replace
 from pathlib import Path
@@ -576,6 +577,19 @@ def test_alpha_without_an_end_is_no_object():
     shots = [replace(shot, pose=pose) for shot, pose in zip(capture.shots, poses, strict=True)]
     frame = assemble(Capture("x", shots)).frame
     assert frame.background == (1.0, 1.0, 1.0) and frame.has_alpha and frame.reach > 1
+
+
+def test_llff_takes_the_bend_of_its_lens_from_the_model_beside_it(tiny, tmp_path):
+    """As COLMAP writes its camera; another one's, of another focal length, counts for nothing."""
+    write_llff(tmp_path, tiny)
+    model = tmp_path / "sparse/0"
+    model.mkdir(parents=True)
+    for focal, bend in ((FOCAL, -0.25), (1.1 * FOCAL, 0.0)):
+        camera = struct.pack("<QiiQQ4d", 1, 1, 2, WIDTH, HEIGHT, focal, WIDTH / 2, HEIGHT / 2, -0.25)
+        (model / "cameras.bin").write_bytes(camera)
+        lens = open_scene(tmp_path).cameras.lens[0]
+        assert isinstance(lens, OpenCV) == bool(bend)
+        assert not bend or lens.distortion[0].tolist() == [bend] + 7 * [0]
 
 
 def test_llff_depths_bound_a_capture_without_points(tiny, tmp_path):

@@ -147,6 +147,9 @@ def test_the_light_of_a_photograph_is_found_on_its_left_half(taught):
     assert halves.psnr > average.psnr + 1
     assert "left half" in halves.protocol["halves"] and average.protocol["halves"] is None
     assert halves.compared == "right halves of 3 test views"
+    alone = evaluate(method.given(appearance="average"), scene, right_halves=True)
+    assert alone.compared == halves.compared and "nothing is told" in alone.protocol["halves"]
+    assert alone.psnr != average.psnr and halves.psnr > alone.psnr + 1
     shot = scene.photograph(0)
     found, again = (method.given(left_half(shot)) for _ in range(2))
     assert torch.equal(found.found, again.found) and method.found is None
@@ -197,3 +200,19 @@ def test_rays_that_meet_no_sample_cost_nothing():
     rays = Rays(3 + away, away, torch.full((3,), 0.01), image_index=torch.arange(3))
     seen = method.given(transient="shown").render_rays(rays, method.background)
     torch.testing.assert_close(seen.rgb, torch.ones(3, 3))
+
+
+def test_skies_are_learnt_in_the_open_alone():
+    """What rays see through the scene is the sky under their photograph's appearance; objects have none."""
+    scene = two_lights()
+    wide = replace(scene.frame, reach=2.0, has_alpha=False)
+    method, generator = made(replace(scene, frame=wide)), torch.Generator().manual_seed(0)
+    batch = replace(method.batch(scene, generator), alpha=None)
+    codes = 0.5 * torch.randn(len(batch), 4, generator=generator)
+    sky = method.network.behind(batch.rays, codes, method.background)
+    assert sky.shape == (len(batch), 3) and sky.std() > 0.01
+    assert not torch.equal(sky, method.network.behind(batch.rays, 2 * codes, method.background))
+    sum(method.loss(batch, 0).values()).backward()
+    assert all(weight.grad.any() for weight in method.network.sky.parameters())
+    for other in (made(scene), made(replace(scene, frame=wide), own_skies=False)):
+        assert torch.equal(other.network.behind(batch.rays, codes, other.background), other.background)

@@ -12,10 +12,12 @@ import pytest
 import tiny
 import torch
 from PIL import Image
+from test_nerf_w import made, two_lights
 from test_viewer import some_cloud, subject
 
 import lumigraph.methods
 from lumigraph.paths.keyframes import CameraPath
+from lumigraph.run import build
 from lumigraph.scene import Frame
 from lumigraph.train import fit
 from lumigraph.viewer import Viewer, choose_address
@@ -220,6 +222,45 @@ def test_a_path_is_set_saved_and_opened(viewer, page):
     page.get_by_role("button", name="Play").click()
     last = np.array(path.keyframes[1].pose)
     wait(lambda: np.abs(np.array(visitor.request().pose) - last).max() < 1e-3)
+
+
+def test_appearances_are_a_list_whose_choice_is_seen(page, faults, tmp_path):
+    """Photographs of NeRF-W, of which number 1 is a third as bright as number 2."""
+    scene = two_lights()
+    method = made(scene, transient_start=1.0, samples_per_step=1 << 12)
+    fit(method, scene, steps=60, show=False, rehearsal=False)
+    with Viewer(method.eval(), subject(scene, tmp_path), choose_address(port=0)) as viewer:
+        visitor = visit(viewer, page)
+        page.get_by_role("checkbox", name="Cameras").click()
+        pictures = {}
+        for photograph in ("1", "2"):
+            choose(page, "Appearance", photograph)
+            wait(lambda n=photograph: visitor.request().told == (("appearance", n),))
+            settle(visitor)
+            told = method.given(appearance=photograph).render(visitor.request().camera(SIZE)).rgb
+            pictures[photograph] = told.clamp(0, 1).numpy()[ROWS, COLUMNS]
+            shows(page, pictures[photograph], 28)
+        assert psnr(*pictures.values()) < 24
+        assert page.get_by_label("Transient", exact=True).first.input_value() == "hidden"
+    assert [fault for fault in faults if "WebSocket" not in fault] == []
+
+
+def test_a_slider_changes_the_picture(page, tmp_path):
+    scene = tiny.scene()
+    kind = lumigraph.methods.find("two-moments")
+    method = build(kind, replace(scene.frame, times=(2.0, 5.0)), kind.Config(), torch.device("cpu"), 0).eval()
+    with Viewer(method, subject(scene, tmp_path), choose_address(port=0)) as viewer:
+        visitor = visit(viewer, page)
+        page.get_by_role("checkbox", name="Cameras").click()
+        shows(page, expected(viewer, visitor), 28)
+        slider = page.get_by_role("slider", name="Brightness")
+        slider.focus()
+        slider.press("End")
+        wait(lambda: dict(visitor.request().told).get("brightness") == 2.0)
+        settle(visitor)
+        bright = method.given(brightness=2.0).render(visitor.request().camera(SIZE)).rgb.clamp(0, 1)
+        assert psnr(bright.numpy()[ROWS, COLUMNS], expected(viewer, visitor)) < 24
+        shows(page, bright.numpy()[ROWS, COLUMNS], 28)
 
 
 def test_gaussians_are_drawn_by_the_browser(page, faults, tmp_path):

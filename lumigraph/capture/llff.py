@@ -1,24 +1,29 @@
 """LLFF captures (Mildenhall et al. 2019): poses_bounds.npy, one row of 17 numbers for each image in order of name.
 
 A row holds a 3x5 matrix and the nearest and farthest depth seen. The matrix's columns are the camera's down, right and
-backward axes, its position, and (height, width, focal length) in pixels.
+backward axes, its position, and (height, width, focal length) in pixels. How the lens bends is not in it; the camera of
+the COLMAP model that the table was made from, where that lies beside it, tells.
 """
 
 from __future__ import annotations
 
+import struct
 from pathlib import Path
 
 import numpy as np
 import torch
 
 from ..errors import LumigraphError
-from ..lens import Pinhole
+from ..lens import Lens, OpenCV, Pinhole
 from .capture import Capture, Shot
 from .numbers import load_array
 from .pictures import list_images, reductions, versions
 from .points import read_points3d
 
 LOOKED_FOR = "poses_bounds.npy (LLFF)"
+SIMPLE_RADIAL = 2  # COLMAP's number of the lens that LLFF's own script asks for
+ONE_CAMERA = struct.Struct("<QiiQQ4d")  # how many, id, model, width, height; focal length, centre and bend
+SAME = 1e-3  # of the focal length by which two cameras may differ
 
 
 def recognises(folder: Path) -> bool:
@@ -46,14 +51,14 @@ def read(folder: Path) -> Capture:
     if names is None:
         found = ", ".join(f"{len(names)} in {place.name}" for place, names in listed.items()) or "no folder of images"
         raise LumigraphError(f"{path} has poses of {len(table)} images, but there are {found}; restore the images")
-    shots = []
+    shots, bend = [], bend_of(folder / "sparse/0/cameras.bin")
     for name, files, line in zip(names, versions(folders, names), table, strict=True):
         matrix, depths = line[:15].reshape(3, 5), line[15:]
         down, right, backward, position, (height, width, focal) = matrix.T
         if not (np.isfinite(line).all() and 1 <= min(height, width) and max(height, width) <= 1e5 and focal > 0):
             raise LumigraphError(f"{path} has no usable numbers for image {name}; make or copy it again")
         size = (round(width), round(height))
-        lens = Pinhole(torch.tensor([[focal, focal]]).float(), torch.tensor([[width / 2, height / 2]]).float())
+        lens = lens_of(width, height, focal, bend)
         pose = np.stack([right, down, -backward, position], -1)
         shots.append(Shot(name, pose, lens, size, files, depths=(float(depths[0]), float(depths[1]))))
     cloud = folder / "sparse/0/points3D.bin"
@@ -61,3 +66,23 @@ def read(folder: Path) -> Capture:
         return Capture(str(folder), shots)
     points = read_points3d(cloud)
     return Capture(str(folder), shots, points.positions, points.colours, points.sightings)
+
+
+def lens_of(width: float, height: float, focal: float, bend: tuple[float, float] | None) -> Lens:
+    """A pinhole, or where a bend is known of the same focal length, in widths, the lens that has it."""
+    focals, centre = torch.tensor([[focal, focal]]).float(), torch.tensor([[width / 2, height / 2]]).float()
+    if bend is None or abs(bend[0] * width / focal - 1) > SAME:
+        return Pinhole(focals, centre)
+    distortion = torch.zeros(1, 8)
+    distortion[0, 0] = bend[1]
+    return OpenCV(focals, centre, distortion)
+
+
+def bend_of(path: Path) -> tuple[float, float] | None:
+    """Focal length, in widths of the picture, and radial distortion of the one camera in a COLMAP file; None where it
+    is another kind of file."""
+    data = path.read_bytes() if path.is_file() else b""
+    if len(data) != ONE_CAMERA.size:
+        return None
+    count, _, model, width, _, focal, _, _, bend = ONE_CAMERA.unpack(data)
+    return (focal / width, bend) if count == 1 and model == SIMPLE_RADIAL and width and bend else None

@@ -37,6 +37,8 @@ class Eval:
     """Files with the weights of LPIPS, .pth or .safetensors."""
     save_images: bool = False
     """Keep every rendering, as RUN/eval/NAME.png."""
+    right_halves: bool = False
+    """Compare right halves of photographs alone, as of methods that are told their left halves."""
     overwrite: Overwrite = False
     scene: Annotated[str | None, option("SCENE", "where they were")] = None
     """Where what it learnt from is now, if it has moved."""
@@ -56,7 +58,7 @@ class Eval:
         lpips = chosen_lpips(self.lpips)
         method = tell(run, run.method(choose_device(self.device)), self.told)
         data = run.dataset(self.scene)
-        result = evaluate_run(run, method, data, self.split, self.save_images, self.views, lpips)
+        result = evaluate_run(run, method, data, self.split, self.save_images, self.views, lpips, self.right_halves)
         rows: dict[str, Any] = {score.name: bold(score) for score in scores_of(result)}
         for size, part in result.get("by_resolution", {}).items():
             rows[size] = f"{', '.join(f'{x.name} {x}' for x in scores_of(part))}, {part['views']} views"

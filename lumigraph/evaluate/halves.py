@@ -14,6 +14,7 @@ from ..method import Method
 from ..scene import Photograph, Scene
 
 DEFINITION = "each photograph's code is found on its left half, and its right half is compared"
+RIGHT_ALONE = "right halves are compared; nothing is told of left ones"
 
 
 def judged_by_halves(method: Method) -> bool:
@@ -21,6 +22,11 @@ def judged_by_halves(method: Method) -> bool:
     control."""
     takes = issubclass(method.learns_from, Scene) and Photograph in method.accepts
     return takes and not any(control.of_photographs and control.name in method.told for control in method.controls)
+
+
+def definition(method: Method, right_halves: bool) -> str | None:
+    """What an evaluation says of halves; None where photographs are compared as a whole."""
+    return DEFINITION if judged_by_halves(method) else RIGHT_ALONE if right_halves else None
 
 
 def left_half(photograph: Photograph) -> Photograph:

@@ -51,18 +51,20 @@ def evaluate_on(
     keep: Callable[[str, Rendering], object] = lambda name, rendering: None,
     most: int | None = None,
     lpips: Lpips | None = None,
+    right_halves: bool = False,
 ) -> Evaluated:
     """A method on a dataset, under the protocol for its kind.
 
     keep: told each view's name and rendering, where views are compared
     most: so many views or shapes at most, evenly spread; None means all
+    right_halves: of a Scene, compare those alone, whatever the method
     """
     if isinstance(data, Shapes):
         return evaluate_shapes(method, data, split, most)
     if isinstance(data, Collection):
         return evaluate_collection(method, data, split, keep, most, lpips)
     assert isinstance(data, Scene)
-    return evaluate(method, data, split, keep, most, lpips)
+    return evaluate(method, data, split, keep, most, lpips, right_halves)
 
 
 def evaluate_run(
@@ -73,6 +75,7 @@ def evaluate_run(
     save_images: bool = False,
     most: int | None = None,
     lpips: Lpips | None = None,
+    right_halves: bool = False,
 ) -> dict[str, Any]:
     """Evaluate a Run's Method on its dataset and write the files. Returns what eval.json says."""
     claim_evaluation(run, split, save_images)
@@ -81,7 +84,7 @@ def evaluate_run(
         if save_images:
             save_picture(image_of(run, name), rendering.rgb, "rendering")
 
-    found, state = evaluate_on(method, data, split, keep, most, lpips), run.state
+    found, state = evaluate_on(method, data, split, keep, most, lpips, right_halves), run.state
     result = found.to_json() | {
         "training_seconds": state.seconds,
         "compile_seconds": state.compile_seconds,

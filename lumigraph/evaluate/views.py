@@ -128,11 +128,13 @@ def evaluate(
     keep: Callable[[str, Rendering], object] = lambda name, rendering: None,
     views: int | None = None,
     lpips: Lpips | None = None,
+    right_halves: bool = False,
 ) -> Evaluation:
     """Render the views of a split and compare them with their photographs.
 
     keep:  told each view's name and rendering
     views: so many of them at most, evenly spread over the split; None means all
+    right_halves: compare those alone also where a method is told nothing of left ones
     Cameras are those that the method refined; held-out ones are then found as `held_out_poses` says. Pixels that the
     photograph's mask rules out do not count, nor does a photograph that it rules out altogether. A method that
     photographs can be given to is judged by halves (see `evaluate.halves`). Raises LumigraphError if the split has no
@@ -156,7 +158,7 @@ def evaluate(
     for index in track(compared, "Comparing views", len(compared)):
         shot = scene.photograph(index, [name for name in (CLEAN, LIGHT) if name in scene.layers])
         camera = found.camera(index) if found else method.refined(shot.camera)
-        columns = halves.right_half(shot) if by_halves else slice(None)
+        columns = halves.right_half(shot) if by_halves or right_halves else slice(None)
         if shot.mask is not None and not shot.mask[:, columns].any():
             continue
         photograph = shot.before(scene.frame.background)
@@ -179,7 +181,7 @@ def evaluate(
         raise LumigraphError(
             f"{scene.source} has masks that leave nothing of the views in the split {split!r} to compare"
         )
-    stated = protocol(scene, split, compared, lpips, method) | ({"poses": PROTOCOL} if found else {})
+    stated = protocol(scene, split, compared, lpips, method, right_halves) | ({"poses": PROTOCOL} if found else {})
     poses = tuple(pose_scores(method, scene))
     return Evaluation(scores, stated, compile_seconds, shown | worst, poses)
 
@@ -222,7 +224,9 @@ def warm_up(method: Method, camera: Camera) -> float:
     return time.perf_counter() - begin
 
 
-def protocol(scene: Scene, split: str, compared: list[int], lpips: Lpips | None, method: Method) -> dict[str, Any]:
+def protocol(
+    scene: Scene, split: str, compared: list[int], lpips: Lpips | None, method: Method, right_halves: bool = False
+) -> dict[str, Any]:
     """All that one must know to compare these figures with others."""
     captured = scene.cameras[torch.tensor(compared)]
     refined = not torch.equal(method.refined(captured).pose.cpu(), captured.pose)
@@ -235,7 +239,7 @@ def protocol(scene: Scene, split: str, compared: list[int], lpips: Lpips | None,
         "background": list(scene.frame.background) if scene.frame.has_alpha else None,
         "poses": "as the method refined them" if refined else "as captured",
         "controls": dict(method.told),
-        "halves": halves.DEFINITION if halves.judged_by_halves(method) else None,
+        "halves": halves.definition(method, right_halves),
         "masked": any(scene.images.mask(i) is not None for i in compared),
         "colours": LIGHT_PROTOCOL if LIGHT in scene.layers else "sRGB in [0, 1]; renderings clipped, not rounded",
         "psnr": "per view, then averaged",

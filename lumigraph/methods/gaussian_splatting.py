@@ -23,6 +23,7 @@ from ..components.clouds.seen_from import seen_from
 from ..components.clouds.smoothing import sampling_interval, smoothed
 from ..components.clouds.tidying import before_a_lens, confined, nearest_camera
 from ..components.clouds.witnesses import hold_back
+from ..components.fields import own_sky
 from ..components.fields.affine_colours import NUMBERS, changed, changed_harmonics, found
 from ..components.fields.appearance import PhotographCodes
 from ..components.fields.taken_over import taken_over
@@ -80,6 +81,7 @@ class Config:
     refine_cameras: bool = False  # learn where each photograph was taken from, small pictures first
     pose_learning_rate: LearningRate = 5e-3  # radians by which a step moves a picture, with refine_cameras
     appearance: Literal["auto", "yes", "no"] = "auto"  # learn how each photograph's colours differ; auto: where they do
+    own_skies: bool = True  # and in the open what shows behind everything, for each photograph
     appearance_lr: LearningRate = 5e-3  # of those changes of colour
     final_appearance_lr: LearningRate = 5e-4
     appearance_regularization: NonNegative = 1e-3  # of a change's squared numbers in the loss
@@ -105,6 +107,8 @@ NEAR = 0.1  # times the scene's near distance: the near plane of splats
 COARSE = 0.5  # of the budget: where poses are refined, plain colours, and half size if nothing else is said
 SMALLEST = 64  # pixels of a photograph's shorter side that are kept when it is reduced
 ENOUGH = 2400  # steps, with which sizes and colours need not hurry
+OFTEN = 400  # times that each photograph is learnt from, with which its light need not hurry
+MOST_HASTE = 6.0  # times the rate at which photographs' light is learnt, in short runs
 RECOVERY = 3  # opacity_reset_intervals that must be left after opacities are reset, or the pictures stay dim
 GROWTH = 1.05  # of the number at each change, for mcmc (Kheradmand 2024, section 3.2)
 LAST_MOVE = 0.9  # share of the budget after which mcmc moves and adds no Gaussians, so that those there converge
@@ -116,7 +120,7 @@ class GaussianSplatting(Method):
     """A cloud of Gaussians that learns from one photograph a step; `density_control` changes their number."""
 
     Config = Config
-    before: ClassVar[dict[str, Any]] = {"appearance": "no", "robust": "no"}
+    before: ClassVar[dict[str, Any]] = {"appearance": "no", "robust": "no", "own_skies": False}
     formerly: ClassVar[dict[str, str]] = {
         "degree": "sh_degree",
         "raise_degree_every": "sh_degree_interval",
@@ -156,7 +160,9 @@ class GaussianSplatting(Method):
         refining, rate = config.refine_cameras, config.pose_learning_rate
         self.poses = PoseRefinement(frame.image_count, rate) if refining else None
         photographs, told_apart = frame.image_count, config.appearance != "no"
-        self.lights: PhotographCodes | None = PhotographCodes(photographs, NUMBERS) if told_apart else None
+        self.skies = config.own_skies and frame.reach > 1 and not frame.has_alpha
+        numbers = NUMBERS + own_sky.NUMBERS * self.skies
+        self.lights: PhotographCodes | None = PhotographCodes(photographs, numbers) if told_apart else None
         self.found: Tensor | None = None  # the light of a photograph that was given
         self.trimming = Trimming() if config.robust != "no" else None
         self.rhythm = Rhythm(config.refine_every, config.refine_every_share)
@@ -275,6 +281,8 @@ class GaussianSplatting(Method):
         if self.appearance and camera.image_index is not None:
             code = self.appearance(camera.image_index)[0]
             rgb = changed(rgb, seen.opacity, code)
+            if self.skies:
+                background = own_sky.sky(code[NUMBERS:], batch.camera)
         if background.any():
             rgb = over(rgb, seen.opacity, background)
         if batch.mask is not None:
@@ -292,7 +300,7 @@ class GaussianSplatting(Method):
             "ssim": config.ssim_weight * (1 - kernels.ssim(rgb, target)),
         }
         if code is not None:
-            terms["appearance"] = config.appearance_regularization * code.square().sum()
+            terms["appearance"] = config.appearance_regularization * code[:NUMBERS].square().sum()
         if config.strategy == "mcmc":
             terms["opacity"] = config.opacity_regularization * cloud.opacities.sigmoid().mean()
             terms["scale"] = config.scale_regularization / float(self.extent) * cloud.log_scales.exp().mean()
@@ -321,7 +329,8 @@ class GaussianSplatting(Method):
         means = float(self.extent) * falling(c.means_lr, c.final_means_lr, progress)
         rates = {"means": means, "scales": times * c.scales_lr, "harmonics": times * c.sh_lr}
         if self.lights:
-            rates["appearance"] = falling(c.appearance_lr, c.final_appearance_lr, progress)
+            hurry = haste(step, progress, OFTEN * self.frame.image_count, MOST_HASTE)
+            rates["appearance"] = hurry * falling(c.appearance_lr, c.final_appearance_lr, progress)
         return rates | ({"poses": self.poses.rate(progress)} if self.poses else {})
 
     def before_step(self, step: int, progress: float) -> None:
@@ -465,11 +474,13 @@ class GaussianSplatting(Method):
         return self.poses.refined(cameras) if self.poses else cameras
 
     def render(self, camera: Camera) -> Rendering:
-        seen = render(self._cloud(), camera.to(self.device), BLACK, self._near)
-        rgb, code, background = seen.rgb, self._light, self.background[0]
-        if code is not None:
-            rgb = changed(rgb, seen.opacity, code.detach()).clamp(0, 1)
-        return replace(seen, rgb=over(rgb, seen.opacity, background))
+        camera = camera.to(self.device)
+        seen, code = render(self._cloud(), camera, BLACK, self._near), self._light
+        if code is None:
+            return replace(seen, rgb=over(seen.rgb, seen.opacity, self.background[0]))
+        rgb = changed(seen.rgb, seen.opacity, code.detach()).clamp(0, 1)
+        behind = own_sky.sky(code.detach()[NUMBERS:], camera).clamp(0, 1) if self.skies else self.background[0]
+        return replace(seen, rgb=over(rgb, seen.opacity, behind))
 
     # Photographs that differ
 
@@ -484,11 +495,13 @@ class GaussianSplatting(Method):
 
     def _tell_apart(self, scene: Scene) -> None:
         """Find out whether photographs differ so much that each has to be seen in a light of its own."""
-        if self.config.appearance != "auto":
-            return
-        stops = spread_of_light(scene)
-        self.differ.fill_(stops > STOPS)
-        if bool(self.differ):
+        if self.config.appearance == "auto":
+            stops = spread_of_light(scene)
+            self.differ.fill_(stops > STOPS)
+        if self.appearance and self.skies:
+            with torch.no_grad():
+                self.appearance.codes[:, NUMBERS:] = own_sky.mean_skies(scene).to(self.device)
+        if self.config.appearance == "auto" and bool(self.differ):
             warnings.warn(
                 f"Neighbouring photographs differ by {stops:.1f} stops, so each has colours of its own, and what moved "
                 "between them is left out; `--appearance no` takes all for the same light",
@@ -521,7 +534,7 @@ class GaussianSplatting(Method):
         return told
 
     @property
-    def _light(self) -> Float[Tensor, " 12"] | None:
+    def _light(self) -> Float[Tensor, " number"] | None:
         """The code that was told, else the one that was found, else the average; None where there are none."""
         if self.appearance is None:
             return None
@@ -530,16 +543,22 @@ class GaussianSplatting(Method):
         return self.appearance.told(str(self.control("appearance")))
 
     @torch.no_grad()
-    def _found(self, photograph: Photograph) -> Float[Tensor, " 12"]:
+    def _found(self, photograph: Photograph) -> Float[Tensor, " number"]:
         """The light in which the cloud looks most like a photograph; the average, where no pixel tells."""
         assert self.appearance is not None
         photograph, background = photograph.to(self.device), self.background[0]
-        seen = render(self._cloud(), photograph.camera, BLACK, self._near)
+        camera = photograph.camera
+        seen = render(self._cloud(), camera, BLACK, self._near)
         target, trusted = photograph.before(background), photograph.mask
         if trusted is None:
             trusted = torch.ones_like(seen.opacity, dtype=torch.bool)
         rgb, opacity = seen.rgb.detach()[trusted], seen.opacity.detach()[trusted]
-        return found(self.appearance.average.detach(), rgb, opacity, background, target[trusted])
+
+        def picture(code: Tensor) -> Tensor:
+            behind = own_sky.sky(code[NUMBERS:], camera)[trusted] if self.skies else background
+            return over(changed(rgb, opacity, code), opacity, behind)
+
+        return found(self.appearance.average.detach(), picture, target[trusted])
 
     def statistics(self) -> dict[str, float]:
         return {"mse": float(self._difference.square().mean()), "gaussians": len(self.cloud)}

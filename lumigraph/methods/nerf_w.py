@@ -58,6 +58,7 @@ class Config(OpenNumbers):
     beta_min: PositiveShare = 0.03  # least deviation of a colour, section 5
     transient_weight: NonNegative = 0.01  # lambda_u, of the mean transient density, section 5
     transient_start: Share = 0.0  # share of the budget before which nobody passes by, so that what stays takes shape
+    own_skies: bool = True  # of the hash table in the open: behind everything a sky that the appearance tells
     hidden_width: Width = 256  # channels of a layer, supplement
     learning_rate: LearningRate = 5e-4
     final_learning_rate: LearningRate = 5e-5  # at the end of the budget
@@ -107,6 +108,7 @@ class NeRFW(RayMethod):
 
     Config = Config
     accepts: ClassVar[tuple[type, ...]] = (Photograph,)
+    before: ClassVar[dict[str, Any]] = {"own_skies": False}
 
     def __init__(self, frame: Frame, config: Any = None):
         config = config or Config()
@@ -129,6 +131,7 @@ class NeRFW(RayMethod):
             field="hash",
             transient_layers=2,
             transient_width=32,
+            beta_min=0.1,
             transient_start=0.1,
             hidden_width=32,
             learning_rate=2e-2,
@@ -200,6 +203,7 @@ class NeRFW(RayMethod):
         background = backdrop(batch, self.background, generator)
         target = batch.before(background)
         appearance, transient = self.appearance(rays.image_index), self.transient(rays.image_index)
+        background = self.network.behind(rays, appearance, background)
         *coarse, last = self.network.passes(rays, generator)
         terms = {}
         for places in coarse:
@@ -252,8 +256,9 @@ class NeRFW(RayMethod):
         return found
 
     def render_rays(self, rays: Rays, background: Float[Tensor, "#ray 3"]) -> Rendering:
-        last = self.network.passes(rays)[-1]
-        rgb = self.network.colour(last, self._appearance.expand(len(last.samples), -1))
+        last, appearance = self.network.passes(rays)[-1], self._appearance
+        background = self.network.behind(rays, appearance.expand(len(rays), -1), background)
+        rgb = self.network.colour(last, appearance.expand(len(last.samples), -1))
         if self.control("transient") == HIDDEN:
             return composite(last.samples, last.density, rgb, background)
         codes = self.transient.told(str(self.told.get("appearance", AVERAGE))).expand(len(last.samples), -1)
@@ -311,7 +316,8 @@ class NeRFW(RayMethod):
 
         def error(code: Tensor) -> Tensor:
             rgb = self.network.colour(places, code.expand(len(places.samples), -1))
-            return squared(composite(places.samples, places.density, rgb, background).rgb - target).mean()
+            behind = self.network.behind(batch.rays, code.expand(len(batch), -1), background)
+            return squared(composite(places.samples, places.density, rgb, behind).rgb - target).mean()
 
         return fitted(self.appearance.average, error, FIT_STEPS, FIT_RATE)
 

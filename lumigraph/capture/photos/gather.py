@@ -122,7 +122,7 @@ def nothing(source: str, unreadable: Mapping[str, str]) -> str:
     if not unreadable:
         return f"{source} holds no photographs ({', '.join(sorted(PHOTOGRAPHS))}); name the folder or the video to use"
     name, why = next(iter(unreadable.items()))
-    return f"{source} holds no photograph that can be read ({name}: {why}); convert them to JPEG"
+    return f"{source} holds no photograph that can be read ({name}: {why}); copy them again, or convert them to JPEG"
 
 
 def is_bare(path: Path) -> bool:

@@ -6,11 +6,12 @@ balance, exposure and most of a grey day are such a map (Rematas 2022, Urban Rad
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from ...blending import over
 from .appearance import fitted
 
 NUMBERS = 12  # of a photograph's code: the nine of A by rows, the three of b
@@ -20,7 +21,7 @@ FIT_STEPS, FIT_RATE = 200, 0.02  # of Adam, where the light of a photograph is f
 
 
 def changed(
-    rgb: Float[Tensor, "*#row 3"], opacity: Float[Tensor, "*#row"], code: Float[Tensor, " 12"]
+    rgb: Float[Tensor, "*#row 3"], opacity: Float[Tensor, "*#row"], code: Float[Tensor, " number"]
 ) -> Float[Tensor, "*#row 3"]:
     """Colours over black, in a photograph's light: the map is of the scene, and not of what shows behind it.
 
@@ -32,7 +33,7 @@ def changed(
 
 
 def changed_harmonics(
-    harmonics: Float[Tensor, "gaussian coefficient 3"], code: Float[Tensor, " 12"]
+    harmonics: Float[Tensor, "gaussian coefficient 3"], code: Float[Tensor, " number"]
 ) -> Float[Tensor, "gaussian coefficient 3"]:
     """Coefficients whose colours are those of others in a photograph's light, from every side.
 
@@ -47,27 +48,21 @@ def changed_harmonics(
 
 @torch.no_grad()
 def found(
-    start: Float[Tensor, " 12"],
-    rgb: Float[Tensor, "pixel 3"],
-    opacity: Float[Tensor, " pixel"],
-    background: Float[Tensor, " 3"],
+    start: Float[Tensor, " number"],
+    picture: Callable[[Float[Tensor, " number"]], Float[Tensor, "pixel 3"]],
     target: Float[Tensor, "pixel 3"],
-) -> Float[Tensor, " 12"]:
-    """What brings a picture closest to a photograph by mean absolute difference, which passers-by hardly sway.
+) -> Float[Tensor, " number"]:
+    """The code whose picture is closest to a photograph by mean absolute difference, which passers-by hardly sway.
 
     start:   where the search begins, and what comes back where there is no pixel
-    rgb:     of the picture, over black; with its opacity and what shows behind it
-    target:  of the photograph
+    picture: the pixels' colours under a code, differentiable in it
+    target:  those of the photograph
     """
-    if not len(rgb):
+    if not len(target):
         return start
-
-    def error(code: Float[Tensor, " 12"]) -> Tensor:
-        return (over(changed(rgb, opacity, code), opacity, background) - target).abs().mean()
-
-    return fitted(start, error, FIT_STEPS, FIT_RATE)
+    return fitted(start, lambda code: (picture(code) - target).abs().mean(), FIT_STEPS, FIT_RATE)
 
 
-def _map(code: Float[Tensor, " 12"]) -> tuple[Float[Tensor, "3 3"], Float[Tensor, " 3"]]:
-    """I + A, and b."""
-    return torch.eye(3, device=code.device) + code[:9].view(3, 3), code[9:]
+def _map(code: Float[Tensor, " number"]) -> tuple[Float[Tensor, "3 3"], Float[Tensor, " 3"]]:
+    """I + A, and b; what else a photograph's code holds comes after them."""
+    return torch.eye(3, device=code.device) + code[:9].view(3, 3), code[9:NUMBERS]

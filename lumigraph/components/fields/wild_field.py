@@ -99,6 +99,12 @@ class WildField(nn.Module, ABC):
     def optimizers(self, codes: list[nn.Parameter]) -> list[torch.optim.Optimizer]:
         """Of the field, and of the photographs' codes with it."""
 
+    def behind(
+        self, rays: Rays, codes: Float[Tensor, "ray code"], background: Float[Tensor, "#ray 3"]
+    ) -> Float[Tensor, "#ray 3"]:
+        """What shows behind everything under each ray's appearance: the background, or a sky."""
+        return background
+
     def begin(self, scene: Scene, seconds: float, generator: torch.Generator) -> None:
         """Ahead of the first step; see `Method.begin`."""
 

@@ -9,6 +9,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn.functional import softplus
 
+from ... import kernels
 from ...rays import Rays
 from ...scene import Frame, Scene
 from ..sampling.coarse_to_fine import first_grid, keep_looking, lattice, stage
@@ -47,6 +48,8 @@ class WildHash(WildField):
         self.scene = HashField(config, self.space, frame.reach, config.appearance_code)
         inputs = config.levels * config.features_per_level + config.transient_code
         self.transient = MLP(inputs, *[config.transient_width] * config.transient_layers, 5)
+        open_sky = config.own_skies and self.unbounded is not None and not frame.has_alpha
+        self.sky = MLP(config.sh_bands**2 + config.appearance_code, config.hidden_width, 3) if open_sky else None
         self.occupancy = first_grid(config, frame.reach)
         self.lattice = lattice(config, frame.reach)
         first = rays_of(config.samples_per_step, config) if self.unbounded else FIRST_RAYS
@@ -87,6 +90,18 @@ class WildHash(WildField):
 
     def colour(self, places: Places, codes: Float[Tensor, "sample code"]) -> Float[Tensor, "sample 3"]:
         return self.scene.colour(*places.seen, codes)
+
+    def behind(
+        self, rays: Rays, codes: Float[Tensor, "ray code"], background: Float[Tensor, "#ray 3"]
+    ) -> Float[Tensor, "#ray 3"]:
+        """In the open a sky, which a direction and an appearance tell (as in Rematas 2022, beside the appearance).
+
+        No two photographs agree on the weather, so that without it what passes would take the sky, and nothing stay.
+        """
+        if self.sky is None:
+            return background
+        harmonics = kernels.spherical_harmonics(rays.directions, self.config.sh_bands)
+        return self.sky(side_by_side(harmonics, codes)).sigmoid()
 
     def passing(self, places: Places, codes: Float[Tensor, "sample code"]) -> Passing:
         raw = self.transient(side_by_side(places.unseen, codes))

@@ -1,0 +1,66 @@
+"""Held-out photographs of one scene beside what several runs make of them, as a small JPEG: the pictures of
+docs/own-photographs.md.
+
+    python benchmarks/side_by_side.py plain=RUN nerf-w=RUN --views 2 --output pair.jpg
+
+A method that holds a code for each photograph is told left halves, as in `lumigraph eval`.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import Annotated
+
+import torch
+import tyro
+from tyro.conf import Positional
+
+from lumigraph.choice import evenly
+from lumigraph.evaluate.halves import judged_by_halves, left_half
+from lumigraph.evaluate.light import LIGHT, in_light
+from lumigraph.figures import Row, contact_sheet
+from lumigraph.run import Run
+from lumigraph.scene import Scene
+
+MOST = 60_000  # bytes of a picture
+
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+    runs: Annotated[Positional[tuple[str, ...]], tyro.conf.arg(metavar="TITLE=RUN ...")]
+    output: Path
+    views: int = 2  # of the held-out ones, evenly spread
+    only: tuple[int, ...] = ()  # or those with these numbers among the held-out ones
+    scene: str | None = None  # where the photographs are now
+    title: str = ""
+    width: int = 900  # of the picture, at most
+
+
+def main(options: Options) -> None:
+    named = dict(text.split("=", 1) for text in options.runs)
+    runs = {title: Run(Path(folder)) for title, folder in named.items()}
+    scene = next(iter(runs.values())).dataset(options.scene)
+    assert isinstance(scene, Scene)
+    held_out = scene.splits["test"].tolist()
+    chosen = [held_out[i] for i in options.only] or evenly(held_out, options.views)
+    methods = {title: run.method(torch.device("cpu")).eval() for title, run in runs.items()}
+    rows = []
+    for index in chosen:
+        shot = scene.photograph(index, [name for name in (LIGHT,) if name in scene.layers])
+        pictures = [shot.rgb]
+        for method in methods.values():
+            told = method.given(left_half(shot)) if judged_by_halves(method) else method
+            seen = told.render(method.refined(shot.camera))
+            pictures.append(in_light(seen, shot.extra[LIGHT])[0] if LIGHT in shot.extra else seen.rgb.clamp(0, 1))
+        rows.append(Row(scene.names[index], pictures))
+    sheet = contact_sheet(options.title, ["photograph", *methods], rows).convert("RGB")
+    sheet.thumbnail((options.width, 4 * options.width))
+    for quality in range(85, 20, -5):
+        sheet.save(options.output, quality=quality)
+        if options.output.stat().st_size <= MOST:
+            break
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Options, description=__doc__))
