@@ -7,7 +7,7 @@ about, and patches such as no photograph has, say that the field explains each p
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, fields
 from typing import Annotated, Any, Literal
 
 import torch
@@ -15,12 +15,13 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ..camera import Camera
+from ..components.fields.hash_field import check_levels
 from ..components.training.fog import evened
 from ..components.training.patch_flow import SIDE, PatchFlow
 from ..components.training.photometric import backdrop, residuals
 from ..components.training.unseen_views import patches, roughness, unseen_cameras
 from ..method import RayMethod
-from ..ranges import NonNegative, PositiveShare, Seed, Share, between
+from ..ranges import LearningRate, NonNegative, PositiveShare, Share, between
 from ..rays import Look, Rays, Rendering
 from ..scene import Batch, Frame, Scene
 from ..volume import composite
@@ -31,8 +32,9 @@ from .mip_nerf import MipNeRF
 
 
 @dataclass(frozen=True)
-class Config:
-    """The paper's numbers, with where it gives them; `RegNeRF.preset` says what a plain CPU does otherwise."""
+class Config(MipConfig):
+    """The paper's numbers, with where it gives them, beside those of mip-NeRF's network, and Instant-NGP's of the hash
+    table, which are explained there; `RegNeRF.preset` says what a plain CPU does otherwise."""
 
     field: Literal["network", "hash"] = "network"  # what is learnt: mip-NeRF's network, the paper's, or a hash table
     unseen_patches: Annotated[int, between(0, 4096)] = 64  # of 8 x 8 rays in a step; the paper has as many rays as seen
@@ -42,15 +44,33 @@ class Config:
     likelihood_weight: NonNegative = 1e-3  # of how unlikely their colours are, eq. 8, in nats a number
     annealing: Share = 0.01  # share of the budget in which samples spread from the middle of rays, eq. 10
     annealing_start: PositiveShare = 0.5  # p_s, share of each ray that is sampled at first, eq. 10
-    network: MipConfig = MipConfig(learning_rate=2e-3, final_learning_rate=2e-5)
-    hash: NgpConfig = NgpConfig()
-    seed: Seed = 0
+    learning_rate: LearningRate = 2e-3
+    final_learning_rate: LearningRate = 2e-5
+    # Of the hash table.
+    levels: Annotated[int, between(1, 32)] = 16
+    features_per_level: Annotated[int, between(1, 16)] = 2
+    log2_hashmap_size: Annotated[int, between(1, 28)] = 19
+    base_resolution: Annotated[int, between(1, 4096)] = 16
+    max_resolution: Annotated[int, between(1, 1 << 20)] = 2048
+    samples_per_step: Annotated[int, between(64, 1 << 24)] = 1 << 18
 
     def check(self) -> None:
         """Raises LumigraphError for numbers that contradict each other."""
-        self.hash.check()
+        check_levels(self)
+
+    def numbers_of(self, kind: type[Any]) -> Any:
+        """The numbers of the field, as its own method has them: a `MipConfig` or an `NgpConfig`."""
+        ours = {x.name for x in fields(self)}
+        return kind(**{x.name: getattr(self, x.name) for x in fields(kind) if x.name in ours})
 
 
+TABLE: dict[str, Any] = {  # of a CPU, as Instant-NGP's preset has it
+    "levels": 8,
+    "features_per_level": 4,
+    "log2_hashmap_size": 17,
+    "max_resolution": 512,
+    "samples_per_step": 1 << 15,
+}
 STRIDES = (1, 2, 4)  # pixels between rays of a patch: what is smooth, and what looks like a photograph, is so in each
 
 
@@ -79,9 +99,9 @@ class RegNeRF(RayMethod):
         super().__init__(frame, config)
         self.marcher: MipNeRF | InstantNGP
         if config.field == "hash":
-            self.marcher = InstantNGP(frame, replace(config.hash, seed=config.seed))
+            self.marcher = InstantNGP(frame, config.numbers_of(NgpConfig))
         else:
-            self.marcher = MipNeRF(frame, replace(config.network, seed=config.seed))
+            self.marcher = MipNeRF(frame, config.numbers_of(MipConfig))
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(config.seed)
             self.flow = PatchFlow() if config.likelihood_weight else None
@@ -93,18 +113,19 @@ class RegNeRF(RayMethod):
         """On a GPU the paper's numbers. On a CPU a smaller network, and fewer patches."""
         if device.type == "cuda":
             return Config()
-        return Config(unseen_patches=8, network=MipNeRF.preset(device), hash=InstantNGP.preset(device))
+        own = asdict(MipNeRF.preset(device))
+        return Config(**own, unseen_patches=8, **TABLE)
 
     @classmethod
     def smallest(cls) -> Any:
         """Tiny networks and two patches: every part, within some twenty quick steps."""
-        return Config(unseen_patches=2, network=MipNeRF.smallest(), hash=InstantNGP.smallest())
+        return Config(**asdict(MipNeRF.smallest()), unseen_patches=2)
 
     @classmethod
     def further_bytes(cls, frame: Frame, config: Any, learning: bool) -> int:
         if config.field == "hash":
-            return InstantNGP.further_bytes(frame, config.hash, learning)
-        return MipNeRF.further_bytes(frame, config.network, learning)
+            return InstantNGP.further_bytes(frame, config.numbers_of(NgpConfig), learning)
+        return MipNeRF.further_bytes(frame, config.numbers_of(MipConfig), learning)
 
     # Being seen
 
