@@ -42,6 +42,7 @@ class Config(MipConfig):
     depth_weight_start: NonNegative = 10.0  # what that weight falls from at first
     depth_settling: Share = 0.05  # share of the budget in which it falls
     likelihood_weight: NonNegative = 1e-3  # of how unlikely their colours are, eq. 8, in nats a number
+    flow_steps: Steps = 400  # in which it is learnt, of 512 patches each, what is likely
     annealing: Share = 0.01  # share of the budget in which samples spread from the middle of rays, eq. 10
     annealing_start: PositiveShare = 0.5  # p_s, share of each ray that is sampled at first, eq. 10
     learning_rate: LearningRate = 2e-3
@@ -119,7 +120,7 @@ class RegNeRF(RayMethod):
     @classmethod
     def smallest(cls) -> Any:
         """Tiny networks and two patches: every part, within some twenty quick steps."""
-        return Config(**asdict(MipNeRF.smallest()), unseen_patches=2)
+        return Config(**asdict(MipNeRF.smallest()), unseen_patches=2, flow_steps=8)
 
     @classmethod
     def further_bytes(cls, frame: Frame, config: Any, learning: bool) -> int:
@@ -150,7 +151,7 @@ class RegNeRF(RayMethod):
     def begin(self, scene: Scene, seconds: float = math.inf) -> None:
         self.marcher.begin(scene, seconds)
         if self.flow:
-            self.flow.learn(scene, self.random(-1))
+            self.flow.learn(scene, self.config.flow_steps, self.random(-1))
 
     def rehearse_begin(self) -> None:
         self.marcher.rehearse_begin()

@@ -18,7 +18,7 @@ SIDE = 8  # pixels along a patch's side (section 3.4)
 COUPLINGS, WIDTH = 4, 96  # steps of the flow, and neurons of the two layers in each
 PATCHES = 1 << 14  # that it learns from
 SIZES = (1, 2, 4)  # times that photographs are reduced
-STEPS, BATCH, RATE = 400, 512, 2e-3
+BATCH, RATE = 512, 2e-3
 GRAIN = 2 / 255  # deviation of noise on patches: colours are whole numbers, and a density of those has no bound
 STIFF = 1.5  # bound of each coupling's log scale
 
@@ -72,8 +72,8 @@ class PatchFlow(nn.Module):
         nats = 0.5 * x.square().sum(-1) + 0.5 * x.shape[1] * math.log(2 * math.pi) - stretched
         return nats / x.shape[1]
 
-    def learn(self, scene: Scene, generator: torch.Generator) -> None:
-        """Learn from patches of a scene's training photographs, in several sizes."""
+    def learn(self, scene: Scene, steps: int, generator: torch.Generator) -> None:
+        """Learn from patches of a scene's training photographs, in several sizes, for so many steps."""
         known = photographed(scene, generator).to(self.mean)
         centred = known.flatten(1) - known.flatten(1).mean(0)
         variance, axes = torch.linalg.eigh(centred.T @ centred / len(centred))
@@ -84,13 +84,14 @@ class PatchFlow(nn.Module):
         self.stretched.copy_(-deviation.log().sum())
         self.requires_grad_(True)
         optimizer = torch.optim.Adam(self.parameters(), RATE)
-        for _ in range(STEPS):
+        for _ in range(steps):
             drawn = torch.randint(len(known), (BATCH,), generator=generator)
             grain = GRAIN * torch.randn(BATCH, SIDE, SIDE, 3, generator=generator)
             optimizer.zero_grad()
             with torch.enable_grad():
                 self(known[drawn.to(known.device)] + grain.to(known)).mean().backward()
             optimizer.step()
+        optimizer.zero_grad()
         self.requires_grad_(False)
 
 
