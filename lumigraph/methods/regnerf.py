@@ -21,7 +21,7 @@ from ..components.training.patch_flow import SIDE, PatchFlow
 from ..components.training.photometric import backdrop, residuals
 from ..components.training.unseen_views import patches, roughness, unseen_cameras
 from ..method import RayMethod
-from ..ranges import LearningRate, NonNegative, PositiveShare, Share, between
+from ..ranges import LearningRate, NonNegative, PositiveShare, Share, Steps, between
 from ..rays import Look, Rays, Rendering
 from ..scene import Batch, Frame, Scene
 from ..volume import composite
