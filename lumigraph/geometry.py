@@ -14,6 +14,7 @@ from torch import Tensor
 Vector = tuple[float, float, float]
 Rows = tuple[tuple[float, float, float, float], ...]  # of a 4x4 matrix, as plain numbers
 ROUNDING = 1e-3  # by which a matrix may fail to be a similarity
+LOOSE = 0.02  # how much the other point counts for `nearest_to_lines`, beside one line
 RIGID = 0.01  # how far the axes of a pose may be from unit length and right angles
 
 
@@ -30,6 +31,19 @@ def look_at(
     z = unit(forward)
     x = unit(torch.linalg.cross(z, up.expand_as(z)))
     return torch.stack([x, torch.linalg.cross(z, x), z, position], -1)
+
+
+def nearest_to_lines(
+    origins: Float[Tensor, "line 3"], directions: Float[Tensor, "line 3"], otherwise: Float[Tensor, " 3"]
+) -> Float[Tensor, " 3"]:
+    """The point nearest to all lines by least squares; where they leave it open, nearest to another point.
+
+    directions: unit length
+    """
+    across = torch.eye(3).to(directions) - directions[:, :, None] * directions[:, None, :]
+    loose = LOOSE * torch.eye(3).to(directions)
+    target = (across @ origins[:, :, None])[:, :, 0].mean(0) + loose @ otherwise
+    return torch.linalg.solve(across.mean(0) + loose, target)
 
 
 def turning(start: Float[Tensor, " 3"], end: Float[Tensor, " 3"]) -> Float[Tensor, "3 3"]:

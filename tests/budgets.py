@@ -84,6 +84,7 @@ GROUPS: dict[str, str] = {
         "test_coordinate_network test_density_control test_gaussians test_encodings test_nerf_w".split(), "methods"
     ),
     "test_plenoctrees": "methods",
+    "test_regnerf": "methods",
     **dict.fromkeys("test_house test_budgets".split(), "house"),
 }  # the others are of nouns and capture
 MUCH, TOO_MUCH = 1.5, 4.0  # times its share: what is told, and what fails

@@ -86,6 +86,7 @@ class MipNeRF(RayMethod):
         shape = config.depth, config.hidden_width, config.skip_layer
         self.network = CoordinateNetwork(*inputs, *shape, exact=not config.bfloat16)
         self.empty = OccupancyMask(config.occupancy_resolution, config.occupancy_threshold)
+        self.sampled = 1.0  # share of each ray, around its middle, that is sampled in training
         refining, rate = config.refine_cameras, config.pose_learning_rate
         self.poses = PoseRefinement(frame.image_count, rate) if refining else None
 
@@ -168,6 +169,8 @@ class MipNeRF(RayMethod):
         between = stratified(count, c.coarse_samples - 1, generator, device)
         between = (0.5 + (c.coarse_samples - 1) * between) / c.coarse_samples
         edges = pad(pad(between, (1, 0)), (0, 1), value=1.0)
+        if generator:
+            edges = 0.5 + self.sampled * (edges - 0.5)
         with torch.set_grad_enabled(torch.is_grad_enabled() and colours):
             coarse = self._look("coarse", rays, edges, colours)
             weights = weights_of(coarse.samples, coarse.density).view(count, -1).detach()

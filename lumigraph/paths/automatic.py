@@ -19,7 +19,7 @@ from torch import Tensor
 
 from ..camera import Camera
 from ..errors import LumigraphError
-from ..geometry import look_at, unit
+from ..geometry import look_at, nearest_to_lines, unit
 from ..lens import Pinhole
 from ..scene import Frame
 
@@ -88,11 +88,8 @@ class Surroundings:
     @cached_property
     def focus(self) -> Float[Tensor, " 3"]:
         """The point nearest to all optical axes; where they leave it open, nearest to the middle of the bounds."""
-        across = torch.eye(3, dtype=torch.double) - self.forward[:, :, None] * self.forward[:, None, :]
         middle = torch.tensor(self.frame.bounds, dtype=torch.double).mean(0)
-        loose = 0.02 * torch.eye(3, dtype=torch.double)
-        target = (across @ self.position[:, :, None])[:, :, 0].mean(0) + loose @ middle
-        return torch.linalg.solve(across.mean(0) + loose, target)
+        return nearest_to_lines(self.position, self.forward, middle)
 
     @cached_property
     def cosine(self) -> Float[Tensor, " camera"]:

@@ -1,0 +1,136 @@
+"""RegNeRF: cameras between the photographs, smooth depth, how likely a patch is."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import pytest
+import tiny
+import torch
+
+from lumigraph.components.training.patch_flow import SIDE, PatchFlow, photographed
+from lumigraph.components.training.unseen_views import patches, roughness, unseen_cameras
+from lumigraph.geometry import nearest_to_lines, unit
+from lumigraph.methods.regnerf import RegNeRF
+from lumigraph.run import build
+
+
+def chance(seed: int = 0) -> torch.Generator:
+    return torch.Generator().manual_seed(seed)
+
+
+def test_the_point_nearest_to_lines():
+    point = torch.tensor([0.3, -0.2, 0.5], dtype=torch.float64)
+    origins = torch.randn(5, 3, generator=chance(), dtype=torch.float64)
+    found = nearest_to_lines(origins, unit(point - origins), point)
+    assert torch.allclose(found, point, atol=1e-9)
+    parallel = torch.tensor([[0.0, 0.0, 1.0]], dtype=torch.float64).expand(2, 3)
+    found = nearest_to_lines(torch.tensor([[0.0, 0, 0], [1, 0, 0]], dtype=torch.float64), parallel, point)
+    assert found[2] == pytest.approx(0.5)  # along them, the other point says
+
+
+def test_unseen_cameras_stand_between_and_look_at_the_same():
+    scene = tiny.scene()
+    cameras = scene.cameras[scene.splits["train"]]
+    unseen = unseen_cameras(cameras, 200, chance())
+    low, high = cameras.position.amin(0), cameras.position.amax(0)
+    assert ((unseen.position >= low) & (unseen.position <= high)).all()
+    rotation = unseen.pose[:, :, :3]
+    assert torch.allclose(rotation @ rotation.mT, torch.eye(3).expand(200, 3, 3), atol=1e-5)
+    up = unit(-cameras.pose[:, :, 1].mean(0))
+    assert ((-rotation[:, :, 1] * up).sum(-1) > 0).all()  # nobody stands on their head
+    away = unseen.position.norm(dim=-1)
+    missed = torch.linalg.cross(unseen.position, unseen.forward).norm(dim=-1)  # the tiny scene is around the origin
+    assert (missed / away).median() < 0.25 and unseen.image_index is None
+
+
+def test_patches_are_squares_of_pixels_with_wider_cones():
+    scene = tiny.scene()
+    cameras = unseen_cameras(scene.cameras, 6, chance())
+    rays = patches(cameras, 4, (1, 2), chance())
+    assert len(rays) == 6 * 16
+    for i in range(6):
+        one = slice(16 * i, 16 * i + 16)
+        points = rays.origins[one] + rays.directions[one]
+        xy, valid = cameras[i].project(points)
+        xy = xy.view(4, 4, 2)
+        assert valid.all()
+        step = float(xy[0, 1, 0] - xy[0, 0, 0])
+        assert step == pytest.approx(1, abs=1e-3) or step == pytest.approx(2, abs=1e-3)
+        assert torch.allclose(xy[:, 1:, 0] - xy[:, :-1, 0], torch.tensor(step), atol=1e-3)
+        assert torch.allclose(xy[1:, :, 1] - xy[:-1, :, 1], torch.tensor(step), atol=1e-3)
+        narrow = cameras[i].rays(xy.view(-1, 2)).radius
+        assert torch.allclose(rays.radius[one], narrow * step, rtol=1e-3)
+
+
+def test_roughness_counts_what_is_opaque_alone():
+    depth = torch.zeros(1, 3, 3)
+    depth[0, 1, 1] = 0.5
+    opaque, clear = torch.ones(1, 3, 3), torch.ones(1, 3, 3)
+    clear[0, 1, 1] = 0
+    assert float(roughness(depth, opaque)) == pytest.approx(0.5 * (0.5 + 0.5) / 6)  # 2 of 6 pairs each way
+    assert float(roughness(depth, clear)) == 0
+
+
+def test_the_flow_is_a_density():
+    """Its log is that of a standard normal of what it makes of a patch, and of how much it stretches patches there."""
+    flow = PatchFlow()
+    for parameter in flow.parameters():
+        parameter.data = 0.1 * torch.randn(parameter.shape, generator=chance(len(parameter)))
+    flow.whiten.copy_(torch.diag(torch.linspace(0.5, 2, 192)))
+    flow.stretched.copy_(flow.whiten.diagonal().log().sum())
+    flow = flow.double()
+    patch = torch.rand(1, SIDE, SIDE, 3, generator=chance(), dtype=torch.float64)
+
+    def code(x):
+        x = (x - flow.mean) @ flow.whiten
+        for coupling in flow.couplings:
+            x, _ = coupling(x)
+        return x
+
+    x = patch.flatten(1)
+    jacobian = torch.autograd.functional.jacobian(code, x)[0, :, 0]
+    expected = 0.5 * code(x).square().sum() + 96 * math.log(2 * math.pi) - torch.linalg.slogdet(jacobian)[1]
+    assert float(flow(patch)) == pytest.approx(float(expected) / 192)
+
+
+def test_it_tells_photographs_from_noise(monkeypatch):
+    from lumigraph.components.training import patch_flow
+
+    monkeypatch.setattr(patch_flow, "PATCHES", 1024)
+    flow, scene = PatchFlow(), tiny.scene()
+    flow.learn(scene, 60, chance())
+    assert not any(p.requires_grad for p in flow.parameters())
+    known = photographed(scene, chance(1))
+    shuffled = known.flatten(1)[:, torch.randperm(192, generator=chance(2))].view_as(known)
+    assert flow(known).median() < flow(shuffled).median() - 0.5
+
+
+@pytest.mark.parametrize("field", ["network", "hash"])
+def test_a_step_learns_from_patches_nobody_photographed(field):
+    scene = tiny.scene()
+    config = replace(RegNeRF.smallest(), field=field, samples_per_step=2048, levels=4, log2_hashmap_size=11)
+    method = build(RegNeRF, scene.frame, config, torch.device("cpu"), 0)
+    method.begin(scene)
+    method.before_step(0, 0.0)
+    batch = method.batch(scene, chance())
+    assert batch.unseen is not None and len(batch.unseen) == 2 * SIDE**2
+    terms = method.loss(batch, 0)
+    assert {"depth", "likelihood"} <= terms.keys()
+    (terms["depth"] + terms["likelihood"]).backward()
+    moved = [p for p in method.marcher.parameters() if p.grad is not None and p.grad.any()]
+    assert moved and all(p.grad is None for p in method.flow.parameters())
+
+
+def test_samples_spread_from_the_middle():
+    scene = tiny.scene()
+    method = build(RegNeRF, scene.frame, RegNeRF.smallest(), torch.device("cpu"), 0)
+    rays = scene.sample_rays(64, chance()).rays
+    for progress, share in (0.0, 0.5), (1.0, 1.0):
+        method.before_step(0, progress)
+        look = method.marcher.looks(rays, chance())[0]
+        near, far = method.marcher.space.interval(rays)
+        hit = far > near
+        start = look.samples.t_start.view(64, -1)[:, 0]
+        assert torch.allclose((start - near)[hit], ((1 - share) / 2 * (far - near))[hit], atol=1e-4)
