@@ -375,7 +375,7 @@ class SNeRG(RayMethod):
 
     def loss(self, batch: Batch, step: int) -> dict[str, Tensor]:
         generator = self.random(step)
-        opaque = self.unbounded is not None and (self.stage == FIELD or not self._bounded)
+        opaque = self.unbounded is not None and (int(self.stage) == FIELD or not self._bounded)
         background = backdrop(batch, self.background, generator, opaque)
         if self.stage == FIELD:
             seen, terms = self._learn(batch, generator)
