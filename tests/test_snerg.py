@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import warnings
 from dataclasses import replace
 
 import numpy as np
@@ -34,10 +35,19 @@ def ball():
     return tiny_atlas.baked()
 
 
+@pytest.fixture(scope="module")
+def room():
+    """What reaches beyond the box of interest, contracted."""
+    return tiny_atlas.baked(OPEN, field=tiny_atlas.room, resolution=60)
+
+
 @pytest.fixture
 def folder(ball, tmp_path):
     snerg.write(tmp_path / "scene", ball.atlas())
     return tmp_path / "scene"
+
+
+OPEN = replace(tiny.scene().frame, reach=4.0, has_alpha=False)
 
 
 def through_the_middle(count: int) -> Rays:
@@ -129,6 +139,39 @@ def test_looks_composite_to_the_picture(ball):
     torch.testing.assert_close(seen.depth, whole.depth, atol=5e-3, rtol=0)
 
 
+def test_straight_out_a_ray_meets_all_that_is_beyond_the_ball(room):
+    """From the middle, from beyond the wall, and from beside it, which the wall's own density says."""
+    out = torch.nn.functional.normalize(torch.randn(40, 3, generator=torch.Generator().manual_seed(1)), dim=-1)
+    wall = 1 - math.exp(-tiny_atlas.WALL * tiny_atlas.WIDE * math.sqrt(math.pi))
+    rays = Rays(0.9 * out, out, torch.full((40,), 0.01))
+    with torch.no_grad():
+        seen, inwards = room._marched(rays), room._marched(replace(rays, origins=5 * out, directions=-out))
+    torch.testing.assert_close(seen.opacity, torch.full((40,), wall), atol=0.02, rtol=0)
+    through = 1 - (1 - wall) ** 2 * math.exp(-2 * RADIUS * DENSITY)
+    torch.testing.assert_close(inwards.opacity, torch.full((40,), through), atol=0.02, rtol=0)
+    assert float((seen.distance / seen.opacity).mean()) == pytest.approx(1.6, abs=0.1)
+    points = torch.cat([2.2 * out, 2.8 * out, 0.3 * out])
+    torch.testing.assert_close(room.density(points), tiny_atlas.room(points).density, atol=0.02, rtol=0.05)
+
+
+def test_steps_of_curved_rays_are_as_long_as_voxels(room):
+    """In the coordinates of the grid, between where their samples begin and end."""
+    rays = tiny.scene().cameras[4].rays(tiny.scene().cameras[4].pixels())[::7]
+    with torch.no_grad():
+        samples, _ = room.voxels.samples(rays, room._values, 0.1)
+    ray = samples.ray_index
+    ends = [
+        2 * room.baked_in.warp(rays.origins[ray] + t[:, None] * rays.directions[ray])
+        for t in (samples.t_start, samples.t_end)
+    ]
+    torch.testing.assert_close((ends[1] - ends[0]).norm(dim=-1), room.voxels.edge.expand(len(ray)), rtol=0.1, atol=0)
+    assert float(samples.t_end.max()) > 4
+
+
+def test_looks_of_an_open_capture_composite_to_the_picture(room):
+    test_looks_composite_to_the_picture(room)
+
+
 def test_what_no_ray_sees_is_left_out():
     method = SNeRG(tiny.scene().frame, SNeRG.smallest())
     with pytest.raises(LumigraphError, match="no ray sees"):
@@ -176,6 +219,29 @@ def test_the_papers_network_is_baked_as_well():
     method = SNeRG(tiny.scene().frame, config)
     fit(method, tiny.scene(), steps=8, show=False, rehearsal=False)
     assert method.stage == ATLAS and not sum(x.numel() for x in method.network.parameters())
+
+
+@pytest.mark.parametrize("whole", [True, False])
+def test_an_open_capture_is_baked_whole_or_within_its_box(whole):
+    scene = replace(tiny.scene(), frame=OPEN)
+    method = SNeRG(OPEN, replace(SNeRG.smallest(), whole=whole, depth_weight=0.0))
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always")
+        fit(method, scene, steps=20, show=False, rehearsal=False)
+    assert method.stage == ATLAS and method.atlas().contracted == whole
+    assert any("box of interest" in str(x.message) for x in told) != whole
+    places = method.voxels.low + (method.voxels.places + 0.5) * method.voxels.edge
+    assert (float(places.abs().max()) > 1) == whole
+
+
+def test_runs_from_before_end_at_their_box(tmp_path):
+    method = SNeRG(OPEN, replace(SNeRG.smallest(), whole=False))
+    run = Run.create(tmp_path / "run", method, replace(tiny.scene(), frame=OPEN))
+    path = run.folder / "config.json"
+    text = json.loads(path.read_text())
+    assert text["config"].pop("whole") is False
+    path.write_text(json.dumps(text))
+    assert Run(run.folder).new_method("cpu").voxels.space is None
 
 
 class OnlySeen:
@@ -278,6 +344,16 @@ def test_a_folder_opens_like_a_run(ball, folder):
     assert len(opened.cameras()["train"]) and not opened.photographed
 
 
+def test_an_open_capture_comes_back_from_its_folder(room, tmp_path, capsys):
+    snerg.write(tmp_path / "room", room.atlas())
+    opened, camera = open_any(tmp_path / "room"), tiny.scene().cameras[4]
+    shown = opened.method()
+    assert shown.atlas().contracted and opened.frame.reach > 1
+    assert psnr(shown.render(camera).rgb, room.render(camera).rgb) > 40
+    assert main(["export", "snerg", str(tmp_path / "room"), str(tmp_path / "again")]) == 0
+    assert "out of shape" in capsys.readouterr().err
+
+
 def test_a_scene_of_another_size_is_brought_within_reach(ball, tmp_path):
     atlas = ball.atlas()
     snerg.write(tmp_path / "large", replace(atlas, low=atlas.low * 30 + 5, voxel=atlas.voxel * 30, network=None))
@@ -332,6 +408,7 @@ FAULTS = {
     "counts that disagree": (lambda f: said(f, num_slices=3), "does not hold"),
     "normalised coordinates": (lambda f: said(f, ndc=True), "normalised device"),
     "another format": (lambda f: said(f, format="webp"), "only png"),
+    "contracted, and no cube": (lambda f: said(f, contracted=True), "fills the cube"),
     "a layer too narrow": (lambda f: said(f, **{"1_bias": [0.0]}), "Layer 1|layer 1"),
 }
 

@@ -80,6 +80,18 @@ def test_from_inside_a_cell(tmp_path, window):
     assert agreement(window(tmp_path / "page.html").look(camera), ours) > 45
 
 
+def test_an_open_atlas_is_seen_along_curved_rays(tmp_path, window):
+    made = volumes.open_atlas()
+    volume_page(tmp_path / "page.html", atlas_for_browser(made), OPENING)
+    opened = window(tmp_path / "page.html")
+    for index in (1, 4):
+        camera = some_camera(index)
+        shown, rays = opened.look(camera), some_rays(camera)
+        assert agreement(shown, volumes.atlas_seen(made, rays, OPENING.near, GROUND)) > 45
+        straight = dataclasses.replace(made, contracted=False)
+        assert agreement(shown, volumes.atlas_seen(straight, rays, OPENING.near, GROUND)) < 25
+
+
 @pytest.mark.parametrize("network", [False, True])
 def test_an_atlas_is_seen_as_its_rays_say(tmp_path, window, network):
     made = volumes.atlas(network=network)

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cache
 
+import numpy as np
 import torch
 from solids import Distance, ball, painted, together, torus
 
@@ -123,6 +125,12 @@ def shades() -> ViewNetwork:
     return ViewNetwork(weights, biases)
 
 
+def open_atlas() -> Atlas:
+    """The same in contracted coordinates: most of it lies beyond the unit ball."""
+    made = atlas()
+    return replace(made, low=torch.full((3,), -2.0), voxel=4 / 48, contracted=True)
+
+
 def dense(made: Atlas) -> torch.Tensor:
     """All voxels of the grid, in [0, 1]: (8, x, y, z)."""
     block, shape = made.block, [made.block * n for n in made.index.shape]
@@ -140,9 +148,15 @@ def atlas_seen(made: Atlas, rays: Rays, near: float, background: torch.Tensor) -
     whole = dense(made)
     size = torch.tensor(whole.shape[1:])
     enter, leave = rays.through_box(torch.stack([made.low, made.low + size * made.voxel]))
-    steps = int((leave - enter).max() / made.voxel) + 1
-    t = enter.clamp_min(near)[:, None] + (torch.arange(steps) + 0.5) * made.voxel
-    points = (rays.origins[:, None] + t[..., None] * rays.directions[:, None] - made.low) / made.voxel / size * 2 - 1
+    if made.contracted:
+        t = curved(rays, near, made.voxel)
+    else:
+        steps = int((leave - enter).max() / made.voxel) + 1
+        t = enter.clamp_min(near)[:, None] + (torch.arange(steps) + 0.5) * made.voxel
+    points = rays.origins[:, None] + t[..., None] * rays.directions[:, None]
+    if made.contracted:
+        points = contract(points)
+    points = (points - made.low) / made.voxel / size * 2 - 1
     grid = points.flip(-1)[None, None]
     kept = ((points > -1) & (points < 1)).all(-1, keepdim=True)
     found = torch.nn.functional.grid_sample(whole[None], grid, align_corners=False)[0, :, 0].movedim(0, -1) * kept
@@ -152,6 +166,26 @@ def atlas_seen(made: Atlas, rays: Rays, near: float, background: torch.Tensor) -
     if made.network:
         colour = colour + (1 - left) * network_of(made.network, rays.directions, colour, total[:, 4:])
     return colour + left * background
+
+
+def contract(points: torch.Tensor) -> torch.Tensor:
+    """Barron 2022, eq. 10."""
+    radius = points.norm(dim=-1, keepdim=True).clamp_min(1)
+    return (2 - 1 / radius) / radius * points
+
+
+def curved(rays: Rays, near: float, voxel: float, fine: int = 40) -> torch.Tensor:
+    """Distances along rays, a voxel of contracted coordinates from each to the next, counted in much smaller steps."""
+    t = near + torch.cat([torch.arange(0, 8, voxel / fine), 8 / (1 - torch.arange(1, 2000) / 2000)])
+    path = contract(rays.origins[:, None] + t[:, None] * rays.directions[:, None])
+    gone = torch.nn.functional.pad(path.diff(dim=1).norm(dim=-1).cumsum(1), (1, 0))
+    wanted = (torch.arange(int(gone[:, -1].max() / voxel)) * voxel).expand(len(gone), -1)
+    # As the march does, half of a straight step ahead of the first.
+    wanted = wanted + torch.stack([torch.from_numpy(np.interp(near + voxel / 2, t, x)) for x in gone])[:, None].float()
+    after = torch.searchsorted(gone, wanted.contiguous()).clamp(1, len(t) - 1)
+    least, most = gone.gather(1, after - 1), gone.gather(1, after)
+    share = ((wanted - least) / (most - least).clamp_min(1e-9)).clamp(0, 1)
+    return torch.lerp(t[after - 1], t[after], share)
 
 
 def network_of(made: ViewNetwork, directions, colours, features) -> torch.Tensor:

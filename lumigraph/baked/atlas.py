@@ -36,6 +36,9 @@ class Atlas:
     voxel:    side of a voxel, in scene units
     block:    voxels along a block's side, without the apron
     network:  None where the diffuse colour is all there is
+    contracted: whether the grid is that of an open capture, all of it in the cube of [-2, 2]^3: places x beyond the
+              unit ball lie at (2 - 1 / |x|) x / |x| in it (Barron 2022, eq. 10), a step is a voxel long there, and alpha
+              is that of a ray straight outwards
     """
 
     index: Int[Tensor, "x y z"]
@@ -44,6 +47,7 @@ class Atlas:
     voxel: float
     block: int
     network: ViewNetwork | None = None
+    contracted: bool = False
 
     def voxels(self) -> tuple[Int[Tensor, "voxel 3"], UInt8[Tensor, "voxel 8"]]:
         """Where in the grid the voxels are that hold anything, and what they hold."""

@@ -116,6 +116,7 @@ def atlas_for_browser(atlas: Atlas) -> Browsable:
         "cell": cell,
         "cells": list(far.shape),
         "network": plain(atlas.network) if atlas.network else None,
+        "contracted": atlas.contracted,
     }
     index, blocks = x_first(atlas.index.cpu().int()), values.permute(4, 0, 3, 2, 1)
     return Browsable(settings, b"".join(map(raw, (index, x_first(far), blocks))))

@@ -4,6 +4,9 @@ https://github.com/google-research/google-research/tree/master/snerg. Four layer
 below another: rgba_000.png holds colours and alpha, feature_000.png the features. atlas_indices.png says for each block
 of the grid where in the atlas it is, 255 where nothing is. Without a network there are neither features nor weights.
 
+An open capture's atlas lies in contracted coordinates, of which the format knows nothing: "contracted" in
+scene_params.json is our own word for it, and other viewers show it out of shape.
+
 The viewer's world has +y up, so x, y, z of the scene are -x, z, y there, and worldspace_T_opengl leads back.
 
 What a pixel is differs in one point: the viewer adds what the network says wherever a ray met anything, before white,
@@ -17,7 +20,7 @@ import io
 import json
 import math
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -71,6 +74,7 @@ class Params:
     atlas_blocks_z: Blocks
     worldspace_T_opengl: tuple[Row, Row, Row, Row]  # noqa: N815
     ndc: bool = False
+    contracted: bool = False
     format: str = "png"
     weights_0: Weights | None = None
     weights_1: Weights | None = None
@@ -92,7 +96,16 @@ class Params:
             raise LumigraphError("Its scene lies in normalised device coordinates, which is not read; bake it without")
         if self.format != "png":
             raise LumigraphError(f"Its slices are {self.format!r}, of which only png is read; write them as that")
-        turn = np.array(self.worldspace_T_opengl)[:3, :3]
+        to_scene = np.array(self.worldspace_T_opengl)
+        if self.contracted and (
+            len({self.grid_width, self.grid_height, self.grid_depth}) > 1
+            or self.grid_width % self.block_size
+            or abs(self.grid_width * self.voxel_size - 4) > 1e-3
+            or max(abs(low + 2) for low in (self.min_x, self.min_y, self.min_z)) > 1e-3
+            or to_scene[:3, 3].any()
+        ):
+            raise LumigraphError("What is contracted fills the cube of [-2, 2]^3, and its grid does not; export it anew")
+        turn = to_scene[:3, :3]
         if sorted(np.abs(turn).ravel()) != [0] * 6 + [1] * 3 or np.linalg.det(turn) < 0:
             raise LumigraphError("worldspace_T_opengl turns by something other than right angles; bake it upright")
 
@@ -189,6 +202,8 @@ def params(atlas: Atlas, blocks: tuple[int, int, int]) -> dict[str, Any]:
     said |= {f"atlas_blocks_{axis}": n for axis, n in zip("xyz", blocks, strict=True)}
     said |= {"input_height": 800.0, "input_width": 800.0, "input_focal": 1111.0}  # of cameras, asked for ndc alone
     said |= {"worldspace_T_opengl": AXES, "ndc": False, "format": "png"}
+    if atlas.contracted:
+        said |= {"contracted": True}
     if atlas.network:
         for number, (weight, bias) in enumerate(zip(atlas.network.weights, atlas.network.biases, strict=True)):
             said |= {f"{number}_weights": weight.tolist(), f"{number}_bias": bias.tolist()}
@@ -234,11 +249,12 @@ def read(folder: Path) -> Atlas:
         about.voxel_size,
         about.block_size,
         network,
+        about.contracted,
     )
     to_scene = np.array(about.worldspace_T_opengl)
     moved = turned(atlas, to_scene[:3, :3])
     low = moved.low + torch.from_numpy(to_scene[:3, 3]).float()
-    return Atlas(moved.index, moved.values, low, moved.voxel, moved.block, network)
+    return replace(moved, low=low)
 
 
 def read_indices(bundle: Bundle, about: Params) -> np.ndarray:
@@ -279,4 +295,4 @@ def turned(atlas: Atlas, turn: np.ndarray) -> Atlas:
     extent = atlas.voxel * atlas.block * torch.tensor(atlas.index.shape)
     low: Tensor = torch.where(torch.tensor(turn.sum(1)) < 0, -(atlas.low + extent)[axes], atlas.low[axes])
     index, values = index.flip(flipped), values.flip([1 + axis for axis in flipped])
-    return Atlas(index.contiguous(), values.contiguous(), low, atlas.voxel, atlas.block, atlas.network)
+    return replace(atlas, index=index.contiguous(), values=values.contiguous(), low=low)

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import Annotated, Any, Literal, NamedTuple
+from typing import Annotated, Any, ClassVar, Literal, NamedTuple
 
 import torch
 from jaxtyping import Float
@@ -27,7 +27,7 @@ from ..components.sampling.marching import FIRST_RAYS, rays_for, reached
 from ..components.sampling.occupancy import OccupancyGrid
 from ..components.sampling.proposal import Proposed
 from ..components.sampling.sightings import Sightings, smoothed
-from ..components.sampling.spaces import space_of
+from ..components.sampling.spaces import Box, contraction_of, space_of
 from ..components.sampling.unbounded import RAYS, OpenNumbers, Unbounded, rays_of, unbounded
 from ..components.training.exchange import exchange
 from ..components.training.fog import scaled_by_distance
@@ -67,7 +67,9 @@ class Config(OpenNumbers):
     sparsity_weight: NonNegative = 1e-4  # lambda_s, section 4.2
     deferred_share: Annotated[float, between(0.05, 0.99)] = 0.9  # of the budget, ahead of baking
     voxel_share: Share = 0.0  # of what is left then, in which voxels learn too; afterwards the network alone does
-    resolution: Annotated[int, between(8, 2048)] = 1000  # voxels along the longest side, section 5.1
+    whole: bool = True  # whether of an open capture all is baked, contracted, rather than its box of interest
+    resolution: Annotated[int, between(8, 2048)] = 1000  # voxels along the longest side, section 5.1; across the unit
+    # ball of what is contracted, whose grid is twice as wide, and so are its cells of visibility
     block_size: Annotated[int, between(4, 66)] = 32  # voxels along a block's side, its apron included, section 5.1
     visibility_resolution: Annotated[int, between(8, 512)] = 256  # cells per axis in which is told what rays see
     least_alpha: Share = 0.005  # of a voxel, below which it is empty, section 5.1
@@ -147,6 +149,7 @@ class SNeRG(RayMethod):
     """A field learns from photographs; its values are baked into voxels; the small network learns on with those."""
 
     Config = Config
+    before: ClassVar[dict[str, Any]] = {"whole": False}
     rays_per_step: Tensor
     stage: Tensor
     began: Tensor
@@ -164,8 +167,10 @@ class SNeRG(RayMethod):
         self.unbounded = unbounded(frame, self.space, config)
         self.occupancy = first_grid(config, frame.reach)
         self.lattice = lattice(config, frame.reach)
-        self.sightings = Sightings(config.visibility_resolution)
-        self.voxels, self.tuned = BakedVoxels(config.block_size - 2), Tuned()
+        contracted = contraction_of(frame) if config.whole and frame.reach > 1 else None
+        self.baked_in = contracted or Box(frame.bounds, frame.near)  # the space that voxels lie in
+        self.sightings = Sightings(config.visibility_resolution * (2 if contracted else 1))
+        self.voxels, self.tuned = BakedVoxels(config.block_size - 2, contracted), Tuned()
         first = rays_of(config.samples_per_step, config) if self.unbounded else FIRST_RAYS
         self.register_buffer("rays_per_step", torch.tensor(first))
         self.register_buffer("stage", torch.tensor(FIELD))
@@ -272,6 +277,11 @@ class SNeRG(RayMethod):
     # The baked voxels
 
     @property
+    def _bounded(self) -> bool:
+        """Whether voxels hold only a part of what there is."""
+        return self.frame.reach > 1 and self.voxels.space is None
+
+    @property
     def _values(self) -> Float[Tensor, "voxel 8"]:
         """Of voxels: as they are learnt, or as eight bits tell them."""
         return self.tuned.values if self.stage == VOXELS else self.voxels.values
@@ -326,7 +336,7 @@ class SNeRG(RayMethod):
         else:
             samples, values = self.voxels.samples(rays, self._values, self.frame.near)
             alpha = values[:, ALPHA]
-            density, diffuse = self.voxels.density(alpha), values[:, :ALPHA] / alpha[:, None]
+            density, diffuse = self.voxels.density(alpha, samples.length), values[:, :ALPHA] / alpha[:, None]
             seen = self._marched(rays)
         added = self.view(rays.directions, seen.diffuse, seen.features)
         return [Look("samples", samples, density, diffuse + added[samples.ray_index])]
@@ -335,7 +345,10 @@ class SNeRG(RayMethod):
         """Density per scene unit."""
         if self.stage == FIELD:
             return self._deferred(points).density
-        return self.voxels.density(self.voxels.at(points, self._values)[:, ALPHA])
+        return self._density_of(self.voxels.at(points, self._values)[:, ALPHA], points)
+
+    def _density_of(self, alpha: Float[Tensor, " point"], points: Float[Tensor, "point 3"]) -> Float[Tensor, " point"]:
+        return self.voxels.density(alpha, self.voxels.length(points, self.voxels.edge))
 
     def field(
         self, points: Float[Tensor, "point 3"], directions: Float[Tensor, "point 3"]
@@ -346,7 +359,7 @@ class SNeRG(RayMethod):
         else:
             values = self.voxels.at(points, self._values)
             alpha = values[:, ALPHA]
-            density = self.voxels.density(alpha)
+            density = self._density_of(alpha, points)
             diffuse, features = (values / alpha.clamp_min(1e-4)[:, None]).split([ALPHA, 1, CHANNELS - 4], -1)[::2]
         return density, (diffuse + self.view(directions, diffuse, features)).clamp(0, 1)
 
@@ -362,15 +375,16 @@ class SNeRG(RayMethod):
 
     def loss(self, batch: Batch, step: int) -> dict[str, Tensor]:
         generator = self.random(step)
+        opaque = self.unbounded is not None and (int(self.stage) == FIELD or not self._bounded)
+        background = backdrop(batch, self.background, generator, opaque)
         if self.stage == FIELD:
-            background = backdrop(batch, self.background, generator, opaque=self.unbounded is not None)
             seen, terms = self._learn(batch, generator)
         else:
-            background, seen, terms = backdrop(batch, self.background, generator), self._marched(batch.rays), {}
+            seen, terms = self._marched(batch.rays), {}
             self.figures = {"rays": len(batch)}
         rendering = self._pixel(seen, batch.rays.directions, background)
         residual, self.figures["mse"] = residuals(rendering, batch, background)
-        if self.unbounded and self.stage > FIELD:  # what lies beyond the box is not there to be learnt
+        if self._bounded and self.stage > FIELD:  # what lies beyond the box is not there to be learnt
             residual = residual * (seen.opacity.detach() > SOLID)[:, None]
         delta = self.config.huber_delta
         huber = nn.functional.huber_loss(residual, torch.zeros_like(residual), delta=delta) / delta
@@ -381,7 +395,7 @@ class SNeRG(RayMethod):
         found = self._found(batch.rays, torch.rand(len(batch), 2, generator=generator).to(self.device))
         self.figures |= {"rays": len(batch), "samples": found.asked, "visible_samples": len(found.samples)}
         weights = weights_of(found.samples, found.density.detach())
-        self.sightings.note(found.samples.along(batch.rays)[0], weights)
+        self.sightings.note(self.baked_in.warp(found.samples.along(batch.rays)[0]), weights)
         terms = {}
         if weight := self.config.sparsity_weight:
             terms["sparsity"] = weight * cauchy(found.density, len(batch))
@@ -432,7 +446,8 @@ class SNeRG(RayMethod):
         if scene.images.has_alpha and self.frame.reach == 1:
             self.occupancy.rule_out(visual_hull(scene, self.config.occupancy_resolution)[None])
         if self.unbounded:
-            warnings.warn(BOUNDED, LumigraphWarning, stacklevel=2)
+            if self._bounded:
+                warnings.warn(BOUNDED, LumigraphWarning, stacklevel=2)
             self.unbounded.begin(scene, seconds, self.random(1))
 
     def rehearse_begin(self) -> None:
@@ -474,18 +489,21 @@ class SNeRG(RayMethod):
     def _bake(self, field: Callable[[Float[Tensor, "point 3"]], Deferred]) -> None:
         """Hold a field's values at the voxels that rays see, instead of the field (section 5.1)."""
         c, seen = self.config, self.sightings.seen
-        low, high = self._box(seen)
-        edge = float((high - low).max()) / c.resolution
-        size = ((high - low) / edge - 1e-3).ceil().long()
+        low, edge, size = self._grid(seen)
+        wide = 2.0 if self.voxels.space else 1.0  # what the grid is in coordinates of its space
         places, values = [], []
-        for first in range(0, int(size[0]), max(1, SLAB // int(size[1] * size[2]))):
-            last = min(int(size[0]), first + max(1, SLAB // int(size[1] * size[2])))
+        for first, last in slabs(*size.tolist()):
             axes = torch.arange(first, last), torch.arange(int(size[1])), torch.arange(int(size[2]))
-            there = torch.cartesian_prod(*axes).to(self.device)
-            there = there[seen.view(-1)[self.sightings.cells(low + (there + 0.5) * edge)]]
+            x, y, z = (
+                self.sightings.along((low[axis] + (places.to(low) + 0.5) * edge) / wide)
+                for axis, places in enumerate(axes)
+            )
+            there = seen[x][:, y][:, :, z].nonzero()
+            there[:, 0] += first
             for part in there.split(PART):
-                density, diffuse, features = field(low + (part + 0.5) * edge)
-                alpha = 1 - torch.exp(-density * edge)
+                points = self.baked_in.unwarp((low + (part + 0.5) * edge) / wide)
+                density, diffuse, features = field(points)
+                alpha = 1 - torch.exp(-density * self.voxels.length(points, edge))
                 kept = alpha >= c.least_alpha
                 alpha = alpha[kept, None]
                 places.append(part[kept])
@@ -499,16 +517,21 @@ class SNeRG(RayMethod):
         self.stage.fill_(VOXELS)
         self._release()
 
-    def _box(self, seen: Tensor) -> tuple[Float[Tensor, " 3"], Float[Tensor, " 3"]]:
-        """The box around all that rays see; of an open capture, within the box of interest."""
+    def _grid(self, seen: Tensor) -> tuple[Float[Tensor, " 3"], float, Tensor]:
+        """Corner, side of a voxel, and voxels along each axis, of the grid around all that rays see: within the box of
+        interest, or all that there is, contracted."""
         cells = seen.nonzero()
         if not len(cells):
             raise LumigraphError("There is nothing to bake: no ray sees anything in the box of interest; train longer")
+        if self.voxels.space:
+            count = -(-2 * self.config.resolution // self.voxels.block) * self.voxels.block
+            return self.background.new_full((3,), -2.0), 4 / count, torch.full((3,), count, device=self.device)
         low, high = (x * (2 / len(seen)) - 1 for x in (cells.amin(0), cells.amax(0) + 1))
         if self.frame.reach > 1:
             bounds = torch.tensor(self.frame.bounds, device=low.device)
             low, high = torch.maximum(low, bounds[0]), torch.minimum(high, bounds[1])
-        return low, high
+        edge = float((high - low).max()) / self.config.resolution
+        return low, edge, ((high - low) / edge - 1e-3).ceil().long()
 
     def _release(self) -> None:
         """Let go of what was for the field alone."""
@@ -535,15 +558,16 @@ class SNeRG(RayMethod):
         """
         known, n = taken_over(teacher, cameras), self.sightings.resolution
         points, origins = (x.to(self.device) for x in (known.surface.points, known.surface.origins))
-        self.sightings.note(points, points.new_ones(len(points)))
-        inside = self.sightings.inside(points)
+        seen = self.baked_in.warp(points)
+        self.sightings.note(seen, seen.new_ones(len(seen)))
+        inside = self.sightings.inside(seen)
         ways = torch.zeros(n**3, 3, device=self.device)
-        ways.index_add_(0, self.sightings.cells(points[inside]), unit(points - origins)[inside])
+        ways.index_add_(0, self.sightings.cells(seen[inside]), unit(points - origins)[inside])
         ways = smoothed(ways.view(n, n, n, 3)).reshape(-1, 3)
 
         def field(points: Float[Tensor, "point 3"]) -> Deferred:
             if can(teacher, HasField):
-                density, rgb = teacher.field(points, unit(ways[self.sightings.cells(points)]))
+                density, rgb = teacher.field(points, unit(ways[self.sightings.cells(self.baked_in.warp(points))]))
             else:
                 density = known.density(points.cpu()).to(self.device)
                 rgb = K00 * known.harmonics(points.cpu(), 1, lambda rgb: rgb)[:, 0].to(self.device)
@@ -551,6 +575,13 @@ class SNeRG(RayMethod):
 
         self._bake(field)
         self.of_another.fill_(True)
+
+
+def slabs(x: int, y: int, z: int) -> Iterator[tuple[int, int]]:
+    """From where to where along x parts of a grid go that can be looked at together."""
+    thick = max(1, SLAB // (y * z))
+    for first in range(0, x, thick):
+        yield first, min(x, first + thick)
 
 
 BOUNDED = (

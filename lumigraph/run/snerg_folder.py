@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from pathlib import Path
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from .. import methods
+from ..baked import Atlas
 from ..camera import Camera, ring
 from ..errors import LumigraphError
 from ..exchange import snerg
@@ -32,13 +34,15 @@ class SnergFolder(Opened):
         if not len(places):
             raise LumigraphError(f"{self.path} holds no voxels, so there is nothing to show")
         corners = atlas.low + atlas.voxel * torch.stack([places.amin(0), places.amax(0) + 1])
-        to_source = within_reach(corners)
+        to_source = Similarity.make(1.0) if atlas.contracted else within_reach(corners)
         scale, shift = to_source.inverse.scale, to_source.inverse.matrix[:3, 3].float()
         self.atlas = replace(atlas, low=scale * atlas.low + shift, voxel=scale * atlas.voxel)
         if (network := self.atlas.network) and len(network.biases[0]) != len(network.biases[1]):
             raise LumigraphError(f"{self.path} has a network of two widths, of which one is read; export it anew")
         low, high = ((scale * corner + shift).clamp(-1, 1).tolist() for corner in corners)
-        self.frame = Frame((tuple(low), tuple(high)), near=0.01, background=WHITE, source_from_scene=to_source.rows)
+        reach = reach_of(atlas, places) if atlas.contracted else 1.0
+        rows = to_source.rows
+        self.frame = Frame((tuple(low), tuple(high)), reach, near=0.01, background=WHITE, source_from_scene=rows)
 
     def method(self, device: torch.device | str = "cpu") -> Method:
         """The atlas, ready to render."""
@@ -52,6 +56,13 @@ class SnergFolder(Opened):
     def cameras(self) -> dict[str, Camera]:
         """A ring of cameras around the middle, looking at it."""
         return {"train": ring(self.frame.bounds)}
+
+
+def reach_of(atlas: Atlas, places: Int[Tensor, "voxel 3"]) -> float:
+    """The least power of two with which rays go as far as what lies in these voxels of contracted coordinates."""
+    radius = float((atlas.low + atlas.voxel * (places + 0.5)).norm(dim=-1).amax())
+    farthest = 1 / max(2 - radius, 0.5 * atlas.voxel)
+    return min(64.0, max(2.0, 2.0 ** math.ceil(math.log2(farthest / (2 * math.sqrt(3))))))
 
 
 def within_reach(corners: Float[Tensor, "2 3"]) -> Similarity:

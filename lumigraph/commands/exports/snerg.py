@@ -2,20 +2,28 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
 from tyro.conf import Positional
 
+from ...errors import LumigraphWarning
 from ..common import needed, show
+
+CONTRACTED = (
+    "An open capture is baked in contracted coordinates, which Lumigraph opens again and SNeRG's viewer shows out of "
+    "shape; for that viewer train with --no-whole, which bakes the box of interest alone"
+)
 
 
 @dataclass(frozen=True)
 class ExportSnerg:
     """A baked run as the folder that SNeRG's own viewer opens: scene_params.json and slices of its atlas as PNG.
 
-    It lies in the scene's frame with +y up. A folder of that kind opens like a run, too.
+    It lies in the scene's frame with +y up. A folder of that kind opens like a run, too. An open capture is contracted
+    (docs/methods/snerg.md), which other viewers do not undo; trained with --no-whole, it ends at its box of interest.
     """
 
     source: Annotated[Positional[Path], needed("RUN_OR_FOLDER")]
@@ -32,6 +40,8 @@ class ExportSnerg:
         claim_folder(self.output, "atlas")
         atlas = needs(open_any(self.source).method(), HasAtlas).atlas()
         snerg.write(self.output, atlas)
+        if atlas.contracted:
+            warnings.warn(CONTRACTED, LumigraphWarning, stacklevel=2)
         x, y, z = (n * atlas.block for n in atlas.index.shape)
         show(
             {

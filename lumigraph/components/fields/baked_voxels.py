@@ -11,8 +11,10 @@ from torch import Tensor, nn
 from ... import kernels
 from ...baked import Atlas
 from ...kernels.block_march import ALPHA, CHANNELS
+from ...kernels.block_march.reference import contracted, steps
 from ...rays import Rays, Samples
 from ...volume import packed
+from ..sampling.spaces import Contraction
 from .deferred import ViewDependence
 
 STEPS = 255  # between the least and the largest of a value that is told by eight bits
@@ -27,6 +29,10 @@ class BakedVoxels(nn.Module):
     levels:    of each voxel red, green, blue, alpha and four features, all but alpha multiplied by alpha, in 256 steps
     low, edge: corner of the grid and side of a voxel, in the scene's frame
     size:      voxels along each axis
+
+    With a space the grid is [-2, 2]^3, and holds an open capture in twice the coordinates of that contraction, which
+    inside the unit ball are the scene's own (Reiser 2023, section 4.1, has a similar one). Elsewhere a voxel's length
+    in the scene is that along the way out.
     """
 
     grows: ClassVar[tuple[str, ...]] = ("places", "levels")
@@ -36,9 +42,9 @@ class BakedVoxels(nn.Module):
     edge: Tensor
     size: Tensor
 
-    def __init__(self, block: int):
+    def __init__(self, block: int, space: Contraction | None = None):
         super().__init__()
-        self.block = block
+        self.block, self.space = block, space
         self.register_buffer("places", torch.zeros(0, 3, dtype=torch.int16))
         self.register_buffer("levels", torch.zeros(0, CHANNELS, dtype=torch.uint8))
         self.register_buffer("low", torch.full((3,), -1.0))
@@ -75,7 +81,8 @@ class BakedVoxels(nn.Module):
         of = self.places, self.places._version, self.levels, self.levels._version
         if self._made is None or any(a is not b for a, b in zip(self._made[0], of, strict=True)):
             x, y, z = self.size.tolist()
-            self._made = of, kernels.Blocks.of(self.places.long(), (x, y, z), self.block), self.levels.float() / STEPS
+            blocks = kernels.Blocks.of(self.places.long(), (x, y, z), self.block, self.space is not None)
+            self._made = of, blocks, self.levels.float() / STEPS
         return self._made[1:]
 
     @property
@@ -102,13 +109,12 @@ class BakedVoxels(nn.Module):
         self, rays: Rays, values: Float[Tensor, "voxel 8"], near: float
     ) -> tuple[Samples, Float[Tensor, "sample 8"]]:
         """The steps of rays that meet something, each a voxel long, with what they meet."""
-        starts, counts, found = [], [], []
+        starts, ends, counts, found = [], [], [], []
         for first in range(0, len(rays), FEW):
             origins, directions, enter, leave = self._along(rays[first : first + FEW], near)
-            steps = torch.arange(int((leave - enter).ceil().clamp_min(0).amax()), device=enter.device)
-            t = enter[:, None] + steps
+            t = steps(origins, directions, enter, leave, self.blocks.ball)
             points = origins[:, None] + t[..., None] * directions[:, None]
-            own = ((points + 0.5) / self.block).floor().long()
+            own = ((contracted(points, self.blocks.ball) + 0.5) / self.block).floor().long()
             blocks = torch.tensor(self.blocks.index.shape, device=own.device)
             inside = (t < leave[:, None]) & ((own >= 0) & (own < blocks)).all(-1)
             x, y, z = torch.where(inside[..., None], own, 0).unbind(-1)
@@ -116,17 +122,26 @@ class BakedVoxels(nn.Module):
             seen = self.at(points[inside] * self.edge + (self.low + 0.5 * self.edge), values)
             full = seen[:, ALPHA] > 0
             inside[inside.clone()] = full
-            starts.append(t[inside])
+            half = torch.nn.functional.pad(0.5 * t.diff(), (0, 1), value=0.5)  # of the way to the next step
+            before = torch.cat([half[:, :1], half[:, :-1]], 1)
+            starts.append((t - before)[inside])
+            ends.append((t + half)[inside])
             counts.append(inside.sum(-1))
             found.append(seen[full])
-        middle = torch.cat(starts) if starts else rays.radius[:0]
+        begin, end = (torch.cat(x) * self.edge if x else rays.radius[:0] for x in (starts, ends))
         each = torch.cat(counts) if counts else torch.zeros(0, dtype=torch.int64, device=rays.radius.device)
-        samples = Samples((middle - 0.5) * self.edge, (middle + 0.5) * self.edge, packed(each))
+        samples = Samples(begin, end, packed(each))
         return samples, torch.cat(found) if found else values[:0]
 
-    def density(self, alpha: Float[Tensor, " point"]) -> Float[Tensor, " point"]:
-        """Per scene unit, of what has an alpha over one voxel: alpha = 1 - exp(-density edge)."""
-        return -torch.log1p(-alpha.clamp(0, OPAQUE)) / self.edge
+    def length(self, points: Float[Tensor, "point 3"], edge: Tensor | float) -> Float[Tensor, " point"]:
+        """Of a voxel with such an edge, where it lies in the scene, in scene units; along the way out."""
+        radius = points.norm(dim=-1) if self.space else points.new_zeros(len(points))
+        return edge * radius.clamp_min(1).square()
+
+    @staticmethod
+    def density(alpha: Float[Tensor, " point"], length: Float[Tensor, " point"]) -> Float[Tensor, " point"]:
+        """Per scene unit, of what has an alpha over a length: alpha = 1 - exp(-density length)."""
+        return -torch.log1p(-alpha.clamp(0, OPAQUE)) / length
 
     def atlas(self, levels: UInt8[Tensor, "voxel 8"], view: ViewDependence | None) -> Atlas:
         """All of it for browsers and files."""
@@ -134,8 +149,8 @@ class BakedVoxels(nn.Module):
         table = torch.cat([levels, levels.new_zeros(1, CHANNELS)])
         values = table[torch.where(rows >= 0, rows, len(levels))]
         network = None if view is None else view.baked()
-        index, low, edge = self.blocks.index.long().cpu(), self.low.cpu(), float(self.edge)
-        return Atlas(index, values.cpu(), low, edge, self.block, network)
+        index, low, edge = self.blocks.index.long().clamp_min(-1).cpu(), self.low.cpu(), float(self.edge)
+        return Atlas(index, values.cpu(), low, edge, self.block, network, self.space is not None)
 
     def _in_voxels(self, points: Float[Tensor, "point 3"]) -> Float[Tensor, "point 3"]:
         """Points of the scene where the centre of voxel (x, y, z) is (x, y, z)."""
@@ -143,7 +158,8 @@ class BakedVoxels(nn.Module):
 
     def _along(self, rays: Rays, near: float) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Rays in voxels, the first step half a voxel behind where they enter the grid."""
-        enter, leave = (t / self.edge for t in rays.through_box(self.box))
+        bounds = self.space.interval(rays) if self.space else rays.through_box(self.box)
+        enter, leave = (t / self.edge for t in bounds)
         enter = enter.clamp_min(near / float(self.edge)) + 0.5
         return self._in_voxels(rays.origins), rays.directions, enter, torch.maximum(leave, enter - 1)
 

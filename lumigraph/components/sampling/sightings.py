@@ -56,8 +56,13 @@ class Sightings(nn.Module):
     def cells(self, points: Float[Tensor, "sample 3"]) -> Tensor:
         """Numbers of the cells that hold points."""
         n = self.resolution
-        x, y, z = ((points + 1) * (0.5 * n)).long().clamp(0, n - 1).unbind(-1)
+        x, y, z = self.along(points).unbind(-1)
         return (x * n + y) * n + z
+
+    def along(self, coordinates: Tensor) -> Tensor:
+        """Which cells hold coordinates, along their axis."""
+        n = self.resolution
+        return ((coordinates + 1) * (0.5 * n)).long().clamp(0, n - 1)
 
 
 def smoothed(ways: Float[Tensor, "x y z 3"]) -> Float[Tensor, "x y z 3"]:

@@ -31,6 +31,11 @@ def space_of(frame: Frame) -> Space:
         return Box(frame.bounds, frame.near)
     if frame.forward is not None:
         return NDC(frame.forward, frame.near)
+    return contraction_of(frame)
+
+
+def contraction_of(frame: Frame) -> Contraction:
+    """The ball that holds all of an open capture."""
     return Contraction(frame.near, 2 * math.sqrt(3) * frame.reach)
 
 

@@ -12,11 +12,12 @@ from .._dispatch import implementation
 from .._doors import door, require
 from .._facts import Facts
 
-FACTS = Facts(unit="rays", outputs=2, differentiable=(5,), typical=4, compiled=5, smooth=(2, 3))
+FACTS = Facts(unit="rays", outputs=2, differentiable=(5,), typical=4, compiled=9, smooth=(2, 3, 7))
 
 CHANNELS = 8  # of a voxel: red, green, blue, alpha, four features
 ALPHA = 3
 FARTHEST = 6  # of an empty voxel's distance to what is not empty, that is told
+EMPTIEST = 64  # of an empty block's
 
 
 @dataclass(frozen=True)
@@ -26,20 +27,30 @@ class Blocks:
     Voxel (x, y, z) has its centre there. Block (a, b, c) holds voxels from (a, b, c) * block on, and one more on each
     side, its apron, so that all that is blended at a place lies within one block.
 
-    index: each block's number, -1 where it and its apron are empty
+    With a `ball` the voxels lie in contracted coordinates (Barron 2022, eq. 10), h the ball's radius, c the middle of
+    the grid, 4 h voxels wide: x is x inside the ball around c, and beyond it c + (2 - h / |x - c|) h (x - c) / |x - c|,
+    so that all there is lies within 2 h of c.
+
+    index: each block's number; or -d where it and its apron are empty, and so are all blocks fewer than d away
     rows:  of each voxel of each block: its row; or -d where it is empty, and all voxels within that block that are
            fewer than d away along every axis are, too
     count: of rows
+    ball:  radius in voxels of the ball inside of which nothing is contracted; 0 where nothing is anywhere
     """
 
     index: Int32[Tensor, "x y z"]
     rows: Int32[Tensor, "block side side side"]
     count: int
+    ball: float = 0.0
 
     @classmethod
-    def of(cls, places: Int[Tensor, "row 3"], shape: tuple[int, int, int], block: int) -> Blocks:
-        """Rows for voxels at these places, which all differ, of a grid of a shape. Raises ValueError for others."""
+    def of(
+        cls, places: Int[Tensor, "row 3"], shape: tuple[int, int, int], block: int, contracted: bool = False
+    ) -> Blocks:
+        """Rows for voxels at these places, which all differ, of a grid of a shape; contracted, it is a cube. Raises
+        ValueError for others."""
         size = torch.tensor(shape, device=places.device)
+        require(not contracted or len(set(shape)) == 1, f"what is contracted lies in a cube, and {shape} is none")
         require(bool(((places >= 0) & (places < size)).all()), f"places of voxels go from 0 below {shape}")
         blocks = (size + block - 1) // block
         require(block >= 1 and int(blocks.prod()) < 1 << 31, f"a grid cannot have {blocks.tolist()} blocks")
@@ -63,7 +74,9 @@ class Blocks:
         x, y, z = (places[which].long() - block * own + 1).unbind(-1)
         rows[number, x, y, z] = which.int()
         require(int((rows >= 0).sum()) == len(which), "two rows belong to one voxel")
-        return cls(index.view(*blocks.tolist()), _with_distances(rows), len(places))
+        index = _with_distances(index.view(1, *blocks.tolist()), EMPTIEST, beyond=False)[0]
+        rows = _with_distances(rows, FARTHEST, beyond=True)  # beyond a block may be anything
+        return cls(index, rows, len(places), shape[0] / 4 if contracted else 0.0)
 
     @property
     def block(self) -> int:
@@ -71,20 +84,22 @@ class Blocks:
         return self.rows.shape[1] - 2
 
     def to(self, device: torch.device | str) -> Blocks:
-        return Blocks(self.index.to(device), self.rows.to(device), self.count)
+        return Blocks(self.index.to(device), self.rows.to(device), self.count, self.ball)
 
 
-def _with_distances(rows: Int32[Tensor, "block side side side"]) -> Int32[Tensor, "block side side side"]:
-    """Rows whose empty voxels say how far what is not empty is; beyond the block may be anything."""
-    near = torch.nn.functional.pad(rows >= 0, (1,) * 6, value=True)
-    far = torch.full_like(near, FARTHEST, dtype=torch.int8)
-    for distance in range(1, FARTHEST):
+def _with_distances(rows: Int32[Tensor, "n x y z"], farthest: int, beyond: bool) -> Int32[Tensor, "n x y z"]:
+    """Rows whose empty places say how far what is not empty is. beyond: whether there may be something around them"""
+    near = torch.nn.functional.pad(rows >= 0, (1,) * 6, value=beyond)
+    far = torch.full_like(near, farthest, dtype=torch.int8)
+    for distance in range(1, farthest):
+        if near.all():
+            break
         for axis in (1, 2, 3):
             wider, n = near.clone(), near.shape[axis]
             wider.narrow(axis, 1, n - 1).logical_or_(near.narrow(axis, 0, n - 1))
             wider.narrow(axis, 0, n - 1).logical_or_(near.narrow(axis, 1, n - 1))
             near = wider
-        far[near & (far == FARTHEST)] = distance
+        far[near & (far == farthest)] = distance
     return torch.where(rows >= 0, rows, -far[:, 1:-1, 1:-1, 1:-1].int())
 
 
@@ -103,9 +118,14 @@ def block_march(
         t_i = enter + i, while t_i < leave      v_i: trilinear at o + t_i d, alpha_i one of its channels
         T_i = prod_{j<i} (1 - alpha_j)          light that reaches step i; 0 once it is below `stop`
 
-    origins:      in voxels; the centre of voxel (x, y, z) is there
+    In contracted blocks v_i is found where o + t_i d lies contracted, and t_i goes on by as much as brings the ray one
+    voxel onward there: r / (h^2 s / r - cos), where r is the distance from the middle, cos that of the angle to the way
+    out, h^2 s / r^2 the ray's speed in contracted voxels, s^2 = 1 + 4 (r sin / h)^2 (1 - h / r). To first order that
+    is r^2 / (h^2 s), the rest makes it exact straight in and out.
+
+    origins:      in voxels; the centre of voxel (x, y, z) is there. Nothing contracts them
     directions:   unit length
-    enter, leave: distances of the first step and of the end, in voxels
+    enter, leave: distances of the first step and of the end, in voxels as origins
     blocks:       which row each voxel has, 0 where it has none; trusted to be as its maker leaves it
     values:       (blocks.count, 8): red, green, blue, alpha, four features, all but alpha multiplied by alpha
 
@@ -128,6 +148,12 @@ def cases(generator: torch.Generator):
         (3, (6, 6, 6), 4, 0.0, 0.9, 0.0),
     ]:
         yield _inputs(rays, shape, block, share, most, stop, generator)
+    for rays, size, block, share, most, stop in [
+        (4, 8, 3, 0.6, 0.4, 0.0),
+        (33, 32, 4, 0.03, 0.7, 0.0),
+        (20, 20, 5, 0.3, 0.5, 0.05),
+    ]:
+        yield _contracted(rays, size, block, share, most, stop, generator)
 
 
 def benchmark_case(generator: torch.Generator, size: int = 2**14):
@@ -147,6 +173,21 @@ def _inputs(rays, shape, block, share, most, stop, generator):
     values = most * torch.rand(len(places), CHANNELS, generator=generator)
     values[: len(places) // 8, ALPHA] = most
     return *_rays(rays, shape, generator), Blocks.of(places, shape, block), values, stop
+
+
+def _contracted(rays, size, block, share, most, stop, generator):
+    """Rays from inside the ball and around it, to far beyond; one that goes straight out."""
+    numbers = torch.randperm(size**3, generator=generator)[: int(share * size**3)]
+    places = torch.stack(torch.unravel_index(numbers, (size,) * 3), -1)
+    values = most * torch.rand(len(places), CHANNELS, generator=generator)
+    values[: len(places) // 8, ALPHA] = most
+    middle, ball = (size - 1) / 2, size / 4
+    origins = middle + ball * torch.randn(rays, 3, generator=generator)
+    directions = torch.nn.functional.normalize(torch.randn(rays, 3, generator=generator), dim=-1)
+    origins[:1], directions[:1] = middle, torch.tensor([0.0, 0.0, 1.0])
+    enter = torch.rand(rays, generator=generator)
+    blocks = Blocks.of(places, (size,) * 3, block, contracted=True)
+    return origins, directions, enter, torch.full((rays,), 9 * ball), blocks, values, stop
 
 
 def _rays(count, shape, generator):

@@ -7,11 +7,55 @@ from numba import njit, prange
 
 from .._dispatch import empty
 from ..sparse_grid.cpu import slabs_of
+from .reference import LEAST
 
-ZERO, HALF, ONE = np.float32(0), np.float32(0.5), np.float32(1)
+ZERO, HALF, ONE, TWO, FOUR = (np.float32(x) for x in (0, 0.5, 1, 2, 4))
+NARROWEST = np.float32(LEAST)
 FAR = np.float32(1e30)
 CHUNK = 64  # rays a thread takes at a time
 C, A = 8, 3  # channels, and which of them is alpha
+SURE = np.float32(0.9)  # voxels of a step, in a count of steps that must not lead too far
+
+
+@njit(inline="always")
+def placed(o, d, t, ball):
+    """Where in the grid a ray is at a distance; contracted, if there is a ball (Barron 2022, eq. 10)."""
+    x, y, z = o[0] + t * d[0], o[1] + t * d[1], o[2] + t * d[2]
+    if ball > ZERO:
+        middle = TWO * ball - HALF
+        u, v, w = x - middle, y - middle, z - middle
+        radius = np.sqrt(u * u + v * v + w * w)
+        if radius > ball:
+            share = ball / radius
+            scale = (TWO - share) * share
+            x, y, z = middle + scale * u, middle + scale * v, middle + scale * w
+    return x, y, z
+
+
+@njit(inline="always")
+def nearest(o, d, ball):
+    """How far behind a ray's origin it is nearest to the middle of the ball, and the square of how near."""
+    middle = TWO * ball - HALF
+    u, v, w = o[0] - middle, o[1] - middle, o[2] - middle
+    along = u * d[0] + v * d[1] + w * d[2]
+    u, v, w = u - along * d[0], v - along * d[1], w - along * d[2]
+    return along, u * u + v * v + w * w
+
+
+@njit(inline="always")
+def later(t, steps, along, aside, ball):
+    """The distance so many steps onward. along, aside: of `nearest`"""
+    if ball == ZERO:
+        return t + np.float32(steps)
+    for _ in range(steps):
+        radius = np.sqrt(aside + (along + t) * (along + t))
+        if radius <= ball:
+            t += ONE
+        else:
+            share = ball / radius
+            speed = np.sqrt(ONE + FOUR * aside / (ball * ball) * (ONE - share)) * share * ball
+            t += radius / max(speed - (along + t) / radius, NARROWEST)
+    return t
 
 
 @njit(inline="always")
@@ -41,6 +85,23 @@ def beyond(x, y, z, dx, dy, dz, bx, by, bz, block):
 
 
 @njit(inline="always")
+def from_sides(x, b, block):
+    """Distance along one axis from the nearer side of block b."""
+    inside = x + HALF - np.float32(block * b)
+    return min(inside, np.float32(block) - inside)
+
+
+@njit(inline="always")
+def past(x, y, z, d, bx, by, bz, number, block, ball):
+    """Steps, one at least, that lead over what is empty where a block is, wherever a curved ray turns to."""
+    if ball == ZERO:
+        return beyond(x, y, z, d[0], d[1], d[2], bx, by, bz, block)
+    clear = min(from_sides(x, bx, block), from_sides(y, by, block), from_sides(z, bz, block))
+    clear += np.float32(block * (-1 - number))
+    return max(np.int64(1), np.int64(SURE * clear))
+
+
+@njit(inline="always")
 def cell_of(x, b, block):
     """Along one axis: the first of the two voxels around a place, counted in its block, and the place beyond it."""
     place = x - np.float32(block * b) + ONE
@@ -49,9 +110,11 @@ def cell_of(x, b, block):
 
 
 @njit(inline="always")
-def onward(row):
-    """Steps that an empty voxel's distance leaves empty; 0 where there is something to look up."""
-    return np.int64(0) if row >= -1 else np.int64(-1 - row)
+def onward(row, ball):
+    """Steps that an empty voxel's distance leaves empty; 0 where there is something to look up. Those of curved rays
+    may be longer than a voxel, so there is one less."""
+    leap = np.int64(0) if row >= -1 else np.int64(-1 - row)
+    return leap if ball == ZERO else max(leap - 1, np.int64(0))
 
 
 @njit(inline="always")
@@ -80,80 +143,76 @@ def blended(values, at, weights, count, seen):
 
 
 @njit(parallel=True, fastmath=True, cache=True)
-def _forward(origins, directions, enter, leave, index, rows, values, stop, totals, distance, lengths):
+def _forward(origins, directions, enter, leave, index, rows, values, ball, stop, totals, distance, lengths):
     """lengths: how many steps of each ray met something"""
     n, block = len(origins), rows.shape[1] - 2
     for chunk in prange((n + CHUNK - 1) // CHUNK):
         at, weights = np.empty(9, np.int64), np.empty(9, np.float32)
         seen, total = np.empty(C, np.float32), np.empty(C, np.float32)
         for r in range(chunk * CHUNK, min(n, (chunk + 1) * CHUNK)):
-            dx, dy, dz = directions[r, 0], directions[r, 1], directions[r, 2]
-            light, along, met, i = ONE, ZERO, 0, np.int64(0)
+            o, d, t = origins[r], directions[r], enter[r]
+            ahead, aside = nearest(o, d, ball)
+            light, along, met = ONE, ZERO, 0
             for c in range(C):
                 total[c] = ZERO
-            while True:
-                t = enter[r] + np.float32(i)
-                if t >= leave[r] or light < stop:
-                    break
-                x, y, z = origins[r, 0] + t * dx, origins[r, 1] + t * dy, origins[r, 2] + t * dz
+            while t < leave[r] and light >= stop:
+                x, y, z = placed(o, d, t, ball)
                 bx, by, bz, number = block_of(x, y, z, index, block)
                 if number < 0:
-                    i += beyond(x, y, z, dx, dy, dz, bx, by, bz, block)
+                    t = later(t, past(x, y, z, d, bx, by, bz, number, block, ball), ahead, aside, ball)
                     continue
                 (cx, fx), (cy, fy), (cz, fz) = cell_of(x, bx, block), cell_of(y, by, block), cell_of(z, bz, block)
-                leap = onward(rows[number, cx, cy, cz])
+                leap = onward(rows[number, cx, cy, cz], ball)
                 if leap > 0:
-                    i += leap
+                    t = later(t, leap, ahead, aside, ball)
                     continue
                 count = corners(rows, number, cx, fx, cy, fy, cz, fz, at, weights)
-                i += 1
-                if count == 0:
-                    continue
-                met += 1
-                blended(values, at, weights, count, seen)
-                for c in range(C):
-                    total[c] += light * seen[c]
-                along += light * seen[A] * t
-                light *= ONE - seen[A]
+                if count > 0:
+                    met += 1
+                    blended(values, at, weights, count, seen)
+                    for c in range(C):
+                        total[c] += light * seen[c]
+                    along += light * seen[A] * t
+                    light *= ONE - seen[A]
+                t = later(t, 1, ahead, aside, ball)
             for c in range(C):
                 totals[r, c] = total[c]
             distance[r], lengths[r] = along, met
 
 
 @njit(parallel=True, fastmath=True, cache=True)
-def _steps(origins, directions, enter, leave, index, rows, values, stop, starts, steps, lights):
-    """The steps of each ray that met something, and the light that reached them."""
+def _steps(origins, directions, enter, leave, index, rows, values, ball, stop, starts, steps, lights):
+    """Distances of the steps of each ray that met something, and the light that reached them."""
     n, block = len(origins), rows.shape[1] - 2
     for chunk in prange((n + CHUNK - 1) // CHUNK):
         at, weights, seen = np.empty(9, np.int64), np.empty(9, np.float32), np.empty(C, np.float32)
         for r in range(chunk * CHUNK, min(n, (chunk + 1) * CHUNK)):
-            dx, dy, dz = directions[r, 0], directions[r, 1], directions[r, 2]
-            light, s, i = ONE, starts[r], np.int64(0)
+            o, d, t = origins[r], directions[r], enter[r]
+            ahead, aside = nearest(o, d, ball)
+            light, s = ONE, starts[r]
             while s < starts[r + 1]:
-                t = enter[r] + np.float32(i)
-                x, y, z = origins[r, 0] + t * dx, origins[r, 1] + t * dy, origins[r, 2] + t * dz
+                x, y, z = placed(o, d, t, ball)
                 bx, by, bz, number = block_of(x, y, z, index, block)
                 if number < 0:
-                    i += beyond(x, y, z, dx, dy, dz, bx, by, bz, block)
+                    t = later(t, past(x, y, z, d, bx, by, bz, number, block, ball), ahead, aside, ball)
                     continue
                 (cx, fx), (cy, fy), (cz, fz) = cell_of(x, bx, block), cell_of(y, by, block), cell_of(z, bz, block)
-                leap = onward(rows[number, cx, cy, cz])
+                leap = onward(rows[number, cx, cy, cz], ball)
                 if leap > 0:
-                    i += leap
+                    t = later(t, leap, ahead, aside, ball)
                     continue
                 count = corners(rows, number, cx, fx, cy, fy, cz, fz, at, weights)
-                i += 1
-                if count == 0:
-                    continue
-                blended(values, at, weights, count, seen)
-                steps[s], lights[s] = i - 1, light
-                light *= ONE - seen[A]
-                s += 1
+                if count > 0:
+                    blended(values, at, weights, count, seen)
+                    steps[s], lights[s] = t, light
+                    light *= ONE - seen[A]
+                    s += 1
+                t = later(t, 1, ahead, aside, ball)
 
 
 @njit(parallel=True, fastmath=True, cache=True)
 def _owed(
-    g_totals, g_distance, origins, directions, enter, index, rows, values, starts, steps, lights, points, first, out
+    g_totals, g_distance, origins, directions, index, rows, values, ball, starts, steps, lights, points, first, out
 ):
     """What each step's blended values owe: dL/dv = T g, and for alpha beside it what it hides of all behind it.
 
@@ -164,10 +223,9 @@ def _owed(
         at, weights, seen = np.empty(9, np.int64), np.empty(9, np.float32), np.empty(C, np.float32)
         hidden = ZERO  # sum over steps j behind step i of prod_{i<k<j} (1 - alpha_k) dL/dT_j
         for s in range(starts[r + 1] - 1, starts[r] - 1, -1):
-            t = enter[r] + np.float32(steps[s])
-            for axis in range(3):
-                points[s, axis] = origins[r, axis] + t * directions[r, axis]
-            x, y, z = points[s, 0], points[s, 1], points[s, 2]
+            t = steps[s]
+            x, y, z = placed(origins[r], directions[r], t, ball)
+            points[s, 0], points[s, 1], points[s, 2] = x, y, z
             bx, by, bz, number = block_of(x, y, z, index, block)
             (cx, fx), (cy, fy), (cz, fz) = cell_of(x, bx, block), cell_of(y, by, block), cell_of(z, bz, block)
             count = corners(rows, max(number, np.int64(0)), cx, fx, cy, fy, cz, fz, at, weights)
@@ -206,7 +264,7 @@ class _BlockMarch(torch.autograd.Function):
         totals, distance = empty(len(origins), C), empty(len(origins))
         lengths = torch.zeros(len(origins), dtype=torch.int64)
         given = (x.detach().numpy() for x in (origins, directions, enter, leave, blocks.index, blocks.rows, values))
-        _forward(*given, ctx.stop, totals.numpy(), distance.numpy(), lengths.numpy())
+        _forward(*given, np.float32(blocks.ball), ctx.stop, totals.numpy(), distance.numpy(), lengths.numpy())
         ctx.save_for_backward(origins, directions, enter, leave, values, lengths)
         return totals, distance
 
@@ -217,11 +275,11 @@ class _BlockMarch(torch.autograd.Function):
         index, rows = ctx.blocks.index.numpy(), ctx.blocks.rows.numpy()
         starts = np.concatenate([np.zeros(1, np.int64), lengths.cumsum()])
         total, block = int(starts[-1]), ctx.blocks.block
-        steps, first = np.empty(total, np.int32), np.empty(total, np.int32)
-        lights, points, owed = empty(total).numpy(), empty(total, 3).numpy(), empty(total, C).numpy()
-        _steps(origins, directions, enter, leave, index, rows, values, ctx.stop, starts, steps, lights)
+        ball, first = np.float32(ctx.blocks.ball), np.empty(total, np.int32)
+        steps, lights, points, owed = (empty(total, *width).numpy() for width in ((), (), (3,), (C,)))
+        _steps(origins, directions, enter, leave, index, rows, values, ball, ctx.stop, starts, steps, lights)
         grads = g_totals.contiguous().numpy(), g_distance.contiguous().numpy()
-        _owed(*grads, origins, directions, enter, index, rows, values, starts, steps, lights, points, first, owed)
+        _owed(*grads, origins, directions, index, rows, values, ball, starts, steps, lights, points, first, owed)
         # Places of one slab of cells touch its voxels and the next one's first: see `sparse_grid`.
         order, slabs = slabs_of(first, block * index.shape[0] + 1)
         to_values = torch.zeros(values.shape)

@@ -9,9 +9,51 @@ from torch import Tensor
 
 from .._dispatch import empty
 from . import ALPHA, CHANNELS, Blocks
+from .reference import LEAST
 
 BLOCK = 32  # rays; they march together, so a program is as slow as its slowest
 C, A = tl.constexpr(CHANNELS), tl.constexpr(ALPHA)
+NARROWEST = tl.constexpr(LEAST)
+SURE = tl.constexpr(0.9)  # voxels of a step, in a count of steps that must not lead too far
+
+
+@triton.jit
+def _placed(ox, oy, oz, dx, dy, dz, t, ball, CURVED: tl.constexpr):
+    """Where in the grid each ray is at a distance; contracted, if there is a ball (Barron 2022, eq. 10)."""
+    x, y, z = ox + t * dx, oy + t * dy, oz + t * dz
+    if CURVED:
+        middle = 2 * ball - 0.5
+        u, v, w = x - middle, y - middle, z - middle
+        share = ball / tl.maximum(tl.sqrt(u * u + v * v + w * w), ball)
+        scale = (2 - share) * share
+        x, y, z = middle + scale * u, middle + scale * v, middle + scale * w
+    return x, y, z
+
+
+@triton.jit
+def _nearest(ox, oy, oz, dx, dy, dz, ball):
+    """How far behind each ray's origin it is nearest to the middle of the ball, and the square of how near."""
+    middle = 2 * ball - 0.5
+    u, v, w = ox - middle, oy - middle, oz - middle
+    along = u * dx + v * dy + w * dz
+    u, v, w = u - along * dx, v - along * dy, w - along * dz
+    return along, u * u + v * v + w * w
+
+
+@triton.jit
+def _later(t, steps, along, aside, ball, CURVED: tl.constexpr):
+    """The distance so many steps onward. along, aside: of `_nearest`"""
+    if CURVED:
+        while tl.max(steps, 0) > 0:
+            radius = tl.maximum(tl.sqrt(aside + (along + t) * (along + t)), 1e-6)
+            share = ball / tl.maximum(radius, ball)
+            speed = tl.sqrt(1 + 4 * aside / (ball * ball) * (1 - share)) * share * ball
+            stride = radius / tl.maximum(speed - (along + t) / radius, NARROWEST)
+            t += tl.where(steps > 0, tl.where(radius <= ball, 1.0, stride), 0.0)
+            steps -= 1
+    else:
+        t += steps.to(tl.float32)
+    return t
 
 
 @triton.jit
@@ -30,6 +72,13 @@ def _to_side(x, d, b, B: tl.constexpr):
     still = tl.abs(d) < 1e-9
     side = (B * (b + (d > 0).to(tl.int32))).to(tl.float32) - 0.5
     return tl.where(still, 1e9, (side - x) / tl.where(still, 1.0, d))
+
+
+@triton.jit
+def _from_sides(x, b, B: tl.constexpr):
+    """Distance along one axis from the nearer side of block b."""
+    inside = x + 0.5 - (B * b).to(tl.float32)
+    return tl.minimum(inside, B - inside)
 
 
 @triton.jit
@@ -89,8 +138,10 @@ def _march(
     X,
     Y,
     Z,
+    ball,
     stop,
     NOTE: tl.constexpr,
+    CURVED: tl.constexpr,
     BLOCK: tl.constexpr,
     B: tl.constexpr,
 ):
@@ -104,7 +155,7 @@ def _march(
     dx = tl.load(directions + 3 * r, mask=here, other=1.0)
     dy = tl.load(directions + 3 * r + 1, mask=here, other=0.0)
     dz = tl.load(directions + 3 * r + 2, mask=here, other=0.0)
-    begin = tl.load(enter + r, mask=here, other=0.0)
+    t = tl.load(enter + r, mask=here, other=0.0)
     end = tl.load(leave + r, mask=here, other=0.0)
     if NOTE:
         first = tl.load(starts + r, mask=here, other=0)
@@ -113,11 +164,10 @@ def _march(
     along = tl.zeros([BLOCK], tl.float32)
     total = tl.zeros([BLOCK, C], tl.float32)
     met = tl.zeros([BLOCK], tl.int32)
-    i = tl.zeros([BLOCK], tl.int32)
-    alive = here & (begin < end) & (light >= stop)
+    ahead, aside = _nearest(ox, oy, oz, dx, dy, dz, ball)
+    alive = here & (t < end) & (light >= stop)
     while tl.max(alive.to(tl.int32), 0) > 0:
-        t = begin + i.to(tl.float32)
-        x, y, z = ox + t * dx, oy + t * dy, oz + t * dz
+        x, y, z = _placed(ox, oy, oz, dx, dy, dz, t, ball, CURVED)
         bx, by, bz, number = _block_of(x, y, z, index, alive, X, Y, Z, B)
         there = number >= 0
         cx, fx = _cell_of(x, bx, B)
@@ -125,21 +175,28 @@ def _march(
         cz, fz = _cell_of(z, bz, B)
         nearest = _row_of(rows, number, cx, cy, cz, there, B)
         leap = tl.where(nearest < -1, -1 - nearest, 0)
+        if CURVED:  # a step may be longer than a voxel
+            leap = tl.maximum(leap - 1, 0)
         there &= leap == 0
         seen, some = _blended(rows, values, number, cx, fx, cy, fy, cz, fz, there, BLOCK, B)
         alpha = _alpha(seen)
         if NOTE:
             place = first + met
-            tl.store(steps + place, i, mask=some & (place < last))
+            tl.store(steps + place, t, mask=some & (place < last))
             tl.store(lights + place, light, mask=some & (place < last))
         total += light[:, None] * seen
         along += light * alpha * t
         light *= 1 - alpha
         met += some.to(tl.int32)
-        away = tl.minimum(tl.minimum(_to_side(x, dx, bx, B), _to_side(y, dy, by, B)), _to_side(z, dz, bz, B))
-        out = tl.ceil(tl.minimum(away, 1e9)).to(tl.int32)
-        i += tl.maximum(tl.where(number < 0, out, leap), 1)
-        alive &= (begin + i.to(tl.float32) < end) & (light >= stop)
+        if CURVED:
+            clear = tl.minimum(tl.minimum(_from_sides(x, bx, B), _from_sides(y, by, B)), _from_sides(z, bz, B))
+            out = (SURE * (clear + (B * (-1 - number)).to(tl.float32))).to(tl.int32)
+        else:
+            away = tl.minimum(tl.minimum(_to_side(x, dx, bx, B), _to_side(y, dy, by, B)), _to_side(z, dz, bz, B))
+            out = tl.ceil(tl.minimum(away, 1e9)).to(tl.int32)
+        onward = tl.where(alive, tl.maximum(tl.where(number < 0, out, leap), 1), 0)
+        t = _later(t, onward, ahead, aside, ball, CURVED)
+        alive &= (t < end) & (light >= stop)
     if not NOTE:
         tl.store(totals + r[:, None] * C + c[None, :], total, mask=here[:, None])
         tl.store(distance + r, along, mask=here)
@@ -152,7 +209,6 @@ def _backward(
     g_distance,
     origins,
     directions,
-    enter,
     index,
     rows,
     values,
@@ -164,6 +220,8 @@ def _backward(
     X,
     Y,
     Z,
+    ball,
+    CURVED: tl.constexpr,
     BLOCK: tl.constexpr,
     B: tl.constexpr,
 ):
@@ -177,7 +235,6 @@ def _backward(
     dx = tl.load(directions + 3 * r, mask=here, other=1.0)
     dy = tl.load(directions + 3 * r + 1, mask=here, other=0.0)
     dz = tl.load(directions + 3 * r + 2, mask=here, other=0.0)
-    begin = tl.load(enter + r, mask=here, other=0.0)
     g = tl.load(g_totals + r[:, None] * C + c[None, :], mask=here[:, None], other=0.0)
     g_along = tl.load(g_distance + r, mask=here, other=0.0)
     first = tl.load(starts + r, mask=here, other=0)
@@ -185,9 +242,9 @@ def _backward(
     hidden = tl.zeros([BLOCK], tl.float32)
     alive = here & (s >= first)
     while tl.max(alive.to(tl.int32), 0) > 0:
-        t = begin + tl.load(steps + s, mask=alive, other=0).to(tl.float32)
+        t = tl.load(steps + s, mask=alive, other=0.0)
         light = tl.load(lights + s, mask=alive, other=0.0)
-        x, y, z = ox + t * dx, oy + t * dy, oz + t * dz
+        x, y, z = _placed(ox, oy, oz, dx, dy, dz, t, ball, CURVED)
         bx, by, bz, number = _block_of(x, y, z, index, alive, X, Y, Z, B)
         there = number >= 0
         cx, fx = _cell_of(x, bx, B)
@@ -212,13 +269,14 @@ class _BlockMarch(torch.autograd.Function):
     def forward(ctx, origins, directions, enter, leave, blocks: Blocks, values, stop: float):
         device, rays = origins.device, len(origins)
         ctx.given = blocks.index.contiguous(), blocks.rows.contiguous()
-        ctx.sizes = rays, *blocks.index.shape
-        ctx.options = {"BLOCK": BLOCK, "B": blocks.block, "num_warps": 1, "enable_fp_fusion": False}
+        ctx.sizes = rays, *blocks.index.shape, float(blocks.ball)
+        ctx.options = {"CURVED": blocks.ball > 0, "BLOCK": BLOCK, "B": blocks.block}
+        ctx.options |= {"num_warps": 1, "enable_fp_fusion": False}
         ctx.stop = float(stop)
         totals, distance = empty(rays, CHANNELS, device=device), empty(rays, device=device)
         lengths = torch.zeros(rays, dtype=torch.int32, device=device)
         if rays:
-            out = totals, distance, lengths, lengths, lengths, distance  # the last three are only noted into
+            out = totals, distance, lengths, lengths, distance, distance  # the last three are only noted into
             rest = *out, *ctx.sizes, ctx.stop
             _march[(triton.cdiv(rays, BLOCK),)](
                 origins, directions, enter, leave, *ctx.given, values, *rest, NOTE=False, **ctx.options
@@ -231,7 +289,7 @@ class _BlockMarch(torch.autograd.Function):
     def backward(ctx, g_totals, g_distance):
         origins, directions, enter, leave, values, totals, distance, lengths = ctx.saved_tensors
         starts = torch.nn.functional.pad(lengths.long().cumsum(0), (1, 0))
-        steps = torch.zeros(int(starts[-1]), dtype=torch.int32, device=values.device)
+        steps = torch.zeros(int(starts[-1]), device=values.device)
         lights, to_values = empty(len(steps), device=values.device), torch.zeros_like(values)
         if len(origins):
             grid = (triton.cdiv(len(origins), BLOCK),)
@@ -240,7 +298,7 @@ class _BlockMarch(torch.autograd.Function):
             _march[grid](origins, directions, enter, leave, *ctx.given, values, *rest, NOTE=True, **ctx.options)
             grads = g_totals.contiguous(), g_distance.contiguous()
             noted = starts, steps, lights, to_values
-            given = origins, directions, enter, *ctx.given, values
+            given = origins, directions, *ctx.given, values
             _backward[grid](*grads, *given, *noted, *ctx.sizes, **ctx.options)
         return None, None, None, None, None, to_values, None
 

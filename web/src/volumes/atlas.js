@@ -4,7 +4,7 @@ import shader from "./atlas.glsl";
 import { grid, reader, table } from "./textures.js";
 
 export function atlas(settings, data, longest) {
-  const { grid: blocks, blocks: count, block, channels, voxel, cell, cells, network } = settings;
+  const { grid: blocks, blocks: count, block, channels, voxel, cell, cells, network, contracted } = settings;
   const side = block + 2;
   const read = reader(data);
   const index = read(Int32Array, blocks[0] * blocks[1] * blocks[2]);
@@ -21,10 +21,15 @@ export function atlas(settings, data, longest) {
     cell,
     atlas: shape,
   };
-  if (!network) return { uniforms, fragment: [shader] };
+  const fragment = [shader];
+  if (contracted) {
+    uniforms.ball = (blocks[0] * block) / 4;
+    fragment.unshift("#define CURVED");
+  }
+  if (!network) return { uniforms, fragment };
   const widths = [network[0].weights.length, ...network.map((layer) => layer.biases.length)];
   Object.assign(uniforms, { features: place(4), network: weights(network) });
-  return { uniforms, fragment: ["#define WIDTHS", "uniform highp sampler2D network;", seen(widths), shader] };
+  return { uniforms, fragment: ["#define WIDTHS", "uniform highp sampler2D network;", seen(widths), ...fragment] };
 }
 
 // Blocks along x, y and z of a texture that holds so many, none more than there may be along a side.
