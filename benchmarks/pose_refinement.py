@@ -38,8 +38,9 @@ class Options:
     methods: tuple[str, ...] = ("nerf", "instant-ngp", "gaussian-splatting")
     scenes: tuple[str, ...] = ("still-life", "courtyard")  # of `procedural:`
     seeds: tuple[int, ...] = (0,)
+    poses: tuple[str, ...] = POSES
     jitter: int = 2  # degrees, and percent of the extent
-    size: int = 100  # of the pictures, pixels
+    size: int = 200  # of the pictures, pixels
     views: int = 30
     steps: dict[str, int] = field(default_factory=lambda: dict(STEPS))  # of training, by method
     device: str = "cuda" if torch.cuda.is_available() else "cpu"
@@ -52,7 +53,7 @@ def main(options: Options) -> None:
     for scene in options.scenes:
         for seed in options.seeds:
             for name in options.methods:
-                rows += [trained(name, scene, seed, poses, options) for poses in POSES]
+                rows += [trained(name, scene, seed, poses, options) for poses in options.poses]
                 show(rows)
                 if options.output:
                     write_json(options.output, rows)
