@@ -25,6 +25,7 @@ from ...scene import Scene
 
 LONGEST = 800  # pixels of the longer side, to which larger photographs are reduced
 SHORTEST = 400  # to which smaller ones are enlarged: features have a size that pictures of 100 pixels lack
+MOST = 4.0  # times that a small one is enlarged
 FEATURES = 2000  # of a photograph, at most
 CONTRAST = 0.003  # of a feature's peak, at least
 RATIO = 0.8  # of the distances to the best and the second-best feature (Lowe 2004, section 7.1)
@@ -80,7 +81,7 @@ def features(photograph: Float[Tensor, "height width 3"], camera: Camera) -> See
     """Scale-invariant features (Lowe 2004) of a photograph, enlarged where it is small."""
     grey = (photograph.cpu() @ torch.tensor([0.299, 0.587, 0.114]))[None, None]
     longest = max(grey.shape[2:])
-    scale = min(1.0, LONGEST / longest) if longest > SHORTEST else SHORTEST / longest
+    scale = min(1.0, LONGEST / longest) if longest > SHORTEST else min(MOST, SHORTEST / longest)
     grey = interpolate(grey, scale_factor=scale, mode="bicubic", antialias=scale < 1)[0, 0].clamp(0, 1)
     places, found = finder().extract((255 * grey + 0.5).byte().contiguous().numpy())
     shrink = torch.tensor([camera.size[0, 0] / grey.shape[1], camera.size[0, 1] / grey.shape[0]])
