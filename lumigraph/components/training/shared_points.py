@@ -21,7 +21,7 @@ from torch.nn.functional import interpolate, normalize
 from ...camera import Camera
 from ...library import pycolmap
 from ...progress import track
-from ...scene import Scene
+from ...scene import Photograph, Scene
 
 LONGEST = 800  # pixels of the longer side, to which larger photographs are reduced
 SHORTEST = 400  # to which smaller ones are enlarged: features have a size that pictures of 100 pixels lack
@@ -77,9 +77,11 @@ def finder() -> Any:
         return pycolmap.Sift(options, pycolmap.Device.cpu)
 
 
-def features(photograph: Float[Tensor, "height width 3"], camera: Camera) -> Seen:
-    """Scale-invariant features (Lowe 2004) of a photograph, enlarged where it is small."""
-    grey = (photograph.cpu() @ torch.tensor([0.299, 0.587, 0.114]))[None, None]
+def features(photograph: Photograph) -> Seen:
+    """Scale-invariant features (Lowe 2004) of a photograph's trusted pixels, enlarged where it is small."""
+    photograph = photograph.to("cpu")
+    camera, mask = photograph.camera, photograph.mask
+    grey = (photograph.before(torch.full((3,), 0.5)) @ torch.tensor([0.299, 0.587, 0.114]))[None, None]
     longest = max(grey.shape[2:])
     scale = min(1.0, LONGEST / longest) if longest > SHORTEST else min(MOST, SHORTEST / longest)
     grey = interpolate(grey, scale_factor=scale, mode="bicubic", antialias=scale < 1)[0, 0].clamp(0, 1)
@@ -88,7 +90,11 @@ def features(photograph: Float[Tensor, "height width 3"], camera: Camera) -> See
     pixels = torch.from_numpy(np.array(places[:, :2], np.float32)) * shrink
     descriptors = torch.from_numpy(np.array(found, np.float32))
     descriptors = normalize(normalize(descriptors, p=1, dim=-1).sqrt(), dim=-1)
-    return Seen(camera.to("cpu").lens.unproject(pixels), descriptors)
+    if mask is not None:
+        x, y = pixels.long().unbind(-1)
+        trusted = mask[y.clamp(0, mask.shape[0] - 1), x.clamp(0, mask.shape[1] - 1)]
+        pixels, descriptors = pixels[trusted], descriptors[trusted]
+    return Seen(camera.lens.unproject(pixels), descriptors)
 
 
 def matched(a: Seen, b: Seen) -> Int[Tensor, "match 2"]:
@@ -133,10 +139,10 @@ def shared_points(scene: Scene) -> tuple[list[Seen], Matches]:
     """Features of the photographs to learn from, in the order of the split, and which of them are the same by pairs of
     photographs. Poses say only which to compare."""
     learnt = scene.splits["train"].tolist()
-    cameras, grey = scene.cameras[scene.splits["train"]].to("cpu"), torch.full((3,), 0.5)
+    cameras = scene.cameras[scene.splits["train"]].to("cpu")
     seen = [
-        features(scene.photograph(image).before(grey), cameras[i])
-        for i, image in enumerate(track(learnt, "Looking for points that photographs share", len(learnt)))
+        features(scene.photograph(image))
+        for image in track(learnt, "Looking for points that photographs share", len(learnt))
     ]
     pairs = neighbours(cameras) if len(learnt) > 1 else []
     compared = track(pairs, "Comparing photographs", len(pairs))
