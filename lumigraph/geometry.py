@@ -58,6 +58,15 @@ def turning(start: Float[Tensor, " 3"], end: Float[Tensor, " 3"]) -> Float[Tenso
     return eye + cross + cross @ cross / (1 + cosine)
 
 
+def rotated(vectors: Float[Tensor, "row 3"], omega: Float[Tensor, "row 3"]) -> Float[Tensor, "row 3"]:
+    """Each vector turned about an axis by its length in radians (Rodrigues); differentiable at zero as well."""
+    squared = omega.square().sum(-1, keepdim=True)
+    angle = squared.clamp_min(1e-12).sqrt()
+    once = torch.linalg.cross(omega, vectors)
+    twice = torch.linalg.cross(omega, once)
+    return vectors + angle.sin() / angle * once + (1 - angle.cos()) / angle.square() * twice
+
+
 def to_matrix(quaternions: Float[Tensor, "rotation 4"]) -> Float[Tensor, "rotation 3 3"]:
     """Rotation matrices of quaternions, which need not have unit length."""
     w, x, y, z = torch.nn.functional.normalize(quaternions, dim=-1).unbind(-1)

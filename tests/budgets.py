@@ -59,6 +59,7 @@ SHARES: dict[str, tuple[str, float]] = {
     "test_compress": ("runs, commands, benchmark", 15),
     "test_convert": ("runs, commands, benchmark", 15),
     "test_priors": ("nouns, capture", 20),
+    "test_shared_points": ("methods", 8),
     "test_memory": ("runs, commands, benchmark", 12),
     "test_nerf": ("methods", 16),
     "test_tensorf": ("methods", 5),

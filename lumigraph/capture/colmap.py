@@ -12,9 +12,9 @@ import torch
 
 from ..errors import LumigraphError
 from ..lens import Equirectangular, Fisheye, Lens, OpenCV, Pinhole
+from ..library import pycolmap
 from ..names import natural
 from .capture import Capture, Shot
-from .library import pycolmap
 from .pictures import reductions, versions
 from .points import SparsePoints, read_points3d
 

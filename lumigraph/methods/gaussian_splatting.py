@@ -237,7 +237,7 @@ class GaussianSplatting(Method):
         self._begin_with(found, scene.cameras[scene.splits["train"]])
         self._tell_apart(scene)
         if self.poses:
-            self.poses.begin(scene.cameras, scene.frame)
+            self.poses.find(scene)
 
     def _begin_with(self, found: Gaussians, cameras: Camera) -> None:
         """A first cloud, and what follows from the cameras that it will be learnt by."""

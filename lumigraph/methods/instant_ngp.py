@@ -175,7 +175,7 @@ class InstantNGP(RayMethod):
 
     def begin(self, scene: Scene, seconds: float = math.inf) -> None:
         if self.poses:  # silhouettes seen from wrong poses would carve what is there
-            self.poses.begin(scene.cameras, scene.frame)
+            self.poses.find(scene)
         elif scene.images.has_alpha and self.frame.reach == 1:
             self.occupancy.rule_out(visual_hull(scene, self.config.occupancy_resolution)[None])
         if self.unbounded and not self.poses:

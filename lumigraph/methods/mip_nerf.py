@@ -132,7 +132,7 @@ class MipNeRF(RayMethod):
 
     def begin(self, scene: Scene, seconds: float = math.inf) -> None:
         if self.poses:
-            self.poses.begin(scene.cameras, scene.frame)
+            self.poses.find(scene)
         else:  # silhouettes seen from wrong poses would carve what is there
             self.empty.begin(scene)
 

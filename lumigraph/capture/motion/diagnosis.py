@@ -11,9 +11,9 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial import ConvexHull, QhullError
 
+from ...library import pycolmap
 from ...names import natural
 from ..folds import in_steps, jumps
-from ..library import pycolmap
 from ..normalise import where_axes_meet
 from ..photos import Intake, Photo
 

@@ -11,7 +11,7 @@ from jaxtyping import Float
 
 from ...camera import Camera
 from ...lens import Pinhole
-from ..library import pycolmap
+from ...library import pycolmap
 from ..photos import Photo
 from ..up import common_up, turn_onto_z
 

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.cluster.vq import kmeans2, vq
 
-from ..library import pycolmap
+from ...library import pycolmap
 
 Matching = Literal["auto", "exhaustive", "sequential", "retrieval"]
 Pair = tuple[int, int]

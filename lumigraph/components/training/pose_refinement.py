@@ -9,15 +9,21 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from ...camera import Camera
+from ...geometry import rotated
 from ...rays import Rays
-from ...scene import Frame
+from ...scene import Frame, Scene
+from .bundle_adjustment import adjusted, pixel_angle, rotation_vector
 from .coarse_to_fine import ENDS, band_weights
 from .pose_adam import PoseAdam
 from .schedules import falling
+from .shared_points import shared_points
 
 PLACES = 16  # along each side of a picture, and as many depths: where its motion is measured
 DAMPING, LEAST = 0.1, 1e-8  # of the whitening, lambda and mu of Park 2023
 WARMUP = 0.2  # share of the budget in which poses' rate grows: at first nothing is there to be aligned with
+ACCURACY = 0.4  # pixels to which a feature's place is known
+TIED = 12  # matches for each photograph, fewer of which are not asked where cameras stand
+FINE = 0.1  # of the rate, where poses were found before the scene
 FALL = 0.02  # of the rate, that is left of it at the end of the budget
 
 
@@ -30,11 +36,13 @@ class PoseRefinement(nn.Module):
 
     learning_rate: radians that a step moves a picture by, at most
     progress:      share of the budget spent, by which `weights` lets bands of an encoding join
+    found:         whether points that photographs share told the poses to begin at, see `find`
     whitened:      whether `axes` are there; runs of version 0.1 learnt rotation and shift themselves
     """
 
     axes: Tensor
     progress: Tensor
+    found: Tensor
 
     def __init__(self, image_count: int, learning_rate: float = 1e-3):
         super().__init__()
@@ -42,12 +50,30 @@ class PoseRefinement(nn.Module):
         self.twist = nn.Parameter(torch.zeros(image_count, 6))
         self.register_buffer("axes", torch.eye(6).repeat(image_count, 1, 1))
         self.register_buffer("progress", torch.tensor(1.0))
+        self.register_buffer("found", torch.tensor(False))
 
     def begin(self, cameras: Camera, frame: Frame) -> None:
         """Choose the coordinates by what each camera sees. cameras: of photographs, by their `image_index`"""
         if cameras.image_index is not None:
             for i, image in enumerate(cameras.image_index.tolist()):
                 self.axes[image] = whitening(cameras[i], frame)
+
+    @torch.no_grad()
+    def find(self, scene: Scene) -> None:
+        """Begin at the poses that points say which photographs share, where these are enough; see `adjusted`."""
+        self.begin(scene.cameras, scene.frame)
+        given = scene.cameras[scene.splits["train"]].to("cpu")
+        seen, matches = shared_points(scene)
+        tied = sum(len(m) for m in matches.values()) >= TIED * len(given)
+        if given.image_index is None or not tied:
+            return
+        low, high = torch.tensor(scene.frame.bounds)
+        found = adjusted(given, seen, matches, float((high - low).max()), ACCURACY * pixel_angle(given[0]))
+        turn = rotation_vector(found.pose[:, :, :3] @ given.pose[:, :, :3].mT)
+        moves = torch.cat([turn, found.position - given.position], -1).to(self.twist.device)
+        image = given.image_index.to(self.twist.device)
+        self.twist[image] = torch.linalg.solve(self.axes[image].mT, moves)
+        self.found.fill_(True)
 
     @property
     def moves(self) -> Float[Tensor, "image 6"]:
@@ -80,22 +106,14 @@ class PoseRefinement(nn.Module):
 
     def rate(self, progress: float) -> float:
         """The learning rate at a share of the budget: it grows, then falls exponentially."""
-        return falling(self.learning_rate, FALL * self.learning_rate, progress, WARMUP)
+        highest = (FINE if self.found else 1.0) * self.learning_rate
+        return falling(highest, FALL * self.learning_rate, progress, WARMUP)
 
     def _load_from_state_dict(self, state_dict, prefix, *others) -> None:
         self.whitened = f"{prefix}axes" in state_dict
-        for name in ("axes", "progress"):  # which older runs lack: rotation and shift as they are, all bands
+        for name in ("axes", "progress", "found"):  # which older runs lack: rotation and shift as they are, all bands
             state_dict.setdefault(prefix + name, getattr(self, name))
         super()._load_from_state_dict(state_dict, prefix, *others)
-
-
-def rotated(vectors: Float[Tensor, "row 3"], omega: Float[Tensor, "row 3"]) -> Float[Tensor, "row 3"]:
-    """Each vector turned about an axis by its length in radians (Rodrigues); differentiable at zero as well."""
-    squared = omega.square().sum(-1, keepdim=True)
-    angle = squared.clamp_min(1e-12).sqrt()
-    once = torch.linalg.cross(omega, vectors)
-    twice = torch.linalg.cross(omega, once)
-    return vectors + angle.sin() / angle * once + (1 - angle.cos()) / angle.square() * twice
 
 
 def whitening(camera: Camera, frame: Frame) -> Float[Tensor, "6 6"]:

@@ -1,0 +1,165 @@
+"""Points that photographs share: scale-invariant features, compared, and kept where one motion between two views
+explains them."""
+
+from __future__ import annotations
+
+import math
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cache
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+from torch import Tensor
+from torch.nn.functional import interpolate, normalize
+
+from ...camera import Camera
+from ...library import pycolmap
+from ...progress import track
+from ...scene import Photograph, Scene
+
+LONGEST = 800  # pixels of the longer side, to which larger photographs are reduced
+SHORTEST = 400  # to which smaller ones are enlarged: features have a size that pictures of 100 pixels lack
+MOST = 4.0  # times that a small one is enlarged
+FEATURES = 2000  # of a photograph, at most
+CONTRAST = 0.003  # of a feature's peak, at least
+RATIO = 0.8  # of the distances to the best and the second-best feature (Lowe 2004, section 7.1)
+FARTHEST = 0.7  # angle between descriptors that may be the same, radians
+NEIGHBOURS = 16  # photographs that each one is compared with: those that look most alike by their poses
+SIDEWAYS = math.radians(75)  # between two views, beyond which they are not compared
+ERROR = 4.0  # of FOCAL, off the epipolar line that the two views' own best motion may leave
+FOCAL = 1000.0  # in which pixels of all lenses are compared
+FLAT = 0.1  # cosine off the axis, beyond which a picture has no flat plane
+FEWEST = 8  # matches of two views, fewer of which are chance
+
+
+@dataclass(frozen=True)
+class Seen:
+    """Features of one photograph.
+
+    bearings:    unit directions in the camera's own frame
+    descriptors: root-SIFT of unit length (Arandjelovic and Zisserman 2012)
+    """
+
+    bearings: Float[Tensor, "feature 3"]
+    descriptors: Float[Tensor, "feature 128"]
+
+
+@dataclass(frozen=True)
+class Tracks:
+    """Points that several photographs show, an observation to a row.
+
+    point, view: numbers of the point and of the photograph
+    bearing:     where the photograph shows it, a unit direction in its camera's own frame
+    """
+
+    point: Int[Tensor, " row"]
+    view: Int[Tensor, " row"]
+    bearing: Float[Tensor, "row 3"]
+
+
+Matches = dict[tuple[int, int], Int[Tensor, "match 2"]]  # features of both, by pairs of photographs
+
+
+@cache
+def finder() -> Any:
+    """COLMAP's finder of features on a CPU, silent, for pictures in memory."""
+    options = pycolmap.FeatureExtractionOptions()
+    options.use_gpu, options.num_threads, options.sift.max_num_features = False, 1, FEATURES
+    options.sift.peak_threshold, pycolmap.logging.minloglevel = CONTRAST, 1
+    with warnings.catch_warnings():  # its successor gives no arrays
+        warnings.simplefilter("ignore", DeprecationWarning)
+        return pycolmap.Sift(options, pycolmap.Device.cpu)
+
+
+def features(photograph: Photograph) -> Seen:
+    """Scale-invariant features (Lowe 2004) of a photograph's trusted pixels, enlarged where it is small."""
+    photograph = photograph.to("cpu")
+    camera, mask = photograph.camera, photograph.mask
+    grey = (photograph.before(torch.full((3,), 0.5)) @ torch.tensor([0.299, 0.587, 0.114]))[None, None]
+    longest = max(grey.shape[2:])
+    scale = min(1.0, LONGEST / longest) if longest > SHORTEST else min(MOST, SHORTEST / longest)
+    grey = interpolate(grey, scale_factor=scale, mode="bicubic", antialias=scale < 1)[0, 0].clamp(0, 1)
+    places, found = finder().extract((255 * grey + 0.5).byte().contiguous().numpy())
+    shrink = torch.tensor([camera.size[0, 0] / grey.shape[1], camera.size[0, 1] / grey.shape[0]])
+    pixels = torch.from_numpy(np.array(places[:, :2], np.float32)) * shrink
+    descriptors = torch.from_numpy(np.array(found, np.float32))
+    descriptors = normalize(normalize(descriptors, p=1, dim=-1).sqrt(), dim=-1)
+    if mask is not None:
+        x, y = pixels.long().unbind(-1)
+        trusted = mask[y.clamp(0, mask.shape[0] - 1), x.clamp(0, mask.shape[1] - 1)]
+        pixels, descriptors = pixels[trusted], descriptors[trusted]
+    return Seen(camera.lens.unproject(pixels), descriptors)
+
+
+def matched(a: Seen, b: Seen) -> Int[Tensor, "match 2"]:
+    """Features of two photographs that are each other's best, and clearly better than the second."""
+    none = torch.empty(0, 2, dtype=torch.int64)
+    if min(len(a.bearings), len(b.bearings)) < 2:
+        return none
+    alike = a.descriptors @ b.descriptors.T
+    best, there = alike.topk(2, -1)
+    angles = best.clamp(max=1).acos()
+    mine = torch.arange(len(alike))
+    good = (angles[:, 0] < FARTHEST) & (angles[:, 0] < RATIO * angles[:, 1]) & (alike.argmax(0)[there[:, 0]] == mine)
+    pairs = torch.stack([mine, there[:, 0]], -1)[good]
+    return one_motion(a, b, pairs) if len(pairs) >= FEWEST else none
+
+
+def one_motion(a: Seen, b: Seen, pairs: Int[Tensor, "match 2"]) -> Int[Tensor, "kept 2"]:
+    """The matches that one motion between two views explains (RANSAC on the essential matrix, Nister 2004); none where
+    they are so few that chance explains them too."""
+    ends = a.bearings[pairs[:, 0]], b.bearings[pairs[:, 1]]
+    ahead = (ends[0][:, 2] > FLAT) & (ends[1][:, 2] > FLAT)
+    pairs, (first, second) = pairs[ahead], [(FOCAL * end[:, :2] / end[:, 2:])[ahead].double().numpy() for end in ends]
+    options = pycolmap.RANSACOptions(max_error=ERROR, random_seed=0)
+    flat = pycolmap.Camera.create_from_model_name(1, "SIMPLE_PINHOLE", FOCAL, 1, 1)
+    flat.params = [FOCAL, 0.0, 0.0]
+    found = pycolmap.estimate_essential_matrix(first, second, flat, flat, options) if len(pairs) >= FEWEST else None
+    kept = pairs[torch.from_numpy(np.array(found["inlier_mask"]))] if found else pairs[:0]
+    return kept if len(kept) >= FEWEST else pairs[:0]
+
+
+def neighbours(cameras: Camera) -> list[tuple[int, int]]:
+    """Pairs of views that should show the same, by their poses: alike in direction, then in place."""
+    forward, apart = cameras.forward, torch.cdist(cameras.position, cameras.position)
+    turned = forward @ forward.T
+    alike = (turned - 0.1 * apart / apart.median().clamp_min(1e-9)).fill_diagonal_(-math.inf)
+    nearest = alike.topk(min(NEIGHBOURS, len(cameras) - 1)).indices.tolist()
+    pairs = {(min(i, j), max(i, j)) for i, others in enumerate(nearest) for j in others}
+    return sorted((i, j) for i, j in pairs if turned[i, j] > math.cos(SIDEWAYS))
+
+
+def shared_points(scene: Scene) -> tuple[list[Seen], Matches]:
+    """Features of the photographs to learn from, in the order of the split, and which of them are the same by pairs of
+    photographs. Poses say only which to compare."""
+    learnt = scene.splits["train"].tolist()
+    cameras = scene.cameras[scene.splits["train"]].to("cpu")
+    seen = [
+        features(scene.photograph(image))
+        for image in track(learnt, "Looking for points that photographs share", len(learnt))
+    ]
+    pairs = neighbours(cameras) if len(learnt) > 1 else []
+    compared = track(pairs, "Comparing photographs", len(pairs))
+    return seen, {(i, j): matched(seen[i], seen[j]) for i, j in compared}
+
+
+def tracks(seen: Sequence[Seen], matches: Matches) -> Tracks:
+    """Matches, joined to points; one that a photograph shows in two places is none."""
+    first = np.cumsum([0, *(len(one.bearings) for one in seen)])
+    ends = [(first[i] + m[:, 0].numpy(), first[j] + m[:, 1].numpy()) for (i, j), m in matches.items()]
+    rows, columns = (np.concatenate([end[k] for end in ends] or [np.zeros(0, int)]) for k in range(2))
+    graph = coo_matrix((np.ones(len(rows)), (rows, columns)), (first[-1], first[-1]))
+    _, label = connected_components(graph, directed=False)
+    view = np.repeat(np.arange(len(seen)), np.diff(first))
+    size = np.bincount(label, minlength=1)
+    views = np.bincount(np.unique(np.stack([label, view]), axis=1)[0], minlength=len(size))
+    kept = ((size > 1) & (size == views))[label]
+    _, point = np.unique(label[kept], return_inverse=True)
+    bearings = torch.cat([one.bearings for one in seen])[torch.from_numpy(kept)]
+    return Tracks(torch.from_numpy(point), torch.from_numpy(view[kept]), bearings)
