@@ -385,7 +385,8 @@ class SNeRG(RayMethod):
         rendering = self._pixel(seen, batch.rays.directions, background)
         residual, self.figures["mse"] = residuals(rendering, batch, background)
         if self._bounded and self.stage > FIELD:  # what lies beyond the box is not there to be learnt
-            residual = residual * (seen.opacity.detach() > SOLID)[:, None]
+            solid = seen.opacity.detach() > SOLID
+            residual = residual * solid.repeat(len(residual) // len(solid))[:, None]  # before two backgrounds, maybe
         delta = self.config.huber_delta
         huber = nn.functional.huber_loss(residual, torch.zeros_like(residual), delta=delta) / delta
         return {"huber": huber, **terms}

@@ -190,7 +190,7 @@ def _march(
         met += some.to(tl.int32)
         if CURVED:
             clear = tl.minimum(tl.minimum(_from_sides(x, bx, B), _from_sides(y, by, B)), _from_sides(z, bz, B))
-            out = (SURE * (clear + (B * (-1 - number)).to(tl.float32))).to(tl.int32)
+            out = ((clear + (B * (-1 - number)).to(tl.float32)) * SURE).to(tl.int32)
         else:
             away = tl.minimum(tl.minimum(_to_side(x, dx, bx, B), _to_side(y, dy, by, B)), _to_side(z, dz, bz, B))
             out = tl.ceil(tl.minimum(away, 1e9)).to(tl.int32)
