@@ -37,8 +37,8 @@ class Atlas:
     block:    voxels along a block's side, without the apron
     network:  None where the diffuse colour is all there is
     contracted: whether the grid is that of an open capture, all of it in the cube of [-2, 2]^3: places x beyond
-              the unit ball lie at (2 - 1 / |x|) x / |x| in it (Barron 2022, eq. 10), a step is a voxel long there, and alpha
-              is that of a ray straight outwards
+              the unit ball lie at (2 - 1 / |x|) x / |x| in it (Barron 2022, eq. 10), a step is a voxel long there,
+              and alpha is that of a ray straight outwards
     """
 
     index: Int[Tensor, "x y z"]
