@@ -29,9 +29,7 @@ def colour(points: torch.Tensor) -> torch.Tensor:
     return (0.4 + points / 2.4).clamp(0, 1)
 
 
-def baked(
-    frame: Frame | None = None, diffuse: bool = False, density: float = 1.0, field=ball, **numbers
-) -> Method:
+def baked(frame: Frame | None = None, diffuse: bool = False, density: float = 1.0, field=ball, **numbers) -> Method:
     """A method that holds the ball, so many times as dense; its small network says something, unless it is diffuse."""
     kind = methods.find("snerg")
     config = kind.Config(**{**vars(kind.smallest()), **numbers})

@@ -104,7 +104,9 @@ class Params:
             or max(abs(low + 2) for low in (self.min_x, self.min_y, self.min_z)) > 1e-3
             or to_scene[:3, 3].any()
         ):
-            raise LumigraphError("What is contracted fills the cube of [-2, 2]^3, and its grid does not; export it anew")
+            raise LumigraphError(
+                "What is contracted fills the cube of [-2, 2]^3, and its grid does not; export it anew"
+            )
         turn = to_scene[:3, :3]
         if sorted(np.abs(turn).ravel()) != [0] * 6 + [1] * 3 or np.linalg.det(turn) < 0:
             raise LumigraphError("worldspace_T_opengl turns by something other than right angles; bake it upright")
