@@ -36,9 +36,9 @@ class Atlas:
     voxel:    side of a voxel, in scene units
     block:    voxels along a block's side, without the apron
     network:  None where the diffuse colour is all there is
-    contracted: whether the grid is that of an open capture, all of it in the cube of [-2, 2]^3: places x beyond
-              the unit ball lie at (2 - 1 / |x|) x / |x| in it (Barron 2022, eq. 10), a step is a voxel long there,
-              and alpha is that of a ray straight outwards
+    contracted: whether the grid is the cube of [-2, 2]^3 and holds an open capture: places x beyond the unit ball lie
+              at (2 - 1 / |x|) x / |x| in it (Barron 2022, eq. 10), a step is a voxel long there, and alpha is that of
+              a ray straight out
     """
 
     index: Int[Tensor, "x y z"]
