@@ -6,7 +6,7 @@ import math
 import warnings
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import Annotated, Any, ClassVar, Literal, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple
 
 import torch
 from jaxtyping import Float
@@ -67,7 +67,7 @@ class Config(OpenNumbers):
     sparsity_weight: NonNegative = 1e-4  # lambda_s, section 4.2
     deferred_share: Annotated[float, between(0.05, 0.99)] = 0.9  # of the budget, ahead of baking
     voxel_share: Share = 0.0  # of what is left then, in which voxels learn too; afterwards the network alone does
-    whole: bool = True  # whether of an open capture all is baked, contracted, rather than its box of interest
+    whole: bool = False  # bake all of an open capture, contracted, rather than its box of interest; takes gigabytes
     resolution: Annotated[int, between(8, 2048)] = 1000  # voxels along the longest side, section 5.1; across the unit
     # ball of what is contracted, whose grid is twice as wide, and so are its cells of visibility
     block_size: Annotated[int, between(4, 66)] = 32  # voxels along a block's side, its apron included, section 5.1
@@ -149,7 +149,6 @@ class SNeRG(RayMethod):
     """A field learns from photographs; its values are baked into voxels; the small network learns on with those."""
 
     Config = Config
-    before: ClassVar[dict[str, Any]] = {"whole": False}
     rays_per_step: Tensor
     stage: Tensor
     began: Tensor
@@ -587,5 +586,5 @@ def slabs(x: int, y: int, z: int) -> Iterator[tuple[int, int]]:
 
 BOUNDED = (
     "SNeRG bakes what lies in the box of interest, as `lumigraph info` tells it; what lies beyond is learnt "
-    "beside it until then, and afterwards shows as the plain background"
+    "beside it until then, and afterwards shows as the plain background; --whole bakes all, in gigabytes"
 )

@@ -13,8 +13,8 @@ from ...errors import LumigraphWarning
 from ..common import needed, show
 
 CONTRACTED = (
-    "An open capture is baked in contracted coordinates, which Lumigraph opens again and SNeRG's viewer shows out of "
-    "shape; for that viewer train with --no-whole, which bakes the box of interest alone"
+    "This open capture was baked whole, in contracted coordinates, which Lumigraph opens again and SNeRG's viewer "
+    "shows out of shape; for that viewer train without --whole, which bakes the box of interest alone"
 )
 
 
@@ -22,8 +22,8 @@ CONTRACTED = (
 class ExportSnerg:
     """A baked run as the folder that SNeRG's own viewer opens: scene_params.json and slices of its atlas as PNG.
 
-    It lies in the scene's frame with +y up. A folder of that kind opens like a run, too. An open capture is contracted
-    (docs/methods/snerg.md), which other viewers do not undo; trained with --no-whole, it ends at its box of interest.
+    It lies in the scene's frame with +y up. A folder of that kind opens like a run, too. One baked with --whole
+    is contracted (docs/methods/snerg.md), which other viewers do not undo; without, it ends at its box of interest.
     """
 
     source: Annotated[Positional[Path], needed("RUN_OR_FOLDER")]
