@@ -38,7 +38,7 @@ def ball():
 @pytest.fixture(scope="module")
 def room():
     """What reaches beyond the box of interest, contracted."""
-    return tiny_atlas.baked(OPEN, field=tiny_atlas.room, resolution=60)
+    return tiny_atlas.baked(OPEN, field=tiny_atlas.room, resolution=60, whole=True)
 
 
 @pytest.fixture

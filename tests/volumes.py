@@ -181,7 +181,7 @@ def curved(rays: Rays, near: float, voxel: float, fine: int = 40) -> torch.Tenso
     gone = torch.nn.functional.pad(path.diff(dim=1).norm(dim=-1).cumsum(1), (1, 0))
     wanted = (torch.arange(int(gone[:, -1].max() / voxel)) * voxel).expand(len(gone), -1)
     # As the march does, half of a straight step ahead of the first.
-    wanted = wanted + torch.stack([torch.from_numpy(np.interp(near + voxel / 2, t, x)) for x in gone])[:, None].float()
+    wanted = wanted + torch.stack([torch.as_tensor(np.interp(near + voxel / 2, t, x)) for x in gone])[:, None].float()
     after = torch.searchsorted(gone, wanted.contiguous()).clamp(1, len(t) - 1)
     least, most = gone.gather(1, after - 1), gone.gather(1, after)
     share = ((wanted - least) / (most - least).clamp_min(1e-9)).clamp(0, 1)

@@ -80,6 +80,7 @@ class Config:
     filter_3d: bool = False  # Mip-Splatting's 3-D filter (Yu 2024, section 5.1)
     refine_cameras: bool = False  # learn where each photograph was taken from, small pictures first
     pose_learning_rate: LearningRate = 5e-3  # radians by which a step moves a picture, with refine_cameras
+    match_photographs: bool = False  # with refine_cameras, begin where features that photographs share say (slow)
     appearance: Literal["auto", "yes", "no"] = "auto"  # learn how each photograph's colours differ; auto: where they do
     own_skies: bool = True  # and in the open what shows behind everything, for each photograph
     appearance_lr: LearningRate = 5e-3  # of those changes of colour
@@ -237,7 +238,7 @@ class GaussianSplatting(Method):
         self._begin_with(found, scene.cameras[scene.splits["train"]])
         self._tell_apart(scene)
         if self.poses:
-            self.poses.find(scene)
+            self.poses.find(scene, self.config.match_photographs)
 
     def _begin_with(self, found: Gaussians, cameras: Camera) -> None:
         """A first cloud, and what follows from the cameras that it will be learnt by."""

@@ -67,6 +67,7 @@ class Config(OpenNumbers):
     exposure_correction: bool = False  # learn a gain per photograph
     refine_cameras: bool = False  # learn where each photograph was taken from, coarse to fine (Lin 2021, BARF)
     pose_learning_rate: LearningRate = 5e-4  # radians by which a step moves a picture, with refine_cameras
+    match_photographs: bool = False  # with refine_cameras, begin where features that photographs share say (slow)
     seed: Seed = 0
 
     def check(self) -> None:
@@ -175,7 +176,7 @@ class InstantNGP(RayMethod):
 
     def begin(self, scene: Scene, seconds: float = math.inf) -> None:
         if self.poses:  # silhouettes seen from wrong poses would carve what is there
-            self.poses.find(scene)
+            self.poses.find(scene, self.config.match_photographs)
         elif scene.images.has_alpha and self.frame.reach == 1:
             self.occupancy.rule_out(visual_hull(scene, self.config.occupancy_resolution)[None])
         if self.unbounded and not self.poses:

@@ -68,6 +68,7 @@ class Config:
     warmup: Share = 0.0  # share of the budget in which the learning rate grows
     refine_cameras: bool = False  # learn where each photograph was taken from, coarse to fine (Lin 2021, BARF)
     pose_learning_rate: LearningRate = 5e-4  # radians by which a step moves a picture, with refine_cameras
+    match_photographs: bool = False  # with refine_cameras, begin where features that photographs share say (slow)
     bfloat16: bool = True  # multiply in bfloat16 where the machine is fast at it
     seed: Seed = 0
 
@@ -159,7 +160,7 @@ class NeRF(RayMethod):
 
     def begin(self, scene: Scene, seconds: float = math.inf) -> None:
         if self.poses:
-            self.poses.find(scene)
+            self.poses.find(scene, self.config.match_photographs)
         else:  # silhouettes seen from wrong poses would carve what is there
             self.empty.begin(scene)
 

@@ -48,8 +48,9 @@ class SnergFolder(Opened):
         """The atlas, ready to render."""
         kind = methods.find("snerg")
         network = self.atlas.network
-        width = {} if network is None else {"view_width": len(network.biases[0])}
-        method = kind(self.frame, replace(kind.smallest(), block_size=self.atlas.block + 2, **width))
+        numbers = {} if network is None else {"view_width": len(network.biases[0])}
+        numbers |= {"block_size": self.atlas.block + 2, "whole": self.atlas.contracted}
+        method = kind(self.frame, replace(kind.smallest(), **numbers))
         method.take(self.atlas)
         return method.to(device).eval()
 

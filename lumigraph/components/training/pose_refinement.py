@@ -59,9 +59,12 @@ class PoseRefinement(nn.Module):
                 self.axes[image] = whitening(cameras[i], frame)
 
     @torch.no_grad()
-    def find(self, scene: Scene) -> None:
-        """Begin at the poses that points say which photographs share, where these are enough; see `adjusted`."""
+    def find(self, scene: Scene, matching: bool = True) -> None:
+        """Begin at the poses as given, or, with matching, at those that points say which photographs share, where these
+        are enough; see `adjusted`."""
         self.begin(scene.cameras, scene.frame)
+        if not matching:
+            return
         given = scene.cameras[scene.splits["train"]].to("cpu")
         seen, matches = shared_points(scene)
         tied = sum(len(m) for m in matches.values()) >= TIED * len(given)
