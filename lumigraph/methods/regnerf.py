@@ -168,7 +168,8 @@ class RegNeRF(RayMethod):
 
     def loss(self, batch: Any, step: int) -> dict[str, Tensor]:
         generator, unseen = self.random(step), batch.unseen
-        rays = batch.rays if unseen is None else joined(batch.rays, unseen)
+        rays = self.marcher.poses(batch.rays) if self.marcher.poses else batch.rays
+        rays = rays if unseen is None else joined(rays, unseen)
         looks, terms = self._look(rays, generator)
         background = backdrop(batch, self.background, generator)
         for look, weight in looks:
