@@ -1,5 +1,5 @@
 """Held-out photographs of one scene beside what several runs make of them, as a small JPEG: the pictures of
-docs/own-photographs.md.
+docs/own-photographs.md and docs/few-views.md.
 
     python benchmarks/side_by_side.py plain=RUN nerf-w=RUN --views 2 --output pair.jpg
 
@@ -19,7 +19,7 @@ from tyro.conf import Positional
 from lumigraph.choice import evenly
 from lumigraph.evaluate.halves import judged_by_halves, left_half
 from lumigraph.evaluate.light import LIGHT, in_light
-from lumigraph.figures import Row, contact_sheet
+from lumigraph.figures import Row, colour_depth, contact_sheet, depth_range
 from lumigraph.run import Run
 from lumigraph.scene import Scene
 
@@ -33,6 +33,7 @@ class Options:
     views: int = 2  # of the held-out ones, evenly spread
     only: tuple[int, ...] = ()  # or those with these numbers among the held-out ones
     scene: str | None = None  # where the photographs are now
+    depth: bool = False  # how far away what they show is, below
     title: str = ""
     width: int = 900  # of the picture, at most
 
@@ -48,12 +49,16 @@ def main(options: Options) -> None:
     rows = []
     for index in chosen:
         shot = scene.photograph(index, [name for name in (LIGHT,) if name in scene.layers])
-        pictures = [shot.rgb]
+        pictures, depths = [shot.rgb], []
         for method in methods.values():
             told = method.given(left_half(shot)) if judged_by_halves(method) else method
             seen = told.render(method.refined(shot.camera))
             pictures.append(in_light(seen, shot.extra[LIGHT])[0] if LIGHT in shot.extra else seen.rgb.clamp(0, 1))
+            depths.append((seen.depth, seen.opacity))
         rows.append(Row(scene.names[index], pictures))
+        if options.depth:
+            coloured = (colour_depth(*seen, depth_range(*seen)) for seen in depths)
+            rows.append(Row("depth, each by its own range", [torch.ones_like(shot.rgb), *coloured]))
     sheet = contact_sheet(options.title, ["photograph", *methods], rows).convert("RGB")
     sheet.thumbnail((options.width, 4 * options.width))
     for quality in range(85, 20, -5):

@@ -124,6 +124,14 @@ class CanCompress(Protocol):
         the rows that there are now."""
 
 
+@runtime_checkable
+class CanDraw(Protocol):
+    """Knows what objects of a category are like, so that it can make one up."""
+
+    def drawn(self, seed: int) -> Any:
+        """The method as it shows an object that nobody has photographed, drawn at random by a seed."""
+
+
 LACKING = {
     HasDensity: "holds no density at points; what is made of it comes from its renderings instead",
     HasField: "holds no density and colour at points, so it can be neither baked nor converted",
@@ -134,6 +142,7 @@ LACKING = {
     HasGaussians: "holds no Gaussians, so no splats can be made of it; train gaussian-splatting",
     CanPrune: "cannot learn on with fewer Gaussians; write a splat file instead, by an --output that ends in .ply",
     HasMesh: "is no mesh; `lumigraph export mesh` makes one of what it renders",
+    CanDraw: "knows scenes by their photographs and draws none of its own; name a scene, or a prior of hyp-nerf",
     CanCompress: "cannot be stored in fewer bytes; methods of grids, hash tables and Gaussians can",
     HasLooks: "takes no samples along rays, so there is nothing to draw of one",
 }

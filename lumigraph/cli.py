@@ -18,6 +18,7 @@ import tyro
 
 from . import __version__, methods
 from .commands.bench import Bench
+from .commands.canonicalise import Canonicalise
 from .commands.capture import CaptureCommand
 from .commands.clean import Clean
 from .commands.common import say
@@ -36,6 +37,7 @@ from .commands.render import Render
 from .commands.report import Report
 from .commands.resume import Resume
 from .commands.train import Train, with_options_of
+from .commands.train_blocks import IN_BLOCKS, with_options_of_blocks
 from .commands.view import ViewCommand
 from .errors import LumigraphError, LumigraphWarning
 from .files import refusal
@@ -53,6 +55,7 @@ COMMANDS: dict[str, type] = {
     "view": ViewCommand,
     "clean": Clean,
     "compose": Compose,
+    "canonicalise": Canonicalise,
     "compress": Compress,
     "convert": Convert,
     "export": Export,
@@ -147,6 +150,8 @@ def with_method(command: type, arguments: list[str]) -> type:
     if not named:
         return command
     device, preset = value_of("--device", arguments, "auto"), value_of("--preset", arguments, "auto")
+    if command is Train and methods.check(named[0]) == IN_BLOCKS:
+        return with_options_of_blocks(value_of("--field", arguments, ""), device, preset)
     return with_options_of(named[0], device, preset, command)
 
 

@@ -78,19 +78,16 @@ def to_matrix(quaternions: Float[Tensor, "rotation 4"]) -> Float[Tensor, "rotati
     return torch.stack([torch.stack(row, -1) for row in rows], -2)
 
 
-def to_quaternion(rotation: Float[Tensor, "3 3"]) -> Float[Tensor, " 4"]:
-    """Unit quaternion of a rotation matrix: the eigenvector of Bar-Itzhack's matrix (2000, eq. 4)."""
-    (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = rotation.double().tolist()
-    matrix = torch.tensor(
-        [
-            [xx + yy + zz, zy - yz, xz - zx, yx - xy],
-            [zy - yz, xx - yy - zz, xy + yx, xz + zx],
-            [xz - zx, xy + yx, yy - xx - zz, yz + zy],
-            [yx - xy, xz + zx, yz + zy, zz - xx - yy],
-        ],
-        dtype=torch.float64,
-    )
-    return torch.linalg.eigh(matrix).eigenvectors[:, -1]
+def to_quaternion(rotation: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 4"]:
+    """Unit quaternions of rotation matrices: eigenvectors of Bar-Itzhack's matrix (2000, eq. 4)."""
+    (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = (row.unbind(-1) for row in rotation.double().unbind(-2))
+    rows = [
+        [xx + yy + zz, zy - yz, xz - zx, yx - xy],
+        [zy - yz, xx - yy - zz, xy + yx, xz + zx],
+        [xz - zx, xy + yx, yy - xx - zz, yz + zy],
+        [yx - xy, xz + zx, yz + zy, zz - xx - yy],
+    ]
+    return torch.linalg.eigh(torch.stack([torch.stack(row, -1) for row in rows], -2)).eigenvectors[..., -1]
 
 
 def multiply(a: Float[Tensor, "#rotation 4"], b: Float[Tensor, "#rotation 4"]) -> Float[Tensor, "rotation 4"]:

@@ -30,7 +30,7 @@ Sum = tuple[int, str]  # bytes, SHA-256
 Kind = Literal[
     "film", "film of depth", "pictures of a film", "cameras of a film", "camera path", "composition",
     "page", "splats", "octree", "atlas", "points", "mesh", "panorama", "comparison",
-    "evaluation", "rendering", "report", "figure", "benchmark", "capture", "masks", "file",
+    "evaluation", "rendering", "report", "figure", "benchmark", "capture", "masks", "canonical", "file",
 ]  # fmt: skip
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
+from .capabilities import CanDraw, needs
 from .collection import Collection
 from .errors import LumigraphError
 from .memory import ask_for, room_for
@@ -33,7 +34,7 @@ class Prior:
         return Prior(method)
 
     def infer(self, scene: Scene) -> Method:
-        """An ordinary method of one scene, told its photographs to learn from. Learns nothing.
+        """An ordinary method of one scene, told its photographs to learn from. The prior itself learns nothing.
 
         Raises LumigraphError where memory does not hold what there is to find in so many photographs.
         """
@@ -43,3 +44,8 @@ class Prior:
         less = f"give fewer --views; {fits} would fit" if fits else "give a larger --downscale"
         ask_for(size, device, f"Looking at {views} photographs of {scene.source}", less)
         return self.method.given(scene)
+
+    def draw(self, seed: int) -> Method:
+        """An ordinary method of an object that nobody has photographed. Raises LumigraphError for a prior that draws
+        none."""
+        return needs(self.method, CanDraw).drawn(seed)

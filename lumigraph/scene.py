@@ -252,18 +252,24 @@ class Scene:
         return self.layers[name]
 
     def sample_rays(
-        self, count: int, generator: torch.Generator, split: str = "train", layers: Sequence[str] = ()
+        self,
+        count: int,
+        generator: torch.Generator,
+        split: str = "train",
+        layers: Sequence[str] = (),
+        places: bool = False,
     ) -> Batch:
         """Random pixels of random photographs: photographs evenly, then their trusted pixels evenly.
 
         layers: names of what else to tell of these pixels, in `Batch.extra`. Raises LumigraphError if there is no such
+        places: whether to tell where on their pictures they lie, as shares of width and height, in `extra["place"]`
         """
         chosen = self.splits[split]
         drawn = self.images.draw(count, chosen, generator, positions=bool(layers))
         rays = self.cameras.rays(drawn.xy, drawn.image)
         rgb = drawn.rgba[:, :3].float().div_(255)
         alpha = drawn.rgba[:, 3].float().div_(255) if self.images.has_alpha else None
-        extra = {}
+        extra = {"place": drawn.xy / self.cameras.size[drawn.image]} if places else {}
         for name in layers:
             layer = self.layer(name)
             assert drawn.position is not None

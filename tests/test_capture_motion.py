@@ -26,7 +26,8 @@ from lumigraph.capture.motion import Options, diagnosis, reconstruct, reconstruc
 from lumigraph.capture.motion.diagnosis import Matches, coverage, folds, read_matches, why_not
 from lumigraph.capture.motion.georeference import georeference, upright
 from lumigraph.capture.motion.lenses import group_by_lens, prior
-from lumigraph.capture.motion.pairs import alike, choose_matching, exhaustive, likeness, sequential
+from lumigraph.capture.motion.pairs import aggregated, alike, choose_matching, exhaustive, sequential
+from lumigraph.capture.motion.pairs import near as near_by
 from lumigraph.capture.motion.reconstruction import Reconstruction
 from lumigraph.capture.motion.stages import WORKER, Stages, key_of
 from lumigraph.capture.photos import Intake, Photo
@@ -367,10 +368,25 @@ def test_photographs_of_one_place_are_alike():
         np.clip(places[i % 3][chance.permutation(300)[:200]] + chance.normal(0, 4, (200, 128)), 0, 255).astype(np.uint8)
         for i in range(12)
     ]
-    similar = likeness(photos)
+    similar = aggregated(photos)
     assert all((i - j) % 3 == 0 for i, j in alike(similar, 3))
     assert all(abs(i - j) >= 6 for i, j in alike(similar, 3, apart=6))
-    assert np.isfinite(likeness([np.zeros((0, 128), np.uint8), *photos])).all()
+    assert np.isfinite(aggregated([np.zeros((0, 128), np.uint8), *photos])).all()
+
+
+def test_pairs_of_many_photographs_are_found_a_block_at_a_time(monkeypatch):
+    """The same as all of them at once; and by place, those whose place is known."""
+    random = np.random.default_rng(0)
+    vectors, places = random.normal(size=(50, 6)).astype(np.float32), random.normal(size=(50, 3))
+    whole = alike(vectors, 4, apart=3)
+    monkeypatch.setattr("lumigraph.capture.motion.pairs.BLOCK", 7)
+    assert alike(vectors, 4, apart=3) == whole and all(j - i >= 3 for i, j in whole)
+    places[[3, 20]] = np.nan
+    away = np.linalg.norm(places[:, None] - places, axis=-1)
+    np.fill_diagonal(away, np.nan)
+    expected = {(min(i, j), max(i, j)) for i in range(50) if i not in (3, 20) for j in np.argsort(away[i])[:5].tolist()}
+    assert near_by(places, 5) == expected
+    assert near_by(np.full((4, 3), np.nan)) == set()
 
 
 def test_a_fold_is_a_jump():

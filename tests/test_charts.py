@@ -8,7 +8,7 @@ from xml.etree import ElementTree
 
 import pytest
 
-from lumigraph.benchmark.pictures import curves
+from lumigraph.benchmark.curves import curves
 from lumigraph.figures.charts import (
     COLOURS,
     DASHES,

@@ -14,7 +14,7 @@ import tiny_shapes
 import torch
 
 from lumigraph import methods
-from lumigraph.capture import kind_of, open_dataset
+from lumigraph.capture import kind_of, meshes, open_dataset
 from lumigraph.cli import main
 from lumigraph.collection import Collection
 from lumigraph.dataset import Dataset
@@ -128,6 +128,20 @@ def test_a_mesh_that_is_inside_out_is_turned(tmp_path):
     ball.export(tmp_path / "ball.off")
     shape = open_dataset(tmp_path / "ball.off").members[0]
     assert shape.closed and shape.distance(torch.zeros(1, 3)).item() < -0.8
+
+
+def test_a_material_is_the_colour_of_what_has_no_texture(tmp_path):
+    """Two triangles without texture coordinates, each of a material of its own."""
+    corners = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nv 1 0 1\nv 0 1 1\n"
+    (tmp_path / "two.obj").write_text(f"mtllib two.mtl\n{corners}usemtl red\nf 1 2 3\nusemtl blue\nf 4 5 6\n")
+    (tmp_path / "two.mtl").write_text("newmtl red\nKd 0.8 0.2 0.0\n\nnewmtl blue\nKd 0.0 0.4 1.0\n")
+    mesh = meshes.read_shape(tmp_path / "two.obj", "two").mesh
+    red, blue = (mesh.vertices[(mesh.colours == colour).all(-1)] for colour in ((204, 51, 0), (0, 102, 255)))
+    assert len(red) == len(blue) == 3
+    assert np.ptp(red[:, 1]) < 1e-6 and np.ptp(blue[:, 1]) < 1e-6  # the file's z, which is up no more
+    assert red[0, 1] > blue[0, 1] + 0.1
+    (tmp_path / "two.mtl").unlink()
+    assert (meshes.read_shape(tmp_path / "two.obj", "two").mesh.colours == 160).all()
 
 
 @pytest.mark.parametrize("content", ["", "v 0 0 0\n", "v 1 1 1\nv 1 1 1\nv 1 1 1\nf 1 2 3\n", "v a b c\nf 1 2 3\n"])

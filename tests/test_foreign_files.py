@@ -37,6 +37,7 @@ WRITES: dict[str, tuple[str, tuple[str, ...]]] = {
     "export points": ("export points ball p.ply", ("p.ply",)),
     "export splats": ("export splats gs s.spz", ("s.spz",)),
     "export splats, a folder": ("export splats gs open/meta.json", ("open/",)),
+    "export splats, levels of detail": ("export splats gs city --lod", ("city/",)),
     "export snerg": ("export snerg gs atlas", ("atlas/",)),
     "export mesh": ("export mesh ball m.glb", ("m.glb",)),
     "export panorama": ("export panorama ball sphere.png", ("sphere.png",)),
@@ -46,6 +47,7 @@ WRITES: dict[str, tuple[str, tuple[str, ...]]] = {
     "compress": ("compress gs --output small", ("small/", "small")),
     "convert": ("convert ball plenoxels --output other --steps 1 --distil", ("other/", "other")),
     "compose": ("compose gs gs --output two.json", ("two.json",)),
+    "canonicalise": ("canonicalise . --output alike", ("alike/", "alike")),
     "report": ("report ball", ("ball/report.html",)),
     "eval": ("eval ball --scene photographs", ("ball/eval.json", "ball/eval.png")),
     "eval, pictures": ("eval ball --scene photographs --save-images", ("ball/eval/ball_4.png",)),
@@ -60,6 +62,10 @@ WRITES: dict[str, tuple[str, tuple[str, ...]]] = {
     ),
     "infer": ("infer prior photographs --output found", ("found/", "found", "found/lock.json")),
     "train": ("train voxel-grid photographs --steps 1 --output learnt", ("learnt/", "learnt", "learnt/lock.json")),
+    "train, in blocks": (
+        "train block-nerf photographs --field voxel-grid --blocks 2 --steps 2 --output parts",
+        ("parts/", "parts", "parts/lock.json"),
+    ),
     "demo": ("demo --seconds 1 --output shown", ("shown/", "shown")),
     "capture": ("capture photographs --output placed", ("placed/",)),
 }

@@ -11,7 +11,8 @@ import torch
 
 from lumigraph.capabilities import HasDensity, HasField, HasLooks, can
 from lumigraph.components.fields.appearance import PhotographCodes, fitted
-from lumigraph.components.fields.wild_field import Passing, Places, with_passing
+from lumigraph.components.fields.coded_field import Places
+from lumigraph.components.fields.wild_field import Passing, with_passing
 from lumigraph.controls import Control
 from lumigraph.errors import LumigraphError
 from lumigraph.evaluate import evaluate

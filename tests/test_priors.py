@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 
 import pytest
@@ -65,6 +66,45 @@ def test_a_prior_makes_an_ordinary_run(prior, ball_folder, tmp_path, capsys):
     assert torch.equal(run.method().render(camera).rgb, told.render(camera).rgb)
     assert main(["info", str(found)]) == 0
     assert str(prior.folder.name) in said(capsys, "resume", found, "--steps", 3)
+
+
+@pytest.fixture(scope="module")
+def three(ball_folder, tmp_path_factory):
+    """A folder of three photographs whose source says nothing of which are for testing."""
+    place = tmp_path_factory.mktemp("three") / "photographs"
+    shutil.copytree(ball_folder, place, ignore=shutil.ignore_patterns("transforms_*.json", "test"))
+    said_so = json.loads((ball_folder / "transforms_train.json").read_text())
+    (place / "transforms.json").write_text(json.dumps(said_so | {"frames": said_so["frames"][:3]}))
+    return place
+
+
+def test_three_photographs_are_all_looked_at(prior, three, tmp_path, capsys):
+    """Where there are no more than a prior takes, none is held out; a run of them opens and evaluates as any other."""
+    found, asked = tmp_path / "found", tmp_path / "asked"
+    takes = prior.method().evidence_views
+    assert main(["infer", str(prior.folder), str(three), "--output", str(found)]) == 0
+    told = capsys.readouterr().out
+    looked_at = 2 if takes == 2 else 3  # what pixelnerf's smallest learnt with
+    assert f"{looked_at} photographs" in told and ("held out" in told) == (looked_at == 3)
+    assert Run(found).settings.splits["train"] == looked_at
+    assert main(["infer", str(prior.folder), str(three), "--views", "3", "--output", str(asked)]) == 0
+    assert "3 photographs" in capsys.readouterr().out and Run(asked).settings.splits["train"] == 3
+    assert main(["eval", str(asked)]) == 0
+    assert "cannot be 4" in said(capsys, "infer", prior.folder, three, "--views", 4, "--output", tmp_path / "no")
+
+
+def test_what_a_source_holds_out_stays_held_out(three, tmp_path, capsys):
+    """As Blender's and nerfstudio's lists do."""
+    place = tmp_path / "published"
+    shutil.copytree(three, place)
+    said_so = json.loads((place / "transforms.json").read_text())
+    names = [frame["file_path"] for frame in said_so["frames"]]
+    (place / "transforms.json").write_text(
+        json.dumps(said_so | {"train_filenames": names[:2], "test_filenames": names[2:]})
+    )
+    prior = prior_run(tmp_path / "prior")
+    assert main(["infer", str(prior.folder), str(place), "--output", str(tmp_path / "found")]) == 0
+    assert "2 photographs" in capsys.readouterr().out
 
 
 def test_evaluation_shows_no_more_than_was_learnt_with(tmp_path):
@@ -149,6 +189,13 @@ def test_a_category_is_a_collection_and_a_member_a_scene():
     assert torch.equal(member.images[0], alone.images[0]) and member.frame.bounds == data["toys-0001"].frame.bounds
     assert not torch.equal(member.images[0], data["toys-0004"].images[0])
     assert member.frame.reach == 1 and member.frame.has_alpha
+
+
+def test_a_folder_of_a_categorys_name_stands_in_nobodys_way(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "toys").mkdir()
+    assert kind_of("procedural:toys") is Collection and kind_of("procedural:toys,member=3") is Scene
+    assert kind_of("procedural:./toys") is Collection
 
 
 @pytest.mark.parametrize("name", ["toys", "chairs", "cars"])

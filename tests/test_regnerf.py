@@ -12,6 +12,9 @@ import torch
 from lumigraph.components.training.patch_flow import SIDE, PatchFlow, photographed
 from lumigraph.components.training.unseen_views import patches, roughness, unseen_cameras
 from lumigraph.geometry import nearest_to_lines, unit
+from lumigraph.methods.instant_ngp import Config as NgpConfig
+from lumigraph.methods.instant_ngp import InstantNGP
+from lumigraph.methods.mip_nerf import Config as MipConfig
 from lumigraph.methods.regnerf import RegNeRF
 from lumigraph.run import build
 
@@ -107,6 +110,17 @@ def test_it_tells_photographs_from_noise(monkeypatch):
     assert flow(known).median() < flow(shuffled).median() - 0.5
 
 
+def test_a_flow_stops_when_its_seconds_are_over(monkeypatch):
+    from lumigraph.components.training import patch_flow
+
+    monkeypatch.setattr(patch_flow, "PATCHES", 256)
+    short, long = PatchFlow(), PatchFlow()
+    short.learn(tiny.scene(), 5, chance(), seconds=0.0)
+    long.learn(tiny.scene(), 5, chance())
+    last = [flow.couplings[0].network[-1].weight.abs().max() for flow in (short, long)]
+    assert last[0] == 0 < last[1]
+
+
 @pytest.mark.parametrize("field", ["network", "hash"])
 def test_a_step_learns_from_patches_nobody_photographed(field):
     scene = tiny.scene()
@@ -117,10 +131,33 @@ def test_a_step_learns_from_patches_nobody_photographed(field):
     batch = method.batch(scene, chance())
     assert batch.unseen is not None and len(batch.unseen) == 2 * SIDE**2
     terms = method.loss(batch, 0)
-    assert {"depth", "likelihood"} <= terms.keys()
-    (terms["depth"] + terms["likelihood"]).backward()
+    assert {"smoothness", "likelihood"} <= terms.keys()
+    (terms["smoothness"] + terms["likelihood"]).backward()
     moved = [p for p in method.marcher.parameters() if p.grad is not None and p.grad.any()]
     assert moved and all(p.grad is None for p in method.flow.parameters())
+
+
+def test_a_table_has_numbers_of_its_own():
+    """It learns five times as fast as a network, and the networks behind it are smaller."""
+    config = RegNeRF.preset(torch.device("cpu"))
+    table, network = config.numbers_of(NgpConfig), config.numbers_of(MipConfig)
+    known = InstantNGP.preset(torch.device("cpu"))
+    assert (table.learning_rate, table.hidden_width) == (known.learning_rate, known.hidden_width) == (2e-2, 32)
+    assert (network.learning_rate, network.hidden_width) == (4e-3, 128)
+    assert (table.levels, table.samples_per_step) == (known.levels, known.samples_per_step)
+    assert table.depth_weight == known.depth_weight != config.depth_weight  # of plane sweeps; ours is of roughness
+
+
+def test_what_plane_sweeps_found_counts_beside_what_is_smooth():
+    """In the open a table has a term "depth" of its own."""
+    scene = tiny.scene()
+    frame = replace(scene.frame, reach=4.0, has_alpha=False)
+    config = replace(RegNeRF.smallest(), field="hash", samples_per_step=1024, levels=4, log2_hashmap_size=11)
+    method = build(RegNeRF, frame, config, torch.device("cpu"), 0)
+    method.marcher.unbounded.begin_at(torch.tensor([[0.0, 0.0, 0.1]]).repeat(8, 1), scene.cameras.position[:8])
+    method.before_step(0, 0.0)
+    terms = method.loss(method.batch(scene, chance()), 0)
+    assert {"depth", "smoothness"} <= terms.keys() and float(terms["depth"].detach()) > 0
 
 
 def test_samples_spread_from_the_middle():

@@ -7,10 +7,9 @@ import math
 import pytest
 import torch
 
-from lumigraph.components.sampling.frustums import frustum_moments
+from lumigraph.components.sampling.frustums import blurred, frustum_moments
 from lumigraph.components.sampling.occupancy_mask import OccupancyMask
 from lumigraph.components.sampling.sampling import inverse_transform, stratified
-from lumigraph.methods.mip_nerf import blurred
 
 
 def test_one_in_each_bin(generator):

@@ -38,7 +38,7 @@ def ball():
 @pytest.fixture(scope="module")
 def room():
     """What reaches beyond the box of interest, contracted."""
-    return tiny_atlas.baked(OPEN, field=tiny_atlas.room, resolution=60, whole=True)
+    return tiny_atlas.baked(OPEN, field=tiny_atlas.room, resolution=120, whole=True)
 
 
 @pytest.fixture
@@ -242,6 +242,25 @@ def test_runs_from_before_end_at_their_box(tmp_path):
     assert text["config"].pop("whole") is False
     path.write_text(json.dumps(text))
     assert Run(run.folder).new_method("cpu").voxels.space is None
+
+
+def test_voxels_that_no_ray_meets_are_dropped_and_nobody_sees_it():
+    """Of an opaque ball its inside; of a haze, that rays pass through, nothing."""
+    for density, hidden in ((100.0, True), (1.0, False)):
+        method = tiny_atlas.baked(diffuse=True, density=density, rays_per_step=1 << 16)
+        camera = tiny.scene().photograph(0).camera
+        rays = camera.rays(camera.pixels())
+        optimizer = method.optimizers()[0]
+        for group in optimizer.param_groups:
+            group["lr"] = 0.0
+        before, count = method.render_rays(rays, method.background), len(method.voxels)
+        before.rgb.sum().backward()
+        optimizer.step()
+        method._drop_hidden()
+        after = method.render_rays(rays, method.background)
+        assert torch.equal(before.rgb, after.rgb)
+        assert len(method.voxels) == len(method.tuned.values)
+        assert (len(method.voxels) < 0.8 * count) if hidden else (len(method.voxels) > 0)
 
 
 class OnlySeen:

@@ -17,7 +17,7 @@ from lumigraph.blending import over
 from lumigraph.components.clouds.tidying import CLOSE, GIANT, NEEDLE, before_a_lens, confined, nearest_camera
 from lumigraph.components.clouds.witnesses import FEWEST, MARKS, hold_back, marked, witnesses
 from lumigraph.components.fields.affine_colours import changed, changed_harmonics, found
-from lumigraph.components.fields.own_sky import mean_skies, sky
+from lumigraph.components.fields.own_sky import backdrop_loss, mean_skies, sky
 from lumigraph.components.training.lights import spread_of_light
 from lumigraph.components.training.trimming import BINS, KEPT, Trimming, inliers
 from lumigraph.errors import LumigraphError, LumigraphWarning
@@ -128,6 +128,37 @@ def test_each_photograph_has_a_sky_of_its_own():
         method.appearance.codes[1, 12:] *= 0.5  # what the search begins with
     found = method.given(shot).render(camera).rgb
     assert (found - weather).abs().mean() < 0.25 * (method.render(camera).rgb - weather).abs().mean()
+
+
+def test_a_sky_learns_from_what_a_mask_leaves_out_where_nothing_stands():
+    shot = tiny.scene().photograph(1)
+    height, width = shot.rgb.shape[:2]
+    mask = torch.zeros(height, width, dtype=torch.bool)
+    mask[:, : width // 2] = True
+    opacity = torch.zeros(height, width, requires_grad=True)
+    behind = (shot.rgb + 0.1).requires_grad_()
+    loss = backdrop_loss(behind, replace(shot, mask=mask), opacity)
+    assert float(loss) == pytest.approx(0.1 * float((~mask).float().mean()), rel=1e-4)
+    loss.backward()
+    assert opacity.grad is None and not behind.grad[mask].any() and (behind.grad[~mask] > 0).all()
+    assert float(backdrop_loss(behind, replace(shot, mask=mask), torch.ones(height, width))) == 0
+    assert float(backdrop_loss(behind, replace(shot, mask=None), opacity)) == 0
+
+
+def test_a_sky_that_no_pixel_sees_stays_as_it_was(generator):
+    """A pixel in a hundred that it shines through sways it little."""
+    start = torch.cat([torch.zeros(12), torch.randn(27, generator=generator)])
+    rgb, opacity = torch.rand(500, 3, generator=generator), torch.ones(500)
+    opacity[:5] = 0.5
+
+    def picture(told):
+        behind = sky(told[12:], tiny.scene().cameras[0]).view(-1, 3)[:500]
+        return over(changed(rgb * opacity[:, None], opacity, told), opacity, behind)
+
+    target = picture(start).detach()
+    target[:5] = torch.tensor([1.0, 0.0, 1.0])
+    told = found(start, picture, target)
+    assert (told - start)[12:].abs().max() < 0.2
 
 
 def test_without_it_nothing_is_told():

@@ -9,10 +9,14 @@ from typing import Any
 
 from .. import files
 from ..budget import Budget
+from ..capture import requested
+from ..capture.procedural import is_category
 from ..errors import LumigraphError
 from ..run import Run
+from ..run.inferred import Inferred
 
 SHEET = "views.png"
+MEMBERS = "-members"  # behind a collection's name: its members, averaged
 
 
 @dataclass(frozen=True)
@@ -39,9 +43,12 @@ class Settings:
 class Cell:
     """A method, what it learns, and for how long: seconds or steps.
 
-    scene:  its short name, the same for all cells of the scene
-    source: where it is
-    views:  photographs to learn from; None for all
+    scene:      its short name, the same for all cells of the scene
+    source:     where it is
+    views:      photographs to learn from; None for all
+    collection: the name of the one whose member the scene is, with which it is averaged
+    prior:      the run that makes the cell's out of so many photographs, which learns nothing; its budget is then that
+                of the cells beside it
     """
 
     method: str
@@ -50,17 +57,28 @@ class Cell:
     budget: Budget
     seed: int = 0
     views: int | None = None
+    collection: str = ""
+    prior: str | None = None
 
     @property
     def name(self) -> str:
         """The cell's name for folders, unique among cells that share their settings."""
         views = "" if self.views is None else f"-{self.views}views"
+        if self.prior:
+            return f"{self.scene}-{self.method}{views}-by-{Path(self.prior).name}"
         return f"{self.scene}-{self.method}{views}-{duration(self.budget).replace(' ', '')}-seed{self.seed}"
+
+    @property
+    def seconds(self) -> float:
+        """What is known of how long it learns; 0 where nothing is."""
+        return 0.0 if self.prior else self.budget.seconds or 0.0
 
     @property
     def title(self) -> str:
         """The cell's name for people."""
         views = "" if self.views is None else f" from {self.views} views"
+        if self.prior:
+            return f"{self.method} on {self.scene}{views}, by {Path(self.prior).name}"
         return f"{self.method} on {self.scene}{views}, {duration(self.budget)}, seed {self.seed}"
 
 
@@ -76,18 +94,26 @@ def training(cell: Cell, folder: Path, settings: Settings) -> list[str]:
 
 
 def train_command(cell: Cell, settings: Settings) -> list[str]:
+    downscale = reduced(cell.source, settings.downscale)
+    opened = {"--views": cell.views, "--downscale": downscale, "--reader": settings.reader}
+    if cell.prior:
+        return ["infer", cell.prior, cell.source, *options(opened | {"--device": settings.device})]
     told = {
         "--seconds": cell.budget.seconds,
         "--steps": cell.budget.steps,
         "--seed": cell.seed,
-        "--views": cell.views,
-        "--downscale": settings.downscale,
-        "--reader": settings.reader,
+        **opened,
         "--scales": settings.scales if settings.scales > 1 else None,
         "--preset": settings.preset,
         "--device": settings.device,
     }
     return ["train", cell.method, cell.source, *options(told)]
+
+
+def reduced(source: str, downscale: int | None) -> int | None:
+    """How many times photographs are made smaller; objects of a procedural category are as large as asked for."""
+    request = requested(source)
+    return None if request is not None and is_category(request) else downscale
 
 
 def evaluation(cell: Cell, folder: Path, settings: Settings) -> list[str]:
@@ -106,8 +132,10 @@ def options(told: dict[str, Any]) -> list[str]:
 
 
 def trained(folder: Path) -> bool:
-    """Whether a run has spent its budget."""
+    """Whether a run has spent its budget, or was made without learning."""
     run = Run(folder)
+    if Inferred.of(run.settings, folder / "config.json"):
+        return run.has_state
     return run.has_state and Budget.from_json(run.settings.budget).progress(run.state.step, run.state.seconds) >= 1
 
 
@@ -119,7 +147,7 @@ def evaluated(folder: Path, settings: Settings) -> bool:
         return False
     protocol = result["protocol"]
     there = protocol.get("of", 0)
-    wanted = min(settings.eval_views or there, there)
+    wanted = min((settings.eval_views or there) * protocol.get("members", 1), there)  # of each member so many
     if "views" not in protocol:
         return protocol.get("shapes") == wanted
     kept = (folder / "eval").is_dir() and (result["lpips"] is not None or not settings.lpips)

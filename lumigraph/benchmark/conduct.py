@@ -98,9 +98,9 @@ class Patience:
         self.needed: list[float] = []
 
     def note(self, cell: Cell, seconds: float) -> None:
-        self.needed.append(seconds - (cell.budget.seconds or 0))
+        self.needed.append(seconds - cell.seconds)
 
     def left(self, todo: Sequence[Cell]) -> str:
         beside = sum(self.needed) / len(self.needed) if self.needed else 0.0
-        seconds = sum((cell.budget.seconds or 0) + beside for cell in todo)
+        seconds = sum(cell.seconds + beside for cell in todo)
         return f"{'about' if self.needed else 'at least'} {clock(max(seconds, 0))} left"

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import statistics
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -13,32 +11,29 @@ from jaxtyping import Float
 from PIL import Image
 from torch import Tensor
 
-from .. import files, methods
+from .. import files
 from ..capture.pictures import readable
 from ..evaluate import file_name
 from ..figures import Row as Line
 from ..figures import contact_sheet, save_picture
-from ..figures.charts import Series, line_chart, standalone
+from ..figures.charts import line_chart, standalone
 from ..metrics import scores_of
 from ..run import Run
 from .cell import SHEET
+from .curves import over_time, over_views, places
 from .results import Row
-from .table import resolution, trained_for
+from .table import resolution
 
 
 def draw_charts(rows: Sequence[Row], output: Path) -> list[str]:
     """Draw what the rows have at least two points of. Returns the names of the files."""
-    measured, drawn = [row for row in rows if not row["failed"]], []
-    for scene in sorted({row["scene"] for row in measured}):
-        of_scene = [row for row in measured if row["scene"] == scene]
-        of_all_views = [row for row in of_scene if row["views"] is None]
-        over_time = curves(of_all_views, "training_seconds", budget)
-        over_views = curves(of_scene, "train_views", lambda row: row["train_views"], per=trained_for)
-        seconds = {row["budget"].get("seconds") for row in of_all_views}
-        headline = scores_of(of_scene[0])[0]
+    drawn = []
+    for place, found in places([row for row in rows if not row["failed"]]):
+        seconds = {row["budget"].get("seconds") for row in found if row["views"] is None}
+        headline = scores_of(found[0])[0]
         for name, series, label, ticks in (
-            ("time", over_time, "seconds of training", () if None in seconds else sorted(seconds)),
-            ("views", over_views, "photographs to learn from", sorted({row["train_views"] for row in of_scene})),
+            ("time", over_time(found), "seconds of training", () if None in seconds else sorted(seconds)),
+            ("views", over_views(found), "photographs to learn from", sorted({row["train_views"] for row in found})),
         ):
             if not any(len(one.x) > 1 for one in series):
                 continue
@@ -49,39 +44,12 @@ def draw_charts(rows: Sequence[Row], output: Path) -> list[str]:
                 log_x=True,
                 marks=True,
                 smoothed=False,
-                note=", ".join([*(one.name for one in series if len(series) == 1), scene, resolution(of_scene[0])]),
+                note=", ".join([*(one.name for one in series if len(series) == 1), place, resolution(found[0])]),
                 x_ticks=ticks,
             )
-            drawn.append(f"{scene}-{headline.name.lower().replace(' ', '-')}-over-{name}.svg")
+            drawn.append(f"{place}-{headline.name.lower().replace(' ', '-')}-over-{name}.svg")
             files.write_bytes(output / drawn[-1], standalone(chart), "benchmark")
     return drawn
-
-
-def curves(
-    rows: Sequence[Row], x: str, point: Callable[[Row], Any], per: Callable[[Row], Any] = lambda row: ""
-) -> list[Series]:
-    """The first score over x, a curve for each method. Cells that differ in their seeds alone are a point: their means.
-
-    point: what cells of one point have in common;  per: what else tells curves apart, of one method by their dashes
-    """
-    groups: dict[tuple[str, Any], dict[Any, list[Row]]] = {}
-    for row in rows:
-        groups.setdefault((row["method"], per(row)), {}).setdefault(point(row), []).append(row)
-    others = sorted({other for _, other in groups})
-    series = []
-    for (method, other), points in sorted(groups.items()):
-        found = sorted(
-            (statistics.fmean(row[x] for row in cells), statistics.fmean(scores_of(row)[0].value for row in cells))
-            for cells in points.values()
-        )
-        name = f"{method}, {other}" if len(others) > 1 else method
-        x_of, y_of = [at for at, _ in found], [score for _, score in found]
-        series.append(Series(name, x_of, y_of, methods.colour(method), others.index(other)))
-    return series
-
-
-def budget(row: Row) -> tuple[tuple[str, float], ...]:
-    return tuple(row["budget"].items())
 
 
 def draw_views(rows: Sequence[Row], output: Path) -> list[str]:

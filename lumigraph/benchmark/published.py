@@ -25,6 +25,35 @@ FIGURES: dict[tuple[str, str], Published] = {
 }
 
 
+@dataclass(frozen=True)
+class Few:
+    """Held-out PSNR in dB from few photographs, the mean of several scenes; where a figure's source says how many and
+    of what.
+
+    views: photographs that were learnt from; None where the source does not say
+    """
+
+    method: str
+    psnr: float
+    views: int | None
+    scenes: str
+    source: str
+
+
+STUDY = "a study of few photographs by others, protocol not known"
+FEW: tuple[Few, ...] = (
+    Few("mip-nerf", 14.62, 3, "LLFF", "Niemeyer et al. 2022"),
+    Few("regnerf", 19.08, 3, "LLFF", "Niemeyer et al. 2022"),
+    Few("mip-nerf", 8.68, 3, "DTU", "Niemeyer et al. 2022"),
+    Few("regnerf", 18.89, 3, "DTU", "Niemeyer et al. 2022"),
+    Few("pixelnerf", 19.31, 3, "DTU", "Yu et al. 2021"),
+    Few("nerf", 24.3, None, "not stated", STUDY),
+    Few("pixelnerf", 23.2, None, "not stated", STUDY),
+    Few("regnerf", 25.2, None, "not stated", STUDY),
+    Few("snerg", 24.0, None, "not stated", STUDY),
+)
+
+
 def published(method: str, scene: str) -> Published | None:
     """What the method's own paper reports of a scene of this name; None if nothing is known here."""
     return FIGURES.get((method, scene.lower()))

@@ -47,6 +47,8 @@ class Begun:
     run: Annotated[str, msgspec.Meta(pattern=r"\Aruns/[^/\\\x00]+\Z")]
     views: Tally | None = None
     failed: str | None = None
+    collection: str = ""
+    prior: str | None = None
 
 
 @dataclass(frozen=True)
@@ -86,9 +88,11 @@ def row_of(cell: Cell, output: Path, settings: Settings, failure: str | None) ->
         "views": cell.views,
         "budget": {name: value for name, value in asdict(cell.budget).items() if value is not None},
         "seed": cell.seed,
-        "command": shlex.join(["lumigraph", *train_command(replace(cell, source=public(cell)), settings)]),
+        "command": shlex.join(["lumigraph", *train_command(public(cell), settings)]),
         "run": f"runs/{cell.name}",
         "failed": failure,
+        "collection": cell.collection,
+        "prior": cell.prior and Path(cell.prior).name,
     }
     if failure:
         return row
@@ -101,16 +105,17 @@ def row_of(cell: Cell, output: Path, settings: Settings, failure: str | None) ->
         "model_bytes": run.model_bytes,
         "published": figure and asdict(figure),
     }
-    if views := result.get("views"):
+    if (views := result.get("views")) and "members" not in result["protocol"]:
         row["shown"] = views[len(views) // 2 // settings.scales]  # at full size
     if "by_resolution" in result:
         row["by_resolution"] = result["by_resolution"]
     return row
 
 
-def public(cell: Cell) -> str:
-    """A scene without the place where it lies on this machine."""
-    return cell.scene if Path(cell.source).exists() else cell.source
+def public(cell: Cell) -> Cell:
+    """A cell without the places where its scene and its prior lie on this machine."""
+    source = cell.scene if Path(cell.source).exists() else cell.source
+    return replace(cell, source=source, prior=cell.prior and Path(cell.prior).name)
 
 
 def read_rows(output: Path) -> dict[str, Row]:

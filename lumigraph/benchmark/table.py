@@ -8,9 +8,10 @@ from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any
 
-from ..budget import Budget
 from ..metrics import named, scores_of
-from .cell import duration
+from .cell import MEMBERS
+from .curves import learnt_for, over_views, places, together
+from .published import FEW
 from .results import Row
 
 NONE = "–"
@@ -19,7 +20,8 @@ NONE = "–"
 def markdown(rows: Sequence[Row], pictures: Sequence[str] = ()) -> str:
     """The whole page of a benchmark. pictures: names of files beside it."""
     measured = [row for row in rows if not row["failed"]]
-    parts = ["# Methods side by side", short_table(measured), "\n".join(f"![{name}]({name})" for name in pictures)]
+    parts = ["# Methods side by side", few_photographs(measured), short_table(measured)]
+    parts += ["\n".join(f"![{name}]({name})" for name in pictures)]
     parts += ["## Every cell", full_table(rows)]
     parts += [
         "PSNR in dB and SSIM are means over held-out views, larger is better; LPIPS (AlexNet), smaller is better. "
@@ -30,14 +32,38 @@ def markdown(rows: Sequence[Row], pictures: Sequence[str] = ()) -> str:
     return "\n\n".join(part for part in parts if part) + "\n"
 
 
+def few_photographs(rows: Sequence[Row]) -> str:
+    """For each scene or collection a line for each method and a column for each number of photographs, with what
+    others report below; nothing where nobody learnt from fewer than all."""
+    parts = []
+    for place, found in places(rows):
+        if all(row["views"] is None for row in found):
+            continue
+        numbers = sorted({row["train_views"] for row in found})
+        lines = []
+        for one in over_views(found):
+            known = dict(zip(one.x, one.y, strict=True))
+            lines.append([one.name, *(f"{known[n]:.2f}" if n in known else NONE for n in numbers)])
+        scenes = len({row["scene"] for row in found})
+        members = "one held-out member" if scenes == 1 else f"{scenes} held-out members"
+        of_what = f"{members} of {place.removesuffix(MEMBERS)}" if place.endswith(MEMBERS) else place
+        names = ["photographs", *map(str, numbers)]
+        parts += [f"{scores_of(found[0])[0].name} of {of_what}, {resolution(found[0])}:", table(names, lines)]
+    if not parts:
+        return ""
+    figures = [[f.method, str(f.psnr), str(f.views or NONE), f.scenes, f.source] for f in FEW]
+    told = table(["method", "PSNR", "photographs", "scenes", "source"], figures)
+    return "\n\n".join(["## How many photographs", *parts, "What others report, by protocols of their own:", told])
+
+
 def short_table(rows: Sequence[Row]) -> str:
-    """One line for cells that differ in their seeds alone."""
+    """One line for cells that differ in their seeds, or are members of one collection, alone."""
     groups: dict[tuple[Any, ...], list[Row]] = {}
     for row in in_order(rows):
-        groups.setdefault((row["scene"], row["method"], row["train_views"], trained_for(row)), []).append(row)
+        groups.setdefault((together(row), row["method"], row["train_views"], trained_for(row)), []).append(row)
     columns: dict[str, Callable[[list[Row]], str]] = {
         "method": lambda group: group[0]["method"],
-        "scene": lambda group: ", ".join(part for part in (group[0]["scene"], resolution(group[0])) if part),
+        "scene": lambda group: ", ".join(part for part in (together(group[0]), resolution(group[0])) if part),
         "views": lambda group: str(group[0]["train_views"]),
         "trained for": lambda group: trained_for(group[0]),
         **{name: partial(mean_score, name) for name in score_names(rows)},
@@ -100,7 +126,8 @@ def in_order(rows: Sequence[Row]) -> list[Row]:
 
 
 def trained_for(row: Row) -> str:
-    return duration(Budget.from_json(row["budget"]))
+    """How long a cell learnt, or by which prior it was made."""
+    return f"by {row['prior']}" if row.get("prior") else learnt_for(row)
 
 
 def resolution(row: Row) -> str:

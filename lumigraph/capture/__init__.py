@@ -14,6 +14,7 @@ from ..dataset import Dataset
 from ..errors import LumigraphError
 from ..files import exists, expanded
 from ..names import natural
+from ..ranges import typed
 from ..readers import LISTED, NAMES
 from ..scene import Scene
 from ..shapes import Shapes
@@ -22,10 +23,14 @@ from .assemble import Before as Before
 from .assemble import assemble as assemble
 from .capture import Capture as Capture
 from .capture import Shot as Shot
-from .fewer import with_fewer_views
+from .fewer import with_all_views, with_fewer_views
 from .masks import with_masks
 from .multiscale import multiscale as multiscale
+from .part import Part as Part
+from .part import part_of
 from .pictures import list_images
+from .places import Places as Places
+from .places import places_of as places_of
 from .raw import with_raw
 
 READERS: dict[str, ModuleType] = {n: import_module(f".{n.replace('-', '_')}", __package__) for n in NAMES}
@@ -41,15 +46,9 @@ def open_dataset(source: str | Path, wanted: type[Any] | None = None, **options:
     Raises LumigraphError for anything that keeps the source from becoming a dataset.
     """
     kind, path = kind_of(source, wanted), expanded(source)
-    if kind is Collection and (request := requested(source)) is not None:
-        from . import procedural
-
-        many = {name: f"{PROCEDURAL}{one}" for name, one in procedural.members_of(request).items()}
-        return Collection.of({name: partial(open_dataset, one, **options) for name, one in many.items()}, str(source))
     if kind is Collection:
-        return Collection.of(
-            {name: partial(open_dataset, place, **options) for name, place in members_of(path).items()}, str(source)
-        )
+        many = sources_of(source)
+        return Collection.of({name: partial(open_dataset, one, **options) for name, one in many.items()}, str(source))
     if kind is Shapes:
         told = [name for name, value in options.items() if value not in (None, 1)]
         if told:
@@ -81,6 +80,15 @@ def kind_of(source: str | Path, wanted: type[Any] | None = None) -> type[Any]:
     return Collection if len(members_of(path)) > 1 else Scene
 
 
+def sources_of(collection: str | Path) -> dict[str, str]:
+    """Where each member of a collection is, by its name: what `open_dataset` opens it from."""
+    if (request := requested(collection)) is None:
+        return {name: str(place) for name, place in members_of(expanded(collection)).items()}
+    from . import procedural
+
+    return {name: f"{PROCEDURAL}{one}" for name, one in procedural.members_of(request).items()}
+
+
 def requested(source: str | Path) -> str | None:
     """What is asked for after "procedural:"; None of a path."""
     return str(source).removeprefix(PROCEDURAL) if str(source).startswith(PROCEDURAL) else None
@@ -109,6 +117,8 @@ def open_scene(
     views: int | None = None,
     scales: int = 1,
     before: Before | None = None,
+    whole: bool | None = None,
+    part: Part | dict[str, Any] | None = None,
 ) -> Scene:
     """The Scene in a folder of posed photographs, a single picture as a scene, or a procedural one.
 
@@ -120,21 +130,34 @@ def open_scene(
     views:     learn from so many photographs, spread evenly over the cameras; None means all
     scales:    every photograph so many times, each half as large as the one before; see `multiscale`
     before:    how they were opened for a run; see `Before`
+    whole:     learn from every photograph, also from those that test, unless the source itself says which do
+    part:      some photographs of a large capture alone, of one place in it
     Raises LumigraphError for anything that keeps the photographs from becoming a scene.
     """
-    if (request := requested(source)) is not None:
-        from . import procedural
-
-        capture = procedural.read(request)
-        memory = 0 if memory is None and procedural.is_category(request) else memory  # so that its pictures are kept
+    if requested(source) is not None:
+        capture = read_capture(source)
     elif single_image.recognises(path := expanded(source)):
         capture, downscale = single_image.read(path, downscale), 1  # it is reduced by now
     else:
-        capture = with_raw(with_masks(choose_reader(path, reader).read(path), path), path)
+        capture = read_capture(source, reader)
+    if part is not None:
+        capture = part_of(capture, typed(Part, part, str(source)) if isinstance(part, dict) else part)
     scene = assemble(capture, downscale, memory, cache, before)
+    if whole and not any(shot.split for shot in capture.shots):
+        scene = with_all_views(scene)
     if views is not None:
         scene = with_fewer_views(scene, views)
     return multiscale(scene, scales, memory, cache)
+
+
+def read_capture(source: str | Path, reader: str | None = None) -> Capture:
+    """What a reader finds of photographs with poses: none of their pixels. source, reader: as of `open_scene`"""
+    if (request := requested(source)) is not None:
+        from . import procedural
+
+        return procedural.read(request)
+    path = expanded(source)
+    return with_raw(with_masks(choose_reader(path, reader).read(path), path), path)
 
 
 def choose_reader(folder: Path, name: str | None = None) -> ModuleType:

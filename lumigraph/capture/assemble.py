@@ -15,10 +15,10 @@ from torch import Tensor
 from ..camera import Camera
 from ..errors import LumigraphError, LumigraphWarning
 from ..geometry import RIGID
-from ..images import ImageSource, ImageStore
+from ..images import ImageSource, ImageStore, in_parallel, load
 from ..lens import Equirectangular, Lens, Pinhole
 from ..names import natural
-from ..progress import counting, track
+from ..progress import counting
 from ..scene import Forward, Frame, Scene
 from .beside import make_about, make_layers
 from .capture import Capture, Shot
@@ -66,20 +66,21 @@ def assemble(
             f"{capture.source} has {counted(len(shots), 'usable photograph')} with a pose, and two are the least; "
             f"{'restore the missing files' if capture.missing else 'add more'}"
         )
-    splits = split(capture.source, shots)
+    splits = split(capture.source, shots, whole=capture.around is None)
     poses = np.stack([checked_pose(shot, capture.source) for shot in shots])
     for shot in shots:
         if (fault := shot.lens.fault()) is not None:
             raise LumigraphError(f"{capture.source}: the lens of {shot.name} has a fault: its {fault}; correct it")
     capture, lost = without_stray_points(capture)
     told += capture.told + lost + oddities(capture, shots, poses)
-    chosen = [choose(shot, downscale) for shot in track(shots, "Looking at photographs", len(shots))]
+    with counting("Looking at photographs", len(shots)) as done:
+        chosen = in_parallel(lambda i: choose(shots[i], downscale), range(len(shots)), done)
     told += about_small(capture.source, chosen) if downscale else []
     for warning in told:
         warnings.warn(warning, LumigraphWarning, stacklevel=3)
     lenses = [fitted_lens(shot, c) for shot, c in zip(shots, chosen, strict=True)]
     with counting(f"Reading {Path(capture.source).name}", len(shots)) as done:
-        images = ImageStore.load(masked_by_lens([c.picture for c in chosen], lenses), memory, cache, done)
+        images = load(masked_by_lens([c.picture for c in chosen], lenses), memory, cache, done, capture.kept)
     for shot, pixels in zip(shots, images.trusted_pixels.tolist(), strict=True):
         if not pixels:
             raise LumigraphError(
@@ -95,7 +96,7 @@ def assemble(
     matrix = place.scene_from_source @ translation(-away)
     cameras = make_cameras(shots, moved(poses, matrix), lenses, images.sizes)
     forward = None
-    if place.reach > 1:
+    if place.reach > 1 and capture.around is None:
         train = splits["train"]
         forward = find_forward(capture, [shots[i] for i in train.tolist()], cameras[train], matrix, place.near)
     layers, left_out = make_layers(shots, chosen, images, matrix)
@@ -124,15 +125,15 @@ def in_order(shots: list[Shot], before: Before | None) -> list[Shot]:
     return sorted(shots, key=lambda shot: (place.get(shot.name, len(place)), natural(shot.name)))
 
 
-def split(source: str, shots: list[Shot]) -> dict[str, Int[Tensor, " image"]]:
-    """Image numbers by purpose: as published, otherwise every 8th held out."""
+def split(source: str, shots: list[Shot], whole: bool = True) -> dict[str, Int[Tensor, " image"]]:
+    """Image numbers by purpose: as published, otherwise every 8th held out. whole: of a part, none need be held out"""
     if any(shot.split for shot in shots):
         names = [shot.split for shot in shots]
     else:
         names = ["train" if i % HOLD_OUT else "test" for i in range(len(shots))]
     found = {s: torch.tensor([i for i, name in enumerate(names) if name == s]) for s in ("train", "test", "val")}
     for purpose, task in (("train", "learning"), ("test", "testing")):
-        if not len(found[purpose]):
+        if not len(found[purpose]) and (whole or purpose == "train"):
             raise LumigraphError(
                 f"{source} has no view for {task}: its own lists name none that exists; restore the photographs, "
                 f"or remove those lists so that every {HOLD_OUT}th is held out"
@@ -232,6 +233,9 @@ def translation(by: Float[np.ndarray, " 3"]) -> Float[np.ndarray, "4 4"]:
 def shifted(capture: Capture, by: Float[np.ndarray, " 3"]) -> Capture:
     """The capture with its points and bounds moved; the poses are handed on separately."""
     points = None if capture.points is None else capture.points + by
+    if capture.around is not None:
+        (x, y, z), half = capture.around
+        capture = replace(capture, around=((x + by[0], y + by[1], z + by[2]), half))
     if capture.bounds is None:
         return replace(capture, points=points)
     low, high = (np.asarray(corner) + by for corner in capture.bounds)

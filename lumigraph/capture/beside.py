@@ -15,7 +15,7 @@ from PIL import Image
 from torch import Tensor
 
 from ..errors import LumigraphError
-from ..images import ImageStore, Layer, LayerSource, resized
+from ..images import ImageStore, Layer, LayerSource, in_parallel, resized
 from ..images.layer import known
 from .capture import Plane, Shot
 from .numbers import kind_of, read_numbers
@@ -130,7 +130,7 @@ def read_plane(
 
 def make_about(shots: list[Shot]) -> dict[str, Tensor]:
     """What is known of each photograph, by name; NaN where it is not. The first axis is the photograph."""
-    found = [taken(shot) | shot.about for shot in shots]
+    found = in_parallel(lambda i: taken(shots[i]) | shots[i].about, range(len(shots)))
     about = {}
     for name in dict.fromkeys(name for facts in found for name in facts):
         values = [np.asarray(facts.get(name, np.nan), np.float64) for facts in found]

@@ -92,7 +92,9 @@ class Capture:
     near:     distance within which nothing is, source's units
     background: colour behind everything
     up:       which way is up, source's frame, any length
+    around:   of a part of a larger capture, centre and half-size of its box of interest, source's frame and units
     told:     what its user should know, one sentence each
+    kept:     whether pictures go to the user's cache even where they fit into memory, for they took long to make
     """
 
     source: str
@@ -106,4 +108,6 @@ class Capture:
     near: float | None = None
     background: tuple[float, float, float] | None = None
     up: tuple[float, float, float] | None = None
+    around: tuple[tuple[float, float, float], float] | None = None
     told: list[str] = field(default_factory=list)
+    kept: bool = False

@@ -1,4 +1,4 @@
-"""A scene with fewer photographs to learn from, to see how many a method needs."""
+"""A scene with fewer photographs to learn from, to see how many a method needs; or with all that there are."""
 
 from __future__ import annotations
 
@@ -27,6 +27,11 @@ def with_fewer_views(scene: Scene, views: int) -> Scene:
         )
     kept = spread_out(scene.cameras[train])[:views].sort().values
     return replace(scene, splits=scene.splits | {"train": train[kept]})
+
+
+def with_all_views(scene: Scene) -> Scene:
+    """The scene with every photograph in its "train" split, those that test as well."""
+    return replace(scene, splits=scene.splits | {"train": torch.arange(len(scene.cameras))})
 
 
 def spread_out(cameras: Camera) -> Int[Tensor, " camera"]:

@@ -102,9 +102,15 @@ def joined(parts: list[Any]) -> Mesh:
 
 
 def colours_of(part: Any) -> UInt8[np.ndarray, "vertex 3"]:
-    """A colour at each vertex: the file's, from vertices or from a material or texture; grey where it has none."""
+    """A colour at each vertex: the file's, from vertices or from a material or texture; grey where it has none.
+
+    Where no coordinates say which part of a texture goes where, a material's own colour is that of all vertices.
+    """
     try:
-        visual = part.visual if part.visual.kind in ("vertex", "face") else part.visual.to_color()
+        visual = part.visual
+        if visual.kind == "texture" and visual.uv is None:
+            return np.broadcast_to(visual.material.main_color[:3], (len(part.vertices), 3)).astype(np.uint8)
+        visual = visual if visual.kind in ("vertex", "face") else visual.to_color()
         found = np.asarray(visual.vertex_colors)[:, :3].astype(np.uint8)
         if part.visual.defined and len(found) == len(part.vertices):
             return found

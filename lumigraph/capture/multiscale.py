@@ -14,7 +14,7 @@ import torch
 
 from ..camera import Camera
 from ..errors import LumigraphError
-from ..images import ImageSource, ImageStore, LayerSource
+from ..images import ImageSource, LayerSource, load
 from ..metrics import WINDOW
 from ..scene import Scene
 
@@ -49,7 +49,7 @@ def multiscale(scene: Scene, scales: int, memory: int | None = None, cache: Path
         ImageSource((width, height), partial(reduced, scene, i, f))
         for (i, f), (width, height) in zip(copies, sizes, strict=True)
     ]
-    images = ImageStore.load(pictures, memory, cache)
+    images = load(pictures, memory, cache)
     for name, pixels in zip(names, images.trusted_pixels.tolist(), strict=True):
         if not pixels:
             raise LumigraphError(

@@ -30,6 +30,7 @@ BOX_SHARE = 0.5  # of the distance from which things are looked at: half-size of
 SAME_WAY = 0.5  # length of the mean viewing direction, below which cameras look around themselves rather than one way
 BEFORE_NEAREST = 0.4  # rays begin at this share of the distance to the nearest thing seen
 SMALLEST_NEAR = 1e-3
+INSIDE_NEAR = 0.02  # of its half-size: how near things may be to cameras inside a box, where nothing tells
 SAME_PLACE = 1e-9  # units of the source that are nothing
 SAMPLED_POINTS, SAMPLED_CAMERAS = 5000, 64
 
@@ -66,17 +67,45 @@ def find_place(
     background = capture.background or (WHITE if images.has_alpha else BLACK)
     if capture.bounds is not None:
         return stated_place(capture, cameras, background)
-    if upright is None:
-        cloud = reliable_points(capture, np.eye(4))
-        seen = None if cloud is None else cloud.points
-        upright = find_upright(cameras, seen) if capture.up is None else upright_by(np.array(capture.up))
+    upright = upright_of(capture, cameras) if upright is None else upright
     turned = cameras.transformed(torch.from_numpy(upright))
+    if capture.around is not None:
+        return part_place(capture, turned, upright, background)
     gaze = find_gaze(capture, turned, upright)
     found = silhouettes(turned, images, views, gaze.centre)
     box = None if found is None else hull_box(found.outlines, gaze.centre, gaze.distance)
     if found is None or box is None:
         return open_place(capture, upright, gaze, background)
     return object_place(upright, box, turned, capture.background or found.background)
+
+
+def upright_of(capture: Capture, cameras: Camera) -> Float[np.ndarray, "4 4"]:
+    """The rotation that brings up to +z in a capture's frame: none where it states bounds, which stand upright."""
+    if capture.bounds is not None:
+        return np.eye(4)
+    if capture.up is not None:
+        return upright_by(np.array(capture.up))
+    cloud = reliable_points(capture, np.eye(4))
+    return find_upright(cameras, None if cloud is None else cloud.points)
+
+
+def part_place(capture: Capture, cameras: Camera, upright: np.ndarray, background: Vector) -> Place:
+    """A part of a larger capture: a cube around its middle, and cubes around it as far as the points go.
+
+    cameras: in the turned frame
+    """
+    assert capture.around is not None
+    centre, half = upright[:3, :3] @ np.array(capture.around[0]), capture.around[1]
+    cloud = reliable_points(capture, upright)
+    depths = None if cloud is None else visible_depths(cameras, cloud)
+    near = INSIDE_NEAR * half if depths is None else BEFORE_NEAREST * float(np.nanpercentile(depths[:, 0], 2))
+    reach = UNKNOWN_REACH
+    if capture.reach is not None:
+        reach = power_of_two(capture.reach / half)
+    elif cloud is not None:
+        reach = power_of_two(quantile(np.abs(cloud.points - centre).max(-1), cloud.weights, HELD) / half)
+    near = near if capture.near is None else capture.near
+    return Place(similarity(upright, centre, half), CUBE, max(2.0, reach), max(near / half, SMALLEST_NEAR), background)
 
 
 def stated_place(capture: Capture, cameras: Camera, background: Vector) -> Place:

@@ -49,15 +49,20 @@ class Eval:
     def run(self) -> int:
         from ..evaluate import claim_evaluation, evaluate_run, stem
         from ..metrics import scores_of
-        from ..run import Run
+        from ..run import BlockRun, open_run
         from ..verdict import last_psnr
         from .outcome import next_commands
 
-        run = Run(self.run_folder)
+        run = open_run(self.run_folder)
         claim_evaluation(run, self.split, self.save_images, self.overwrite)
         lpips = chosen_lpips(self.lpips)
-        method = tell(run, run.method(choose_device(self.device)), self.told)
-        data = run.dataset(self.scene)
+        device = choose_device(self.device)
+        if isinstance(run, BlockRun):  # by the exposures of the photographs that it will be given
+            data: Any = run.dataset(self.scene, self.split)
+            method = tell(run, run.method(device, data.about.get("exposure")), self.told)
+        else:
+            method = tell(run, run.method(device), self.told)
+            data = run.dataset(self.scene)
         result = evaluate_run(run, method, data, self.split, self.save_images, self.views, lpips, self.right_halves)
         rows: dict[str, Any] = {score.name: bold(score) for score in scores_of(result)}
         for size, part in result.get("by_resolution", {}).items():

@@ -28,9 +28,12 @@ class Info:
     def run(self) -> int:
         from ..capture import open_dataset
         from ..exchange import is_splat_file, read_gaussians
-        from .info_tree import cloud_tree, composition_tree, dataset_tree, run_tree
+        from ..run.block_run import BlockRun, is_block_run
+        from .info_tree import blocks_tree, canonical_tree, cloud_tree, composition_tree, dataset_tree, run_tree
 
-        if (Path(self.what) / "config.json").exists():
+        if is_block_run(Path(self.what)):
+            tree = blocks_tree(BlockRun(self.what))
+        elif (Path(self.what) / "config.json").exists():
             from ..run import Run
 
             tree = run_tree(Run(self.what))
@@ -38,8 +41,10 @@ class Info:
             tree = cloud_tree(self.what, read_gaussians(self.what))
         elif self.what.lower().endswith(".json") and Path(self.what).is_file():
             from ..run import open_any
+            from ..run.canonicalised import Canonicalised
 
-            tree = composition_tree(open_any(self.what))
+            opened = open_any(self.what)
+            tree = canonical_tree(opened) if isinstance(opened, Canonicalised) else composition_tree(opened)
         else:
             told: dict[str, Any] = {"downscale": self.downscale, "reader": self.reader}
             tree = dataset_tree(open_dataset(self.what, **told))

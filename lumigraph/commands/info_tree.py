@@ -16,7 +16,7 @@ from ..exchange import size_of
 from ..gaussians import Gaussians
 from ..metrics import scores_of
 from ..names import natural
-from ..run import Run
+from ..run import BlockRun, Run
 from ..run.compressed import Compressed
 from ..run.converted import Converted
 from ..run.inferred import Inferred
@@ -30,7 +30,7 @@ MEMBERS = 12  # of many shapes, that are told of one by one
 def run_tree(run: Run) -> Tree:
     said = run.settings
     tree = Tree(bold(run.folder) + f"  a run of {run.method_name}")
-    branch(tree, "scene", {"source": said.scene.source, **said.splits, **said.scene.options})
+    branch(tree, "scene", {"source": said.scene.source, **said.splits, **opened_with(said.scene.options)})
     branch(tree, "frame", frame_rows(run.frame))
     branch(tree, "config", said.config)
     if controls := control_rows(run):
@@ -49,7 +49,8 @@ def run_tree(run: Run) -> Tree:
         smaller = f"{made.times:.1f} times smaller, {made.bytes_after / 1e6:.3g} MB of {made.bytes_before / 1e6:.3g} MB"
         branch(tree, "compressed", {"from": made.source, "model": smaller, "dB": f"{made.psnr_after:.2f}"})
     if inferred := Inferred.of(said, run.folder / "config.json"):
-        branch(tree, "inferred", {"by": inferred.prior, "of": f"{inferred.views} photographs"})
+        seen = f"{inferred.views} photographs" if inferred.seed is None else f"seed {inferred.seed}"
+        branch(tree, "inferred", {"by": inferred.prior, "of": seen})
     if converted := Converted.read(run.folder):
         like = f"{converted.psnr:.2f} dB, of {converted.views} held-out views against the source's"
         told: dict[str, Any] = {
@@ -71,6 +72,34 @@ def run_tree(run: Run) -> Tree:
     return tree
 
 
+def blocks_tree(run: BlockRun) -> Tree:
+    """A run in blocks, with a line for each."""
+    from ..blocks.planning import place_of
+    from ..blocks.watch import described, stand_of
+
+    tree, plan = Tree(bold(run.folder) + f"  a run of {run.method_name} in {len(run.plan.blocks)} blocks"), run.plan
+    branch(tree, "scene", {"source": plan.scene.source, **run.settings.splits, **plan.scene.options})
+    branch(tree, "frame", frame_rows(run.frame))
+    branch(tree, "config", plan.config)
+    each = " ".join(f"{value} {name}" for name, value in plan.budget.items())
+    rows: dict[str, Any] = {"each learns for": each, "weights": f"{run.model_bytes / 1e6:.1f} MB"}
+    for block in plan.blocks:
+        new = f", learnt again from {block.scene.source}" if block.scene else ""
+        where = ", ".join(f"{x:.4g}" for x in block.centre)
+        stand = described(stand_of(place_of(run.folder, block)))
+        rows[block.name] = f"{len(block.photographs)} photographs within {block.radius:.4g} of {where}; {stand}{new}"
+    branch(tree, "blocks", rows)
+    if evaluation := run.evaluation():
+        branch(tree, "evaluated", {score.name: str(score) for score in scores_of(evaluation)})
+    return tree
+
+
+def opened_with(options: dict[str, Any]) -> dict[str, Any]:
+    """What photographs were opened with; of a block, how many were chosen rather than which."""
+    part = options.get("part")
+    return options if part is None else options | {"part": f"{len(part['photographs'])} photographs of a larger scene"}
+
+
 def moves_of(run: Run) -> Moves | None:
     """How far the method has moved cameras; None where it refines none, or has not begun."""
     if not (run.has_state and run.settings.config.get("refine_cameras")):
@@ -79,9 +108,10 @@ def moves_of(run: Run) -> Moves | None:
 
 
 def control_rows(run: Run) -> dict[str, str]:
-    """What each of the method's controls can be; empty where it has none, or where it is not installed."""
+    """What each of the method's controls can be, some of which only the learnt weights tell; empty where it has none,
+    or where it cannot be opened."""
     try:
-        controls = run.new_method().controls
+        controls = (run.method() if run.has_state else run.new_method()).controls
     except LumigraphError:
         return {}
     return {x.name: f"{x.domain} (default: {x.default}). {x.about}".rstrip() for x in controls}
@@ -150,6 +180,14 @@ def composition_tree(composition: Any) -> Tree:
         rows |= {"box": part.box and f"{vector(part.box.lower)} to {vector(part.box.upper)}"}
         branch(tree, f"part {number}", rows)
     branch(tree, "frame", frame_rows(composition.frame))
+    return tree
+
+
+def canonical_tree(placed: Any) -> Tree:
+    tree = Tree(bold(placed.path) + f"  {placed.run.folder.name} in the canonical frame of its kind")
+    rows = {"source": str(placed.run.folder), "scale": placed.place.scale, "agreement": placed.agreement}
+    branch(tree, "run", rows | {"origin": vector(tuple(placed.place.matrix[:3, 3].tolist()))})
+    branch(tree, "frame", frame_rows(placed.frame))
     return tree
 
 

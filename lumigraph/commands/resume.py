@@ -46,7 +46,13 @@ class Resume:
 
     def run(self) -> int:
         from ..run import Run
+        from ..run.block_run import is_block_run
 
+        if is_block_run(self.run_folder):
+            raise LumigraphError(
+                f"{self.run_folder} is a run in blocks, which the same `lumigraph train` command goes on with; for a "
+                "longer budget choose another --output"
+            )
         run = Run(self.run_folder)
         with run.held():
             return self._go_on(run)

@@ -9,9 +9,7 @@ far side is hidden by all or by none of it.
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import Any, NoReturn
 
 import torch
@@ -21,8 +19,8 @@ from torch import Tensor, nn
 from ..camera import Camera
 from ..capabilities import HasDensity, HasGaussians, HasLooks, can
 from ..controls import Control, Value
-from ..errors import LumigraphError, LumigraphWarning
-from ..gaussians import Gaussians, splatting
+from ..errors import LumigraphError
+from ..gaussians import Gaussians, joined, splatting
 from ..method import Method, RayMethod
 from ..rays import Look, Rays, Rendering, Samples
 from ..scene import Frame
@@ -77,7 +75,7 @@ class Composed(Method):
 
     def refined(self, cameras: Camera) -> Camera:
         """Cameras as the part that leads sees them, whose they are."""
-        return next((part.method.refined(cameras) for part in self.parts if part.leads), cameras)
+        return next((part.refined(cameras) for part in self.parts if part.leads), cameras)
 
     def batch(self, data: Any, generator: torch.Generator) -> NoReturn:
         raise LumigraphError("A composition does not learn; train its parts, each by itself")
@@ -104,7 +102,7 @@ class ComposedCloud(Composed):
 
     def gaussians(self) -> Gaussians:
         """All parts' Gaussians, in the scene's frame."""
-        return merged([part.gaussians() for part in self.parts])
+        return joined([part.gaussians() for part in self.parts])
 
     @torch.no_grad()
     def render(self, camera: Camera) -> Rendering:
@@ -138,7 +136,7 @@ class ComposedMixture(Composed):
         clouds = [part.gaussians() for part in rendered if can(part.method, HasGaussians)]
         seen = [part.rendering(camera) for part in rendered if not can(part.method, HasGaussians)]
         if clouds:
-            seen.append(splatting.render(merged(clouds), camera, (0.0, 0.0, 0.0), NEAR * self.frame.near))
+            seen.append(splatting.render(joined(clouds), camera, (0.0, 0.0, 0.0), NEAR * self.frame.near))
         return [(x.rgb.reshape(-1, 3), x.depth.reshape(-1), x.opacity.reshape(-1)) for x in seen]
 
 
@@ -150,27 +148,3 @@ def surface(rgb: Float[Tensor, "ray 3"], depth: Float[Tensor, " ray"], opacity: 
     samples = Samples(depth - half, depth + half, packed(hit.long()))
     density = -torch.log1p(-opacity.clamp_max(OPAQUE)) / samples.length
     return Look("surface", samples, density, rgb / opacity[:, None])
-
-
-def merged(clouds: Sequence[Gaussians]) -> Gaussians:
-    """One cloud from several. Harmonics that some lack are zero; opacities keep the meaning that most of them have."""
-    coefficients = max(cloud.harmonics.shape[1] for cloud in clouds)
-    antialiased = [cloud.antialiased for cloud in clouds for _ in range(len(cloud))]
-    majority = 2 * sum(antialiased) > len(antialiased)
-    if len({cloud.antialiased for cloud in clouds}) > 1:
-        warnings.warn(
-            "Some of these clouds were learnt with the antialiasing filter and some without; the smallest Gaussians of "
-            f"{'the latter' if majority else 'the former'} look a little too {'thin' if majority else 'thick'}",
-            LumigraphWarning,
-            2,
-        )
-    harmonics = [nn.functional.pad(x.harmonics, (0, 0, 0, coefficients - x.harmonics.shape[1])) for x in clouds]
-    return replace(
-        clouds[0],
-        means=torch.cat([x.means for x in clouds]),
-        quaternions=torch.cat([x.quaternions for x in clouds]),
-        log_scales=torch.cat([x.log_scales for x in clouds]),
-        opacities=torch.cat([x.opacities for x in clouds]),
-        harmonics=torch.cat(harmonics),
-        antialiased=majority,
-    )

@@ -63,7 +63,7 @@ class Placed:
 
     def rendering(self, camera: Camera) -> Rendering:
         """What a camera of the picture sees of any method, over black. A crop leaves out pixels by their depth."""
-        local = self._camera(camera)
+        local = self.camera(camera)
         seen = self.method.render(local)
         background = torch.tensor(self.method.frame.background, device=seen.rgb.device)
         rgb = seen.rgb - (1 - seen.opacity)[..., None] * background
@@ -77,6 +77,12 @@ class Placed:
         mine = {x.name for x in self.method.controls if self.leads or not x.of_photographs} & controls.keys()
         return replace(self, method=self.method.given(**{name: controls[name] for name in mine})) if mine else self
 
+    def refined(self, cameras: Camera) -> Camera:
+        """Cameras of the picture as the method has come to see them."""
+        there = cameras.transformed(self.place.inverse.matrix)
+        known = self.method.refined(there)
+        return cameras if known is there else known.transformed(self.place.matrix)
+
     def _inward(self, rays: Rays, behind: float) -> Rays:
         """The same rays in the method's frame, from a distance behind where they began."""
         back = self.place.inverse
@@ -85,7 +91,8 @@ class Placed:
         index = rays.image_index if self.leads else None
         return replace(rays, origins=origins, directions=directions, image_index=index)
 
-    def _camera(self, camera: Camera) -> Camera:
+    def camera(self, camera: Camera) -> Camera:
+        """A camera of the picture in the frame of the method."""
         moved = camera.transformed(self.place.inverse.matrix)
         return moved if self.leads else replace(moved, image_index=None)
 

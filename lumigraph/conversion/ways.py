@@ -10,6 +10,7 @@ from ..dataset import check_kind
 from ..errors import LumigraphError
 from ..method import Method
 from ..run import Opened, Run
+from ..run.canonicalised import Canonicalised
 from ..run.composition import Composition
 from ..scene import Scene
 
@@ -20,7 +21,8 @@ SPATIAL = FromField, HasField, HasDensity, HasLooks, HasGaussians  # what holds 
 def way(teacher: type[Method], student: type[Method]) -> Way | None:
     """How a student can be made of a teacher: by the teacher's field at points, by its Gaussians as they are, by the
     depth of what it renders, or by learning from its pictures alone; None if not at all."""
-    if not all(issubclass(Scene, kind.learns_from) for kind in (teacher, student)):
+    shows = issubclass(Scene, teacher.learns_from) or Scene in teacher.accepts  # a prior's runs are of scenes too
+    if not (shows and issubclass(Scene, student.learns_from)):
         return None
     if can(student, FromField):
         if can(teacher, HasGaussians) and can(student, HasGaussians):
@@ -41,6 +43,10 @@ def check(source: Opened, student: type[Method]) -> None:
     if isinstance(source, Composition):
         raise LumigraphError(
             f"{source.path} is a composition of several; convert its parts, and compose what comes of it"
+        )
+    if isinstance(source, Canonicalised):
+        raise LumigraphError(
+            f"{source.path} is a run at another place; convert {source.run.path}, and align that again"
         )
     if isinstance(source, Run) and not source.photographed:
         raise LumigraphError(f"{source.path} learnt from {source.kind}, so it has no colours that could be taken over")

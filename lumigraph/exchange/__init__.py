@@ -10,7 +10,7 @@ from ..files import claim, claim_folder, exists, expanded, explained
 from ..gaussians import Gaussians
 from ..memory import free_memory
 from ..progress import counting
-from . import compressed_ply, glb, ply, sog, splat, spz
+from . import compressed_ply, glb, ply, sog, splat, spz, streamed_sog
 from .checks import checked
 from .ply_header import read_header
 
@@ -24,43 +24,50 @@ WRITERS = {
 }
 READERS = {".splat": splat.read, ".spz": spz.read, ".sog": sog.read, ".glb": glb.read}  # and two kinds of .ply
 SUFFIXES = tuple(WRITERS)
+FOLDERS = {streamed_sog.META: streamed_sog, sog.META: sog}  # by the name of the file that says what is in them
 REORDERED = ".compressed.ply", ".sog"  # formats that keep the set of Gaussians and not their order
 
 
 def read_gaussians(path: Path | str) -> Gaussians:
-    """The Gaussians in a file of one of SUFFIXES, or in a folder of SOG, on the CPU, in the axes that PLY files keep.
+    """The Gaussians in a file of one of SUFFIXES, or in one of FOLDERS, on the CPU, in the axes that PLY files keep; of
+    a streamed SOG the finest level.
 
     Which of its two layouts a PLY file has, its header says. Infinite logits of opacity become ±20, rotations of
     length zero none at all. Raises LumigraphError for anything else that keeps the file from being a sound cloud.
     """
     path = place_of(expanded(path))
-    is_folder = path.is_dir() and sog.recognises(path)
-    suffix = ".sog" if is_folder else check_ending(path)
+    layout = layout_of(path)
+    suffix = "" if layout else check_ending(path)
     with explained(path):
-        if not is_folder:
+        if not layout:
             _check_file(path)
         with counting(f"Reading {path.name}"):
-            gaussians = _read(path, suffix)
+            gaussians = FOLDERS[layout].read(path) if layout else _read(path, suffix)
     return checked(gaussians, str(path), "restore it from a copy, or remove them with an editor of splats")
 
 
-def write_gaussians(path: Path | str, gaussians: Gaussians) -> None:
-    """Write a cloud in the format that the ending names, whole or not at all; to FOLDER/meta.json, a folder of SOG.
+def write_gaussians(path: Path | str, gaussians: Gaussians, detail: streamed_sog.Detail | None = None) -> None:
+    """Write a cloud in the format that the ending names, whole or not at all; to FOLDER/meta.json, a folder of SOG; to
+    FOLDER/lod-meta.json, a streamed one, with levels as `detail` says.
 
     `.ply` keeps every number as it is; what the others round is said in their files. Those of REORDERED keep the set of
     Gaussians and not their order, `.splat` neither harmonics beyond the plain colour nor `antialiased`. Raises
     LumigraphError where the ending is none of SUFFIXES, the cloud is not sound or the disk refuses.
     """
     path = expanded(path)
-    write = WRITERS[check_ending(path)]
+    ending = check_ending(path)
     claim_splats(path)
+    sound = checked(gaussians, f"what is to be written to {path}", "remove them first")
+    if path.name == streamed_sog.META:
+        streamed_sog.write(path, sound, detail)
+        return
     with counting(f"Writing {path.name}"):
-        write(path, checked(gaussians, f"what is to be written to {path}", "remove them first"))
+        WRITERS[ending](path, sound)
 
 
 def claim_splats(path: Path, overwrite: bool | None = None, reads: Iterable[Path] = ()) -> None:
-    """`files.claim` for a file of Gaussians, or for the whole folder that a path to meta.json lies in."""
-    if path.name != sog.META:
+    """`files.claim` for a file of Gaussians, or for the whole folder that a path to one of FOLDERS lies in."""
+    if path.name not in FOLDERS:
         claim(path, "splats", overwrite, reads)
     elif any(exists(one) and exists(path) and place_of(one).samefile(path.parent) for one in reads):
         raise LumigraphError(f"{path.parent} would be replaced, and is what the command reads; choose another name")
@@ -70,10 +77,10 @@ def claim_splats(path: Path, overwrite: bool | None = None, reads: Iterable[Path
 
 def is_splat_file(path: Path | str) -> bool:
     """Whether `read_gaussians` takes what lies there, or would if something did: known by its name, but for a .glb that
-    is of meshes, and for folders, of which those of SOG are."""
+    is of meshes, and for folders, of which those of SOG, streamed or not, are."""
     path = place_of(expanded(path))
     if path.is_dir():
-        return sog.recognises(path)
+        return layout_of(path) is not None
     if path.name.lower().endswith(".glb") and path.is_file():
         with explained(path):
             return glb.recognises(path)
@@ -83,23 +90,29 @@ def is_splat_file(path: Path | str) -> bool:
 def names_splats(path: Path | str) -> bool:
     """Whether `write_gaussians` takes a name, whatever lies there."""
     path = expanded(path)
-    return path.name == sog.META or (path.name.lower().endswith(SUFFIXES) and not path.is_dir())
+    return path.name in FOLDERS or (path.name.lower().endswith(SUFFIXES) and not path.is_dir())
 
 
 def place_of(path: Path) -> Path:
-    """The folder of SOG where its meta.json is named, or a new one; otherwise the path itself."""
-    return path.parent if path.name == sog.META and (sog.recognises(path.parent) or not exists(path)) else path
+    """The folder of SOG where its meta.json or lod-meta.json is named, or a new one; otherwise the path itself."""
+    layout = FOLDERS.get(path.name)
+    return path.parent if layout and (layout.recognises(path.parent) or not exists(path)) else path
+
+
+def layout_of(folder: Path) -> str | None:
+    """Which of FOLDERS a folder is; None for any other, and for a file."""
+    return next((name for name, layout in FOLDERS.items() if folder.is_dir() and layout.recognises(folder)), None)
 
 
 def size_of(path: Path | str) -> int:
     """Bytes of a file of Gaussians, or of all files of a folder, such as one of SOG."""
     place = place_of(expanded(path))
-    return sum(file.stat().st_size for file in (place.iterdir() if place.is_dir() else [place]))
+    return sum(file.stat().st_size for file in (place.rglob("*") if place.is_dir() else [place]) if file.is_file())
 
 
 def check_ending(path: Path) -> str:
     """The one of SUFFIXES that a name has. Raises LumigraphError if it has none."""
-    if path.name == sog.META:
+    if path.name in FOLDERS:
         return ".sog"
     for suffix in SUFFIXES:
         if path.name.lower().endswith(suffix):

@@ -276,9 +276,11 @@ def write(path: Path, gaussians: Gaussians) -> None:
             (folder / name).write_bytes(data)
 
 
-def encode(gaussians: Gaussians) -> dict[str, bytes]:
-    """The files of version 2 by name, meta.json first."""
-    gaussians = gaussians.to("cpu")[torch.from_numpy(morton_order(array(gaussians.means)))]
+def encode(gaussians: Gaussians, ordered: bool = False) -> dict[str, bytes]:
+    """The files of version 2 by name, meta.json first. ordered: keep the order, which somebody has chosen well."""
+    gaussians = gaussians.to("cpu")
+    if not ordered:
+        gaussians = gaussians[torch.from_numpy(morton_order(array(gaussians.means)))]
     count, files = len(gaussians), dict[str, bytes]()
 
     def picture(name: str, *channels: np.ndarray, width: int = 4 * math.ceil(math.sqrt(count) / 4)) -> str:

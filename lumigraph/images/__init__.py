@@ -4,6 +4,7 @@ files."""
 from __future__ import annotations
 
 from .cache import cache_folder as cache_folder
+from .cache import in_parallel as in_parallel
 from .layer import ENCODINGS as ENCODINGS
 from .layer import UNNAMED as UNNAMED
 from .layer import Layer as Layer
@@ -16,3 +17,5 @@ from .resize import resized as resized
 from .store import ImageSource as ImageSource
 from .store import ImageStore as ImageStore
 from .store import PixelBatch as PixelBatch
+from .stream import ImageStream as ImageStream
+from .stream import load as load

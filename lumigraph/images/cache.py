@@ -73,6 +73,15 @@ def check_size(path: Path, size: int) -> None:
         raise LumigraphError(f"{path} is damaged; delete the folder {path.parent}, which is made again when needed")
 
 
+def free_space(folder: Path) -> int:
+    """Bytes that a disk has for a folder, which need not be there yet; very many where it does not say."""
+    there = next((place for place in (folder, *folder.parents) if place.is_dir()), Path.cwd())
+    try:
+        return shutil.disk_usage(there).free
+    except OSError:
+        return 1 << 60
+
+
 def reserve(file, size: int) -> None:
     """Claim the disk now: writing to a mapped file on a full disk would kill the process."""
     if hasattr(os, "posix_fallocate"):

@@ -86,6 +86,8 @@ class Layer:
 
     def stored(self, image: int) -> np.ndarray:
         """One photograph's numbers as the source stores them, (height, width) or (height, width, channels)."""
+        if self._images.streams:
+            return self._alone(image)
         values, order = self._hold([image])[self._images.span(image)], self._images.order(image)
         if order is not None:
             natural = np.empty_like(values)
@@ -147,18 +149,29 @@ class Layer:
             in_parallel(lambda image: self._fill(values, image), [int(i) for i in wanted if not self._read[i]])
         return values
 
+    def _alone(self, image: int) -> np.ndarray:
+        """One photograph's numbers, row by row, read now."""
+        width, height = self._images.sizes[image].tolist()
+        values = np.empty((width * height, *((self.channels,) if self.channels > 1 else ())), self.dtype)
+        self._put(values, image, None)
+        return values.reshape(height, width, *values.shape[1:])
+
     def _fill(self, values: np.ndarray, image: int) -> None:
         """Read one photograph's numbers to their place."""
-        plane, place = self._planes[image], self._images.span(image)
-        if plane is None:
-            values[place] = self.unknown[0] if self.unknown else UNNAMED if self.encoding == "index" else np.nan
-        else:
-            found, order = plane.read(), self._images.order(image)
-            width, height = self._images.sizes[image].tolist()
-            assert found.shape[:2] == (height, width), f"promised {width}x{height}, read {found.shape}"
-            flat = found.reshape(values[place].shape)
-            values[place] = flat if order is None else flat[order]
+        self._put(values[self._images.span(image)], image, self._images.order(image))
         self._read[image] = True
+
+    def _put(self, place: np.ndarray, image: int, order: np.ndarray | None) -> None:
+        """Read one photograph's numbers, in an order; None for row by row."""
+        plane = self._planes[image]
+        if plane is None:
+            place[:] = self.unknown[0] if self.unknown else UNNAMED if self.encoding == "index" else np.nan
+            return
+        found = plane.read()
+        width, height = self._images.sizes[image].tolist()
+        assert found.shape[:2] == (height, width), f"promised {width}x{height}, read {found.shape}"
+        flat = found.reshape(place.shape)
+        place[:] = flat if order is None else flat[order]
 
     def _mapped(self, shape: tuple[int, ...]) -> np.ndarray:
         """All numbers in a file, which stays for others that ask for the same."""

@@ -75,6 +75,8 @@ class ImageStore:
     cache:    where what does not fit goes; None means the user's cache folder
     """
 
+    streams = False  # whether photographs are read again and again, so that they have no place
+
     def __init__(
         self,
         rgba: Int[Tensor, " pixel"],
@@ -102,19 +104,21 @@ class ImageStore:
         memory: int | None = None,
         cache: Path | None = None,
         progress: Callable[[int], object] = lambda done: None,
+        keep: bool = False,
     ) -> ImageStore:
         """Read pictures in parallel.
 
         memory:   bytes that may stay in memory; None means a share of the machine's
         cache:    where larger captures go; None means the user's cache folder. It may be deleted at any time.
         progress: told how many are done
+        keep:     whether they go to the file even if they fit, so that nobody makes them again
         Raises LumigraphError where the cache's disk is full, and whatever the pictures' `read` raises.
         """
         sizes = torch.tensor([p.size for p in pictures])
         total, memory = int(sizes.prod(-1).sum()), memory_for_images() if memory is None else memory
         nameless = any(p.identity is None for p in pictures)
-        called = key(p.identity and f"{p.size} {p.identity}" for p in pictures)
-        if 4 * total <= memory:
+        called = name_of(pictures)
+        if 4 * total <= memory and not keep:
             rgba = np.empty(total, np.int32)
             has_alpha, trusted = fill(rgba, pictures, progress, shuffled=False)
             left, name = memory - 4 * total, None if nameless else f"{called} in order"
@@ -200,6 +204,11 @@ class ImageStore:
         inputs = (chance, images, self._first, self._count, self._stride, self._width, *runs, self._rgba)
         look_up(piece, *(x.numpy() for x in (*inputs, image, xy, rgba.view(torch.int32)[:, 0], position)))
         return PixelBatch(image, xy, rgba, position if positions else None)
+
+
+def name_of(pictures: Sequence[ImageSource]) -> str:
+    """What a file of these pictures is called."""
+    return key(p.identity and f"{p.size} {p.identity}" for p in pictures)
 
 
 def pair(image: np.ndarray, mask: np.ndarray | None) -> tuple[np.ndarray, np.ndarray | None]:

@@ -18,6 +18,7 @@ from ..components.clouds.at_surfaces import at_surfaces, of_cloud
 from ..components.clouds.cloud import Cloud, CloudAdam
 from ..components.clouds.dense_points import compile_sweep
 from ..components.clouds.density_control import AdaptiveDensity, MarkovChain
+from ..components.clouds.few_photographs import LEFT_OUT, some_left_out, unseen_roughness
 from ..components.clouds.initial_cloud import Initialization, initial_cloud, random_cloud
 from ..components.clouds.seen_from import seen_from
 from ..components.clouds.smoothing import sampling_interval, smoothed
@@ -80,7 +81,7 @@ class Config:
     filter_3d: bool = False  # Mip-Splatting's 3-D filter (Yu 2024, section 5.1)
     refine_cameras: bool = False  # learn where each photograph was taken from, small pictures first
     pose_learning_rate: LearningRate = 5e-3  # radians by which a step moves a picture, with refine_cameras
-    match_photographs: bool = False  # with refine_cameras, begin where features that photographs share say (slow)
+    match_photographs: bool = True  # with refine_cameras, begin where features that photographs share say
     appearance: Literal["auto", "yes", "no"] = "auto"  # learn how each photograph's colours differ; auto: where they do
     own_skies: bool = True  # and in the open what shows behind everything, for each photograph
     appearance_lr: LearningRate = 5e-3  # of those changes of colour
@@ -88,6 +89,8 @@ class Config:
     appearance_regularization: NonNegative = 1e-3  # of a change's squared numbers in the loss
     robust: Literal["auto", "yes", "no"] = "auto"  # leave out what moved; auto: where colours differ
     robust_start: Share = 0.1  # share of the budget before which every pixel counts
+    few_views: bool = False  # leave Gaussians out at random, smooth depth where nobody was, plain colours
+    depth_weight: NonNegative = 1.0  # of the roughness of depth in pictures that nobody took, with few_views
     seed: Seed = 0
 
 
@@ -270,20 +273,25 @@ class GaussianSplatting(Method):
         return max(1, min(wanted, shorter // SMALLEST))
 
     def loss(self, batch: Photograph, step: int) -> dict[str, Tensor]:
-        config, cloud, camera = self.config, self._cloud(), batch.camera
+        config, camera = self.config, batch.camera
+        whole = cloud = self._cloud()
+        chance = self.random(~step)
+        if config.few_views:
+            cloud = some_left_out(cloud, LEFT_OUT * self._progress, chance)
         if self.poses:
             cloud, camera = seen_from(self.poses, cloud, camera)
         seen = splat(cloud, view_of(camera, self._near), self._bands, config.transmittance_threshold)
         rgb, background = seen.rgb, torch.tensor(self.frame.background, device=seen.rgb.device)
         if batch.alpha is not None:  # a random colour behind everything, so that only opacity can imitate opacity
-            background = torch.rand(3, generator=self.random(~step)).to(rgb.device)
+            background = torch.rand(3, generator=chance).to(rgb.device)
         target = batch.before(background)
-        code = None
+        code, terms = None, {}
         if self.appearance and camera.image_index is not None:
             code = self.appearance(camera.image_index)[0]
             rgb = changed(rgb, seen.opacity, code)
             if self.skies:
                 background = own_sky.sky(code[NUMBERS:], batch.camera)
+                terms["sky"] = own_sky.backdrop_loss(background, batch, seen.opacity)
         if background.any():
             rgb = over(rgb, seen.opacity, background)
         if batch.mask is not None:
@@ -296,15 +304,17 @@ class GaussianSplatting(Method):
             counted = self._trimming(self._difference.abs().mean(-1))
             target = torch.where(counted[..., None], target, rgb.detach())
         difference = rgb - target
-        terms = {
+        terms |= {
             "l1": (1 - config.ssim_weight) * difference.abs().mean(),
             "ssim": config.ssim_weight * (1 - kernels.ssim(rgb, target)),
         }
         if code is not None:
             terms["appearance"] = config.appearance_regularization * code[:NUMBERS].square().sum()
+        if config.few_views and config.depth_weight and self._cameras is not None:
+            terms["depth"] = config.depth_weight * unseen_roughness(whole, self._cameras, self._near, chance)
         if config.strategy == "mcmc":
-            terms["opacity"] = config.opacity_regularization * cloud.opacities.sigmoid().mean()
-            terms["scale"] = config.scale_regularization / float(self.extent) * cloud.log_scales.exp().mean()
+            terms["opacity"] = config.opacity_regularization * whole.opacities.sigmoid().mean()
+            terms["scale"] = config.scale_regularization / float(self.extent) * whole.log_scales.exp().mean()
         return terms
 
     def optimizers(self) -> list[torch.optim.Optimizer]:
@@ -339,7 +349,8 @@ class GaussianSplatting(Method):
         if self.poses:
             self.poses.progress.fill_(progress)
         raised = intervals(step, progress, config.sh_degree_interval, config.sh_degree_interval_share)
-        flat = self.poses is not None and progress < COARSE  # colours by direction would explain wrong poses away
+        # Colours by direction would explain wrong poses away, and with few photographs wrong depth.
+        flat = config.few_views or (self.poses is not None and progress < COARSE)
         self._bands = 1 if flat else 1 + min(int(raised), config.sh_degree)
 
     @torch.no_grad()

@@ -67,7 +67,7 @@ class Config(OpenNumbers):
     exposure_correction: bool = False  # learn a gain per photograph
     refine_cameras: bool = False  # learn where each photograph was taken from, coarse to fine (Lin 2021, BARF)
     pose_learning_rate: LearningRate = 5e-4  # radians by which a step moves a picture, with refine_cameras
-    match_photographs: bool = False  # with refine_cameras, begin where features that photographs share say (slow)
+    match_photographs: bool = True  # with refine_cameras, begin where features that photographs share say
     seed: Seed = 0
 
     def check(self) -> None:

@@ -9,14 +9,14 @@ from typing import Any, ClassVar
 import torch
 from jaxtyping import Float
 from torch import Tensor
-from torch.nn.functional import max_pool1d, pad, softplus
+from torch.nn.functional import pad, softplus
 
 from ..camera import Camera
 from ..components.fields.coordinate_network import CoordinateNetwork, bytes_kept
 from ..components.fields.dense import in_chunks
 from ..components.fields.encodings import FrequencyEncoding, IntegratedEncoding
 from ..components.fields.taken_over import taken_over
-from ..components.sampling.frustums import frustum_moments
+from ..components.sampling.frustums import blurred, frustums_between
 from ..components.sampling.occupancy_mask import OccupancyMask
 from ..components.sampling.sampling import inverse_transform, stratified
 from ..components.sampling.spaces import space_of
@@ -25,7 +25,7 @@ from ..components.training.pose_refinement import PoseRefinement
 from ..components.training.schedules import falling
 from ..method import RayMethod
 from ..ranges import BatchSize, Cells, Depth, Layers, LearningRate, NonNegative, Octaves, RaySamples, Seed, Share, Width
-from ..rays import Look, Rays, Rendering, Samples
+from ..rays import Look, Rays, Rendering
 from ..scene import Batch, Frame, Scene
 from ..volume import composite, weights_of
 
@@ -51,7 +51,7 @@ class Config:
     occupancy_threshold: NonNegative = 0.01  # optical thickness across a cell below which it is empty
     refine_cameras: bool = False  # learn where each photograph was taken from, coarse to fine (Lin 2021, BARF)
     pose_learning_rate: LearningRate = 5e-4  # radians by which a step moves a picture, with refine_cameras
-    match_photographs: bool = False  # with refine_cameras, begin where features that photographs share say (slow)
+    match_photographs: bool = True  # with refine_cameras, begin where features that photographs share say
     bfloat16: bool = True  # multiply in bfloat16 where the machine is fast at it
     seed: Seed = 0
 
@@ -181,15 +181,8 @@ class MipNeRF(RayMethod):
 
     def _look(self, name: str, rays: Rays, edges: Float[Tensor, "ray edge"], colours: bool = True) -> Look:
         """The network's outputs for the frustums between edges, which are shares of the way along each ray."""
-        with torch.no_grad():  # where samples lie tells nothing of a pose
-            near, far = self.space.interval(rays)
-            t = self.space.distance(edges, rays, near, far)
-        samples = Samples.rows(t[:, :-1], t[:, -1])
+        samples, means, variances = frustums_between(edges, rays, self.space)
         ray = samples.ray_index
-        distance, along, across = frustum_moments(samples.t_start, samples.t_end, rays.radius[ray])
-        directions = rays.directions[ray]
-        points = rays.origins[ray] + distance[:, None] * directions
-        means, variances = self.space.warp_gaussians(points, directions, along, across)
         seen = self.encode_direction(rays.directions)
 
         def answer(mean: Tensor, variance: Tensor, ray: Tensor) -> tuple[Tensor, Tensor]:
@@ -255,9 +248,3 @@ class MipNeRF(RayMethod):
 def padded(raw: Float[Tensor, "sample 3"]) -> Float[Tensor, "sample 3"]:
     """Colours of a network's raw output, PADDING beyond [0, 1] at most."""
     return raw.sigmoid() * (1 + 2 * PADDING) - PADDING
-
-
-def blurred(weights: Float[Tensor, "ray bin"]) -> Float[Tensor, "ray bin"]:
-    """Weights blurred a little, so that the fine samples surround what the coarse ones found (eq. 17)."""
-    larger = max_pool1d(pad(weights, (1, 1)), 2, 1)  # of each two neighbours
-    return 0.5 * (larger[:, 1:] + larger[:, :-1])

@@ -68,7 +68,7 @@ class Config:
     warmup: Share = 0.0  # share of the budget in which the learning rate grows
     refine_cameras: bool = False  # learn where each photograph was taken from, coarse to fine (Lin 2021, BARF)
     pose_learning_rate: LearningRate = 5e-4  # radians by which a step moves a picture, with refine_cameras
-    match_photographs: bool = False  # with refine_cameras, begin where features that photographs share say (slow)
+    match_photographs: bool = True  # with refine_cameras, begin where features that photographs share say
     bfloat16: bool = True  # multiply in bfloat16 where the machine is fast at it
     seed: Seed = 0
 

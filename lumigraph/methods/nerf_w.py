@@ -13,7 +13,8 @@ from torch import Tensor
 from ..components.clouds.dense_points import compile_sweep
 from ..components.fields import hash_field
 from ..components.fields.appearance import PhotographCodes, drawn, fitted
-from ..components.fields.wild_field import of_samples, with_passing
+from ..components.fields.coded_field import of_samples
+from ..components.fields.wild_field import with_passing
 from ..components.fields.wild_hash import WildHash
 from ..components.fields.wild_networks import WildNetworks
 from ..components.sampling.coarse_to_fine import SAMPLES_OF_A_RAY

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import softplus
 
@@ -24,9 +23,9 @@ from ..components.fields.picture_lookup import look_up
 from ..components.fields.residual_network import ResidualNetwork
 from ..components.sampling.sampling import inverse_transform, midpoints, stratified
 from ..components.sampling.spaces import space_of
+from ..components.training.members import chance, photographed, rays_through
 from ..components.training.schedules import falling
 from ..controls import Control, Value
-from ..dataset import Dataset
 from ..errors import LumigraphError
 from ..method import Method, RayMethod
 from ..quality import Effort, Efforts
@@ -207,7 +206,7 @@ class PixelNeRF(RayMethod):
         if self.config.encoder_weights:
             self.encoder.load(Path(self.config.encoder_weights).expanduser())
         _, first = next(data.members())
-        self.kept = self._keeping(photographed(first), self.config.source_views)
+        self.kept = self._keeping(photographed(first, "pixelnerf"), self.config.source_views)
 
     def steps_per_pass(self, data: Collection) -> float:
         return len(data.splits["train"]) / self.config.members_per_step
@@ -218,28 +217,16 @@ class PixelNeRF(RayMethod):
         views = 1 + chance(c.source_views, generator)
         lesson = Lesson([], [], [])
         for _ in range(c.members_per_step):
-            scene = photographed(data.sample_member(generator)[1])
+            scene = photographed(data.sample_member(generator)[1], "pixelnerf")
             there = scene.splits["train"]
             order = there[torch.randperm(len(there), generator=generator)].tolist()
             lesson.sources.append([scene.photograph(i).to(self.device) for i in order[:views]])
             seen = order[views:] or order
-            lesson.batches.append(self._rays_of(scene, seen[: c.targets], generator).to(self.device))
+            targets = [scene.photograph(i) for i in seen[: c.targets]]
+            rays = rays_through(targets, c.rays_per_member, self._boxed, generator)
+            lesson.batches.append(rays.to(self.device))
             lesson.frames.append(scene.frame)
         return lesson
-
-    def _rays_of(self, scene: Scene, images: Sequence[int], generator: torch.Generator) -> Batch:
-        """Random pixels of some photographs, at first within boxes around what is opaque (appendix B.2)."""
-        c, parts = self.config, []
-        counts = [len(x) for x in torch.arange(c.rays_per_member).tensor_split(len(images))]
-        for image, count in zip(images, counts, strict=True):
-            photograph = scene.photograph(image)
-            places = pixels_of(photograph, self._boxed)
-            x, y = places[torch.randint(len(places), (count,), generator=generator)].unbind(-1)
-            rays = photograph.camera.rays(torch.stack([x, y], -1) + 0.5)
-            rgb = photograph.before(scene.frame.background)[y, x]
-            parts.append((rays, rgb))
-        rays = Rays(*(torch.cat([getattr(r, name) for r, _ in parts]) for name in ("origins", "directions", "radius")))
-        return Batch(rays, torch.cat([rgb for _, rgb in parts]))
 
     def loss(self, batch: Lesson, step: int) -> dict[str, Tensor]:  # type: ignore[override]
         """The squared error of both looks, over all members (section 4.2)."""
@@ -251,7 +238,7 @@ class PixelNeRF(RayMethod):
                 if not (weight := self.pass_weights.get(look.name, 1.0)):
                     continue
                 seen = composite(look.samples, look.density, look.rgb, background)
-                error = share * (seen.rgb - rays.rgb).square().mean()
+                error = share * (seen.rgb - rays.before(background)).square().mean()
                 terms[look.name] = terms.get(look.name, 0.0) + weight * error
         self.figures |= {"mse": float(terms["fine"].detach()), "views": len(batch.sources[0])}
         return terms
@@ -423,29 +410,3 @@ class PixelNeRF(RayMethod):
     ) -> tuple[Float[Tensor, " point"], Float[Tensor, "point 3"]]:
         """Density per scene unit, and sRGB-encoded colour seen along unit directions. Both depend on the direction."""
         return self._ask(len(self.networks) - 1, points, directions, self.sources)
-
-
-def photographed(member: Dataset) -> Scene:
-    """A member as photographs. Raises LumigraphError for any other kind."""
-    if not isinstance(member, Scene):
-        raise LumigraphError(
-            f"pixelnerf learns from collections of photographs, and {member.source} holds {member.kind}; "
-            "name a folder of scenes"
-        )
-    return member
-
-
-def pixels_of(photograph: Photograph, boxed: bool) -> Int[Tensor, "pixel 2"]:
-    """Pixels (x, y) to be trusted; boxed: within the box around what is opaque, where anything is."""
-    height, width = photograph.rgb.shape[:2]
-    there = torch.ones(height, width, dtype=torch.bool) if photograph.mask is None else photograph.mask.clone()
-    if boxed and photograph.alpha is not None and (opaque := photograph.alpha > 0.5).any():
-        rows, columns = opaque.any(1).nonzero(), opaque.any(0).nonzero()
-        box = torch.zeros_like(there)
-        box[int(rows.min()) : int(rows.max()) + 1, int(columns.min()) : int(columns.max()) + 1] = True
-        there = there & box if (there & box).any() else there
-    return there.nonzero().flip(-1)
-
-
-def chance(count: int, generator: torch.Generator) -> int:
-    return int(torch.randint(count, (), generator=generator))

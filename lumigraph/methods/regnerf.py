@@ -21,7 +21,7 @@ from ..components.training.patch_flow import SIDE, PatchFlow
 from ..components.training.photometric import backdrop, residuals
 from ..components.training.unseen_views import patches, roughness, unseen_cameras
 from ..method import RayMethod
-from ..ranges import LearningRate, NonNegative, PositiveShare, Share, Steps, between
+from ..ranges import LearningRate, NonNegative, PositiveShare, Share, Steps, Width, between
 from ..rays import Look, Rays, Rendering
 from ..scene import Batch, Frame, Scene
 from ..volume import composite
@@ -47,7 +47,10 @@ class Config(MipConfig):
     annealing_start: PositiveShare = 0.5  # p_s, share of each ray that is sampled at first, eq. 10
     learning_rate: LearningRate = 2e-3
     final_learning_rate: LearningRate = 2e-5
-    # Of the hash table.
+    # Of the hash table and its networks.
+    table_learning_rate: LearningRate = 1e-2
+    final_table_learning_rate: LearningRate = 1e-3
+    table_width: Width = 64  # neurons per hidden layer
     levels: Annotated[int, between(1, 32)] = 16
     features_per_level: Annotated[int, between(1, 16)] = 2
     log2_hashmap_size: Annotated[int, between(1, 28)] = 19
@@ -61,17 +64,29 @@ class Config(MipConfig):
 
     def numbers_of(self, kind: type[Any]) -> Any:
         """The numbers of the field, as its own method has them: a `MipConfig` or an `NgpConfig`."""
-        ours = {x.name for x in fields(self)}
-        return kind(**{x.name: getattr(self, x.name) for x in fields(kind) if x.name in ours})
+        ours = {x.name: getattr(self, x.name) for x in fields(self)}
+        if kind is NgpConfig:  # a table learns faster than a network, and asks smaller networks
+            ours |= {name: ours[called] for name, called in OF_TABLE.items()}
+            ours |= {name: getattr(NgpConfig, name) for name in ITS_OWN}
+        return kind(**{x.name: ours[x.name] for x in fields(kind) if x.name in ours})
 
 
+OF_TABLE = {  # names of Instant-NGP's numbers, and what they are called beside a network's of the same name
+    "learning_rate": "table_learning_rate",
+    "final_learning_rate": "final_table_learning_rate",
+    "hidden_width": "table_width",
+}
+ITS_OWN = ("depth_weight", "occupancy_threshold")  # numbers of Instant-NGP that mean something else here
 TABLE: dict[str, Any] = {  # of a CPU, as Instant-NGP's preset has it
+    "table_learning_rate": 2e-2,
+    "table_width": 32,
     "levels": 8,
     "features_per_level": 4,
     "log2_hashmap_size": 17,
     "max_resolution": 512,
     "samples_per_step": 1 << 15,
 }
+FLOWING = 0.05  # of a budget of seconds: the share that learning what is likely may take
 STRIDES = (1, 2, 4)  # pixels between rays of a patch: what is smooth, and what looks like a photograph, is so in each
 
 
@@ -111,11 +126,12 @@ class RegNeRF(RayMethod):
 
     @classmethod
     def preset(cls, device: torch.device) -> Any:
-        """On a GPU the paper's numbers. On a CPU a smaller network, and fewer patches."""
+        """On a GPU the paper's numbers. On a CPU a smaller network, and fewer patches; what the paper does in its first
+        some hundred steps takes a larger share of the fewer there are."""
         if device.type == "cuda":
             return Config()
         own = asdict(MipNeRF.preset(device))
-        return Config(**own, unseen_patches=8, **TABLE)
+        return Config(**own, unseen_patches=8, annealing=0.25, depth_settling=0.25, **TABLE)
 
     @classmethod
     def smallest(cls) -> Any:
@@ -151,7 +167,7 @@ class RegNeRF(RayMethod):
     def begin(self, scene: Scene, seconds: float = math.inf) -> None:
         self.marcher.begin(scene, seconds)
         if self.flow:
-            self.flow.learn(scene, self.config.flow_steps, self.random(-1))
+            self.flow.learn(scene, self.config.flow_steps, self.random(-1), FLOWING * seconds)
 
     def rehearse_begin(self) -> None:
         self.marcher.rehearse_begin()
@@ -206,7 +222,7 @@ class RegNeRF(RayMethod):
             weight = c.depth_weight
             if self._progress < c.depth_settling:
                 weight += (c.depth_weight_start - weight) * (1 - self._progress / c.depth_settling)
-            terms["depth"] = weight * roughness(place, opacity)
+            terms["smoothness"] = weight * roughness(place, opacity)
         if self.flow:
             terms["likelihood"] = c.likelihood_weight * self.flow(seen.rgb.view(*shape, 3)).mean()
         return terms

@@ -6,7 +6,7 @@ import math
 import warnings
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import Annotated, Any, Literal, NamedTuple
+from typing import Annotated, Any, ClassVar, Literal, NamedTuple
 
 import torch
 from jaxtyping import Float
@@ -67,9 +67,8 @@ class Config(OpenNumbers):
     sparsity_weight: NonNegative = 1e-4  # lambda_s, section 4.2
     deferred_share: Annotated[float, between(0.05, 0.99)] = 0.9  # of the budget, ahead of baking
     voxel_share: Share = 0.0  # of what is left then, in which voxels learn too; afterwards the network alone does
-    whole: bool = False  # bake all of an open capture, contracted, rather than its box of interest; takes gigabytes
-    resolution: Annotated[int, between(8, 2048)] = 1000  # voxels along the longest side, section 5.1; across the unit
-    # ball of what is contracted, whose grid is twice as wide, and so are its cells of visibility
+    whole: bool = True  # bake all of an open capture, contracted, rather than its box of interest alone
+    resolution: Annotated[int, between(8, 2048)] = 1000  # voxels along the longest side of the grid, section 5.1
     block_size: Annotated[int, between(4, 66)] = 32  # voxels along a block's side, its apron included, section 5.1
     visibility_resolution: Annotated[int, between(8, 512)] = 256  # cells per axis in which is told what rays see
     least_alpha: Share = 0.005  # of a voxel, below which it is empty, section 5.1
@@ -149,6 +148,7 @@ class SNeRG(RayMethod):
     """A field learns from photographs; its values are baked into voxels; the small network learns on with those."""
 
     Config = Config
+    before: ClassVar[dict[str, Any]] = {"whole": False}
     rays_per_step: Tensor
     stage: Tensor
     began: Tensor
@@ -238,7 +238,8 @@ class SNeRG(RayMethod):
 
     @classmethod
     def further_bytes(cls, frame: Frame, config: Any, learning: bool) -> int:
-        surface = 3 * config.resolution**2  # voxels at least, of what fills its box
+        open_air = config.whole and frame.reach > 1  # whose far surroundings are a thick shell
+        surface = (20 if open_air else 3) * config.resolution**2  # voxels, of what fills its box at least
         voxels = surface * (6 + CHANNELS + 4 + 4 * CHANNELS * (4 if learning and config.voxel_share else 1))
         grids = OccupancyGrid.bytes_of(frame.reach, config.occupancy_resolution) + Unbounded.bytes_of(frame, learning)
         kept = 4 * config.samples_per_step * config.hidden_layers * config.hidden_width
@@ -461,6 +462,7 @@ class SNeRG(RayMethod):
         if self.stage > FIELD and self.began < 0:
             self.began.fill_(progress)
         if self.stage == VOXELS and self._spent(progress) >= self._voxel_share:
+            self._drop_hidden()
             self.voxels.settle(self.tuned.values.detach())
             self._exchange(self.tuned, "values", self.tuned.values[:0])
             self.stage.fill_(ATLAS)
@@ -517,6 +519,18 @@ class SNeRG(RayMethod):
         self.stage.fill_(VOXELS)
         self._release()
 
+    @torch.no_grad()
+    def _drop_hidden(self) -> None:
+        """Leave out voxels that no training ray met while they learnt, once more rays came by than there are others."""
+        known = self._lazy.state.get(self.tuned.values) if self._lazy else None
+        if not known:
+            return
+        met = (known["square"] > 0).any(1)
+        if 0 < int(met.sum()) < int(known["step"]) * self.config.rays_per_step:
+            voxels, (low, edge, size) = self.voxels, (self.voxels.low, float(self.voxels.edge), self.voxels.size)
+            voxels.hold(voxels.places[met], low, edge, size)
+            self._exchange(self.tuned, "values", self.tuned.values[met])
+
     def _grid(self, seen: Tensor) -> tuple[Float[Tensor, " 3"], float, Tensor]:
         """Corner, side of a voxel, and voxels along each axis, of the grid around all that rays see: within the box of
         interest, or all that there is, contracted."""
@@ -524,7 +538,7 @@ class SNeRG(RayMethod):
         if not len(cells):
             raise LumigraphError("There is nothing to bake: no ray sees anything in the box of interest; train longer")
         if self.voxels.space:
-            count = -(-2 * self.config.resolution // self.voxels.block) * self.voxels.block
+            count = -(-self.config.resolution // self.voxels.block) * self.voxels.block
             return self.background.new_full((3,), -2.0), 4 / count, torch.full((3,), count, device=self.device)
         low, high = (x * (2 / len(seen)) - 1 for x in (cells.amin(0), cells.amax(0) + 1))
         if self.frame.reach > 1:
@@ -586,5 +600,5 @@ def slabs(x: int, y: int, z: int) -> Iterator[tuple[int, int]]:
 
 BOUNDED = (
     "SNeRG bakes what lies in the box of interest, as `lumigraph info` tells it; what lies beyond is learnt "
-    "beside it until then, and afterwards shows as the plain background; --whole bakes all, in gigabytes"
+    "beside it until then, and afterwards shows as the plain background; --whole bakes all"
 )

@@ -1,5 +1,6 @@
 """What opens: runs, the folders that training fills; splat files; compositions of several."""
 
+from .block_run import BlockRun as BlockRun
 from .checkpoint import State as State
 from .folder import Run as Run
 from .folder import build as build
@@ -8,3 +9,4 @@ from .folder import processor as processor
 from .needs import check_memory as check_memory
 from .opened import Opened as Opened
 from .opening import open_any as open_any
+from .opening import open_run as open_run

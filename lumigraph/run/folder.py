@@ -53,6 +53,11 @@ class Run(Opened):
     def __init__(self, folder: Path | str):
         self.path = self.folder = Path(folder)
         if not files.is_file(self._config):
+            if files.is_file(self.folder / "blocks.json"):
+                raise LumigraphError(
+                    f"{self.folder} is a run in blocks, and this is for one of them at a time: name "
+                    f"{self.folder / 'blocks' / '0'}, or another block"
+                )
             raise LumigraphError(f"{self.folder} is not a run: it holds no config.json; `lumigraph train` makes runs")
         self.settings = Settings.read(self._config)
         self.frame = self.settings.frame
@@ -175,7 +180,10 @@ class Run(Opened):
 
         source = source or self.settings.scene.source
         if self.kind not in KINDS:
-            raise LumigraphError(f"{self._config}: nothing learns from {self.kind!r}; there are {', '.join(KINDS)}")
+            raise LumigraphError(
+                f"{self.folder} was made of {self.kind}, and nothing learns from that or is compared with it; "
+                f"there are {', '.join(KINDS)}"
+            )
         options = {name: value for name, value in self.settings.scene.options.items() if value is not None}
         if self.photographed:
             names = cameras.read(self._cameras).names

@@ -6,7 +6,9 @@ from pathlib import Path
 
 from ..errors import LumigraphError
 from ..exchange import is_splat_file, place_of, snerg
-from ..files import is_file
+from ..files import is_file, read_json
+from .block_run import BlockRun, is_block_run
+from .canonicalised import FORMAT, Canonicalised
 from .composition import Composition
 from .folder import Run
 from .opened import Opened
@@ -15,8 +17,8 @@ from .splat_file import SplatFile
 
 
 def open_any(path: Path | str, within: tuple[Path, ...] = ()) -> Opened:
-    """What lies at a path: a run's folder, a splat file (`exchange.SUFFIXES`, a folder of SOG), a folder of SNeRG's
-    viewer, a composition (.json).
+    """What lies at a path: a run's folder, one in blocks, a splat file (`exchange.SUFFIXES`, SOG, streamed or
+    not), a folder of SNeRG's viewer, a composition (.json), a run as `lumigraph canonicalise` placed it (.json).
 
     within: compositions that it is opened as a part of
     Raises LumigraphError, in one sentence, for anything else.
@@ -25,7 +27,17 @@ def open_any(path: Path | str, within: tuple[Path, ...] = ()) -> Opened:
     if is_splat_file(path):
         return SplatFile(place_of(path))
     if path.suffix.lower() == ".json" and not path.is_dir():
+        said = read_json(path)
+        if isinstance(said, dict) and said.get("format") == FORMAT:
+            return Canonicalised(path)
         return Composition(path, open_any, within)
     if is_file(path):
         raise LumigraphError(f"{path} is none of the files that open: a splat file, or a composition's JSON")
+    if is_block_run(path):
+        return BlockRun(path)
     return SnergFolder(path) if snerg.recognises(path) else Run(path)
+
+
+def open_run(path: Path | str) -> Run | BlockRun:
+    """A run, of one field or in blocks. Raises LumigraphError for a folder that is neither."""
+    return BlockRun(path) if is_block_run(Path(path)) else Run(path)

@@ -8,6 +8,7 @@ from typing import Annotated, Any
 
 from .. import files
 from ..budget import Budget
+from ..capture import Part
 from ..errors import LumigraphError
 from ..method import Method
 from ..plain import alike, renamed
@@ -25,6 +26,8 @@ class Options:
     reader: str | None = None
     views: Count | None = None
     scales: Scales | None = None
+    whole: bool | None = None
+    part: Part | None = None
 
 
 @dataclass(frozen=True)

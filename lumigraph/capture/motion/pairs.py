@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Float
 from scipy.cluster.vq import kmeans2, vq
+from scipy.spatial import cKDTree
 
+from ...choice import evenly
 from ...library import pycolmap
 
 Matching = Literal["auto", "exhaustive", "sequential", "retrieval"]
@@ -21,7 +23,9 @@ ALIKE = 30  # photographs that each is compared with where not all can be
 LOOPS = 5  # those of an ordered capture that look alike without being neighbours: where the camera came back
 WORDS = 64  # of the vocabulary
 SAMPLED = 500  # descriptors of each photograph that are looked at
-LEARNT_FROM = 30_000  # of which the vocabulary is learnt
+SPEAKERS = 240  # photographs that the vocabulary is learnt from
+LEARNT_FROM = 30_000  # of their descriptors, of which it is learnt
+BLOCK = 256  # photographs that are compared with all others at a time
 TILE = 16  # photographs whose features COLMAP keeps at hand: pairs are compared tile by tile
 
 
@@ -41,44 +45,62 @@ def sequential(count: int, neighbours: int = NEIGHBOURS) -> set[Pair]:
     return {(i, i + step) for step in steps for i in range(count - step)}
 
 
-def alike(likeness: Float[np.ndarray, "photo photo"], most: int, apart: int = 1) -> set[Pair]:
-    """Each photograph with the `most` that are most like it, among those at least `apart` places away."""
-    count = len(likeness)
-    places = np.arange(count)
-    allowed = np.where(np.abs(places[:, None] - places) >= apart, likeness, -np.inf)
-    order = np.argsort(-allowed, axis=1, kind="stable")[:, :most]
-    return {(min(i, j), max(i, j)) for i in range(count) for j in order[i].tolist() if np.isfinite(allowed[i, j])}
+def alike(vectors: Float[np.ndarray, "photo number"], most: int, apart: int = 1) -> set[Pair]:
+    """Each photograph with the `most` that are most like it, among those at least `apart` places away.
+
+    vectors: of each, see `aggregated`
+    """
+    places, pairs = np.arange(len(vectors)), set()
+    for block in np.split(places, range(BLOCK, len(places), BLOCK)):
+        likeness = vectors[block] @ vectors.T
+        likeness[np.abs(block[:, None] - places) < apart] = -np.inf
+        order = np.argsort(-likeness, axis=1, kind="stable")[:, :most]
+        found = np.isfinite(np.take_along_axis(likeness, order, 1))
+        pairs |= {
+            (min(i, j), max(i, j))
+            for i, row, there in zip(block.tolist(), order.tolist(), found.tolist(), strict=True)
+            for j, is_one in zip(row, there, strict=True)
+            if is_one
+        }
+    return pairs
 
 
-def likeness(descriptors: Sequence[np.ndarray], seed: int = 0) -> Float[np.ndarray, "photo photo"]:
-    """How alike photographs are, by their features: cosines between vectors of locally aggregated descriptors.
+def aggregated(descriptors: Sequence[np.ndarray], seed: int = 0) -> Float[np.ndarray, "photo number"]:
+    """A vector for each photograph, by its features; the product of two is how alike they are, 1 at most.
 
     VLAD (Jégou 2010) over a vocabulary that is learnt from the photographs themselves. For each word the residuals of
     the descriptors nearest to it are added up; each sum is normalised (Arandjelović 2013), then the whole.
-    descriptors: of each photograph, (feature, 128)
+    descriptors: of each photograph, (feature, 128); asked for one by one, twice, so that they may be in a file
     """
-    chance = np.random.default_rng(seed)
-    sampled = [d[chance.permutation(len(d))[:SAMPLED]].astype(np.float32) for d in descriptors]
-    joined = np.concatenate(sampled)
+
+    def sampled(photo: int) -> np.ndarray:
+        found = descriptors[photo]
+        return found[np.random.default_rng([seed, photo]).permutation(len(found))[:SAMPLED]].astype(np.float32)
+
+    speakers = evenly(range(len(descriptors)), SPEAKERS)
+    joined = np.concatenate([sampled(photo) for photo in speakers])
     if len(joined) <= WORDS:
-        return np.zeros((len(descriptors), len(descriptors)))
-    learnt = joined[chance.permutation(len(joined))[:LEARNT_FROM]]
+        return np.zeros((len(descriptors), 1), np.float32)
+    learnt = joined[np.random.default_rng(seed).permutation(len(joined))[:LEARNT_FROM]]
     words, _ = kmeans2(learnt, WORDS, iter=10, minit="++", seed=seed)
-    vectors = np.zeros((len(sampled), WORDS, joined.shape[1]))
-    for vector, found in zip(vectors, sampled, strict=True):
-        if len(found):
+    vectors = np.zeros((len(descriptors), WORDS, joined.shape[1]), np.float32)
+    for photo, vector in enumerate(vectors):
+        if len(found := sampled(photo)):
             nearest, _ = vq(found, words)
             np.add.at(vector, nearest, found - words[nearest])
-    vectors /= np.linalg.norm(vectors, axis=2, keepdims=True).clip(1e-9)
-    flat = vectors.reshape(len(sampled), -1)
-    flat /= np.linalg.norm(flat, axis=1, keepdims=True).clip(1e-9)
-    return flat @ flat.T
+        vector /= np.linalg.norm(vector, axis=1, keepdims=True).clip(1e-9)
+        vector /= np.linalg.norm(vector).clip(1e-9)
+    return vectors.reshape(len(vectors), -1)
 
 
 def near(positions: Float[np.ndarray, "photo 3"], most: int = NEIGHBOURS) -> set[Pair]:
     """Each photograph with the `most` taken nearest to it; NaN where nobody knows."""
-    distance = np.linalg.norm(positions[:, None] - positions, axis=-1)
-    return alike(-np.nan_to_num(distance, nan=np.inf), most)
+    known = np.flatnonzero(np.isfinite(positions).all(1))
+    if len(known) < 2:
+        return set()
+    _, found = cKDTree(positions[known]).query(positions[known], k=min(most + 1, len(known)))
+    pairs = {(i, j) for i, row in zip(known.tolist(), known[found].tolist(), strict=True) for j in row if i != j}
+    return {(min(pair), max(pair)) for pair in pairs}
 
 
 def choose_pairs(
@@ -94,7 +116,8 @@ def choose_pairs(
     if matching == "exhaustive" or count <= NEIGHBOURS:
         pairs = exhaustive(count)
     else:
-        similar = likeness(read_descriptors(database, names))
+        with Descriptors(database, names) as descriptors:
+            similar = aggregated(descriptors)
         if matching == "sequential":
             pairs = sequential(count) | alike(similar, LOOPS, apart=NEIGHBOURS + 1)
         else:
@@ -102,10 +125,22 @@ def choose_pairs(
     return sorted(pairs, key=lambda pair: (pair[1] // TILE, pair[0] // TILE, pair))
 
 
-def read_descriptors(database: Path, names: Sequence[str]) -> list[np.ndarray]:
-    opened = pycolmap.Database.open(database)
-    try:
-        numbers = {image.name: image.image_id for image in opened.read_all_images()}
-        return [opened.read_descriptors(numbers[name]).data for name in names]
-    finally:
-        opened.close()
+class Descriptors(Sequence[np.ndarray]):
+    """The descriptors of photographs, (feature, 128), each read from COLMAP's database when it is asked for."""
+
+    def __init__(self, database: Path, names: Sequence[str]):
+        self._opened = pycolmap.Database.open(database)
+        numbers = {image.name: image.image_id for image in self._opened.read_all_images()}
+        self._numbers = [numbers[name] for name in names]
+
+    def __enter__(self) -> Descriptors:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._opened.close()
+
+    def __len__(self) -> int:
+        return len(self._numbers)
+
+    def __getitem__(self, photo: Any) -> Any:
+        return self._opened.read_descriptors(self._numbers[photo]).data

@@ -8,7 +8,10 @@
     render(stage.world_of(camera), camera)                the same, of a scene that moves: `swing`
     write_blender(stage, folder)                          the same for other tools
 
+    open_scene("procedural:city,crossings=6")             scenes may have options of their own
+
     open_dataset("procedural:toys,count=200")             a Collection of objects, see `members`
+    open_dataset("procedural:toys,count=20,turned=1")     the same, each in a pose that nobody chose
 
 A new scene is a new file in `scenes/`, a new category of objects one in `categories/`; nothing is compiled for it.
 """
@@ -16,14 +19,13 @@ A new scene is a new file in `scenes/`, a new category of objects one in `catego
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict
 from functools import partial
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
 
 from ...camera import Camera
-from ...ranges import Seed, between
 from ..capture import Capture, Plane, Shot
 from ..raw import RawPhoto, facts, planes
 from . import categories as categories
@@ -49,31 +51,23 @@ from .world import Sun as Sun
 from .world import World as World
 
 TRUE_POSE = "true_pose"  # of `Scene.about`: camera-to-world in the source's frame
+TURN = "turn"  # of `Scene.about`: rotation from an object's upright frame to the source's; see `Stage.turn`
 TRACER = 1  # of the pictures that are kept: another number traces them anew
 
 
-@dataclass(frozen=True)
-class Options:
-    """size: of the square pictures, pixels; views: number of photographs to learn from; seed: where cameras stand;
-    jitter_poses: degrees, and percent of the box of interest, by which poses to learn from are off."""
-
-    size: Annotated[int, between(1, 8192)] = 200
-    views: Annotated[int, between(1, 10_000)] = 100
-    seed: Seed = 0
-    jitter_poses: Annotated[int, between(0, 45)] = 0
-
-
 def read(request: str) -> Capture:
-    """The capture that a name stands for, with `Options` after commas: "still-life", "still-life,size=400,seed=1".
+    """The capture that a name stands for, with options after commas: "still-life", "still-life,size=400,seed=1".
 
     Pictures are traced when somebody reads them. Raises LumigraphError for a name or an option that does not exist.
     """
     if is_category(request):
         return capture(member_stage(request), f"procedural:{request}", kept=True)
-    name, options = told(Options, request)
-    stage = scenes.stage(name, options.size, options.views, options.seed)
-    off = jittered(stage, options.jitter_poses, options.seed) if options.jitter_poses else None
-    return capture(stage, f"procedural:{request}", off)
+    name, options = told(scenes.options(request.partition(",")[0]), request)
+    asked = asdict(options)
+    amount = asked.pop("jitter_poses")
+    stage = scenes.stage(name, **asked)
+    off = jittered(stage, amount, options.seed) if amount else None
+    return capture(stage, f"procedural:{request}", off, kept=stage.called is not None)
 
 
 def capture(stage: Stage, source: str, found: dict[str, Camera] | None = None, kept: bool = False) -> Capture:
@@ -101,12 +95,18 @@ def capture(stage: Stage, source: str, found: dict[str, Camera] | None = None, k
         for i in range(len(cameras))
     ]
     background = (0.0, 0.0, 0.0) if visible else (1.0, 1.0, 1.0)
-    return Capture(source, shots, bounds=stage.bounds, reach=stage.reach, near=stage.near, background=background)
+    return Capture(
+        source, shots, bounds=stage.bounds, reach=stage.reach, near=stage.near, background=background, kept=kept
+    )
 
 
 def identity(stage: Stage, camera: Camera) -> str:
-    """All that a picture of a world that stands still depends on."""
-    return f"traced {TRACER} {stage.world!r} {camera.pose.tolist()} {camera.lens.to_json()} {camera.size.tolist()}"
+    """All that a picture depends on."""
+    if stage.called is not None and camera.image_index is not None:
+        world = stage.called(int(camera.image_index))
+    else:
+        world = repr(stage.world)
+    return f"traced {TRACER} {world} {camera.pose.tolist()} {camera.lens.to_json()} {camera.size.tolist()}"
 
 
 def known_planes(stage: Stage, camera: Camera) -> dict[str, Plane]:
@@ -135,6 +135,10 @@ def known_planes(stage: Stage, camera: Camera) -> dict[str, Plane]:
 def known_facts(stage: Stage, camera: Camera, jittered: bool) -> dict[str, Any]:
     """What one photograph says of itself. jittered: whether its pose is not the true one, which is told then"""
     known = {TRUE_POSE: camera.pose[0].double().numpy()} if jittered else {}
+    if stage.facts is not None and camera.image_index is not None:
+        known |= stage.facts(int(camera.image_index))
+    if stage.turn is not None:
+        known[TURN] = np.array(stage.turn)
     if stage.sensor is None or camera.image_index is None:
         return known
     return known | facts(taken_raw(stage, camera), stage.sensor.brightness(int(camera.image_index)))

@@ -18,6 +18,8 @@ def hierarchy(boxes: list[tuple[np.ndarray, np.ndarray]]) -> np.ndarray:
     Unbounded ones come first; the others are split again and again where a ray then has least to ask (surface area
     heuristic, Goldsmith and Salmon 1987).
     """
+    if not boxes:
+        return np.zeros(0, NODE)
     low, high = (np.clip(np.array(x).reshape(-1, 3), -FAR, FAR) for x in zip(*boxes, strict=True))
     bounded = high[:, 0] < FAR
     nodes: list[tuple] = []
@@ -42,6 +44,8 @@ def hierarchy(boxes: list[tuple[np.ndarray, np.ndarray]]) -> np.ndarray:
 
 def split(low: np.ndarray, high: np.ndarray, members: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Two groups whose boxes, weighted by how many each holds, have least surface."""
+    if len(members) == 2:
+        return members[:1], members[1:]
     best, groups = np.inf, (members[:1], members[1:])
     for axis in range(3):
         order = members[np.argsort((low + high)[members, axis], kind="stable")]

@@ -21,13 +21,17 @@ def look_at(eye, target, up=(0.0, 0.0, 1.0)) -> Float[np.ndarray, "3 4"]:
     return geometry.look_at(eye, target - eye, up).numpy()
 
 
-def pinhole(poses: Float[np.ndarray, "camera 3 4"], size: int, field_of_view: float | np.ndarray) -> Camera:
-    """The lens of square pictures of `size` pixels, `field_of_view` degrees wide, or of each camera."""
+def pinhole(
+    poses: Float[np.ndarray, "camera 3 4"], size: int | tuple[int, int], field_of_view: float | np.ndarray
+) -> Camera:
+    """The lens of pictures of `size` (width, height) pixels, or so many square, `field_of_view` degrees wide, or of
+    each camera."""
     count = len(poses)
+    shape = torch.tensor([size, size] if isinstance(size, int) else size)
     angles = np.broadcast_to(np.radians(field_of_view), count)
-    focal = torch.from_numpy(0.5 * size / np.tan(angles / 2)).float()[:, None].expand(-1, 2)
-    lens = Pinhole(focal, torch.full((count, 2), size / 2))
-    return Camera(torch.from_numpy(np.asarray(poses)).float(), lens, torch.full((count, 2), size))
+    focal = torch.from_numpy(0.5 * int(shape[0]) / np.tan(angles / 2)).float()[:, None].expand(-1, 2)
+    lens = Pinhole(focal, (shape / 2).expand(count, 2).contiguous())
+    return Camera(torch.from_numpy(np.asarray(poses)).float(), lens, shape.expand(count, 2).contiguous())
 
 
 def sphere_point(azimuth: float, elevation: float, radius: float = 1.0) -> np.ndarray:

@@ -14,10 +14,11 @@ from .world import rotation_about
 
 def jittered(stage: Stage, amount: float, seed: int) -> dict[str, Camera]:
     """The stage's cameras, those to learn from each turned by `amount` degrees about an axis of its own and moved by
-    `amount` percent of the longest side of the box of interest, any way. Held-out ones stay where they are."""
+    `amount` percent of the longest side of the box of interest, or of `Stage.error`, any way. Held-out ones stay where
+    they are."""
     random = np.random.default_rng([seed, 0x9E3779B9])
     low, high = (np.array(corner) for corner in stage.bounds)
-    shift = amount / 100 * float((high - low).max())
+    shift = amount / 100 * (stage.error or float((high - low).max()))
     cameras = stage.cameras["train"]
     pose = cameras.pose.double().numpy().copy()
     for one in pose:

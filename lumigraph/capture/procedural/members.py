@@ -6,6 +6,7 @@ Its pictures are traced once and then lie in the user's cache, for a collection 
 
 from __future__ import annotations
 
+import zlib
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated
@@ -18,17 +19,20 @@ from . import categories
 from .meshes import mesh_stage
 from .options import told
 from .stage import Stage
+from .turned import turned
 
 Number = Annotated[int, between(0, 99_999)]
 
 
 @dataclass(frozen=True)
 class Member:
-    """size: of the square pictures, pixels; views: to learn from; seed: of everything; member: its number."""
+    """size: of the square pictures, pixels; views: to learn from; seed: of everything; turned: 1 for a random rotation;
+    member: its number."""
 
     size: Annotated[int, between(1, 8192)] = 64
     views: Annotated[int, between(1, 10_000)] = 20
     seed: Seed = 0
+    turned: Annotated[int, between(0, 1)] = 0
     member: Number = 0
 
 
@@ -40,6 +44,7 @@ class Many:
     size: Annotated[int, between(1, 8192)] = 64
     views: Annotated[int, between(1, 10_000)] = 20
     seed: Seed = 0
+    turned: Annotated[int, between(0, 1)] = 0
 
 
 def is_category(request: str) -> bool:
@@ -48,8 +53,12 @@ def is_category(request: str) -> bool:
 
 
 def path_of(request: str) -> Path | None:
-    """The folder or the mesh that a request names; None where it names something procedural."""
-    path = Path(request.partition(",")[0]).expanduser()
+    """The folder or the mesh that a request names; None where it names something procedural. A category goes first: a
+    folder that is called like one is named ./chairs."""
+    name = request.partition(",")[0]
+    if name in categories.available():
+        return None
+    path = Path(name).expanduser()
     return path if path.is_dir() or meshes.is_mesh(path) else None
 
 
@@ -63,7 +72,8 @@ def is_collection(request: str) -> bool:
 def members_of(request: str) -> dict[str, str]:
     """What to ask for each member by, by its name. Raises LumigraphError for a folder without meshes."""
     name, many = told(Many, request)
-    shared = ",".join(f"{key}={value}" for key, value in asdict(many).items() if key != "count")
+    said = {key: value for key, value in asdict(many).items() if key != "count" and (key != "turned" or value)}
+    shared = ",".join(f"{key}={value}" for key, value in said.items())
     if (folder := path_of(request)) is None:
         return {f"{name}-{i:04d}": f"{name},member={i},{shared}" for i in range(many.count)}
     found = sorted(filter(meshes.is_mesh, folder.resolve().rglob("*")), key=lambda path: natural(path.as_posix()))
@@ -76,5 +86,7 @@ def member_stage(request: str) -> Stage:
     """One object and the cameras around it."""
     name, one = told(Member, request)
     if (path := path_of(request)) is not None:
-        return mesh_stage(path, one.size, one.views, one.seed)
-    return categories.stage(name, one.member, one.size, one.views, one.seed)
+        stage, number = mesh_stage(path, one.size, one.views, one.seed), zlib.crc32(path.name.encode())
+    else:
+        stage, number = categories.stage(name, one.member, one.size, one.views, one.seed), one.member
+    return turned(stage, one.size, (one.seed, number)) if one.turned else stage

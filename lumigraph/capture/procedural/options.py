@@ -2,14 +2,28 @@
 
 from __future__ import annotations
 
-from dataclasses import fields
-from typing import TypeVar
+from dataclasses import dataclass, fields
+from typing import Annotated, TypeVar
 
 from ...errors import LumigraphError
-from ...ranges import typed
+from ...ranges import Seed, between, typed
 
 DIGITS = 20  # of a number, at most
 Options = TypeVar("Options")
+
+
+@dataclass(frozen=True)
+class Pictures:
+    """What every scene can be asked for.
+
+    size: of the square pictures, pixels; views: number of photographs to learn from; seed: where cameras stand;
+    jitter_poses: degrees, and percent of the box of interest, by which poses to learn from are off
+    """
+
+    size: Annotated[int, between(1, 8192)] = 200
+    views: Annotated[int, between(1, 10_000)] = 100
+    seed: Seed = 0
+    jitter_poses: Annotated[int, between(0, 45)] = 0
 
 
 def told(kind: type[Options], request: str) -> tuple[str, Options]:

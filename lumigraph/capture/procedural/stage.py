@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 from ...camera import Camera
 from .sensor import Sensor
-from .world import Vector, World
+from .world import Rotation, Vector, World
 
 
 @dataclass(frozen=True)
@@ -23,7 +24,13 @@ class Stage:
     differing: the world when a photograph was taken, by its `image_index`, where light or people differ from one to the
              next; None where they do not
     lasting: the same without whatever only passed by
+    turn:    rotation from the frame in which an object of a category stands upright and faces the way that all of them
+             do, to the world; None where there is no such frame
     sensor:  what takes its photographs raw, which the cameras' `image_index` counts; None where they are pictures alone
+    facts:   what a photograph says of itself, by its `image_index`; see `Scene.about`
+    called:  a name for all that the world of a photograph depends on, by its `image_index`, under which its picture is
+             kept; None where pictures are not kept
+    error:   the length of which errors of poses are so many percent; None for the longest side of the bounds
     """
 
     world: World
@@ -34,7 +41,11 @@ class Stage:
     moving: Callable[[float], World] | None = None
     differing: Callable[[int], World] | None = None
     lasting: Callable[[int], World] | None = None
+    turn: Rotation | None = None
     sensor: Sensor | None = None
+    facts: Callable[[int], dict[str, Any]] | None = None
+    called: Callable[[int], str] | None = None
+    error: float | None = None
 
     def world_of(self, camera: Camera) -> World:
         """The world at the moment when a camera (a batch of one) takes its photograph."""

@@ -7,9 +7,10 @@ it was. `World.arrays` flattens it for the tracer, which is compiled once and ne
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -19,6 +20,7 @@ from .shapes import Shape
 from .textures import Colour, Texture
 
 Vector = tuple[float, float, float]
+Rotation = tuple[Vector, Vector, Vector]  # its rows
 
 OBJECT = np.dtype(
     [
@@ -57,6 +59,9 @@ SKY = np.dtype(
 )
 
 
+KINDS = ("objects", "materials", "nodes")  # of `Arrays`, what is each object's own
+
+
 class Arrays(NamedTuple):
     """A world as the tracer reads it."""
 
@@ -72,7 +77,7 @@ class Pose:
     """A rigid motion from an object's own frame to the world: x -> rotation x + position."""
 
     position: Vector = (0.0, 0.0, 0.0)
-    rotation: tuple[Vector, Vector, Vector] = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+    rotation: Rotation = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 
     @staticmethod
     def at(x: float, y: float, z: float, turn: float = 0.0, tilt: float = 0.0) -> Pose:
@@ -113,6 +118,15 @@ class Object:
     material: Material
     pose: Pose = Pose()
     name: str = "object"
+
+    def scaled(self, factor: float) -> Object:
+        """It so many times larger, seen from the world's origin; its texture stays as fine as it was."""
+
+        def times(value: Any) -> Any:
+            return tuple(map(times, value)) if isinstance(value, tuple) else factor * value
+
+        shape = type(self.shape)(**{name: times(value) for name, value in vars(self.shape).items()})
+        return replace(self, shape=shape, pose=replace(self.pose, position=times(self.pose.position)))
 
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
         """Lowest and highest corner of a box around it, scene units."""
@@ -225,13 +239,14 @@ class World:
     def arrays(self) -> Arrays:
         """The world as flat arrays, for the tracer."""
         objects = np.zeros(len(self.objects), OBJECT)
-        materials = list(dict.fromkeys(o.material for o in self.objects))
+        materials = numbered(o.material for o in self.objects)
+        names = numbered(self.names)
         for row, thing in zip(objects, self.objects, strict=True):
             kind, size, rounding, half = thing.shape.describe()
             row["kind"], row["half"] = kind, half
             row["size"][: len(size)], row["size"][5] = size, rounding
             row["rotation"], row["position"] = thing.pose.rotation, thing.pose.position
-            row["material"], row["identity"] = materials.index(thing.material), self.names.index(thing.name)
+            row["material"], row["identity"] = materials[thing.material], names[thing.name]
         return Arrays(
             objects,
             np.array([_material(m) for m in materials], MATERIAL),
@@ -239,6 +254,34 @@ class World:
             np.array([self.sky.describe()], SKY),
             hierarchy([o.bounds() for o in self.objects]),
         )
+
+
+def joined(parts: Sequence[World], lights: tuple[Lamp | Sun, ...], sky: Sky) -> World:
+    """The objects of several worlds in one, and in one light. Each part is flattened once for all worlds that it
+    becomes part of. No name may be in two of them."""
+    world = World(tuple(o for part in parts for o in part.objects), lights, sky)
+    names = [name for part in parts for name in part.names]
+    assert len(names) == len(set(names)), "a name is in two parts"
+    flat = [part.arrays for part in parts]
+    objects, materials, nodes = (np.concatenate([getattr(a, kind) for a in flat]) for kind in KINDS)
+    begin = Arrays(*(np.cumsum([0, *(len(a[k]) for a in flat)]) for k in range(len(Arrays._fields))))
+    seen = np.cumsum([0, *(len(part.names) for part in parts)])
+    for k in range(len(parts)):
+        own = slice(begin.objects[k], begin.objects[k + 1])
+        objects["material"][own] += begin.materials[k]
+        objects["identity"][own] += seen[k]
+        tree = nodes[begin.nodes[k] : begin.nodes[k + 1]]
+        tree["skip"] += begin.nodes[k]
+        tree["object"][tree["object"] >= 0] += begin.objects[k]
+    light = World((), lights, sky).arrays
+    # What `arrays` would find, without building the tree again.
+    world.__dict__["arrays"] = Arrays(objects, materials, light.lights, light.sky, nodes)
+    return world
+
+
+def numbered(things: Iterable[Any]) -> dict[Any, int]:
+    """Each different thing with its number."""
+    return {thing: number for number, thing in enumerate(dict.fromkeys(things))}
 
 
 def rotation_about(axis: Vector, degrees: float) -> np.ndarray:

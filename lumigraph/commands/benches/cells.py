@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from ... import methods
+from ...budget import Budget
 from ...errors import LumigraphError
 from ...ranges import Count, Downscale, Scales, Seed
 from ..capture import posed
-from ..common import ReaderOption, choose_device, needed, option, say, scene_name, show
+from ..common import ReaderOption, choose_device, needed, option, say, show
 from ..train import DEFAULT_SECONDS
+
+if TYPE_CHECKING:
+    from ...benchmark.cell import Cell, Settings
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,44 +45,41 @@ class Cells:
     preset: Literal["auto", "laptop", "paper"] = "auto"
     """The methods' own defaults: their papers', or what learns most on a plain CPU; auto looks at --device."""
 
-    def conduct(
-        self,
-        seconds: Sequence[float],
-        steps: Sequence[int],
-        views: Callable[[str], list[int | None]],
-    ) -> int:
-        """Train and compare everything with everything. views: numbers of photographs by the scene's source."""
-        from ...benchmark.cell import Cell, Settings
-        from ...benchmark.conduct import conduct
-        from ...budget import Budget
+    def checked(self) -> Settings:
+        """What all cells share. Raises LumigraphError for what cannot be, before anything is opened or trained."""
+        from ...benchmark.cell import Settings
         from ...metrics.lpips import load_lpips, named_files
 
-        if seconds and steps:
-            raise LumigraphError("--steps and --seconds are two ways to say how long; give one of them")
-        budgets = [Budget(n, None) for n in steps] or [Budget(None, s) for s in seconds or (DEFAULT_SECONDS,)]
-        names = [methods.check(name) for name in self.methods]
+        for name in self.methods:
+            methods.check(name)
         choose_device(self.device)
         weights = tuple(path.resolve() for path in named_files(self.lpips))
         if weights:
-            load_lpips(weights)  # refuses what is wrong, before anything is trained
-        settings = Settings(
-            self.downscale, self.reader, self.scales, self.preset, self.device, self.eval_views, weights
-        )
-        sources = [located(posed(scene)) for scene in self.scenes]
-        cells = [
-            Cell(name, scene_name(source), source, budget, seed, number)
-            for source in sources
-            for number in views(source)
-            for budget in budgets
-            for seed in self.seeds
-            for name in names
-        ]
+            load_lpips(weights)
+        return Settings(self.downscale, self.reader, self.scales, self.preset, self.device, self.eval_views, weights)
+
+    def conduct(self, cells: Sequence[Cell], settings: Settings) -> int:
+        """Train and compare all cells."""
+        from ...benchmark.conduct import conduct
+
         code = conduct(cells, settings, self.output, say)
         if code:
             say("Stopped; what is done is kept, and the same command goes on")
             return code
         show({"table": str(self.output / "results.md"), "figures": str(self.output / "results.json")})
         return 0
+
+
+def budgets(seconds: Sequence[float], steps: Sequence[int]) -> list[Budget]:
+    """How long to train: seconds or steps, DEFAULT_SECONDS where neither is said. Raises LumigraphError for both."""
+    if seconds and steps:
+        raise LumigraphError("--steps and --seconds are two ways to say how long; give one of them")
+    return [Budget(n, None) for n in steps] or [Budget(None, s) for s in seconds or (DEFAULT_SECONDS,)]
+
+
+def place_of(scene: str) -> str:
+    """Where what a user names lies, with poses, in words that mean the same in every folder."""
+    return located(posed(scene))
 
 
 def located(source: str) -> str:

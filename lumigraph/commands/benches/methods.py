@@ -5,9 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Annotated
 
+from ... import methods
 from ...ranges import Seconds, Steps
-from ..common import option
-from .cells import Cells
+from ..common import option, scene_name
+from .cells import Cells, budgets, place_of
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -25,4 +26,14 @@ class BenchMethods(Cells):
     """Train for so many steps instead."""
 
     def run(self) -> int:
-        return self.conduct(self.seconds, self.steps, lambda source: [None])
+        from ...benchmark.cell import Cell
+
+        times, settings = budgets(self.seconds, self.steps), self.checked()
+        cells = [
+            Cell(methods.check(name), scene_name(place), place, budget, seed)
+            for place in map(place_of, self.scenes)
+            for budget in times
+            for seed in self.seeds
+            for name in self.methods
+        ]
+        return self.conduct(cells, settings)

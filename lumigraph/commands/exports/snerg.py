@@ -14,7 +14,7 @@ from ..common import needed, show
 
 CONTRACTED = (
     "This open capture was baked whole, in contracted coordinates, which Lumigraph opens again and SNeRG's viewer "
-    "shows out of shape; for that viewer train without --whole, which bakes the box of interest alone"
+    "shows out of shape; for that viewer train with --no-whole, which bakes the box of interest alone"
 )
 
 
@@ -22,8 +22,8 @@ CONTRACTED = (
 class ExportSnerg:
     """A baked run as the folder that SNeRG's own viewer opens: scene_params.json and slices of its atlas as PNG.
 
-    It lies in the scene's frame with +y up. A folder of that kind opens like a run, too. One baked with --whole
-    is contracted (docs/methods/snerg.md), which other viewers do not undo; without, it ends at its box of interest.
+    It lies in the scene's frame with +y up. A folder of that kind opens like a run, too. One of an open
+    capture is contracted (docs/methods/snerg.md), which other viewers do not undo, unless trained with --no-whole.
     """
 
     source: Annotated[Positional[Path], needed("RUN_OR_FOLDER")]

@@ -4,14 +4,44 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 from tyro.conf import OmitArgPrefixes, Positional
 
 from ...errors import LumigraphError
-from ..common import Overwrite, needed, show
+from ...ranges import between
+from ..common import Overwrite, needed, option, show
 from ..controls import Set, tell
 from ..keeping import Keeping
+
+
+@dataclass(frozen=True)
+class Levels:
+    """Levels of detail: large scenes for viewers that fetch what a camera needs."""
+
+    lod: bool = False
+    """Write a folder of streamed SOG, FILE/lod-meta.json with chunks at several levels of detail beside it."""
+    levels: Annotated[Annotated[int, between(1, 10)] | None, option("N", "4")] = None
+    """With --lod: levels of detail, the finest among them."""
+    ratio: Annotated[Annotated[float, between(1.5, 16)] | None, option("TIMES", "4")] = None
+    """With --lod: Gaussians of a level to one of the next."""
+    chunk: Annotated[Annotated[int, between(1024, 1 << 20)] | None, option("N", "65,536")] = None
+    """With --lod: Gaussians in a chunk at most."""
+
+    def output(self, path: Path) -> Path:
+        """Where lod-meta.json goes, or the path itself. Raises LumigraphError for options that need --lod."""
+        if path.name == "lod-meta.json":
+            return path
+        if self.lod and path.suffix:
+            raise LumigraphError(f"--lod writes a folder, and {path} is named like a file; name one without an ending")
+        if self.given and not self.lod:
+            raise LumigraphError(f"--{next(iter(self.given))} is about levels of detail; give --lod as well")
+        return path / "lod-meta.json" if self.lod else path
+
+    @property
+    def given(self) -> dict[str, Any]:
+        said = {name: getattr(self, name) for name in ("levels", "ratio", "chunk")}
+        return {name: value for name, value in said.items() if value is not None}
 
 
 @dataclass(frozen=True)
@@ -19,14 +49,15 @@ class ExportSplats:
     """A trained cloud of Gaussians for splat viewers, or one splat format turned into another.
 
     The ending says which format: .ply (all there is), .glb (glTF), .sog, .spz, .compressed.ply, .splat (no
-    view-dependent colour); NEW/meta.json is a folder of SOG. What a run exports lies in the frame of the photographs it
-    was trained on.
+    view-dependent colour); NEW/meta.json is a folder of SOG, NEW/lod-meta.json (or NEW with --lod) one of streamed SOG.
+    What a run exports lies in the frame of the photographs it was trained on.
     """
 
     source: Annotated[Positional[Path], needed("RUN_OR_FILE")]
     """Folder of a run, a splat file, or a composition."""
     output: Annotated[Positional[Path], needed("FILE")]
     """The new file."""
+    detail: OmitArgPrefixes[Levels] = Levels()
     overwrite: Overwrite = False
     part: OmitArgPrefixes[Keeping] = Keeping()
     told: Set = ()
@@ -34,12 +65,15 @@ class ExportSplats:
     def run(self) -> int:
         from ...capabilities import HasGaussians, needs
         from ...exchange import check_ending, claim_splats, is_splat_file, read_gaussians, size_of, write_gaussians
+        from ...exchange.streamed_sog import Detail
         from ...export.splats import export_splats
         from ...run import open_any
         from ...run.splat_file import frame_of
 
-        check_ending(self.output)
-        claim_splats(self.output, self.overwrite, [self.source])
+        output = self.detail.output(self.output)
+        check_ending(output)
+        claim_splats(output, self.overwrite, [self.source])
+        detail = Detail(**self.detail.given)
         if is_splat_file(self.source):
             if self.told:
                 raise LumigraphError(f"{self.source} is a file of Gaussians, which has no controls; leave out --set")
@@ -48,17 +82,17 @@ class ExportSplats:
                 frame = frame_of(written)
                 crop = self.part.crop(frame)
                 written = self.part.of_gaussians(written, crop and crop.moved(frame.to_source))
-            write_gaussians(self.output, written)
+            write_gaussians(output, written, detail)
         else:
             opened = open_any(self.source)
             method = tell(opened, opened.method(), self.told)
             gaussians = needs(method, HasGaussians).gaussians()
             gaussians = self.part.of_gaussians(gaussians, self.part.crop(method.frame))
-            written = export_splats(gaussians, method.frame, self.output)
-        size = size_of(self.output)
+            written = export_splats(gaussians, method.frame, output, detail)
+        size = size_of(output)
         show(
             {
-                "file": str(self.output),
+                "file": str(output),
                 "Gaussians": f"{len(written):,}",
                 "size": f"{size / 1e6:.1f} MB, {size / max(len(written), 1):.1f} bytes each",
             }

@@ -18,6 +18,7 @@ NUMBERS = 12  # of a photograph's code: the nine of A by rows, the three of b
 CONSTANT = 0.28209479177387814  # Y_0 of the spherical harmonics
 MIDDLE = 0.5  # the colour of a Gaussian whose harmonics are zero
 FIT_STEPS, FIT_RATE = 200, 0.02  # of Adam, where the light of a photograph is found
+FURTHER = 0.01  # weight of how far the rest of a code moves, which most pixels say nothing of, by the sum of squares
 
 
 def changed(
@@ -53,6 +54,7 @@ def found(
     target: Float[Tensor, "pixel 3"],
 ) -> Float[Tensor, " number"]:
     """The code whose picture is closest to a photograph by mean absolute difference, which passers-by hardly sway.
+    What it holds beyond a map of colours stays where it was, unless pixels say otherwise.
 
     start:   where the search begins, and what comes back where there is no pixel
     picture: the pixels' colours under a code, differentiable in it
@@ -60,7 +62,12 @@ def found(
     """
     if not len(target):
         return start
-    return fitted(start, lambda code: (picture(code) - target).abs().mean(), FIT_STEPS, FIT_RATE)
+
+    def loss(code: Float[Tensor, " number"]) -> Float[Tensor, ""]:
+        further = (code - start)[NUMBERS:]
+        return (picture(code) - target).abs().mean() + FURTHER * further.square().sum()
+
+    return fitted(start, loss, FIT_STEPS, FIT_RATE)
 
 
 def _map(code: Float[Tensor, " number"]) -> tuple[Float[Tensor, "3 3"], Float[Tensor, " 3"]]:

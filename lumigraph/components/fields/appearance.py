@@ -6,6 +6,7 @@ Generative latent optimisation (Bojanowski 2018), as Martin-Brualla 2021, sectio
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -14,6 +15,13 @@ from torch import Tensor, nn
 from ...controls import Control, blend
 from ...scene import Batch, Photograph
 from ..training.corrections import AVERAGE
+
+
+@dataclass(frozen=True)
+class Appearance:
+    """A code as evidence: `method.given(Appearance(code))` is the scene as it looks with that code."""
+
+    code: Float[Tensor, " width"]
 
 
 class PhotographCodes(nn.Module):

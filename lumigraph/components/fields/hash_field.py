@@ -17,6 +17,34 @@ from .mlp import MLP
 CALM = 0.5  # of the table's rate, that of networks in the open: at all of it one seed in three never learns a hue
 WITHIN = 2  # times as fine as asked for, where coordinates are contracted: the box of interest is half as wide in them
 
+# Numbers of a Config for a plain CPU, which learn most in a minute (see docs/methods/instant_ngp.md), and for tests.
+ON_A_CPU: dict[str, Any] = {
+    "levels": 8,
+    "features_per_level": 4,
+    "log2_hashmap_size": 17,
+    "max_resolution": 512,
+    "hidden_width": 32,
+    "samples_per_step": 1 << 15,
+    "steps_per_diagonal": 384,
+    "transmittance_threshold": 1e-3,
+    "cone_angle": 1 / 96,
+    "occupancy_threshold": 0.15,
+    "learning_rate": 2e-2,
+}
+TINY: dict[str, Any] = {
+    "levels": 4,
+    "log2_hashmap_size": 11,
+    "base_resolution": 4,
+    "max_resolution": 32,
+    "hidden_width": 16,
+    "geometry_features": 8,
+    "sh_bands": 2,
+    "samples_per_step": 2048,
+    "steps_per_diagonal": 128,
+    "occupancy_resolution": 16,
+    "learning_rate": 2e-2,
+}
+
 
 class HashField(nn.Module):
     """Density from position, colour from position, direction and a code (Müller 2022, figure 3 and section 5.4).

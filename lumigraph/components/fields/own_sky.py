@@ -13,7 +13,7 @@ from torch import Tensor
 
 from ... import kernels
 from ...camera import Camera
-from ...scene import Scene
+from ...scene import Photograph, Scene
 
 BANDS = 3  # of spherical harmonics
 NUMBERS = 3 * BANDS**2  # of a photograph's code: the harmonics by rows, three colours each
@@ -26,6 +26,17 @@ def sky(code: Float[Tensor, " 27"], camera: Camera) -> Float[Tensor, "height wid
     directions = camera.rays(camera.pixels()).directions
     harmonics = kernels.spherical_harmonics(directions, BANDS)
     return (harmonics @ code.view(BANDS**2, 3)).view(height, width, 3)
+
+
+def backdrop_loss(
+    behind: Float[Tensor, "height width 3"], photograph: Photograph, opacity: Float[Tensor, "height width"]
+) -> Float[Tensor, ""]:
+    """How far a sky is from a photograph where pixels are not trusted and nothing stands: a mask around a thing says
+    that its surroundings are not to be learnt, not that any colour will do behind it."""
+    if photograph.mask is None:
+        return behind.new_zeros(())
+    counts = (1 - opacity.detach()) * ~photograph.mask
+    return (counts[..., None] * (behind - photograph.rgb).abs()).mean()
 
 
 @torch.no_grad()

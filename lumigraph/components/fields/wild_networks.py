@@ -14,10 +14,11 @@ from ...scene import Frame
 from ...volume import weights_of
 from ..sampling.sampling import inverse_transform, midpoints, stratified
 from ..sampling.spaces import space_of
+from .coded_field import Places
 from .coordinate_network import CoordinateNetwork
 from .dense import Dense, in_chunks
 from .encodings import FrequencyEncoding
-from .wild_field import Passing, Places, WildField
+from .wild_field import Passing, WildField
 
 
 class WildNetworks(WildField):

@@ -5,6 +5,10 @@ from __future__ import annotations
 import torch
 from jaxtyping import Float
 from torch import Tensor
+from torch.nn.functional import max_pool1d, pad
+
+from ...rays import Rays, Samples
+from .spaces import Space
 
 
 def frustum_moments(
@@ -23,3 +27,24 @@ def frustum_moments(
     along = half.square() / 3 - 4 / 15 * half**4 * (12 * middle.square() - half.square()) / both.square()
     across = radius.square() * (middle.square() / 4 + 5 / 12 * half.square() - 4 / 15 * half**4 / both)
     return mean, along.clamp_min(0), across.clamp_min(0)
+
+
+def frustums_between(
+    edges: Float[Tensor, "ray edge"], rays: Rays, space: Space
+) -> tuple[Samples, Float[Tensor, "sample 3"], Float[Tensor, "sample 3"]]:
+    """Frustums between edges, which are shares of the way along each ray, and their means and variances in a space."""
+    with torch.no_grad():  # where samples lie tells nothing of a pose
+        near, far = space.interval(rays)
+        t = space.distance(edges, rays, near, far)
+    samples = Samples.rows(t[:, :-1], t[:, -1])
+    ray = samples.ray_index
+    distance, along, across = frustum_moments(samples.t_start, samples.t_end, rays.radius[ray])
+    directions = rays.directions[ray]
+    points = rays.origins[ray] + distance[:, None] * directions
+    return samples, *space.warp_gaussians(points, directions, along, across)
+
+
+def blurred(weights: Float[Tensor, "ray bin"]) -> Float[Tensor, "ray bin"]:
+    """Weights blurred a little, so that the fine samples surround what the coarse ones found (Barron 2021, eq. 17)."""
+    larger = max_pool1d(pad(weights, (1, 1)), 2, 1)  # of each two neighbours
+    return 0.5 * (larger[:, 1:] + larger[:, :-1])

@@ -7,6 +7,7 @@ stretches them. The paper's learnt from millions of photographs; this one learns
 from __future__ import annotations
 
 import math
+import time
 
 import torch
 from jaxtyping import Float
@@ -72,8 +73,10 @@ class PatchFlow(nn.Module):
         nats = 0.5 * x.square().sum(-1) + 0.5 * x.shape[1] * math.log(2 * math.pi) - stretched
         return nats / x.shape[1]
 
-    def learn(self, scene: Scene, steps: int, generator: torch.Generator) -> None:
-        """Learn from patches of a scene's training photographs, in several sizes, for so many steps."""
+    def learn(self, scene: Scene, steps: int, generator: torch.Generator, seconds: float = math.inf) -> None:
+        """Learn from patches of a scene's training photographs, in several sizes, for so many steps, or seconds if
+        these are over sooner."""
+        begin = time.perf_counter()
         known = photographed(scene, generator).to(self.mean)
         centred = known.flatten(1) - known.flatten(1).mean(0)
         variance, axes = torch.linalg.eigh(centred.T @ centred / len(centred))
@@ -85,6 +88,8 @@ class PatchFlow(nn.Module):
         self.requires_grad_(True)
         optimizer = torch.optim.Adam(self.parameters(), RATE)
         for _ in range(steps):
+            if time.perf_counter() - begin > seconds:
+                break
             drawn = torch.randint(len(known), (BATCH,), generator=generator)
             grain = GRAIN * torch.randn(BATCH, SIDE, SIDE, 3, generator=generator)
             optimizer.zero_grad()

@@ -48,7 +48,9 @@ def patches(cameras: Camera, side: int, strides: Sequence[int], generator: torch
     return replace(rays, radius=rays.radius * wider)
 
 
-def roughness(depth: Float[Tensor, "patch side side"], opacity: Float[Tensor, "patch side side"]) -> Float[Tensor, ""]:
+def roughness(
+    depth: Float[Tensor, "patch row column"], opacity: Float[Tensor, "patch row column"]
+) -> Float[Tensor, ""]:
     """Squared difference of each two neighbouring depths of a patch, where both are opaque, mean of all pairs
     (Niemeyer 2022, eq. 6, which has no opacity: there everything is opaque)."""
     counts = opacity.detach()

@@ -1,10 +1,13 @@
 """Categories: procedural objects of one kind, as many as one likes, each with proportions, colours and materials of its
-own. One file each, found by its name, with `objects(random)` and the `BOUNDS` that all of them keep to."""
+own. One file each, found by its name, with `objects(random)` and the `BOUNDS` that all of them keep to. The first of
+the objects stands as the whole does: its rotation says how far this one is turned from the way that all of them face.
+"""
 
 from __future__ import annotations
 
 import importlib
 import pkgutil
+from dataclasses import replace
 
 import numpy as np
 
@@ -31,7 +34,9 @@ def stage(name: str, member: int, size: int, views: int, seed: int) -> Stage:
     """
     category = importlib.import_module(f".{name.replace('-', '_')}", __name__)
     random = np.random.default_rng((seed, member))
-    return surrounded(tuple(category.objects(random)), category.BOUNDS, size, views, random)
+    objects = tuple(category.objects(random))
+    surroundings = surrounded(objects, category.BOUNDS, size, views, random)
+    return replace(surroundings, turn=objects[0].pose.rotation)
 
 
 def surrounded(

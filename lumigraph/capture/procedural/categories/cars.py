@@ -16,12 +16,12 @@ ASIDE = Pose.about((1, 0, 0), 90)  # turns an upright shape along y
 LAMP, TAIL = Material(Plain((0.98, 0.95, 0.80)), gloss=1.0), Material(Plain((0.75, 0.08, 0.08)), gloss=1.0)
 
 
-def objects(random: np.random.Generator) -> Iterator[Object]:
-    """One car, centred. It drives towards -x, give or take."""
+def objects(random: np.random.Generator, astray: float = 25.0) -> Iterator[Object]:
+    """One car, centred. It drives towards -x, give or take `astray` degrees."""
     long, wide = random.uniform(0.62, 0.8), random.uniform(0.27, 0.34)
     wheel, body, cabin = random.uniform(0.10, 0.145), random.uniform(0.10, 0.15), random.uniform(0.10, 0.16)
     floor = 0.8 * wheel
-    turn = Pose.at(0, 0, -0.5 * (floor + 2 * body + 2 * cabin), turn=random.uniform(-25, 25))
+    turn = Pose.at(0, 0, -0.5 * (floor + 2 * body + 2 * cabin), turn=random.uniform(-astray, astray))
     main = paint(colour(random, (0.1, 0.9)))
     roof = main if random.uniform() < 0.6 else paint(colour(random, (0.0, 0.5)))
 

@@ -1,11 +1,13 @@
-"""The scenes that come with the package: one file each, found by its name."""
+"""The scenes that come with the package: one file or folder each, found by its name."""
 
 from __future__ import annotations
 
 import importlib
 import pkgutil
+from types import ModuleType
 
 from ....errors import LumigraphError
+from ..options import Pictures
 from ..stage import Stage
 
 
@@ -13,11 +15,21 @@ def available() -> list[str]:
     return sorted(module.name.replace("_", "-") for module in pkgutil.iter_modules(__path__))
 
 
-def stage(name: str, size: int = 200, views: int = 100, seed: int = 0) -> Stage:
-    """Build a scene. size: of the square pictures, pixels; views: for training; seed: fixes where cameras stand.
+def options(name: str) -> type[Pictures]:
+    """What a scene can be asked for. Raises LumigraphError for a name that nothing here has."""
+    return getattr(scene(name), "Options", Pictures)
+
+
+def stage(name: str, size: int = 200, views: int = 100, seed: int = 0, **further: int) -> Stage:
+    """Build a scene. size: of the pictures, pixels; views: for training; seed: fixes where cameras stand; further: what
+    else its `Options` have.
 
     Raises LumigraphError for a name that nothing here has.
     """
+    return scene(name).stage(size, views, seed, **further)
+
+
+def scene(name: str) -> ModuleType:
     if name not in available():
         raise LumigraphError(f"procedural:{name} does not exist; choose one of {', '.join(available())}")
-    return importlib.import_module(f".{name.replace('-', '_')}", __name__).stage(size, views, seed)
+    return importlib.import_module(f".{name.replace('-', '_')}", __name__)

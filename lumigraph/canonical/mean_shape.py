@@ -1,0 +1,143 @@
+"""The mean shape of a category, and each instance turned so that it lies on it as well as in any rotation.
+
+Instances are moments, in which a rotation is a matrix for each band. Their correlation with another shape under any
+rotation is then one sum over bands, <D_l(R), sum over shells of g_l f_l^T>, so that thousands of rotations are tried at
+once (as Kostelec 2008, in plain products); what is found on that lattice is refined in ever smaller steps.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cache
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from .grids import Instance
+from .harmonics import band, turning
+from .moments import moments
+from .rotations import near, spread
+
+SHELLS, BANDS = 8, 8  # of moments; finer ones tell no more of grids of some forty cells
+LATTICE = 4608  # rotations that are tried: any other one is within 13 degrees of one of them
+STEPS = (6.0, 3.0, 1.5, 0.75, 0.4)  # degrees, of the refinement, each as often as it helps, at most ROUNDS times
+ROUNDS = 4
+SETTLED = 1e-4  # by which the agreement must grow for another round of turning all instances
+TURNS = 12  # such rounds at most
+
+
+@dataclass(frozen=True)
+class Alignment:
+    """rotations: of each instance onto the mean shape
+    agreement: of each with the mean shape, the cosine between their moments
+    explained: share of all instances' squared moments that the mean shape has
+    """
+
+    rotations: Float[Tensor, "some 3 3"]
+    agreement: Float[Tensor, " some"]
+    explained: float
+
+
+def described(instances: Sequence[Instance]) -> Float[Tensor, "some shell basis"]:
+    """Each instance as moments of length one."""
+    found = torch.stack([moments(x.points.double(), x.weights.double(), SHELLS, BANDS) for x in instances])
+    return found / found.square().sum((1, 2), keepdim=True).sqrt()
+
+
+def aligned(shapes: Float[Tensor, "some shell basis"], start: Float[Tensor, "some 3 3"]) -> Alignment:
+    """Instances on their mean shape, from rotations to begin with: all are turned onto the mean of what they are then,
+    by the best of all rotations, until that helps no more (congealing, Learned-Miller 2006)."""
+    rotations, explained = start, 0.0
+    for _ in range(TURNS):
+        mean = turn(shapes, rotations).mean(0)
+        if (now := float(mean.square().sum())) < explained + SETTLED:
+            break
+        explained = now
+        rotations = best_rotations(mean, shapes)
+    there = turn(shapes, rotations)
+    mean = there.mean(0)
+    length = float(mean.square().sum())
+    return Alignment(rotations, (there * mean).sum((1, 2)) / length**0.5, length)
+
+
+def best_alignment(shapes: Float[Tensor, "some shell basis"], starts: Sequence[Float[Tensor, "some 3 3"]]) -> Alignment:
+    """Of alignments from several beginnings, the one whose mean shape explains most."""
+    return max((aligned(shapes, start) for start in starts), key=lambda found: found.explained)
+
+
+def best_rotations(
+    target: Float[Tensor, "shell basis"], shapes: Float[Tensor, "some shell basis"]
+) -> Float[Tensor, "some 3 3"]:
+    """The rotation of each shape that brings it onto the target: of the lattice, then refined."""
+    entries, table = correlations(target, shapes), lattice()
+    which = (entries @ table.flat.T).argmax(-1)
+    return refined(table.take(which), entries)
+
+
+def correlations(
+    target: Float[Tensor, "shell basis"], shapes: Float[Tensor, "some shell basis"]
+) -> Float[Tensor, "some entry"]:
+    """What the correlation of two shapes is linear in, the entries of D: sum over shells of g_l f_l^T for each band."""
+    parts = [target[:, band(n)].mT @ shapes[..., band(n)] for n in range(BANDS)]
+    return torch.cat([part.flatten(-2) for part in parts], -1)
+
+
+def refined(found: Turns, entries: Float[Tensor, "some entry"]) -> Float[Tensor, "some 3 3"]:
+    """Rotations a little further on, as long as the correlation grows."""
+    for degrees in STEPS:
+        around = steps(degrees)
+        for _ in range(ROUNDS):
+            tried = around.after(found)
+            which = (tried.flat * entries[:, None]).sum(-1).argmax(-1)
+            found = tried.pick(which)
+            if not which.any():
+                break
+    return found.rotations
+
+
+@dataclass(frozen=True)
+class Turns:
+    """Rotations, and their matrices in each band."""
+
+    rotations: Float[Tensor, "*some 3 3"]
+    matrices: Sequence[Float[Tensor, "*some _ _"]]
+
+    @staticmethod
+    def of(rotations: Float[Tensor, "*some 3 3"]) -> Turns:
+        return Turns(rotations, turning(rotations, BANDS))
+
+    @property
+    def flat(self) -> Float[Tensor, "*some entry"]:
+        """All entries of the matrices side by side, as `correlations` has them."""
+        return torch.cat([matrix.flatten(-2) for matrix in self.matrices], -1)
+
+    def take(self, which: Tensor) -> Turns:
+        return Turns(self.rotations[which], [matrix[which] for matrix in self.matrices])
+
+    def pick(self, which: Tensor) -> Turns:
+        """Of each row of rotations the one with this number."""
+        rows = torch.arange(len(which))
+        return Turns(self.rotations[rows, which], [matrix[rows, which] for matrix in self.matrices])
+
+    def after(self, others: Turns) -> Turns:
+        """Each of these rotations (columns) after each of the others (rows)."""
+        every = zip(self.matrices, others.matrices, strict=True)
+        return Turns(self.rotations @ others.rotations[:, None], [a @ b[:, None] for a, b in every])
+
+
+@cache
+def lattice() -> Turns:
+    return Turns.of(spread(LATTICE))
+
+
+@cache
+def steps(degrees: float) -> Turns:
+    return Turns.of(near(degrees))
+
+
+def turn(shapes: Float[Tensor, "some shell basis"], rotations: Float[Tensor, "some 3 3"]) -> Tensor:
+    """The moments of shapes that are turned, each by its rotation."""
+    matrices = turning(rotations, BANDS)
+    return torch.cat([shapes[..., band(n)] @ matrices[n].mT for n in range(BANDS)], -1)

@@ -1,0 +1,62 @@
+"""Part of a capture: the photographs of one block of a large scene, which becomes a scene with a frame of its own."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ..errors import LumigraphError
+from ..ranges import Point, Positive
+from .assemble import HOLD_OUT, in_order
+from .capture import Capture, Shot
+
+FAR = 16.0  # radii of a part within which sparse points are kept: what lies beyond is the sky
+
+
+@dataclass(frozen=True)
+class Part:
+    """Some photographs of a capture, and where the place is that they are of.
+
+    photographs: their names; those held out of the whole capture are held out here
+    centre, radius: of the place, in the source's frame and units
+    """
+
+    photographs: list[str]
+    centre: Point
+    radius: Positive
+
+
+def part_of(capture: Capture, part: Part) -> Capture:
+    """The capture with these photographs alone, and a box of interest of that radius around that centre.
+
+    Raises LumigraphError where some of the photographs are not there.
+    """
+    shots = {shot.name: shot for shot in with_splits(capture.shots)}
+    if lost := [name for name in part.photographs if name not in shots]:
+        raise LumigraphError(
+            f"{capture.source} lacks {len(lost)} of the {len(part.photographs)} photographs of a block, such as "
+            f"{lost[0]}; restore them"
+        )
+    chosen = [shots[name] for name in part.photographs]
+    reach = capture.reach
+    if reach is not None and capture.bounds is not None:  # of the whole, from its middle
+        reach += float(np.linalg.norm(np.mean(capture.bounds, 0) - part.centre))
+    found = replace(capture, shots=chosen, missing=[], bounds=None, reach=reach, around=(part.centre, part.radius))
+    if capture.points is None:
+        return found
+    near = np.linalg.norm(capture.points - part.centre, axis=-1) < FAR * part.radius
+    return replace(
+        found,
+        points=capture.points[near],
+        point_colours=None if capture.point_colours is None else capture.point_colours[near],
+        sightings=None if capture.sightings is None else capture.sightings[near],
+    )
+
+
+def with_splits(shots: list[Shot]) -> list[Shot]:
+    """The photographs, each with its purpose: as published, otherwise every 8th by name is held out."""
+    if any(shot.split for shot in shots):
+        return shots
+    purposes = {shot.name: "train" if i % HOLD_OUT else "test" for i, shot in enumerate(in_order(shots, None))}
+    return [replace(shot, split=purposes[shot.name]) for shot in shots]

@@ -1,0 +1,43 @@
+"""Objects in poses that nobody chose: each turned by a random rotation, to see who finds what all of a kind share."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from .cameras import dome, pinhole, spiral
+from .categories import ANGLE
+from .stage import Stage
+from .world import Pose, nested
+
+BALL = 1.2  # radius that every member stays within, whichever way it is turned
+DISTANCE = 4.1  # of cameras from the middle, from where that ball just fits into the picture
+HIGHEST = 60.0  # degrees that cameras stand above the horizon, and below it, for no side is the lower one
+
+
+def turned(stage: Stage, size: int, seed: tuple[int, int]) -> Stage:
+    """The stage with its objects turned about the origin by a random rotation; light and horizon stay. Cameras stand
+    all around. `Stage.turn` is the rotation since the object stood upright, where that is known.
+
+    size: of the square pictures, pixels
+    """
+    random = np.random.default_rng((*seed, 0x7EEDED))
+    motion = Pose(rotation=nested(any_rotation(random)))
+    objects = tuple(replace(thing, pose=motion @ thing.pose) for thing in stage.world.objects)
+    views, held_out = (len(stage.cameras[split]) for split in ("train", "test"))
+    cameras = {
+        "train": pinhole(dome(views, DISTANCE, random, -HIGHEST, HIGHEST), size, ANGLE),
+        "test": pinhole(spiral(held_out, DISTANCE, random, -HIGHEST, HIGHEST), size, ANGLE),
+    }
+    bounds = (-BALL, -BALL, -BALL), (BALL, BALL, BALL)
+    known = Pose() if stage.turn is None else Pose(rotation=stage.turn)
+    world, turn = replace(stage.world, objects=objects), (motion @ known).rotation
+    return replace(stage, world=world, cameras=cameras, bounds=bounds, reach=BALL, turn=turn)
+
+
+def any_rotation(random: np.random.Generator) -> np.ndarray:
+    """A rotation matrix, all equally likely: the first factor of a Gaussian matrix (Stewart 1980)."""
+    q, r = np.linalg.qr(random.normal(size=(3, 3)))
+    q = q * np.sign(np.diag(r))
+    return q * np.sign(np.linalg.det(q))

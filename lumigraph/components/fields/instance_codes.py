@@ -1,0 +1,77 @@
+"""A code for each member of a collection, learnt beside what makes something of it: an auto-decoder (Park 2019)."""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor, nn
+
+from ...controls import blend
+
+AVERAGE = "average"
+
+
+class InstanceCodes(nn.Module):
+    """Numbers of each member, zeros of those that are not learnt from.
+
+    most:  members that there are room for
+    width: numbers of a code
+    """
+
+    def __init__(self, most: int, width: int):
+        super().__init__()
+        self.rows = nn.Parameter(torch.zeros(most, width))
+
+    @torch.no_grad()
+    def begin(self, members: Int[Tensor, " member"], deviation: float, generator: torch.Generator) -> None:
+        """Random codes for the members to learn from."""
+        drawn = deviation * torch.randn(len(members), self.rows.shape[1], generator=generator)
+        self.rows[members.to(self.rows.device)] = drawn.to(self.rows.device)
+
+    def forward(self, members: Int[Tensor, " member"]) -> Float[Tensor, "member code"]:
+        return self.rows[members]
+
+    @property
+    def learnt(self) -> Bool[Tensor, " member"]:
+        """The members whose codes were learnt."""
+        return (self.rows != 0).any(-1)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """What they are called: their numbers."""
+        return tuple(str(number) for number in self.learnt.nonzero()[:, 0].tolist())
+
+    @property
+    def average(self) -> Float[Tensor, " code"]:
+        """The mean of the codes that were learnt; zeros where none was."""
+        known = self.rows.detach()[self.learnt]
+        return known.mean(0) if len(known) else self.rows.detach()[0]
+
+    @property
+    def axes(self) -> Float[Tensor, "axis code"]:
+        """Along which the codes that were learnt differ, each as long as their deviation along it: `average + w @ axes`
+        is distributed as the Gaussian that fits them, where w is of the standard normal distribution."""
+        known = self.rows.detach()[self.learnt] - self.average
+        if len(known) < 2:
+            return known[:0]
+        _, deviation, along = torch.linalg.svd(known / (len(known) - 1) ** 0.5, full_matrices=False)
+        there = deviation > 1e-4 * deviation[:1].clamp_min(1e-9)
+        return (deviation[:, None] * along)[there]
+
+    def along(self, code: Float[Tensor, " code"]) -> Float[Tensor, " axis"]:
+        """Where a code is along the axes, in deviations from the average."""
+        axes = self.axes
+        return (code - self.average) @ axes.T / axes.square().sum(-1)
+
+    def drawn(self, generator: torch.Generator) -> Float[Tensor, " code"]:
+        """A code from the Gaussian that fits those that were learnt."""
+        axes = self.axes
+        return self.average + torch.randn(len(axes), generator=generator).to(axes) @ axes
+
+    def told(self, value: str, **others: Float[Tensor, " code"]) -> Float[Tensor, " code"]:
+        """The code that a control's value stands for: a member's, the average, one of the others by its name, or one
+        between two, as `controls.blend` takes values apart."""
+        known = {AVERAGE: self.average} | others
+        first, second, share = blend(value)
+        a, b = (known[x] if x in known else self.rows.detach()[int(x)] for x in (first, second))
+        return torch.lerp(a, b, share)

@@ -1,0 +1,60 @@
+"""Visibility: a small network that knows which places photographs have seen, and from which side (Tancik 2022)."""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from ... import kernels
+from ...rays import Rays, Samples
+from ..sampling.spaces import Space
+from ..training.fog import evened
+from .encodings import FrequencyEncoding
+from .hash_field import side_by_side
+from .mlp import MLP
+
+BANDS = 3  # of spherical harmonics: from which side, and no more than that
+HORIZON = 0.99  # of evened distances, where rays that do not end are asked about last
+
+
+class Visibility(nn.Module):
+    """f_v(x, d) in [0, 1]: how much of what is at x a photograph that looks along d sees (Tancik 2022, section 4.2).
+
+    It is learnt from the transmittance of a field along the rays of photographs. The field itself learns nothing of it.
+
+    octaves: of the waves that places are told by
+    layers, width: hidden ones
+    """
+
+    def __init__(self, space: Space, octaves: int, layers: int, width: int):
+        super().__init__()
+        self.space, self.encode = space, FrequencyEncoding(3, octaves)
+        self.network = MLP(self.encode.width + BANDS**2, *[width] * layers, 1)
+
+    def forward(
+        self, points: Float[Tensor, "point 3"], directions: Float[Tensor, "point 3"]
+    ) -> Float[Tensor, " point"]:
+        """points: in scene units; directions: unit length, away from the eye"""
+        places = self.encode(self.space.warp(points))
+        return self.network(side_by_side(places, kernels.spherical_harmonics(directions, BANDS)))[:, 0].sigmoid()
+
+    def error(
+        self, rays: Rays, samples: Samples, density: Float[Tensor, " sample"], generator: torch.Generator
+    ) -> Float[Tensor, ""]:
+        """The mean squared error at one random place of each ray, near ones and far ones alike."""
+        with torch.no_grad():
+            first, last = (evened(t).clamp(max=HORIZON) for t in self.space.interval(rays))
+            s = torch.lerp(first, last, torch.rand(len(rays), generator=generator).to(first))
+            t = s / (1 - s)
+            light = transmittance(samples, density, t)
+        return (self(rays.at(t).detach(), rays.directions.detach()) - light).square().mean()
+
+
+def transmittance(
+    samples: Samples, density: Float[Tensor, " sample"], t: Float[Tensor, " ray"]
+) -> Float[Tensor, " ray"]:
+    """T = exp(-integral of density from the eye to t): the light that comes back from a distance along each ray."""
+    ray = samples.ray_index
+    passed = torch.minimum(t[ray] - samples.t_start, samples.length).clamp_min(0)
+    return torch.exp(-torch.zeros_like(t).index_add(0, ray, density * passed))

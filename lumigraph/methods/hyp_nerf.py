@@ -1,0 +1,577 @@
+"""HyP-NeRF: a hypernetwork gives the hash table and networks of an object (Sen et al. 2023, arXiv 2306.06093)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import Annotated, Any, ClassVar
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from ..camera import Camera
+from ..collection import Collection
+from ..components.fields.appearance import fitted
+from ..components.fields.hash_field import check_levels
+from ..components.fields.hash_instance import HashInstance, HashShape
+from ..components.fields.hypernetwork import HyperNetwork
+from ..components.fields.instance_codes import AVERAGE, InstanceCodes
+from ..components.fields.kept_photographs import Kept
+from ..components.fields.picture_denoiser import PictureDenoiser
+from ..components.sampling.carving import visual_hull
+from ..components.sampling.coarse_to_fine import lattice
+from ..components.sampling.marching import reached
+from ..components.sampling.occupancy import OccupancyGrid
+from ..components.training.lazy_adam import LazyAdam
+from ..components.training.members import chance, photographed, rays_through
+from ..components.training.photometric import backdrop, residuals
+from ..components.training.schedules import falling
+from ..controls import Control, Value, blend
+from ..errors import LumigraphError
+from ..geometry import look_at
+from ..method import Method, RayMethod
+from ..quality import Effort, Efforts
+from ..ranges import (
+    BatchSize,
+    Count,
+    Layers,
+    LearningRate,
+    NonNegative,
+    Positive,
+    Seed,
+    Share,
+    Width,
+    between,
+)
+from ..rays import Look, Rays, Rendering
+from ..scene import Batch, Frame, Photograph, Scene
+from ..volume import composite
+
+Tally = Annotated[int, between(0, 100_000)]
+
+
+@dataclass(frozen=True)
+class Config:
+    """The paper's numbers where it or its published code gives them; `HypNeRF.preset` says what a plain CPU does."""
+
+    shape_code: Width = 512  # numbers of the code that table and density are made of
+    colour_code: Width = 512  # of the code that the colour network is made of
+    code_deviation: Positive = 0.01  # of codes at first
+    hyper_width: Width = 512  # of the hypernetwork's hidden layers
+    hyper_layers: Layers = 2  # hidden ones, for each tensor
+    members: Count = 4096  # of a collection at most, which there are codes for
+    levels: Annotated[int, between(1, 32)] = 16
+    features_per_level: Annotated[int, between(1, 16)] = 2
+    log2_hashmap_size: Annotated[int, between(1, 24)] = 11
+    base_resolution: Annotated[int, between(1, 4096)] = 16
+    max_resolution: Annotated[int, between(1, 1 << 20)] = 2048
+    hidden_width: Width = 64  # of an instance's networks
+    density_layers: Layers = 1  # hidden ones
+    colour_layers: Layers = 2  # hidden ones
+    geometry_features: Annotated[int, between(1, 256)] = 16  # from density to colour network
+    sh_bands: Annotated[int, between(1, 4)] = 4  # of spherical harmonics
+    steps_per_diagonal: Annotated[int, between(4, 16_384)] = 512
+    transmittance_threshold: Share = 1e-4  # at which a ray is spent
+    occupancy_resolution: Annotated[int, between(4, 256)] = 64  # cells per axis
+    occupancy_threshold: NonNegative = 0.05  # optical thickness across a cell below which it is empty
+    members_per_step: Annotated[int, between(1, 1024)] = 1
+    rays_per_member: BatchSize = 4096
+    targets: Annotated[int, between(1, 64)] = 4  # photographs of a member that its rays go through
+    empty_points: Tally = 1024  # of a member, where photographs see that nothing is
+    empty_weight: NonNegative = 0.01  # of density there
+    code_weight: NonNegative = 0.0  # of the codes' squares
+    learning_rate: LearningRate = 1e-3
+    final_learning_rate: LearningRate = 1e-4  # at the end of the budget
+    denoiser_width: Width = 32  # channels
+    denoiser_start: Share = 0.7  # share of the budget from which on the denoiser learns
+    # Of finding one scene
+    code_steps: Tally = 200  # in which its code is found
+    code_learning_rate: LearningRate = 0.1  # in deviations of the learnt codes
+    code_prior: NonNegative = 1e-3  # weight of the code's distance from the average, in deviations
+    tune_steps: Tally = 60  # in which the field's own tensors are tuned to its photographs
+    tune_learning_rate: LearningRate = 2e-3
+    denoise_views: Tally = 12  # renderings around it that are denoised and learnt from
+    denoise_steps: Tally = 60
+    denoise_weight: NonNegative = 0.5  # of these beside its photographs
+    seed: Seed = 0
+
+    def check(self) -> None:
+        """Raises LumigraphError for numbers that contradict each other."""
+        check_levels(self)
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """What is known of one scene: some rays, cells that may hold something, and the colour behind it."""
+
+    rays: Batch
+    cells: OccupancyGrid
+    background: Float[Tensor, "1 3"]
+
+
+@dataclass(frozen=True)
+class Lesson:
+    """Members by number with what is known of each; and a part of a photograph of the last, for the denoiser."""
+
+    unit: ClassVar[str] = "rays"
+
+    members: list[int]
+    evidence: list[Evidence]
+    rays: Rays
+    picture: Float[Tensor, "height width 3"]
+
+    def __len__(self) -> int:
+        return sum(len(x.rays) for x in self.evidence)
+
+
+class Tuned(torch.nn.Module):
+    """What was added to the tensors of an instance by tuning: a row of each, or none."""
+
+    def __init__(self, rows: Iterable[Float[Tensor, "_ _ _"]]):
+        super().__init__()
+        self.kept = torch.nn.ModuleList(map(Kept, rows))
+
+    def __bool__(self) -> bool:
+        return all(len(kept.rows) for kept in self.kept)  # type: ignore[arg-type]
+
+    @property
+    def changes(self) -> list[Float[Tensor, "_ _"]]:
+        return [kept.rows[0] for kept in self.kept]  # type: ignore[index]
+
+
+PATCH = 64  # pixels of a picture's side at most, by which the denoiser learns
+LOOKS = 6  # at each cell of a field that is to be seen
+EMPTY = 1 / 16  # scene units over which density counts that should not be there
+RAYS = 1024  # of a step while one scene is found
+CANDIDATES = 64  # learnt codes at most that are tried as a beginning
+FOUND = "found"
+HEIGHTS = 0.35, 0.8  # radians above the horizon, of views that are denoised
+
+Seen = Callable[[int, torch.Generator], Evidence]  # so many random rays of what is known of a scene
+
+
+class HypNeRF(RayMethod):
+    """Learns from a Collection a code for each member, and what a code means; `given` a Scene, it finds the code whose
+    field looks like its photographs and tunes that field to them."""
+
+    Config, learns_from, accepts = Config, Collection, (Scene,)
+    efforts: ClassVar[Efforts] = {"draft": Effort(50, 2000), "good": Effort(300, 10_000), "best": Effort(1500, 50_000)}
+
+    def __init__(self, frame: Frame, config: Any = None):
+        config = config or Config()
+        super().__init__(frame, config)
+        c = config
+        self.shape = HashShape.of(c)
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(c.seed)
+            sizes = [c.colour_code if colour else c.shape_code for colour in self.shape.of_colour]
+            self.hyper = HyperNetwork(sizes, c.hyper_width, c.hyper_layers, self.shape.tensors)
+            self.denoiser = PictureDenoiser(c.denoiser_width)
+        self.codes = InstanceCodes(c.members, c.shape_code + c.colour_code)
+        self.found = Kept(torch.empty(0, c.shape_code + c.colour_code))  # the code of a scene that was given, or drawn
+        self.tuned = untuned(self.shape)
+        self.lattice = lattice(c, 1.0)
+        self._cells: dict[int, OccupancyGrid] = {}  # of members, by number
+        self._shown: tuple[HashInstance, OccupancyGrid] | None = None  # until a step changes it
+        self._denoising = False
+
+    @classmethod
+    def preset(cls, device: torch.device) -> Any:
+        """On a GPU the paper's numbers. On a CPU smaller codes, tables and networks of the same design."""
+        if device.type == "cuda":
+            return Config()
+        return Config(
+            shape_code=64,
+            colour_code=32,
+            code_deviation=0.1,
+            hyper_width=96,
+            hyper_layers=2,
+            members=1024,
+            levels=5,
+            features_per_level=4,
+            log2_hashmap_size=12,
+            base_resolution=8,
+            max_resolution=64,
+            hidden_width=32,
+            geometry_features=16,
+            sh_bands=2,
+            steps_per_diagonal=112,
+            transmittance_threshold=1e-3,
+            occupancy_resolution=32,
+            members_per_step=4,
+            rays_per_member=192,
+            targets=2,
+            empty_points=256,
+            learning_rate=4e-3,
+            final_learning_rate=4e-4,
+            denoiser_start=0.8,
+        )
+
+    @classmethod
+    def smallest(cls) -> Any:
+        return Config(
+            shape_code=4,
+            colour_code=4,
+            code_deviation=0.1,
+            hyper_width=16,
+            hyper_layers=1,
+            members=16,
+            levels=3,
+            log2_hashmap_size=9,
+            base_resolution=4,
+            max_resolution=16,
+            hidden_width=16,
+            geometry_features=8,
+            sh_bands=1,
+            steps_per_diagonal=64,
+            occupancy_resolution=16,
+            members_per_step=2,
+            rays_per_member=128,
+            empty_points=64,
+            learning_rate=1e-2,
+            final_learning_rate=5e-3,
+            denoiser_width=4,
+            denoiser_start=0.0,
+            code_steps=8,
+            tune_steps=4,
+            denoise_views=2,
+            denoise_steps=4,
+        )
+
+    @classmethod
+    def further_bytes(cls, frame: Frame, config: Any, learning: bool) -> int:
+        """Activations that a step keeps for its gradients."""
+        c = config
+        samples = c.members_per_step * c.rays_per_member * c.steps_per_diagonal // 8
+        hidden = c.hidden_width * (c.density_layers + c.colour_layers) + c.levels * c.features_per_level
+        return 4 * samples * hidden * learning
+
+    # Learning
+
+    def begin(self, data: Collection, seconds: float = math.inf) -> None:
+        if len(data) > self.config.members:
+            raise LumigraphError(
+                f"{data.source} has {len(data)} members, and there is room for {self.config.members} codes; "
+                f"give --members {len(data)}"
+            )
+        self.codes.begin(data.splits["train"], self.config.code_deviation, self.random(1))
+
+    def steps_per_pass(self, data: Collection) -> float:
+        return len(data.splits["train"]) / self.config.members_per_step
+
+    def batch(self, data: Collection, generator: torch.Generator) -> Lesson:  # type: ignore[override]
+        """Random members, and rays through random photographs of each."""
+        c, members, evidence = self.config, list[int](), list[Evidence]()
+        for _ in range(c.members_per_step):
+            number, member = data.sample_member(generator)
+            scene = photographed(member, "hyp-nerf")
+            there = scene.splits["train"]
+            chosen = there[torch.randperm(len(there), generator=generator)[: c.targets]].tolist()
+            photographs = [scene.photograph(i) for i in chosen]
+            members.append(number)
+            batch = rays_through(photographs, c.rays_per_member, True, generator).to(self.device)
+            background = torch.tensor([scene.frame.background], device=self.device)
+            evidence.append(Evidence(batch, self._cells_of_member(number, scene), background))
+        rays, picture = patch(photographs[0], scene.frame, generator)  # the last one's
+        return Lesson(members, evidence, rays.to(self.device), picture.to(self.device))
+
+    def _cells_of_member(self, number: int, scene: Scene) -> OccupancyGrid:
+        if number not in self._cells:
+            self._cells[number] = self._cells_of(scene)
+        return self._cells[number]
+
+    def _cells_of(self, scene: Scene) -> OccupancyGrid:
+        """The cells of a scene that no photograph proves empty. Raises LumigraphError for scenes without bounds."""
+        if scene.frame.reach > 1:
+            raise LumigraphError(
+                f"hyp-nerf knows objects, and {scene.source} is a place without bounds; name photographs of an object"
+            )
+        cells, n = OccupancyGrid(1.0, self.config.occupancy_resolution), self.config.occupancy_resolution
+        if scene.images.has_alpha:
+            cells.rule_out(visual_hull(scene, n, n)[None])
+        return cells.to(self.device)
+
+    def loss(self, batch: Lesson, step: int) -> dict[str, Tensor]:  # type: ignore[override]
+        """The squared error of colours of all members (eq. 2), density where nothing is, and the denoiser's error."""
+        generator, share = self.random(step), 1 / len(batch.members)
+        codes = self.codes(torch.tensor(batch.members, device=self.device))
+        instances = self._made(codes)
+        terms: dict[str, Tensor] = {}
+        mse = 0.0
+        for instance, evidence in zip(instances, batch.evidence, strict=True):
+            for name, term in self._errors(instance, evidence, generator).items():
+                terms[name] = terms.get(name, 0.0) + share * term
+            mse += share * self.figures["mse"]
+        self.figures["mse"] = mse
+        if self.config.code_weight:
+            terms["code"] = self.config.code_weight * codes.square().mean()
+        if self._denoising:
+            terms["denoiser"] = self._denoiser_error(batch, instances[-1])
+        return terms
+
+    def _errors(self, instance: HashInstance, evidence: Evidence, generator: torch.Generator) -> dict[str, Tensor]:
+        """Of colours, before random backgrounds where photographs have alpha, and of density where nothing is."""
+        batch, cells = evidence.rays, evidence.cells
+        jitter = torch.rand(len(batch), generator=generator).to(self.device)
+        background = backdrop(batch, evidence.background, generator)
+        seen = self._seen(instance, cells, batch.rays, background, jitter)
+        residual, mse = residuals(seen, batch, background)
+        self.figures |= {"mse": mse}
+        terms = {"colour": residual.square().mean()}
+        if self.config.empty_points and self.config.empty_weight:
+            points = 2 * torch.rand(self.config.empty_points, 3, generator=generator).to(self.device) - 1
+            density = instance.density(points[~held(cells, points)])
+            terms["empty"] = self.config.empty_weight * torch.log1p(EMPTY * density).sum() / len(points)
+        return terms
+
+    def _denoiser_error(self, batch: Lesson, instance: HashInstance) -> Tensor:
+        """Of a denoised rendering, beside the photograph."""
+        last = batch.evidence[-1]
+        with torch.no_grad():
+            seen = self._seen(instance, last.cells, batch.rays, last.background).rgb
+        return (self._denoised(seen.view(batch.picture.shape)) - batch.picture).square().mean()
+
+    def _seen(
+        self,
+        instance: HashInstance,
+        cells: OccupancyGrid,
+        rays: Rays,
+        background: Float[Tensor, "#ray 3"],
+        jitter: Float[Tensor, " ray"] | None = None,
+    ) -> Rendering:
+        """What rays see of an instance, of all samples in cells: few lie far behind what is seen."""
+        samples = cells.sample(rays, self.frame.near, *self.lattice, jitter=jitter)
+        density, rgb = instance.field(*samples.along(rays))
+        self.figures |= {"rays": len(rays), "samples": len(samples)}
+        return composite(samples, density, rgb, background, self.config.transmittance_threshold)
+
+    def _denoised(self, picture: Float[Tensor, "height width 3"]) -> Float[Tensor, "height width 3"]:
+        return self.denoiser(picture.permute(2, 0, 1)[None])[0].permute(1, 2, 0)
+
+    def optimizers(self) -> list[torch.optim.Optimizer]:
+        common = {"lr": self.config.learning_rate, "betas": (0.9, 0.99), "eps": 1e-15}
+        networks = [*self.hyper.parameters(), *self.denoiser.parameters()]
+        return [torch.optim.Adam(networks, fused=True, **common), LazyAdam([self.codes.rows], **common)]
+
+    def learning_rate(self, step: int, progress: float) -> float:
+        return falling(self.config.learning_rate, self.config.final_learning_rate, progress)
+
+    def before_step(self, step: int, progress: float) -> None:
+        self._shown, self._denoising = None, progress >= self.config.denoiser_start
+
+    # Instances
+
+    def _made(self, codes: Float[Tensor, "member code"]) -> list[HashInstance]:
+        """The fields that codes mean (section 3.2): table and density of the shape's, colour of the colour's."""
+        shape, colour = codes.split([self.config.shape_code, self.config.colour_code], -1)
+        made = self.hyper([colour if is_colour else shape for is_colour in self.shape.of_colour])
+        return [HashInstance(self.shape, tensors) for tensors in made]
+
+    @property
+    def shown(self) -> tuple[HashInstance, OccupancyGrid]:
+        """The field that is seen, and the cells where it holds something."""
+        if self._shown is None:
+            with torch.no_grad():
+                instance = self._told()
+            self._shown = instance, self._filled(instance)
+        return self._shown
+
+    def _filled(self, instance: HashInstance) -> OccupancyGrid:
+        """The cells where a field holds something."""
+        cells, generator = OccupancyGrid(1.0, self.config.occupancy_resolution).to(self.device), self.random(0)
+        for _ in range(LOOKS):
+            cells.update(
+                lambda points: instance.density(points) * self._inside(points),
+                self.config.occupancy_threshold,
+                generator,
+                decay=1.0,
+            )
+        return cells
+
+    def _told(self) -> HashInstance:
+        """The field of the code that was told; of the one that was found, as it was tuned."""
+        value = str(self.control("instance"))
+        (instance,) = self._made(self.codes.told(value, **self._others)[None])
+        first, second, share = blend(value)
+        weight = (1 - share) * (first == FOUND) + share * (second == FOUND)
+        if not weight or not self.tuned:
+            return instance
+        tensors = [x + weight * change for x, change in zip(instance.tensors, self.tuned.changes, strict=True)]
+        return HashInstance(self.shape, tensors)
+
+    @property
+    def _others(self) -> dict[str, Tensor]:
+        return {FOUND: self.found.rows[0]} if len(self.found.rows) else {}
+
+    @property
+    def controls(self) -> tuple[Control, ...]:
+        first = (FOUND,) if len(self.found.rows) else ()
+        choices = (*first, AVERAGE, *self.codes.names)
+        about = "Which object is shown: the one that was found or drawn, a member of the collection by its number, or "
+        about += "the average of all."
+        return (Control("instance", choices[0], choices=choices, about=about, blends=True),)
+
+    # One scene
+
+    @property
+    def evidence_views(self) -> int | None:
+        return 1
+
+    def evidence_bytes(self, scene: Scene) -> int:
+        """The pixels that are looked at, as rays."""
+        return 4 * 12 * int(scene.cameras.size[scene.splits["train"]].prod(-1).sum())
+
+    def given(self, *evidence: Any, **controls: Value) -> Method:
+        """An object of which photographs are told: the code is found that looks like them, then the field is tuned to
+        them (section 3.3); or another one of those that were learnt."""
+        scenes = [piece for piece in evidence if isinstance(piece, Scene)]
+        told = super().given(*(piece for piece in evidence if not isinstance(piece, Scene)), **controls)
+        assert isinstance(told, HypNeRF)
+        told._shown = None
+        for scene in scenes[-1:]:
+            told.frame = scene.frame
+            told.told.pop("instance", None)
+            told._find(scene)
+        return told
+
+    def drawn(self, seed: int) -> Method:
+        """An object that nobody has photographed: a code from the Gaussian that fits the learnt ones."""
+        told = super().given()
+        assert isinstance(told, HypNeRF)
+        told.found, told._shown = Kept(self.codes.drawn(torch.Generator().manual_seed(seed))[None]), None
+        told.tuned = untuned(self.shape)
+        told.told.pop("instance", None)
+        return told
+
+    def _find(self, scene: Scene) -> None:
+        """The code and the tuned tensors of a scene, kept here."""
+        c, there = self.config, scene.splits["train"]
+        photographs = [scene.photograph(i) for i in there.tolist()]
+        cells, background = self._cells_of(scene), torch.tensor([scene.frame.background], device=self.device)
+
+        def seen(count: int, generator: torch.Generator) -> Evidence:
+            return Evidence(rays_through(photographs, count, True, generator).to(self.device), cells, background)
+
+        code = self._code_of(seen)
+        with torch.no_grad():
+            (made,) = self._made(code[None])
+        tuned = self._tuned_to([seen], made.tensors, c.tune_steps, 2)
+        if c.denoise_views and c.denoise_steps:
+            denoised = self._denoised_views(HashInstance(self.shape, tuned), photographs[0].camera, background)
+            tuned = self._tuned_to([seen, denoised], tuned, c.denoise_steps, 3)
+        self.found = Kept(code[None])
+        pairs = zip(tuned, made.tensors, strict=True)
+        self.tuned = Tuned((tensor - first)[None] for tensor, first in pairs)
+
+    def _code_of(self, seen: Seen) -> Float[Tensor, " code"]:
+        """The code that explains photographs best, not far from those that were learnt (section 3.3)."""
+        axes, average, generator = self.codes.axes, self.codes.average, self.random(2)
+
+        def error(where: Float[Tensor, " axis"]) -> Tensor:
+            (instance,) = self._made((average + where @ axes)[None])
+            terms = self._errors(instance, seen(RAYS, generator), generator)
+            return torch.stack([*terms.values()]).sum() + self.config.code_prior * where.square().mean()
+
+        if not len(axes):
+            return average
+        start = self.codes.along(self._nearest(seen))
+        return average + fitted(start, error, self.config.code_steps, self.config.code_learning_rate) @ axes
+
+    @torch.no_grad()
+    def _nearest(self, seen: Seen) -> Float[Tensor, " code"]:
+        """The learnt code that explains photographs best, or the average."""
+        known = self.codes.rows[self.codes.learnt]
+        some = torch.randperm(len(known), generator=self.random(3))[:CANDIDATES]
+        codes = torch.cat([self.codes.average[None], known[some.to(known.device)]])
+        evidence, errors = seen(RAYS // 2, self.random(4)), list[Tensor]()
+        for instance in (self._made(code[None])[0] for code in codes):
+            errors.append(self._errors(instance, evidence, self.random(5))["colour"])
+        return codes[int(torch.stack(errors).argmin())]
+
+    @torch.enable_grad()
+    def _tuned_to(self, sources: Sequence[Seen], tensors: Sequence[Tensor], steps: int, number: int) -> list[Tensor]:
+        """Tensors of a field after so many steps of learning from photographs, and from denoised views after them."""
+        tuned = [tensor.detach().clone().requires_grad_() for tensor in tensors]
+        adam, generator = torch.optim.Adam(tuned, eps=1e-15), self.random(number)
+        instance, rate = HashInstance(self.shape, tuned), self.config.tune_learning_rate
+        for step in range(steps):
+            adam.param_groups[0]["lr"] = rate * (1 - step / steps)
+            adam.zero_grad()
+            for weight, seen in zip((1.0, self.config.denoise_weight), sources, strict=False):
+                terms = self._errors(instance, seen(RAYS // len(sources), generator), generator)
+                (weight * torch.stack([*terms.values()]).sum()).backward()
+            adam.step()
+        return [tensor.detach() for tensor in tuned]
+
+    @torch.no_grad()
+    def _denoised_views(self, instance: HashInstance, like: Camera, background: Float[Tensor, "1 3"]) -> Seen:
+        """Renderings of a field from all around, denoised, as photographs of it (section 3.2)."""
+        cells, views = self._filled(instance), list[Photograph]()
+        for camera in around(like, self.frame, self.config.denoise_views):
+            rays = camera.rays(camera.pixels()).to(self.device)
+            width, height = camera.size[0].tolist()
+            picture = self._seen(instance, cells, rays, background).rgb.view(height, width, 3)
+            views.append(Photograph(camera, self._denoised(picture).clamp(0, 1).cpu()))
+
+        def seen(count: int, generator: torch.Generator) -> Evidence:
+            return Evidence(rays_through(views, count, True, generator).to(self.device), cells, background)
+
+        return seen
+
+    # Along rays
+
+    def looks(self, rays: Rays) -> list[Look]:
+        instance, cells = self.shown
+        samples = cells.sample(rays, self.frame.near, *self.lattice)
+        samples, _ = reached(rays, samples, instance.density, self.config.transmittance_threshold)
+        return [Look("samples", samples, *instance.field(*samples.along(rays)))]
+
+    def field(
+        self, points: Float[Tensor, "point 3"], directions: Float[Tensor, "point 3"]
+    ) -> tuple[Float[Tensor, " point"], Float[Tensor, "point 3"]]:
+        """Density per scene unit, nothing beyond the bounds, and sRGB-encoded colour seen along unit directions."""
+        density, rgb = self.shown[0].field(points, directions)
+        return density * self._inside(points), rgb
+
+    def density(self, points: Float[Tensor, "point 3"]) -> Float[Tensor, " point"]:
+        """Density per scene unit, nothing beyond the bounds."""
+        return self.shown[0].density(points) * self._inside(points)
+
+    def _inside(self, points: Float[Tensor, "point 3"]) -> Bool[Tensor, " point"]:
+        low, high = torch.tensor(self.frame.bounds, device=self.device)
+        return ((points > low) & (points < high)).all(-1)
+
+
+def untuned(shape: HashShape) -> Tuned:
+    return Tuned(torch.empty(0, *sizes) for sizes in shape.tensors)
+
+
+def held(cells: OccupancyGrid, points: Float[Tensor, "point 3"]) -> Bool[Tensor, " point"]:
+    """Whether points of [-1, 1]^3 lie in cells that may hold something."""
+    x, y, z = ((points + 1) * (cells.resolution / 2)).long().clamp(0, cells.resolution - 1).unbind(-1)
+    return cells.occupied[0, x, y, z]
+
+
+def patch(
+    photograph: Photograph, frame: Frame, generator: torch.Generator
+) -> tuple[Rays, Float[Tensor, "height width 3"]]:
+    """A random part of a photograph, as rays and as a picture."""
+    height, width = photograph.rgb.shape[:2]
+    rows, columns = min(height, PATCH), min(width, PATCH)
+    top, left = chance(height - rows + 1, generator), chance(width - columns + 1, generator)
+    part = slice(top, top + rows), slice(left, left + columns)
+    pixels = photograph.camera.pixels().view(height, width, 2)[part].reshape(-1, 2)
+    return photograph.camera.rays(pixels), photograph.before(frame.background)[part].contiguous()
+
+
+def around(camera: Camera, frame: Frame, count: int) -> Iterator[Camera]:
+    """Cameras with the same lens, as far from the middle, all around it and now lower, now higher."""
+    middle = torch.tensor(frame.bounds).mean(0)
+    distance = (camera.position - middle).norm()
+    for number in range(count):
+        azimuth, height = torch.tensor(2 * math.pi * number / count), torch.tensor(HEIGHTS[number % len(HEIGHTS)])
+        outward = torch.stack([height.cos() * azimuth.cos(), height.cos() * azimuth.sin(), height.sin()])[None]
+        pose = look_at(middle + distance * outward, -outward, torch.tensor([0.0, 0.0, 1.0]))
+        yield replace(camera, pose=pose)
