@@ -9,7 +9,6 @@ ends the session with code 1: less than that is within what one machine differs 
 from __future__ import annotations
 
 import os
-import statistics
 import time
 from collections import defaultdict
 from dataclasses import astuple, dataclass, field
@@ -97,7 +96,6 @@ GROUPS: dict[str, str] = {
     **dict.fromkeys("test_house test_budgets".split(), "house"),
 }  # the others are of nouns and capture
 MUCH, TOO_MUCH = 1.5, 4.0  # times its share: what is told, and what fails
-SOME = 12  # files with shares, from which on they say how slow a machine is
 CALIBRATION = 0.021  # processor seconds that `probe` takes on the machine that the budgets were set on
 
 
@@ -170,14 +168,8 @@ class Ledger:
 
     @property
     def slowness(self) -> float:
-        """Times as slow as the machine that the budgets were set on; never below 1.
-
-        By the probes, and by the middle one of the files that have a share of their own, if there are SOME: a probe
-        does not feel what two processes side by side cost each other.
-        """
-        probed = sum(self.probes) / len(self.probes) if self.probes else 1.0
-        shares = [cost.counted / SHARES[file][1] for file, cost in self.files.items() if file in SHARES]
-        return max(1.0, probed, statistics.median(shares) if len(shares) >= SOME else 1.0)
+        """Times as slow as the machine that the budgets were set on; never below 1."""
+        return max(1.0, sum(self.probes) / len(self.probes)) if self.probes else 1.0
 
     def readings(self) -> tuple[float, float, float]:
         return time.perf_counter(), processor_seconds(), self.compiling.seconds

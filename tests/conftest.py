@@ -14,8 +14,10 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-if "PYTEST_XDIST_WORKER" in os.environ:  # a process for each processor, so threads that spin only hold up the others
-    os.environ |= {"OMP_NUM_THREADS": "1", "OMP_WAIT_POLICY": "PASSIVE"}
+# A process for each processor: threads that look for work hold up the others. The process that starts them has set how
+# long ours look, which outvotes OMP_WAIT_POLICY.
+if "PYTEST_XDIST_WORKER" in os.environ:
+    os.environ |= {"OMP_NUM_THREADS": "1", "GOMP_SPINCOUNT": "0"}
 
 import lumigraph  # isort: skip
 import pytest  # isort: skip

@@ -5,20 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from budgets import (
-    A_METHOD,
-    BUDGETS,
-    EACH,
-    GROUPS,
-    MUCH,
-    SHARES,
-    SOME,
-    TOO_MUCH,
-    Cost,
-    Ledger,
-    probe,
-    share_of,
-)
+from budgets import A_METHOD, BUDGETS, EACH, GROUPS, MUCH, SHARES, TOO_MUCH, Cost, Ledger, probe, share_of
 
 HERE = Path(__file__).parent
 
@@ -52,19 +39,6 @@ def test_the_table_adds_up():
     (line,) = [line.split() for line in ledger.table() if line.startswith("methods")]
     assert line[1:] == ["8", "7.5", f"{BUDGETS['methods'] + 2 * A_METHOD:.0f}", "11.0", "1.5"]
     assert ledger.table()[-1].split()[1:3] == ["8", "7.5"]
-
-
-def test_a_machine_is_as_slow_as_most_files_say():
-    """One file that takes long is a slow file; most that do are a slow machine."""
-    ledger = Ledger(methods=2)
-    shares = [(file, share) for file, (_, share) in SHARES.items()][: 2 * SOME]
-    for file, share in shares:
-        ledger.files[file] += Cost(1, 0.5 * share, 0.5 * share, 0.0)
-    ledger.files[shares[0][0]] += Cost(1, 5 * shares[0][1], 5 * shares[0][1], 0.0)
-    assert ledger.slowness == 1.0 and len(ledger.excessive()) == 1
-    for file, share in shares[1:]:
-        ledger.files[file] += Cost(1, 4.5 * share, 4.5 * share, 0.0)
-    assert ledger.slowness == pytest.approx(5.0) and not ledger.excessive()
 
 
 def test_shares_are_of_files_that_are_there_and_fit_their_groups():

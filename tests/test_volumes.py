@@ -31,11 +31,16 @@ from lumigraph.viewer import Viewer, choose_address
 GROUND = torch.tensor(OPENING.background)
 LEVELS = 5
 PHONE = {"viewport": {"width": 130, "height": 280}, "device_scale_factor": 2, "has_touch": True, "is_mobile": True}
-SLOW = """{
-  const { readPixels } = WebGL2RenderingContext.prototype;
+SLOW = """{ // 200 pixels in a millisecond, whatever draws them
+  const { readPixels, scissor } = WebGL2RenderingContext.prototype;
+  let pixels = 0;
+  WebGL2RenderingContext.prototype.scissor = function (...all) {
+    pixels = all[2] * all[3];
+    scissor.apply(this, all);
+  };
   WebGL2RenderingContext.prototype.readPixels = function (...all) {
     readPixels.apply(this, all);
-    for (const end = performance.now() + 25; performance.now() < end; );
+    for (const end = performance.now() + pixels / 200; performance.now() < end; );
   };
   const { viewport } = WebGL2RenderingContext.prototype;
   window.sizes = [];
