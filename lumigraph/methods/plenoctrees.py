@@ -96,7 +96,7 @@ class Config:
     final_density_learning_rate: DensityRate = 1.0
     harmonics_learning_rate: LearningRate = 0.02  # of leaves
     final_harmonics_learning_rate: LearningRate = 0.002
-    transmittance_threshold: Share = 1e-3  # at which a ray is spent
+    transmittance_threshold: Share = 0.01  # at which a ray is spent, section 4.2
     seed: Seed = 0
 
     def check(self) -> None:
@@ -104,7 +104,7 @@ class Config:
         check_levels(self)
 
 
-RAYS = 1 << 16  # rendered at once, once there are leaves alone
+RAYS = 1 << 18  # rendered at once, once there are leaves alone
 ROWS = 16  # leaves that are left of most scenes, for each cell of one face of the cube
 
 

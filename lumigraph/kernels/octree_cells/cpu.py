@@ -50,6 +50,12 @@ def leaf(cells, path, level, depth, x, y, z):
 
 
 @njit(inline="always")
+def row_of(value, rows):
+    """The row of a cell that holds something. rows: as `Tree.rows` has them"""
+    return np.int64(rows[-1 - value]) if len(rows) else -1 - value
+
+
+@njit(inline="always")
 def leave(x, y, z, shift, ox, oy, oz, dx, dy, dz, ix, iy, iz, t):
     """Where a ray leaves the cell of side 2^shift at a place, and the place beyond. Origin, direction and one over it
     are in smallest cells."""
@@ -101,7 +107,7 @@ def _walk(o, d, cells, named, density, depth, near, most, write, starts, t_start
                     value, level = leaf(cells, path, level, depth, x, y, z)
                     end, u, v, w = leave(x, y, z, depth - level, ox, oy, oz, dx, dy, dz, ix, iy, iz, t)
                     if value < 0:
-                        row = np.int64(named[-1 - value])
+                        row = row_of(value, named)
                         if row >= 0:
                             if write:
                                 i = starts[r] + count
@@ -117,7 +123,7 @@ def _walk(o, d, cells, named, density, depth, near, most, write, starts, t_start
 
 
 def run(origins, directions, tree, density, near, stop):
-    given = [x.detach().contiguous().numpy() for x in (origins, directions, tree.cells, tree.named, density)]
+    given = [x.detach().contiguous().numpy() for x in (origins, directions, tree.cells, tree.rows, density)]
     numbers = tree.depth, np.float32(near), np.float32(-math.log(stop) if stop > 0 else math.inf)
     starts, nothing = torch.zeros(len(origins) + 1, dtype=torch.int64), empty(0)
     rows = torch.empty(0, dtype=torch.int64)

@@ -5,22 +5,21 @@ import math
 
 import numpy as np
 import torch
-from numba import njit, prange
+from numba import get_num_threads, njit, prange
 
 from .._dispatch import empty
-from ..octree_cells.cpu import CHUNK, FAST, ONE, ZERO, cell_at, inverse_of, leaf, leave, shared, through_cube
+from ..octree_cells.cpu import CHUNK, FAST, ONE, ZERO, cell_at, inverse_of, leaf, leave, row_of, shared, through_cube
 from ..spherical_harmonics.cpu import basis
 
 HALF = np.float32(0.5)
+MET = 64  # cells of a ray whose colours are worked out together
 
 
 def spread(rays):
-    """An order of chunks in which every thread, which takes a run of them, has some from all over a picture."""
-    count = (rays + CHUNK - 1) // CHUNK
-    stride = max(int(0.618 * count), 1)
-    while math.gcd(stride, count) > 1:
-        stride += 1
-    return np.arange(count) * stride % max(count, 1)
+    """An order of chunks in which every thread, which takes a run of them, has some from all over a picture, and none
+    far from what another is at."""
+    threads, chunks = get_num_threads(), np.arange((rays + CHUNK - 1) // CHUNK)
+    return np.concatenate([chunks[i::threads] for i in range(threads)])
 
 
 @njit(inline="always")
@@ -34,6 +33,22 @@ def _colour(harmonics, row, y):
     return ONE / (ONE + np.exp(-red)), ONE / (ONE + np.exp(-green)), ONE / (ONE + np.exp(-blue))
 
 
+@njit(inline="always")
+def _shown(met, weights, count, harmonics, y, asked):
+    """Sums of what some cells show by their weights. All rows are touched before any is worked out: memory then brings
+    several at a time, where it would otherwise be waited for from one to the next."""
+    last = harmonics.shape[1] - 1
+    for i in range(count):
+        asked[0] += harmonics[met[i], 0, 0] + harmonics[met[i], last // 2, 0] + harmonics[met[i], last, 2]
+    red = green = blue = ZERO
+    for i in range(count):
+        r_, g_, b_ = _colour(harmonics, met[i], y)
+        red += weights[i] * r_
+        green += weights[i] * g_
+        blue += weights[i] * b_
+    return red, green, blue
+
+
 @njit(parallel=True, fastmath=True, **FAST)
 def _forward(chunks, o, d, cells, named, density, harmonics, bands, depth, near, stop, rgb, distance, opacity, counts):
     n, side = len(o), np.int64(1) << depth
@@ -41,6 +56,8 @@ def _forward(chunks, o, d, cells, named, density, harmonics, bands, depth, near,
     for i in prange(len(chunks)):
         chunk = chunks[i]
         path, y = np.zeros(depth + 1, np.int64), np.zeros(16, np.float32)
+        met, weights = np.zeros(MET, np.int64), np.zeros(MET, np.float32)
+        asked = np.zeros(1, np.float32)  # a sum that nobody needs, or compilers would leave it out
         for r in range(chunk * CHUNK, min(n, (chunk + 1) * CHUNK)):
             ox, oy, oz = o[r, 0] * across, o[r, 1] * across, o[r, 2] * across
             dx, dy, dz = d[r, 0] * across, d[r, 1] * across, d[r, 2] * across
@@ -51,7 +68,7 @@ def _forward(chunks, o, d, cells, named, density, harmonics, bands, depth, near,
             )
             t, far = through_cube(ox, oy, oz, ix, iy, iz, across, near)
             red = green = blue = way = spent = ZERO
-            through, count, level = ONE, np.int64(0), np.int64(0)
+            through, count, level, waiting = ONE, np.int64(0), np.int64(0), 0
             if t < far:
                 basis(d[r, 0], d[r, 1], d[r, 2], bands, y)
                 u, v, w = cell_at(ox + t * dx, 0, side), cell_at(oy + t * dy, 0, side), cell_at(oz + t * dz, 0, side)
@@ -59,23 +76,26 @@ def _forward(chunks, o, d, cells, named, density, harmonics, bands, depth, near,
                     value, level = leaf(cells, path, level, depth, u, v, w)
                     end, u2, v2, w2 = leave(u, v, w, depth - level, ox, oy, oz, dx, dy, dz, ix, iy, iz, t)
                     if value < 0:
-                        row = np.int64(named[-1 - value])
+                        row = row_of(value, named)
                         if row >= 0:
                             count += 1
                             keep = np.exp(-density[row] * (end - t))
                             weight = through * (ONE - keep)
                             through *= keep
-                            if weight > ZERO:
-                                r_, g_, b_ = _colour(harmonics, row, y)
-                                red += weight * r_
-                                green += weight * g_
-                                blue += weight * b_
-                                way += weight * HALF * (t + end)
-                                spent += weight
+                            way += weight * HALF * (t + end)
+                            spent += weight
+                            met[waiting], weights[waiting] = row, weight
+                            waiting += weight > ZERO
+                            if waiting == MET:
+                                r_, g_, b_ = _shown(met, weights, waiting, harmonics, y, asked)
+                                red, green, blue, waiting = red + r_, green + g_, blue + b_, 0
                     if u2 < 0 or v2 < 0 or w2 < 0 or u2 >= side or v2 >= side or w2 >= side or through < stop:
                         break
                     level = shared(level - 1, depth, (u ^ u2) | (v ^ v2) | (w ^ w2))
                     u, v, w, t = u2, v2, w2, end
+                if waiting:
+                    r_, g_, b_ = _shown(met, weights, waiting, harmonics, y, asked)
+                    red, green, blue = red + r_, green + g_, blue + b_
             rgb[r, 0], rgb[r, 1], rgb[r, 2] = red, green, blue
             distance[r], opacity[r], counts[r] = way, spent, count
 
@@ -117,7 +137,7 @@ def _share(
                 value, level = leaf(cells, path, level, depth, u, v, w)
                 end, u2, v2, w2 = leave(u, v, w, depth - level, ox, oy, oz, dx, dy, dz, ix, iy, iz, t)
                 if value < 0:
-                    row = np.int64(named[-1 - value])
+                    row = row_of(value, named)
                     if row >= 0:
                         length = end - t
                         keep = np.exp(-density[row] * length)
@@ -174,7 +194,7 @@ class _OctreeMarch(torch.autograd.Function):
         rgb, distance, opacity = empty(n, 3), empty(n), empty(n)
         starts = torch.zeros(n + 1, dtype=torch.int64)
         ctx.numbers = math.isqrt(harmonics.shape[1]), tree.depth, np.float32(near)
-        ctx.tree = tree.cells.numpy(), tree.named.numpy()
+        ctx.tree = tree.cells.numpy(), tree.rows.numpy()
         rays = origins.detach().numpy(), directions.detach().numpy()
         tables = density.detach().numpy(), harmonics.detach().numpy()
         out = rgb.numpy(), distance.numpy(), opacity.numpy(), starts.numpy()[1:]
