@@ -94,13 +94,16 @@ def test_the_sun_moves_and_the_same_place_looks_different_later():
     assert toward[0] @ toward[1] < np.cos(np.radians(60))
 
 
-def test_pictures_are_traced_once(tmp_path, monkeypatch):
-    first = open_scene(SMALL, cache=tmp_path)
+@pytest.mark.parametrize(
+    "source", [SMALL, *(f"procedural:{name},size=16,views=4" for name in ("still-life", "swing", "night"))]
+)
+def test_pictures_are_traced_once(source, tmp_path, monkeypatch):
+    first = open_scene(source, cache=tmp_path)
     monkeypatch.setattr(procedural, "picture", lambda *_: pytest.fail("traced again"))
-    again = open_scene(SMALL, cache=tmp_path)
+    again = open_scene(source, cache=tmp_path)
     assert torch.equal(first.photograph(3).rgb, again.photograph(3).rgb)
     with pytest.raises(pytest.fail.Exception):
-        open_scene(f"{SMALL},seed=1", cache=tmp_path)
+        open_scene(f"{source},seed=1", cache=tmp_path)
 
 
 def test_poses_are_off_by_shares_of_a_street():

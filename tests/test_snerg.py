@@ -396,6 +396,7 @@ def test_the_command_writes_the_folder(ball, tmp_path, capsys):
     assert "MB" in capsys.readouterr().out
     assert torch.equal(snerg.read(output).index >= 0, ball.atlas().index >= 0)
     assert main(["export", "snerg", str(output), str(tmp_path / "again")]) == 0
+    assert main(["info", str(output)]) == 0 and "SNeRG's viewer" in capsys.readouterr().out
     assert (tmp_path / "again" / "rgba_000.png").is_file()
 
 

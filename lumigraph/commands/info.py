@@ -1,4 +1,4 @@
-"""`lumigraph info`: what a run, a folder of photographs, a mesh, a splat file or a composition is."""
+"""`lumigraph info`: what a run, a folder of photographs, a mesh, a file of splats or a composition is."""
 
 from __future__ import annotations
 
@@ -27,9 +27,17 @@ class Info:
 
     def run(self) -> int:
         from ..capture import open_dataset
-        from ..exchange import is_splat_file, read_gaussians
+        from ..exchange import is_splat_file, read_gaussians, snerg
         from ..run.block_run import BlockRun, is_block_run
-        from .info_tree import blocks_tree, canonical_tree, cloud_tree, composition_tree, dataset_tree, run_tree
+        from .info_tree import (
+            atlas_tree,
+            blocks_tree,
+            canonical_tree,
+            cloud_tree,
+            composition_tree,
+            dataset_tree,
+            run_tree,
+        )
 
         if is_block_run(Path(self.what)):
             tree = blocks_tree(BlockRun(self.what))
@@ -45,6 +53,10 @@ class Info:
 
             opened = open_any(self.what)
             tree = canonical_tree(opened) if isinstance(opened, Canonicalised) else composition_tree(opened)
+        elif snerg.recognises(Path(self.what)):
+            from ..run.snerg_folder import SnergFolder
+
+            tree = atlas_tree(SnergFolder(self.what))
         else:
             told: dict[str, Any] = {"downscale": self.downscale, "reader": self.reader}
             tree = dataset_tree(open_dataset(self.what, **told))

@@ -172,6 +172,20 @@ def cloud_tree(name: str, cloud: Gaussians) -> Tree:
     return tree
 
 
+def atlas_tree(opened: Any) -> Tree:
+    tree = Tree(bold(opened.path) + "  an atlas for SNeRG's viewer")
+    atlas = opened.atlas
+    x, y, z = (number * atlas.block for number in atlas.index.shape)
+    rows: dict[str, Any] = {
+        "voxels": f"{x} x {y} x {z}, in {len(atlas.values):,} of {atlas.index.numel():,} blocks of {atlas.block}",
+        "coordinates": "contracted" if atlas.contracted else None,
+        "depends on direction": "no" if atlas.network is None else "by a small network",
+    }
+    branch(tree, "atlas", rows)
+    branch(tree, "frame", frame_rows(opened.frame))
+    return tree
+
+
 def composition_tree(composition: Any) -> Tree:
     tree = Tree(bold(composition.path) + f"  a composition of {len(composition.parts)} parts")
     for number, (part, place) in enumerate(zip(composition.parts, composition.places, strict=True)):

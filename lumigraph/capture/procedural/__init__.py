@@ -67,7 +67,7 @@ def read(request: str) -> Capture:
     amount = asked.pop("jitter_poses")
     stage = scenes.stage(name, **asked)
     off = jittered(stage, amount, options.seed) if amount else None
-    return capture(stage, f"procedural:{request}", off, kept=stage.called is not None)
+    return capture(stage, f"procedural:{request}", off, kept=stage.differing is None or stage.called is not None)
 
 
 def capture(stage: Stage, source: str, found: dict[str, Camera] | None = None, kept: bool = False) -> Capture:
@@ -105,8 +105,9 @@ def identity(stage: Stage, camera: Camera) -> str:
     if stage.called is not None and camera.image_index is not None:
         world = stage.called(int(camera.image_index))
     else:
-        world = repr(stage.world)
-    return f"traced {TRACER} {world} {camera.pose.tolist()} {camera.lens.to_json()} {camera.size.tolist()}"
+        world = repr(stage.world_of(camera))
+    taken = "" if stage.sensor is None else f" {stage.sensor} {camera.image_index}"
+    return f"traced {TRACER} {world} {camera.pose.tolist()} {camera.lens.to_json()} {camera.size.tolist()}{taken}"
 
 
 def known_planes(stage: Stage, camera: Camera) -> dict[str, Plane]:
