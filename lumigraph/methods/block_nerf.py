@@ -22,6 +22,7 @@ from ..components.fields.coded_field import of_samples
 from ..components.fields.coded_frustums import CodedFrustums
 from ..components.fields.coded_hash import CodedHash
 from ..components.fields.exposures import Exposures
+from ..components.fields.hash_field import HashNumbers
 from ..components.fields.visibility import Visibility
 from ..components.sampling.coarse_to_fine import SAMPLES_OF_A_RAY
 from ..components.sampling.occupancy import OccupancyGrid
@@ -57,7 +58,7 @@ Code = Annotated[int, between(1, 1024)]  # numbers of a photograph's code
 
 
 @dataclass(frozen=True)
-class Config(OpenNumbers):
+class Config(HashNumbers, OpenNumbers):
     """The paper's numbers, with where it gives them; `BlockNeRF.preset` says what a plain CPU does otherwise."""
 
     field: Literal["hash", "network"] = "network"  # what holds the block: a hash table, or the paper's Mip-NeRF
@@ -90,12 +91,6 @@ class Config(OpenNumbers):
     coarse_loss_weight: NonNegative = 0.1  # 0: the first look only guides the second
     rays_per_step: BatchSize = 4096
     bfloat16: bool = True  # multiply in bfloat16 where the machine is fast at it
-    # Of the field in a hash table: see instant-ngp, whose numbers these are.
-    levels: Annotated[int, between(1, 32)] = 16
-    features_per_level: Annotated[int, between(1, 16)] = 2
-    log2_hashmap_size: Annotated[int, between(1, 28)] = 19
-    base_resolution: Annotated[int, between(1, 4096)] = 16
-    max_resolution: Annotated[int, between(1, 1 << 20)] = 2048  # times the reach
     density_layers: Layers = 1  # hidden layers
     colour_layers: Layers = 2  # hidden layers
     geometry_features: Annotated[int, between(1, 256)] = 16  # from density to colour network

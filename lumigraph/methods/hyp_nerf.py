@@ -14,7 +14,7 @@ from torch import Tensor
 from ..camera import Camera
 from ..collection import Collection
 from ..components.fields.appearance import fitted
-from ..components.fields.hash_field import check_levels
+from ..components.fields.hash_field import HashNumbers, check_levels
 from ..components.fields.hash_instance import HashInstance, HashShape
 from ..components.fields.hypernetwork import HyperNetwork
 from ..components.fields.instance_codes import AVERAGE, InstanceCodes
@@ -53,7 +53,7 @@ Tally = Annotated[int, between(0, 100_000)]
 
 
 @dataclass(frozen=True)
-class Config:
+class Config(HashNumbers):
     """The paper's numbers where it or its published code gives them; `HypNeRF.preset` says what a plain CPU does."""
 
     shape_code: Width = 512  # numbers of the code that table and density are made of
@@ -62,11 +62,7 @@ class Config:
     hyper_width: Width = 512  # of the hypernetwork's hidden layers
     hyper_layers: Layers = 2  # hidden ones, for each tensor
     members: Count = 4096  # of a collection at most, which there are codes for
-    levels: Annotated[int, between(1, 32)] = 16
-    features_per_level: Annotated[int, between(1, 16)] = 2
     log2_hashmap_size: Annotated[int, between(1, 24)] = 11
-    base_resolution: Annotated[int, between(1, 4096)] = 16
-    max_resolution: Annotated[int, between(1, 1 << 20)] = 2048
     hidden_width: Width = 64  # of an instance's networks
     density_layers: Layers = 1  # hidden ones
     colour_layers: Layers = 2  # hidden ones

@@ -12,7 +12,15 @@ from torch import Tensor, nn
 
 from ..camera import Camera
 from ..components.clouds.dense_points import compile_sweep
-from ..components.fields.hash_field import CALM, HashField, bytes_kept, check_levels
+from ..components.fields.hash_field import (
+    CALM,
+    TABLE_ON_A_CPU,
+    TINY_TABLE,
+    HashField,
+    HashNumbers,
+    bytes_kept,
+    check_levels,
+)
 from ..components.fields.taken_over import taken_over
 from ..components.sampling.carving import visual_hull
 from ..components.sampling.coarse_to_fine import SAMPLES_OF_A_RAY, first_grid, keep_looking, lattice, stage
@@ -37,14 +45,9 @@ from ..volume import composite
 
 
 @dataclass(frozen=True)
-class Config(OpenNumbers):
+class Config(HashNumbers, OpenNumbers):
     """The paper's numbers, with where it gives them; `InstantNGP.preset` says what a plain CPU does otherwise."""
 
-    levels: Annotated[int, between(1, 32)] = 16  # L, table 1
-    features_per_level: Annotated[int, between(1, 16)] = 2  # F, table 1
-    log2_hashmap_size: Annotated[int, between(1, 28)] = 19  # log2 T, table 1: 14 to 24
-    base_resolution: Annotated[int, between(1, 4096)] = 16  # N_min, table 1
-    max_resolution: Annotated[int, between(1, 1 << 20)] = 2048  # N_max, times the reach (section 5.4)
     hidden_width: Width = 64  # neurons per hidden layer, section 5.4
     density_layers: Layers = 1  # hidden layers, section 5.4
     colour_layers: Layers = 2  # hidden layers, section 5.4
@@ -131,10 +134,7 @@ class InstantNGP(RayMethod):
         if device.type == "cuda":
             return Config()
         return Config(
-            levels=8,
-            features_per_level=4,
-            log2_hashmap_size=17,
-            max_resolution=512,
+            **TABLE_ON_A_CPU,
             hidden_width=32,
             samples_per_step=1 << 15,
             steps_per_diagonal=384,
@@ -150,10 +150,7 @@ class InstantNGP(RayMethod):
     def smallest(cls) -> Any:
         """Tiny tables and networks with both corrections and a grid of three sizes, within some twenty quick steps."""
         return Config(
-            levels=4,
-            log2_hashmap_size=11,
-            base_resolution=4,
-            max_resolution=32,
+            **TINY_TABLE,
             hidden_width=16,
             geometry_features=8,
             sh_bands=2,

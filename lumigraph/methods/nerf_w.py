@@ -14,6 +14,7 @@ from ..components.clouds.dense_points import compile_sweep
 from ..components.fields import hash_field
 from ..components.fields.appearance import PhotographCodes, drawn, fitted
 from ..components.fields.coded_field import of_samples
+from ..components.fields.hash_field import TABLE_ON_A_CPU, TINY_TABLE, HashNumbers
 from ..components.fields.wild_field import with_passing
 from ..components.fields.wild_hash import WildHash
 from ..components.fields.wild_networks import WildNetworks
@@ -48,7 +49,7 @@ Code = Annotated[int, between(1, 1024)]  # numbers of a photograph's code
 
 
 @dataclass(frozen=True)
-class Config(OpenNumbers):
+class Config(HashNumbers, OpenNumbers):
     """The paper's numbers, with where it gives them; `NeRFW.preset` says what a plain CPU does otherwise."""
 
     field: Literal["hash", "network"] = "network"  # what holds the scene: a hash table, or the paper's networks
@@ -73,12 +74,6 @@ class Config(OpenNumbers):
     fine_samples: RaySamples = 64  # of a ray, drawn where the first found something
     rays_per_step: BatchSize = 2048  # supplement
     bfloat16: bool = True  # multiply in bfloat16 where the machine is fast at it
-    # Of the field in a hash table: see instant-ngp, whose numbers these are.
-    levels: Annotated[int, between(1, 32)] = 16
-    features_per_level: Annotated[int, between(1, 16)] = 2
-    log2_hashmap_size: Annotated[int, between(1, 28)] = 19
-    base_resolution: Annotated[int, between(1, 4096)] = 16
-    max_resolution: Annotated[int, between(1, 1 << 20)] = 2048  # times the reach
     density_layers: Layers = 1  # hidden layers
     colour_layers: Layers = 2  # hidden layers
     geometry_features: Annotated[int, between(1, 256)] = 16  # from density to colour network
@@ -138,10 +133,7 @@ class NeRFW(RayMethod):
             learning_rate=2e-2,
             final_learning_rate=1e-3,
             decay_start=0.3,
-            levels=8,
-            features_per_level=4,
-            log2_hashmap_size=17,
-            max_resolution=512,
+            **TABLE_ON_A_CPU,
             samples_per_step=1 << 15,
             steps_per_diagonal=384,
             transmittance_threshold=1e-3,
@@ -161,10 +153,7 @@ class NeRFW(RayMethod):
             hidden_width=16,
             learning_rate=2e-2,
             final_learning_rate=1e-3,
-            levels=4,
-            log2_hashmap_size=11,
-            base_resolution=4,
-            max_resolution=32,
+            **TINY_TABLE,
             geometry_features=8,
             sh_bands=2,
             samples_per_step=2048,

@@ -15,7 +15,7 @@ from ..baked import Octree
 from ..camera import Camera
 from ..capabilities import HasField, HasLooks, can
 from ..components.fields.harmonic_field import HarmonicHash, HarmonicNetwork, colour
-from ..components.fields.hash_field import check_levels
+from ..components.fields.hash_field import TABLE_ON_A_CPU, TINY_TABLE, HashNumbers, check_levels
 from ..components.fields.leaves import Leaves, ask_for_octree
 from ..components.fields.octree_baking import (
     Baking,
@@ -60,7 +60,7 @@ DensityRate = Annotated[float, between(1e-6, 1e4)]
 
 
 @dataclass(frozen=True)
-class Config:
+class Config(HashNumbers):
     """The paper's numbers, with where it or its release gives them; `PlenOctrees.preset` says what a CPU does."""
 
     field: Literal["hash", "network"] = "network"  # what is learnt first: the paper's network, or a hash table
@@ -68,11 +68,6 @@ class Config:
     skip_layer: Layers = 5  # the layer whose activation its input joins again
     position_frequencies: Octaves = 10  # octaves that it sees places in
     hidden_width: Width = 256  # channels of a layer, of either
-    levels: Annotated[int, between(1, 32)] = 16  # of the hash table (Müller 2022, table 1), as what follows
-    features_per_level: Annotated[int, between(1, 16)] = 2
-    log2_hashmap_size: Annotated[int, between(1, 28)] = 19
-    base_resolution: Annotated[int, between(1, 4096)] = 16
-    max_resolution: Annotated[int, between(1, 1 << 20)] = 2048
     hidden_layers: Layers = 2  # after the hash table
     sh_bands: Annotated[int, between(1, 4)] = 4  # of harmonics: 16 coefficients, section 5.1
     sparsity_weight: NonNegative = 1e-3  # of density at random points, eq. 4; the release's
@@ -147,10 +142,7 @@ class PlenOctrees(RayMethod):
         return Config(
             field="hash",
             hidden_width=32,
-            levels=8,
-            features_per_level=4,
-            log2_hashmap_size=17,
-            max_resolution=512,
+            **TABLE_ON_A_CPU,
             sh_bands=3,
             sparsity_points=1024,
             samples_per_step=1 << 15,
@@ -170,10 +162,7 @@ class PlenOctrees(RayMethod):
         return Config(
             field="hash",
             hidden_width=16,
-            levels=4,
-            log2_hashmap_size=11,
-            base_resolution=4,
-            max_resolution=32,
+            **TINY_TABLE,
             hidden_layers=1,
             sh_bands=2,
             sparsity_points=64,

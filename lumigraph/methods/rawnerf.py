@@ -18,7 +18,7 @@ from .. import kernels
 from ..camera import Camera
 from ..components.fields.activations import truncated_exp
 from ..components.fields.development import CONTROLS, decoded, exposed, toned
-from ..components.fields.hash_field import HashField, side_by_side
+from ..components.fields.hash_field import HashField, HashNumbers, side_by_side
 from ..components.sampling.spaces import Space
 from ..components.sampling.thin_lens import through_lens
 from ..components.training.fog import evened
@@ -34,17 +34,12 @@ from .instant_ngp import InstantNGP
 
 
 @dataclass(frozen=True)
-class Config:
+class Config(HashNumbers):
     """The paper's numbers of the loss, and Instant-NGP's of the field, which are explained there."""
 
     epsilon: Positive = 1e-3  # added to what the error is relative to, eq. 4; 1 is white in the longest exposure
     variance_weight: NonNegative = 1e-3  # of the variance of weights along a ray, supplement
     exposure_scales: bool = True  # learn a factor per colour of each exposure, section 4.2
-    levels: Annotated[int, between(1, 32)] = 16
-    features_per_level: Annotated[int, between(1, 16)] = 2
-    log2_hashmap_size: Annotated[int, between(1, 28)] = 19
-    base_resolution: Annotated[int, between(1, 4096)] = 16
-    max_resolution: Annotated[int, between(1, 1 << 20)] = 2048
     hidden_width: Width = 64
     density_layers: Layers = 1
     colour_layers: Layers = 2

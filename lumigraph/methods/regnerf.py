@@ -15,7 +15,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ..camera import Camera
-from ..components.fields.hash_field import check_levels
+from ..components.fields.hash_field import HashNumbers, check_levels
 from ..components.training.fog import evened
 from ..components.training.patch_flow import SIDE, PatchFlow
 from ..components.training.photometric import backdrop, residuals
@@ -32,7 +32,7 @@ from .mip_nerf import MipNeRF
 
 
 @dataclass(frozen=True)
-class Config(MipConfig):
+class Config(HashNumbers, MipConfig):
     """The paper's numbers, with where it gives them, beside those of mip-NeRF's network, and Instant-NGP's of the hash
     table, which are explained there; `RegNeRF.preset` says what a plain CPU does otherwise."""
 
@@ -51,11 +51,6 @@ class Config(MipConfig):
     table_learning_rate: LearningRate = 1e-2
     final_table_learning_rate: LearningRate = 1e-3
     table_width: Width = 64  # neurons per hidden layer
-    levels: Annotated[int, between(1, 32)] = 16
-    features_per_level: Annotated[int, between(1, 16)] = 2
-    log2_hashmap_size: Annotated[int, between(1, 28)] = 19
-    base_resolution: Annotated[int, between(1, 4096)] = 16
-    max_resolution: Annotated[int, between(1, 1 << 20)] = 2048
     samples_per_step: Annotated[int, between(64, 1 << 24)] = 1 << 18
 
     def check(self) -> None:

@@ -19,7 +19,7 @@ from ..capabilities import HasField, can
 from ..components.clouds.dense_points import compile_sweep
 from ..components.fields.baked_voxels import BakedVoxels, rounded
 from ..components.fields.deferred import Deferred, HashDeferred, NetworkDeferred, ViewDependence
-from ..components.fields.hash_field import check_levels
+from ..components.fields.hash_field import TABLE_ON_A_CPU, TINY_TABLE, HashNumbers, check_levels
 from ..components.fields.taken_over import taken_over
 from ..components.sampling.carving import visual_hull
 from ..components.sampling.coarse_to_fine import SAMPLES_OF_A_RAY, first_grid, keep_looking, lattice, stage
@@ -59,7 +59,7 @@ from ..volume import composite, weights_of
 
 
 @dataclass(frozen=True)
-class Config(OpenNumbers):
+class Config(HashNumbers, OpenNumbers):
     """The paper's numbers, with where it gives them; `SNeRG.preset` says what a plain CPU does otherwise."""
 
     field: Literal["hash", "network"] = "network"  # what is baked: a hash table, or the paper's network
@@ -91,12 +91,6 @@ class Config(OpenNumbers):
     # Of the paper's network.
     skip_layer: Layers = 5  # the layer whose activation the input joins again
     position_frequencies: Octaves = 10
-    # Of the hash table: see instant-ngp, whose numbers these are.
-    levels: Annotated[int, between(1, 32)] = 16
-    features_per_level: Annotated[int, between(1, 16)] = 2
-    log2_hashmap_size: Annotated[int, between(1, 28)] = 19
-    base_resolution: Annotated[int, between(1, 4096)] = 16
-    max_resolution: Annotated[int, between(1, 1 << 20)] = 2048
     hash_weight_decay: NonNegative = 0.0  # of the table, decoupled; of objects only
     huber_delta: PositiveShare = 0.1  # residual at which the loss turns from square to linear
     seed: Seed = 0
@@ -199,10 +193,7 @@ class SNeRG(RayMethod):
             view_learning_rate=5e-3,
             hidden_layers=2,
             hidden_width=32,
-            levels=8,
-            features_per_level=4,
-            log2_hashmap_size=17,
-            max_resolution=512,
+            **TABLE_ON_A_CPU,
             hash_weight_decay=0.3,
             huber_delta=0.3,
             samples_per_step=1 << 15,
@@ -227,10 +218,7 @@ class SNeRG(RayMethod):
             view_learning_rate=5e-3,
             hidden_layers=1,
             hidden_width=16,
-            levels=4,
-            log2_hashmap_size=11,
-            base_resolution=4,
-            max_resolution=32,
+            **TINY_TABLE,
             samples_per_step=2048,
             steps_per_diagonal=128,
             occupancy_resolution=16,

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Any
+from dataclasses import dataclass
+from typing import Annotated, Any
 
 import torch
 from jaxtyping import Float
@@ -10,6 +11,7 @@ from torch import Tensor, nn
 
 from ... import kernels
 from ...errors import LumigraphError
+from ...ranges import between
 from ..sampling.spaces import Box, Space
 from .activations import truncated_exp
 from .mlp import MLP
@@ -17,12 +19,23 @@ from .mlp import MLP
 CALM = 0.5  # of the table's rate, that of networks in the open: at all of it one seed in three never learns a hue
 WITHIN = 2  # times as fine as asked for, where coordinates are contracted: the box of interest is half as wide in them
 
+
+@dataclass(frozen=True)
+class HashNumbers:
+    """A Config's numbers of the table (Müller 2022, table 1)."""
+
+    levels: Annotated[int, between(1, 32)] = 16  # L
+    features_per_level: Annotated[int, between(1, 16)] = 2  # F
+    log2_hashmap_size: Annotated[int, between(1, 28)] = 19  # log2 T: 14 to 24
+    base_resolution: Annotated[int, between(1, 4096)] = 16  # N_min
+    max_resolution: Annotated[int, between(1, 1 << 20)] = 2048  # N_max, times the reach (section 5.4)
+
+
 # Numbers of a Config for a plain CPU, which learn most in a minute (see docs/methods/instant_ngp.md), and for tests.
+TABLE_ON_A_CPU: dict[str, Any] = {"levels": 8, "features_per_level": 4, "log2_hashmap_size": 17, "max_resolution": 512}
+TINY_TABLE: dict[str, Any] = {"levels": 4, "log2_hashmap_size": 11, "base_resolution": 4, "max_resolution": 32}
 ON_A_CPU: dict[str, Any] = {
-    "levels": 8,
-    "features_per_level": 4,
-    "log2_hashmap_size": 17,
-    "max_resolution": 512,
+    **TABLE_ON_A_CPU,
     "hidden_width": 32,
     "samples_per_step": 1 << 15,
     "steps_per_diagonal": 384,
@@ -32,10 +45,7 @@ ON_A_CPU: dict[str, Any] = {
     "learning_rate": 2e-2,
 }
 TINY: dict[str, Any] = {
-    "levels": 4,
-    "log2_hashmap_size": 11,
-    "base_resolution": 4,
-    "max_resolution": 32,
+    **TINY_TABLE,
     "hidden_width": 16,
     "geometry_features": 8,
     "sh_bands": 2,
