@@ -233,7 +233,7 @@ class QuickGains(InstantNGP):
 def test_gains_are_learnt_and_an_exposure_multiplies_as_they_do():
     """Half as bright, in the photographs' own encoded colours, is one stop."""
     scene = two_exposures()
-    config = replace(SMALL, learning_rate=2e-2, samples_per_step=1024, steps_per_diagonal=24, exposure_correction=True)
+    config = replace(SMALL, learning_rate=2e-2, samples_per_step=1024, steps_per_diagonal=24, exposure_correction="yes")
     method = build(QuickGains, scene.frame, config, torch.device("cpu"), 0)
     assert [control.name for control in method.controls] == ["exposure", "exposed_as"]
     fit(method, scene, steps=80, show=False)
@@ -256,7 +256,7 @@ def test_gains_are_learnt_and_an_exposure_multiplies_as_they_do():
 
 def test_the_background_is_not_exposed():
     scene = tiny.scene()  # before white
-    method = ngp(scene, exposure_correction=True)
+    method = ngp(scene, exposure_correction="yes")
     camera = scene.cameras[0]
     plain, brighter = (m.render(camera) for m in (method, method.given(exposure=1)))
     behind = (1 - plain.opacity)[..., None]
@@ -388,7 +388,7 @@ def test_photographs_are_named(tmp_path):
     from lumigraph.commands.controls import open_method
 
     scene = tiny.scene()
-    made = ngp(scene, exposure_correction=True, refine_cameras=True)
+    made = ngp(scene, exposure_correction="yes", refine_cameras=True)
     run = Run.create(tmp_path / "run", made, scene)
     fit(run.new_method(), scene, run, steps=1, show=False)
     with_name, with_number = (open_method(run.folder, "cpu", [f"exposed-as={which}"])[1] for which in ("ball_5", "5"))
