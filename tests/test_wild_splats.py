@@ -93,7 +93,7 @@ def test_a_told_light_shows_in_pictures_and_in_the_cloud(taught):
 def test_the_light_of_a_picture_is_found(generator):
     """Where the photograph is the picture in some light, it is that light, although a tenth is hidden."""
     rgb, opacity = torch.rand(500, 3, generator=generator), torch.ones(500)
-    target, background = changed(rgb, opacity, code()), torch.ones(3)
+    target = changed(rgb, opacity, code())
     target[:50] = 0.5
 
     at = rgb, opacity, target

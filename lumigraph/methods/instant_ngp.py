@@ -23,11 +23,12 @@ from ..components.sampling.spaces import Box, space_of
 from ..components.sampling.unbounded import RAYS, OpenNumbers, Unbounded, rays_of, unbounded
 from ..components.training.corrections import Setting
 from ..components.training.distillation import distil
-from ..components.training.exposed import ExposedMethod
+from ..components.training.exposed import Exposed
 from ..components.training.lazy_adam import LazyAdam
 from ..components.training.photometric import backdrop, residuals
 from ..components.training.pose_refinement import PoseRefinement
 from ..components.training.schedules import held
+from ..method import RayMethod
 from ..packing import Stored, most_important
 from ..ranges import Layers, LearningRate, NonNegative, PositiveShare, Seed, Share, Steps, Width, between
 from ..rays import Look, Rays, Rendering
@@ -74,7 +75,7 @@ class Config(OpenNumbers):
         check_levels(self)
 
 
-class InstantNGP(ExposedMethod):
+class InstantNGP(Exposed, RayMethod):  # type: ignore[override]  # what is accepted
     """Rays are sampled in occupied cells; a first pass without gradients drops hidden samples, a second one learns.
 
     Open captures are contracted, and sampled where a grid proposes; see `components.sampling.unbounded`.

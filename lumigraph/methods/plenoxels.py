@@ -20,7 +20,7 @@ from ..components.sampling.occupancy import OccupancyGrid
 from ..components.sampling.spaces import NDC, space_of
 from ..components.sampling.unbounded import RAYS, OpenNumbers, Unbounded, rays_of, unbounded
 from ..components.training.corrections import Setting
-from ..components.training.exposed import ExposedMethod
+from ..components.training.exposed import Exposed
 from ..components.training.lazy_rmsprop import LazyRMSprop
 from ..components.training.photometric import backdrop, residuals
 from ..components.training.schedules import falling
@@ -28,6 +28,7 @@ from ..components.training.sparsity import cauchy
 from ..errors import LumigraphError
 from ..kernels import total_variation
 from ..kernels.harmonic_grid import BANDS
+from ..method import RayMethod
 from ..packing import Stored, most_important
 from ..ranges import BatchSize, LearningRate, NonNegative, Positive, PositiveShare, Seed, Share, Steps, between
 from ..rays import Look, Rays, Rendering, Samples
@@ -96,7 +97,7 @@ LEAST = 1e-2  # density of a node at least, where another method is taken over: 
 EDGE = 1e-3  # opacities are kept so far from 0 and 1 in the beta loss
 
 
-class Plenoxels(ExposedMethod):
+class Plenoxels(Exposed, RayMethod):  # type: ignore[override]  # what is accepted
     """Rays are sampled in occupied cells; a first pass looks up density alone, and what light reaches is looked up once
     more, with colour. Values belong to the nodes of a grid over the coordinates of a `Space`: an object as it is, a
     forward-facing capture in normalised device coordinates, anything else contracted into a ball."""

@@ -6,10 +6,9 @@ from typing import Any
 
 import torch
 from jaxtyping import Float
-from torch import Tensor
+from torch import Tensor, nn
 
 from ...controls import Control, Value
-from ...method import Method, RayMethod
 from ...scene import Frame, Photograph, Scene
 from ..fields.appearance import drawn
 from .corrections import Exposure, Setting, gain_between
@@ -17,15 +16,20 @@ from .corrections import Exposure, Setting, gain_between
 FOUND_BY = 4096  # pixels of a photograph that tell its exposure
 
 
-class ExposedMethod(RayMethod):
-    """A method of rays with `Exposure`: what it learns, what it can be told, and how it is told of a photograph.
+class Exposed(nn.Module):
+    """What a RayMethod with `Exposure` has beside its own: what it learns, what it can be told, how it is told of a
+    photograph. It stands before RayMethod among the bases.
 
-    Subclasses call `expose` when they are made and `tell_exposed` when they begin, learn with `gains`, and show colours
+    Methods call `expose` when they are made and `tell_exposed` when they begin, learn with `gains`, and show colours
     as `exposed` has them.
     """
 
     exposure: Exposure | None
     found_gain: Tensor | None = None  # of a photograph that was given
+    config: Any
+    random: Any
+    device: Any
+    told: dict[str, Value]
 
     def expose(self, frame: Frame, setting: Setting) -> None:
         self.exposure = Exposure(frame.image_count, setting) if setting != "no" else None
@@ -50,16 +54,15 @@ class ExposedMethod(RayMethod):
         return self.gains.controls if self.gains else ()
 
     @property
-    def accepts(self) -> tuple[type, ...]:  # type: ignore[override]  # it depends on the run
+    def accepts(self) -> tuple[type, ...]:
         """Photographs, where their exposures were learnt to differ."""
         return (Photograph,) if self.gains else ()
 
-    def given(self, *evidence: Any, **controls: Value) -> Method:
+    def given(self, *evidence: Any, **controls: Value) -> Any:
         """The same scene, told its controls, or as bright as a photograph, by the pixels that are to be trusted."""
         photographs = [piece for piece in evidence if self.gains and isinstance(piece, Photograph)]
         others = (piece for piece in evidence if not (self.gains and isinstance(piece, Photograph)))
-        told = super().given(*others, **controls)
-        assert isinstance(told, ExposedMethod)
+        told = super().given(*others, **controls)  # type: ignore[misc]  # the method's
         if "exposed_as" in controls:
             told.found_gain = None
         for photograph in photographs:
@@ -73,8 +76,7 @@ class ExposedMethod(RayMethod):
         batch = drawn(photograph, FOUND_BY, self.random(0)).to(self.device)
         if not len(batch):
             return torch.ones(3, device=self.device)
-        plain = super().given()
-        assert isinstance(plain, ExposedMethod)
+        plain = super().given()  # type: ignore[misc]
         plain.told, plain.found_gain = {}, None
         background = plain.background
         parts = [
