@@ -112,8 +112,6 @@ COARSE = 0.5  # of the budget: where poses are refined, plain colours, and half 
 SMALLEST = 64  # pixels of a photograph's shorter side that are kept when it is reduced
 ENOUGH = 2400  # steps, with which sizes and colours need not hurry
 OFTEN = 400  # times that each photograph is learnt from, with which its light need not hurry
-LIT_FROM = 0.03  # share of the budget after which a photograph's light is found anew with each step on it ...
-LIT = 0.5  # ... and how far its code then goes there
 MOST_HASTE = 6.0  # times the rate at which photographs' light is learnt, in short runs
 RECOVERY = 3  # opacity_reset_intervals that must be left after opacities are reset, or the pictures stay dim
 GROWTH = 1.05  # of the number at each change, for mcmc (Kheradmand 2024, section 3.2)
@@ -289,8 +287,6 @@ class GaussianSplatting(Method):
         target = batch.before(background)
         code, terms = None, {}
         if self.appearance and camera.image_index is not None:
-            if self.training and self._progress >= LIT_FROM:
-                self._relight(batch, seen)
             code = self.appearance(camera.image_index)[0]
             rgb = changed(rgb, seen.opacity, code)
             if self.skies:
@@ -573,23 +569,6 @@ class GaussianSplatting(Method):
             target = target - (1 - seen.opacity[..., None]) * background
         start = self.appearance.average.detach()
         return found(start, seen.rgb[trusted], seen.opacity[trusted], target[trusted], behind)
-
-    @torch.no_grad()
-    def _relight(self, batch: Photograph, seen: Splatted) -> None:
-        """Bring the photograph's code nearer to the light in which the cloud, as it is, looks most like it: in short
-        runs a photograph is learnt from a few times only, and a step of a gradient is a small one."""
-        assert self.lights is not None
-        rgb, opacity, codes = seen.rgb.detach(), seen.opacity.detach(), self.lights.codes
-        behind = own_sky.harmonics(batch.camera) if self.skies else None
-        target = batch.rgb if behind is not None else batch.before(self.background[0])
-        if behind is None:
-            target = target - (1 - opacity[..., None]) * self.background[0]
-        trusted = torch.ones_like(opacity, dtype=torch.bool) if batch.mask is None else batch.mask
-        start = codes[self._image].clone()
-        start[:NUMBERS] = 0
-        firm = self.config.appearance_regularization
-        parts = rgb[trusted], opacity[trusted], target[trusted], None if behind is None else behind[trusted]
-        codes[self._image] = torch.lerp(codes[self._image], found(start, *parts, firm), LIT)
 
     def statistics(self) -> dict[str, float]:
         return {"mse": float(self._difference.square().mean()), "gaussians": len(self.cloud)}

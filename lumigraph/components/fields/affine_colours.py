@@ -53,7 +53,6 @@ def found(
     opacity: Float[Tensor, " pixel"],
     target: Float[Tensor, "pixel 3"],
     behind: Float[Tensor, "pixel 9"] | None = None,
-    firm: float = FIRM,
 ) -> Float[Tensor, " number"]:
     """The code whose picture is closest to a photograph by mean absolute difference, which passers-by hardly sway.
 
@@ -63,7 +62,6 @@ def found(
     start:   what the code is drawn towards, and what comes back where there is no pixel
     rgb:     of the scene over black;  target: the photograph, less a background of which nothing is to be found
     behind:  harmonics of the directions, where a code holds a sky; it stays unless pixels say otherwise
-    firm:    weight of how far A and b move, by the sum of squares
     """
     few = slice(None, None, -(-len(target) // ENOUGH_PIXELS) or 1)
     rgb, opacity, target = rgb[few].double(), opacity[few, None].double(), target[few].double()
@@ -72,7 +70,7 @@ def found(
     parts = [rgb, opacity] if behind is None else [rgb, opacity, (1 - opacity) * behind[few]]
     rows, matrix = torch.cat(parts, 1), _columns(start).double()
     held = torch.full_like(matrix, FURTHER)
-    held[:4] = firm
+    held[:4] = FIRM
     first, drawn = matrix, torch.diag_embed(held.T)
     for _ in range(ROUNDS):
         weights = 0.5 / (rows @ matrix - target).abs().clamp_min(LEAST_ERROR) / target.numel()
