@@ -16,7 +16,8 @@ MIDDLE = 0.5  # the colour of a Gaussian whose harmonics are zero
 ROUNDS = 12  # of least squares, where the light of a photograph is found
 ENOUGH_PIXELS = 1 << 14  # that tell it, evenly chosen
 LEAST_ERROR = 0.01  # beyond which no pixel weighs more
-FIRM = 1e-5  # weight of how far A and b move from where they began, by the sum of squares
+FIRM = 3e-3  # weight of how far A and b move from where they began, by the sum of squares: of a grey wall nobody can
+# tell which colour is made of which
 FURTHER = 0.01  # of how far the rest of a code moves, which most pixels say nothing of
 
 
