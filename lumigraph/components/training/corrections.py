@@ -15,7 +15,7 @@ from ...scene import Scene
 from .lights import BRIGHTEST, DARKEST, spread_of_exposure
 
 Setting = Literal["auto", "yes", "no"]
-DIFFERENT = 0.1  # stops between neighbouring photographs, beyond which they are of different exposure
+DIFFERENT = 0.15  # stops between neighbouring photographs, beyond which they are of different exposure
 STOPS = 4.0  # that exposure can be turned up or down
 SCENE, AVERAGE = "scene", "average"  # beside the photographs: a gain of 1, and the mean of those that were learnt
 
