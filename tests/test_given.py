@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 from dataclasses import replace
+from typing import Literal
 
 import numpy as np
 import pytest
@@ -16,15 +17,19 @@ from lumigraph.camera import Camera
 from lumigraph.capture import open_scene, procedural
 from lumigraph.capture.procedural.scenes import swing
 from lumigraph.cli import main
+from lumigraph.components.training.corrections import gain_between
+from lumigraph.components.training.lights import spread_of_exposure
 from lumigraph.controls import Control, moment
-from lumigraph.errors import LumigraphError
+from lumigraph.errors import LumigraphError, LumigraphWarning
 from lumigraph.evaluate import evaluate
+from lumigraph.evaluate.halves import judged_by_halves, left_half
 from lumigraph.export.film import animated
 from lumigraph.images import ImageStore
 from lumigraph.methods.instant_ngp import Config, InstantNGP
 from lumigraph.paths.keyframes import CameraPath, Keyframe
 from lumigraph.rays import Rays
 from lumigraph.run import Run, build
+from lumigraph.run.settings import in_words
 from lumigraph.scene import Frame
 from lumigraph.train import fit
 
@@ -233,7 +238,7 @@ class QuickGains(InstantNGP):
 def test_gains_are_learnt_and_an_exposure_multiplies_as_they_do():
     """Half as bright, in the photographs' own encoded colours, is one stop."""
     scene = two_exposures()
-    config = replace(SMALL, learning_rate=2e-2, samples_per_step=1024, steps_per_diagonal=24, exposure_correction=True)
+    config = replace(SMALL, learning_rate=2e-2, samples_per_step=1024, steps_per_diagonal=24, exposure_correction="yes")
     method = build(QuickGains, scene.frame, config, torch.device("cpu"), 0)
     assert [control.name for control in method.controls] == ["exposure", "exposed_as"]
     fit(method, scene, steps=80, show=False)
@@ -254,9 +259,54 @@ def test_gains_are_learnt_and_an_exposure_multiplies_as_they_do():
     assert torch.equal(method.given(exposure=0, exposed_as="scene").render(camera).rgb, plain)
 
 
+def test_exposures_are_told_apart_where_they_differ(generator):
+    """By points that neighbours show, else by what photographs say of themselves; a photograph's gain is then found on
+    its left half."""
+    one, scene = tiny.scene(), two_exposures()
+    points = 0.6 * torch.nn.functional.normalize(torch.randn(1000, 3, generator=generator), dim=-1)
+    auto = {"exposure_correction": "auto"}
+    alike, apart = ngp(one, **auto), ngp(scene, **auto)
+    alike.begin(replace(one, points=points))
+    assert alike.gains is None and not alike.controls and not judged_by_halves(alike)
+    with pytest.warns(LumigraphWarning, match="an exposure of its own"):
+        apart.begin(replace(scene, points=points))
+    assert apart.gains is not None and judged_by_halves(apart)
+    assert ngp(scene, exposure_correction="no").exposure is None
+    stops = torch.tensor([0.0, 1.0]).repeat_interleave(6)
+    assert spread_of_exposure(scene) == 0
+    assert spread_of_exposure(replace(scene, about={"exposure": 2**stops})) == pytest.approx(stops.std() / 2.2)
+    developed = {"exposure": 2**stops, "brightness": 2**-stops}
+    assert spread_of_exposure(replace(scene, about=developed)) == pytest.approx(0, abs=1e-6)
+
+
+def test_a_photographs_gain_is_found(generator):
+    rgb = 0.1 + 0.5 * torch.rand(100, 3, generator=generator)
+    target = rgb * torch.tensor([1.2, 1.0, 0.8])
+    target[:20] = 0.9  # somebody passes
+    torch.testing.assert_close(gain_between(rgb, target), torch.tensor([1.2, 1.0, 0.8]))
+    assert torch.equal(gain_between(rgb, torch.ones_like(rgb)), torch.ones(3))
+    scene = tiny.scene()
+    method = ngp(scene, exposure_correction="yes")
+    camera, shot = scene.cameras[0], scene.photograph(0)
+    plain, given = method.render(camera), method.given(left_half(shot))
+    assert torch.allclose(given.given(exposed_as="scene").render(camera).rgb, plain.rgb)
+    behind = (1 - plain.opacity)[..., None]
+    found = (plain.rgb - behind) * given.found_gain + behind
+    assert torch.allclose(given.render(camera).rgb, found, atol=1e-5)
+    assert torch.equal(method.given(exposure=1).given(shot).found_gain, method.given(shot).found_gain)
+
+
+def test_older_runs_say_true_and_false():
+    kinds = {"exposure_correction": Literal["auto", "yes", "no"], "contraction": bool}
+    assert in_words({"exposure_correction": True, "contraction": False}, kinds) == {
+        "exposure_correction": "yes",
+        "contraction": False,
+    }
+
+
 def test_the_background_is_not_exposed():
     scene = tiny.scene()  # before white
-    method = ngp(scene, exposure_correction=True)
+    method = ngp(scene, exposure_correction="yes")
     camera = scene.cameras[0]
     plain, brighter = (m.render(camera) for m in (method, method.given(exposure=1)))
     behind = (1 - plain.opacity)[..., None]
@@ -388,7 +438,7 @@ def test_photographs_are_named(tmp_path):
     from lumigraph.commands.controls import open_method
 
     scene = tiny.scene()
-    made = ngp(scene, exposure_correction=True, refine_cameras=True)
+    made = ngp(scene, exposure_correction="yes", refine_cameras=True)
     run = Run.create(tmp_path / "run", made, scene)
     fit(run.new_method(), scene, run, steps=1, show=False)
     with_name, with_number = (open_method(run.folder, "cpu", [f"exposed-as={which}"])[1] for which in ("ball_5", "5"))

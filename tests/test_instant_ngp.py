@@ -56,7 +56,7 @@ def test_it_learns_held_out_views():
 
 def test_gradients_reach_everything_that_learns():
     scene = tiny.scene()
-    made = method(scene, exposure_correction=True, refine_cameras=True)
+    made = method(scene, exposure_correction="yes", refine_cameras=True)
     made.optimizers()
     made.before_step(0, 0.0)
     sum(made.loss(made.batch(scene, torch.Generator().manual_seed(0)), 0).values()).backward()
@@ -95,7 +95,7 @@ def test_the_same_seed_gives_the_same_losses(scene, tmp_path):
 
 
 @pytest.mark.parametrize(
-    "options", [{}, {"exposure_correction": True, "refine_cameras": True}], ids=["plain", "corrections"]
+    "options", [{}, {"exposure_correction": "yes", "refine_cameras": True}], ids=["plain", "corrections"]
 )
 def test_resuming_equals_never_having_stopped_to_the_bit(options, tmp_path):
     scene, ends = tiny.scene(), []
@@ -121,7 +121,7 @@ def test_exposure_finds_the_dark_photographs():
     dark = scene.splits["train"][::2]
     pictures = [tiny.picture(pose)[..., :3] // (4 if i in dark else 1) for i, pose in enumerate(scene.cameras.pose)]
     scene = replace(scene, images=ImageStore.from_arrays(pictures))
-    made = method(scene, exposure_correction=True, decay_start=0.9)
+    made = method(scene, exposure_correction="yes", decay_start=0.9)
     train(made, scene, 120)
     gain = made.exposure.log_gain.detach()
     bright = scene.splits["train"][1::2]

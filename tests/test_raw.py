@@ -2,6 +2,7 @@
 
 import json
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ import torch
 from PIL import Image
 
 from lumigraph.capture import open_scene
+from lumigraph.capture.motion.reconstruction import also_unreadable
 from lumigraph.capture.photos import gather
 from lumigraph.capture.procedural.sensor import BLACK, PHOTON, READ_NOISE, WHITE, Sensor
 from lumigraph.capture.raw import RawPhoto, is_raw, open_raw
@@ -160,6 +162,8 @@ def test_raw_files_among_others_are_refused_and_damaged_ones_named(tmp_path):
     (folder / "b.raw").write_bytes(b"short")
     intake = gather([folder], tmp_path / "work")
     assert intake.unreadable["b.raw"].startswith("it has 5 bytes") and len(intake.photos) == 2
+    assert also_unreadable(intake).startswith(" (b.raw could not be used: it has 5 bytes")
+    assert not also_unreadable(replace(intake, unreadable={}))
     Image.new("RGB", (48, 32)).save(folder / "d.jpg")
     with pytest.raises(LumigraphError, match=r"3 raw files and 1 other photographs, such as a.raw and d.jpg"):
         gather([folder], tmp_path / "other")

@@ -508,7 +508,7 @@ class GaussianSplatting(Method):
     def _tell_apart(self, scene: Scene) -> None:
         """Find out whether photographs differ so much that each has to be seen in a light of its own."""
         if self.config.appearance == "auto":
-            stops = spread_of_light(scene)
+            stops = spread_of_light(scene) or 0.0
             self.differ.fill_(stops > STOPS)
         if self.appearance and self.skies:
             with torch.no_grad():
@@ -564,13 +564,11 @@ class GaussianSplatting(Method):
         target, trusted = photograph.before(background), photograph.mask
         if trusted is None:
             trusted = torch.ones_like(seen.opacity, dtype=torch.bool)
-        rgb, opacity = seen.rgb.detach()[trusted], seen.opacity.detach()[trusted]
-
-        def picture(code: Tensor) -> Tensor:
-            behind = own_sky.sky(code[NUMBERS:], camera)[trusted] if self.skies else background
-            return over(changed(rgb, opacity, code), opacity, behind)
-
-        return found(self.appearance.average.detach(), picture, target[trusted])
+        behind = own_sky.harmonics(camera)[trusted] if self.skies else None
+        if behind is None:
+            target = target - (1 - seen.opacity[..., None]) * background
+        start = self.appearance.average.detach()
+        return found(start, seen.rgb[trusted], seen.opacity[trusted], target[trusted], behind)
 
     def statistics(self) -> dict[str, float]:
         return {"mse": float(self._difference.square().mean()), "gaussians": len(self.cloud)}

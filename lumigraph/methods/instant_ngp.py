@@ -29,13 +29,13 @@ from ..components.sampling.marching import FIRST_RAYS, rays_for, reached
 from ..components.sampling.occupancy import OccupancyGrid
 from ..components.sampling.spaces import Box, space_of
 from ..components.sampling.unbounded import RAYS, OpenNumbers, Unbounded, rays_of, unbounded
-from ..components.training.corrections import Exposure
+from ..components.training.corrections import Setting
 from ..components.training.distillation import distil
+from ..components.training.exposed import Exposed
 from ..components.training.lazy_adam import LazyAdam
 from ..components.training.photometric import backdrop, residuals
 from ..components.training.pose_refinement import PoseRefinement
 from ..components.training.schedules import held
-from ..controls import Control
 from ..method import RayMethod
 from ..packing import Stored, most_important
 from ..ranges import Layers, LearningRate, NonNegative, PositiveShare, Seed, Share, Steps, Width, between
@@ -67,7 +67,7 @@ class Config(HashNumbers, OpenNumbers):
     hash_weight_decay: NonNegative = 0.0  # of the table, decoupled; of objects only, for it pulls density towards 1
     huber_delta: PositiveShare = 0.1  # residual at which the loss turns from square to linear
     contraction: bool = True  # of open captures (Barron 2022), with proposals; or section 5.4's cascades around them
-    exposure_correction: bool = False  # learn a gain per photograph
+    exposure_correction: Setting = "auto"  # learn a gain per photograph; auto: where they are found to differ
     refine_cameras: bool = False  # learn where each photograph was taken from, coarse to fine (Lin 2021, BARF)
     pose_learning_rate: LearningRate = 5e-4  # radians by which a step moves a picture, with refine_cameras
     match_photographs: bool = True  # with refine_cameras, begin where features that photographs share say
@@ -78,7 +78,7 @@ class Config(HashNumbers, OpenNumbers):
         check_levels(self)
 
 
-class InstantNGP(RayMethod):
+class InstantNGP(Exposed, RayMethod):  # type: ignore[override]  # what is accepted
     """Rays are sampled in occupied cells; a first pass without gradients drops hidden samples, a second one learns.
 
     Open captures are contracted, and sampled where a grid proposes; see `components.sampling.unbounded`.
@@ -106,7 +106,7 @@ class InstantNGP(RayMethod):
         "huber": "huber_delta",
         "exposure": "exposure_correction",
     }
-    before: ClassVar[dict[str, Any]] = {"contraction": False}
+    before: ClassVar[dict[str, Any]] = {"contraction": False, "exposure_correction": "no"}
     rays_per_step: Tensor
 
     def __init__(self, frame: Frame, config: Any = None):
@@ -119,7 +119,7 @@ class InstantNGP(RayMethod):
         self.unbounded = unbounded(frame, self.space, config) if config.contraction else None
         if self.unbounded:
             self.rays_per_chunk = RAYS
-        self.exposure = Exposure(frame.image_count) if config.exposure_correction else None
+        self.expose(frame, config.exposure_correction)
         refining, rate = config.refine_cameras, config.pose_learning_rate
         self.poses = PoseRefinement(frame.image_count, rate) if refining else None
         self.occupancy = first_grid(config, frame.reach)
@@ -158,7 +158,7 @@ class InstantNGP(RayMethod):
             steps_per_diagonal=128,
             occupancy_resolution=16,
             learning_rate=2e-2,
-            exposure_correction=True,
+            exposure_correction="yes",
             refine_cameras=True,
         )
 
@@ -172,6 +172,7 @@ class InstantNGP(RayMethod):
         return c.samples_per_step / (c.samples_per_ray if self.unbounded else SAMPLES_OF_A_RAY)
 
     def begin(self, scene: Scene, seconds: float = math.inf) -> None:
+        self.tell_exposed(scene)
         if self.poses:  # silhouettes seen from wrong poses would carve what is there
             self.poses.find(scene, self.config.match_photographs)
         elif scene.images.has_alpha and self.frame.reach == 1:
@@ -233,7 +234,7 @@ class InstantNGP(RayMethod):
         look, terms = self.look_to_learn(rays, generator)
         background = backdrop(batch, self.background, generator, opaque=self.unbounded is not None)
         rendering = composite(look.samples, look.density, look.rgb, background)
-        residual, self.figures["mse"] = residuals(rendering, batch, background, self.exposure)
+        residual, self.figures["mse"] = residuals(rendering, batch, background, self.gains)
         # Divided by delta, so that the linear part has slope 1.
         delta = self.config.huber_delta
         huber = nn.functional.huber_loss(residual, torch.zeros_like(residual), delta=delta) / delta
@@ -282,7 +283,7 @@ class InstantNGP(RayMethod):
         density, geometry = self.network.density(self._encoded(points))
         density = density * self.space.stretch(points)
         rgb = self.network.colour(geometry, directions)
-        return density, rgb * self.exposure.gain(self.told) if self.told and self.exposure else rgb
+        return density, self.exposed(rgb)
 
     def density(self, points: Float[Tensor, "sample 3"]) -> Float[Tensor, " sample"]:
         """Density per scene unit."""
@@ -315,10 +316,6 @@ class InstantNGP(RayMethod):
         """Set the least important entries of the table to zero."""
         self.network.table[~most_important(importance["network.table"], 1 - share)] = 0.0
         return importance
-
-    @property
-    def controls(self) -> tuple[Control, ...]:
-        return self.exposure.controls if self.exposure else ()
 
     def refined(self, cameras: Camera) -> Camera:
         return self.poses.refined(cameras) if self.poses else cameras

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Annotated, Any
+from typing import Annotated, Any, ClassVar
 
 import torch
 from jaxtyping import Bool, Float
@@ -19,12 +19,12 @@ from ..components.sampling.importance import importance
 from ..components.sampling.occupancy import OccupancyGrid
 from ..components.sampling.spaces import NDC, space_of
 from ..components.sampling.unbounded import RAYS, OpenNumbers, Unbounded, rays_of, unbounded
-from ..components.training.corrections import Exposure
+from ..components.training.corrections import Setting
+from ..components.training.exposed import Exposed
 from ..components.training.lazy_rmsprop import LazyRMSprop
 from ..components.training.photometric import backdrop, residuals
 from ..components.training.schedules import falling
 from ..components.training.sparsity import cauchy
-from ..controls import Control
 from ..errors import LumigraphError
 from ..kernels import total_variation
 from ..kernels.harmonic_grid import BANDS
@@ -71,7 +71,7 @@ class Config(OpenNumbers):
     tv_interval: Steps = 1  # steps from one look at it to the next
     sparsity: NonNegative = 1e-11  # weight of the densities' Cauchy loss, eq. 4
     beta: NonNegative = 0.0  # weight of the loss of opacities between 0 and 1, eq. 5; for captures without alpha
-    exposure_correction: bool = False  # learn a gain per photograph
+    exposure_correction: Setting = "auto"  # learn a gain per photograph; auto: where they are found to differ
     seed: Seed = 0
 
     def check(self) -> None:
@@ -97,12 +97,13 @@ LEAST = 1e-2  # density of a node at least, where another method is taken over: 
 EDGE = 1e-3  # opacities are kept so far from 0 and 1 in the beta loss
 
 
-class Plenoxels(RayMethod):
+class Plenoxels(Exposed, RayMethod):  # type: ignore[override]  # what is accepted
     """Rays are sampled in occupied cells; a first pass looks up density alone, and what light reaches is looked up once
     more, with colour. Values belong to the nodes of a grid over the coordinates of a `Space`: an object as it is, a
     forward-facing capture in normalised device coordinates, anything else contracted into a ball."""
 
     Config = Config
+    before: ClassVar[dict[str, Any]] = {"exposure_correction": "no"}
     rays_per_step: Tensor
 
     def __init__(self, frame: Frame, config: Any = None):
@@ -112,7 +113,7 @@ class Plenoxels(RayMethod):
         first, _ = config.resolutions(frame.reach > 1)
         self.voxels = SparseVoxels(cells_of(frame, first), config.initial_density)
         self.occupancy = OccupancyGrid(1.0, config.occupancy_resolution)
-        self.exposure = Exposure(frame.image_count) if config.exposure_correction else None
+        self.expose(frame, config.exposure_correction)
         self.unbounded, rays = unbounded(frame, self.space, config), config.rays_per_step
         if self.unbounded:
             self.rays_per_chunk, rays = RAYS, min(rays, rays_of(config.samples_per_step, config))
@@ -170,7 +171,7 @@ class Plenoxels(RayMethod):
             tv_interval=2,
             sparsity=1e-5,
             beta=1e-4,
-            exposure_correction=True,
+            exposure_correction="yes",
         )
 
     @classmethod
@@ -216,7 +217,7 @@ class Plenoxels(RayMethod):
     ) -> tuple[Float[Tensor, " point"], Float[Tensor, "point 3"]]:
         """Density per scene unit, and sRGB-encoded colour seen along unit directions."""
         density, rgb = self._field(points, directions, self.voxels)
-        return density, rgb * self.exposure.gain(self.told) if self.told and self.exposure else rgb
+        return density, self.exposed(rgb)
 
     def _field(
         self, points: Float[Tensor, "point 3"], directions: Float[Tensor, "point 3"], voxels: SparseVoxels | Part
@@ -260,13 +261,10 @@ class Plenoxels(RayMethod):
         self.voxels.keep(kept)
         return {"voxels.harmonics": weights[kept]}
 
-    @property
-    def controls(self) -> tuple[Control, ...]:
-        return self.exposure.controls if self.exposure else ()
-
     # Learning
 
     def begin(self, scene: Scene, seconds: float = math.inf) -> None:
+        self.tell_exposed(scene)
         if scene.images.has_alpha and self.frame.reach == 1:
             hull = visual_hull(scene, self.config.occupancy_resolution)
             self.occupancy.rule_out(hull[None])
@@ -321,7 +319,7 @@ class Plenoxels(RayMethod):
             rows, part = self._touched
         background = backdrop(batch, self.background, generator, self.frame.reach > 1)
         rendering = composite(look.samples, look.density, look.rgb, background)
-        residual, self.figures["mse"] = residuals(rendering, batch, background, self.exposure)
+        residual, self.figures["mse"] = residuals(rendering, batch, background, self.gains)
         self.figures |= {"voxels": len(self.voxels), "touched": len(rows)}
         terms = {"colour": residual.square().mean(), **further}
         if config.sparsity:

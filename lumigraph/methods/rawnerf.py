@@ -66,7 +66,7 @@ class Config(HashNumbers):
     @property
     def field(self) -> NgpConfig:
         """The numbers of the field, as Instant-NGP has them."""
-        return NgpConfig(**{name: getattr(self, name) for name in OF_THE_FIELD})
+        return NgpConfig(**{name: getattr(self, name) for name in OF_THE_FIELD}, exposure_correction="no")
 
     @classmethod
     def around(cls, field: NgpConfig, **own: Any) -> Config:

@@ -7,7 +7,7 @@ about, and patches such as no photograph has, say that the field explains each p
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, fields, replace
 from typing import Annotated, Any, Literal
 
 import torch
@@ -110,7 +110,7 @@ class RegNeRF(RayMethod):
         super().__init__(frame, config)
         self.marcher: MipNeRF | InstantNGP
         if config.field == "hash":
-            self.marcher = InstantNGP(frame, config.numbers_of(NgpConfig))
+            self.marcher = InstantNGP(frame, replace(config.numbers_of(NgpConfig), exposure_correction="no"))
         else:
             self.marcher = MipNeRF(frame, config.numbers_of(MipConfig))
         with torch.random.fork_rng(devices=[]):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, get_args, get_type_hints
 
 from .. import files
 from ..budget import Budget
@@ -101,9 +101,16 @@ class Settings:
 
         file: to name where a number is unknown, of another type, or beyond its range
         """
-        return typed(kind.Config, kind.before | renamed(self.config, kind.formerly), file, closed=True)
+        said = in_words(renamed(self.config, kind.formerly), get_type_hints(kind.Config))
+        return typed(kind.Config, kind.before | said, file, closed=True)
 
     def agrees(self, frame: Frame) -> bool:
         """Whether a frame is the run's, up to rounding. Older runs know fewer numbers of a frame than newer ones."""
         mine, other = self.to_json()["frame"], frame.to_json()
         return alike({name: other.get(name) for name in mine}, mine)
+
+
+def in_words(config: dict[str, Any], kinds: dict[str, Any]) -> dict[str, Any]:
+    """A Config's fields: "yes" and "no" for true and false, where older runs had these and today there are three."""
+    words = {name: set(get_args(kinds.get(name))) >= {"yes", "no"} for name in config}
+    return {k: ("yes" if v else "no") if isinstance(v, bool) and words[k] else v for k, v in config.items()}

@@ -83,7 +83,7 @@ def reconstruct(
         if len(photos) < FEWEST:
             raise LumigraphError(
                 f"{intake.source} has {counted(len(photos), 'photograph')} that can be used, and {FEWEST} are the "
-                f"least; take some from other places"
+                f"least{also_unreadable(intake)}; take some from other places"
             )
         work_to_do = Reconstruction(sources, folder, work, options, intake, photos, track)
         return finished(folder, work_to_do.keys["result"]) or work_to_do.run()
@@ -290,7 +290,7 @@ class Reconstruction:
         matches = read_matches(self.database)
         found, told = self.choose(matches)
         if not found or found[0].num_reg_images() < FEWEST:
-            raise LumigraphError(nothing_fits(self.intake.source, self.photos, matches))
+            raise LumigraphError(nothing_fits(self.intake, self.photos, matches))
         for name in (RESULT, "transforms.json"):
             claim_file(self.folder / name, "capture")
             remove(self.folder / name)
@@ -392,7 +392,16 @@ def keep_near(path: Path, names: Sequence[str], reach: int) -> None:
                 database.delete_two_view_geometry(number[a], number[b])
 
 
-def nothing_fits(source: str, photos: Sequence[Photo], matches: Matches) -> str:
+def also_unreadable(intake: Intake) -> str:
+    """What to add where photographs are too few: that there were others, which nobody could read, and why."""
+    if not intake.unreadable:
+        return ""
+    name, why = next(iter(intake.unreadable.items()))
+    more = len(intake.unreadable) - 1
+    return f" ({name} could not be used: {why}{f'; nor {more} more' if more else ''})"
+
+
+def nothing_fits(intake: Intake, photos: Sequence[Photo], matches: Matches) -> str:
     """Why no model came about, in a sentence."""
     poor = sum(matches.features.get(photo.name, 0) < FEW_FEATURES for photo in photos)
     if poor > len(photos) / 2:
@@ -405,6 +414,6 @@ def nothing_fits(source: str, photos: Sequence[Photo], matches: Matches) -> str:
         largest = len(matches.groups()[0])
         why = f"at most {largest} of {len(photos)} show the same things, and not from places that tell depth"
     return (
-        f"{source}: the photographs' cameras could not be found, for {why}; take 20 or more of one thing from places "
-        f"a step apart, so that neighbours overlap by two thirds"
+        f"{intake.source}: the photographs' cameras could not be found, for {why}{also_unreadable(intake)}; take "
+        f"20 or more of one thing from places a step apart, so that neighbours overlap by two thirds"
     )

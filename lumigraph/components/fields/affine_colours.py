@@ -6,19 +6,19 @@ balance, exposure and most of a grey day are such a map (Rematas 2022, Urban Rad
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from .appearance import fitted
-
 NUMBERS = 12  # of a photograph's code: the nine of A by rows, the three of b
 CONSTANT = 0.28209479177387814  # Y_0 of the spherical harmonics
 MIDDLE = 0.5  # the colour of a Gaussian whose harmonics are zero
-FIT_STEPS, FIT_RATE = 200, 0.02  # of Adam, where the light of a photograph is found
-FURTHER = 0.01  # weight of how far the rest of a code moves, which most pixels say nothing of, by the sum of squares
+ROUNDS = 12  # of least squares, where the light of a photograph is found
+ENOUGH_PIXELS = 1 << 14  # that tell it, evenly chosen
+LEAST_ERROR = 0.01  # beyond which no pixel weighs more
+FIRM = 3e-3  # weight of how far A and b move from where they began, by the sum of squares: of a grey wall nobody can
+# tell which colour is made of which
+FURTHER = 0.01  # of how far the rest of a code moves, which most pixels say nothing of
 
 
 def changed(
@@ -50,24 +50,41 @@ def changed_harmonics(
 @torch.no_grad()
 def found(
     start: Float[Tensor, " number"],
-    picture: Callable[[Float[Tensor, " number"]], Float[Tensor, "pixel 3"]],
+    rgb: Float[Tensor, "pixel 3"],
+    opacity: Float[Tensor, " pixel"],
     target: Float[Tensor, "pixel 3"],
+    behind: Float[Tensor, "pixel 9"] | None = None,
 ) -> Float[Tensor, " number"]:
     """The code whose picture is closest to a photograph by mean absolute difference, which passers-by hardly sway.
-    What it holds beyond a map of colours stays where it was, unless pixels say otherwise.
 
-    start:   where the search begins, and what comes back where there is no pixel
-    picture: the pixels' colours under a code, differentiable in it
-    target:  those of the photograph
+    The picture, rgb (I + A)^T + opacity b + (1 - opacity) behind s, is linear in all of it: so least squares whose
+    pixels weigh one over their last error, a few times over (Schlossmacher 1973), get there at once.
+
+    start:   what the code is drawn towards, and what comes back where there is no pixel
+    rgb:     of the scene over black;  target: the photograph, less a background of which nothing is to be found
+    behind:  harmonics of the directions, where a code holds a sky; it stays unless pixels say otherwise
     """
+    few = slice(None, None, -(-len(target) // ENOUGH_PIXELS) or 1)
+    rgb, opacity, target = rgb[few].double(), opacity[few, None].double(), target[few].double()
     if not len(target):
         return start
+    parts = [rgb, opacity] if behind is None else [rgb, opacity, (1 - opacity) * behind[few]]
+    rows, matrix = torch.cat(parts, 1), _columns(start).double()
+    held = torch.full_like(matrix, FURTHER)
+    held[:4] = FIRM
+    first, drawn = matrix, torch.diag_embed(held.T)
+    for _ in range(ROUNDS):
+        weights = 0.5 / (rows @ matrix - target).abs().clamp_min(LEAST_ERROR) / target.numel()
+        normal = torch.einsum("nc,na,nb->cab", weights, rows, rows) + drawn
+        wanted = torch.einsum("nc,na->ca", weights * target, rows) + (held * first).T
+        matrix = torch.linalg.solve(normal, wanted).T
+    return torch.cat([(matrix[:3].T - torch.eye(3).to(matrix)).flatten(), matrix[3:].flatten()]).to(start)
 
-    def loss(code: Float[Tensor, " number"]) -> Float[Tensor, ""]:
-        further = (code - start)[NUMBERS:]
-        return (picture(code) - target).abs().mean() + FURTHER * further.square().sum()
 
-    return fitted(start, loss, FIT_STEPS, FIT_RATE)
+def _columns(code: Float[Tensor, " number"]) -> Float[Tensor, "row 3"]:
+    """(I + A)^T, b and what else a code holds, three colours a row."""
+    matrix, offset = _map(code)
+    return torch.cat([matrix.T, offset[None], code[NUMBERS:].view(-1, 3)])
 
 
 def _map(code: Float[Tensor, " number"]) -> tuple[Float[Tensor, "3 3"], Float[Tensor, " 3"]]:

@@ -22,10 +22,14 @@ CONSTANT = 0.28209479177387814  # Y_0 of the spherical harmonics
 
 def sky(code: Float[Tensor, " 27"], camera: Camera) -> Float[Tensor, "height width 3"]:
     """The colours behind every pixel of one camera."""
+    return harmonics(camera) @ code.view(BANDS**2, 3)
+
+
+def harmonics(camera: Camera) -> Float[Tensor, "height width 9"]:
+    """The harmonics behind every pixel of one camera."""
     width, height = camera.size[0].tolist()
     directions = camera.rays(camera.pixels()).directions
-    harmonics = kernels.spherical_harmonics(directions, BANDS)
-    return (harmonics @ code.view(BANDS**2, 3)).view(height, width, 3)
+    return kernels.spherical_harmonics(directions, BANDS).view(height, width, BANDS**2)
 
 
 def backdrop_loss(

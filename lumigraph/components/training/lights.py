@@ -16,24 +16,40 @@ LONGEST = 200  # pixels along their longer side
 POINTS = 1 << 14  # places at most
 FEWEST = 30  # places that two photographs must share to be compared
 DARKEST, BRIGHTEST = 0.05, 0.95  # colours between which a ratio says something
+ENCODED = 2.2  # stops of light to one of sRGB-encoded colours
 
 
 @torch.no_grad()
-def spread_of_light(scene: Scene) -> float:
+def spread_of_light(scene: Scene) -> float | None:
     """How much brighter or darker, redder or bluer neighbouring photographs show the same places, in stops: the root
-    mean square over photographs and channels of the median log2 ratio. 0 where the scene has no points to tell by.
+    mean square over photographs and channels of the median log2 ratio. None where the scene has no points to tell by.
 
     Neighbours see about the same side of things and the same things before others, so that what is left is the light
     and the camera's reading of it.
     """
     if scene.points is None or len(train := scene.splits["train"]) < 2:
-        return 0.0
+        return None
     points = scene.points[evenly(range(len(scene.points)), POINTS)]
     beside = neighbours(scene.cameras[train])
     chosen = evenly(range(len(train)), LOOKED_AT)
     views = {i: flat_view(scene.photograph(int(train[i])), LONGEST) for i in {*chosen, *beside[chosen].tolist()}}
     ratios = [ratio for i in chosen if (ratio := brighter(points, views[i], views[int(beside[i])])) is not None]
-    return float(torch.stack(ratios).square().mean().sqrt()) if ratios else 0.0
+    return float(torch.stack(ratios).square().mean().sqrt()) if ratios else None
+
+
+def spread_of_exposure(scene: Scene) -> float:
+    """The same, and where no points tell, what photographs say of their exposures (`Scene.about`): their deviation, in
+    stops of encoded colours. 0 where nothing is known. Those developed from raw files are as bright as `brightness`
+    made them."""
+    measured = spread_of_light(scene)
+    if measured is not None:
+        return measured
+    exposure = scene.about.get("exposure")
+    if exposure is None:
+        return 0.0
+    stops = (exposure * scene.about.get("brightness", torch.tensor(1.0))).log2()[scene.splits["train"]]
+    known = stops[stops.isfinite()]
+    return float(known.std()) / ENCODED if len(known) > 1 else 0.0
 
 
 def neighbours(cameras: Camera) -> Int[Tensor, " camera"]:
