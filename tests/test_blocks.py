@@ -76,6 +76,14 @@ def test_crossings_and_corners_of_streets_are_found(rig):
     assert len(found) == 6 and away.min(0).max() < 2.0
 
 
+def test_two_lanes_are_one_street():
+    """A drive along every street once in each direction, as `procedural:city` has it, meets where streets do."""
+    found = crossings.find_crossings(places_of(read_capture("procedural:city,crossings=6,views=420,size=32")).ground)
+    expected = np.array([[x, y] for x in (0, 36, 72) for y in (0, 36)])
+    away = np.linalg.norm(found[:, None] - expected, axis=-1)
+    assert len(found) == 6 and away.min(0).max() < 5.0
+
+
 def test_a_survey_flight_and_a_road_have_no_crossings():
     grid = np.stack(np.meshgrid(np.arange(20) * 3.0, np.arange(20) * 3.0), -1).reshape(-1, 2)
     road = np.stack([np.arange(100.0), np.zeros(100)], -1)
