@@ -2,9 +2,9 @@
 
     python benchmarks/block_kills.py SCENE --output FOLDER --blocks 4 --steps 2000 --workers 2 --kills 10 --drivers 2
 
-The command runs three times: undisturbed; with SIGKILL for a worker that holds a block, again and again; and with
-SIGKILL for the driver, after which the same command is given again. The weights of all blocks are then compared to the
-byte, and it is counted which of the kills met a block that was being learnt.
+The command runs undisturbed; then with SIGKILL for a worker that holds a block, again and again, and anew until there
+were so many kills; and with SIGKILL for the driver, after which the same command is given again. The weights of all
+blocks are compared to the byte after each run.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ class Options:
     steps: int = 2000  # of all blocks together
     workers: int = 2
     kills: int = 10  # of workers
-    gap: tuple[float, float] = (2.0, 8.0)  # seconds from one kill to the next, at least and at most
+    gap: tuple[float, float] = (1.0, 5.0)  # seconds from one kill to the next, at least and at most
     drivers: int = 2  # kills of the driver
     seed: int = 0
 
@@ -73,10 +73,10 @@ def weights(run: Path) -> dict[str, bytes]:
     return {folder.name: next(folder.glob(WEIGHTS)).read_bytes() for folder in done}
 
 
-def killed_workers(options: Options, run: Path, chance: random.Random) -> int:
+def killed_workers(options: Options, run: Path, chance: random.Random, most: int) -> int:
     """How many workers were killed while they held a block."""
     process, kills = started(options, run), 0
-    while kills < options.kills and process.poll() is None:
+    while kills < most and process.poll() is None:
         time.sleep(chance.uniform(*options.gap))
         if there := holders(run):
             name, number = chance.choice(there)
@@ -106,29 +106,32 @@ def killed_drivers(options: Options, run: Path, chance: random.Random, alone: fl
 
 def main(options: Options) -> int:
     chance, begin = random.Random(options.seed), time.perf_counter()
-    folders = [options.output / name for name in ("undisturbed", "workers", "drivers")]
-    for folder in folders:
-        shutil.rmtree(folder, ignore_errors=True)
-    ended(started(options, folders[0]))
-    alone = time.perf_counter() - begin
-    expected = weights(folders[0])
-    print(f"undisturbed: {len(expected)} blocks in {alone:.0f} s", flush=True)
-    faults = 0
-    for folder in folders[1:]:
-        begin = time.perf_counter()
-        if folder.name == "workers":
-            kills = killed_workers(options, folder, chance)
-        else:
-            kills = killed_drivers(options, folder, chance, alone)
-        found = weights(folder)
-        same = sum(found.get(name) == content for name, content in expected.items())
-        print(
-            f"{kills} {folder.name} killed: {len(found)} of {len(expected)} blocks done in "
-            f"{time.perf_counter() - begin:.0f} s, {same} identical to the byte",
-            flush=True,
-        )
-        faults += len(expected) - same
+    alone = options.output / "undisturbed"
+    shutil.rmtree(options.output, ignore_errors=True)
+    ended(started(options, alone))
+    seconds = time.perf_counter() - begin
+    expected = weights(alone)
+    print(f"undisturbed: {len(expected)} blocks in {seconds:.0f} s", flush=True)
+    faults = kills = 0
+    while kills < options.kills:
+        run, begin = options.output / f"workers-{kills}", time.perf_counter()
+        number = killed_workers(options, run, chance, options.kills - kills)
+        faults += differing("workers", number, run, expected, time.perf_counter() - begin)
+        kills += number
+    if options.drivers:
+        run, begin = options.output / "drivers", time.perf_counter()
+        number = killed_drivers(options, run, chance, seconds)
+        faults += differing("drivers", number, run, expected, time.perf_counter() - begin)
     return 1 if faults else 0
+
+
+def differing(who: str, kills: int, run: Path, expected: dict[str, bytes], seconds: float) -> int:
+    """How many blocks are not what they are undisturbed."""
+    found = weights(run)
+    same = sum(found.get(name) == content for name, content in expected.items())
+    done = f"{len(found)} of {len(expected)} blocks done in {seconds:.0f} s"
+    print(f"{kills} {who} killed: {done}, {same} identical to the byte", flush=True)
+    return len(expected) - same
 
 
 if __name__ == "__main__":

@@ -300,6 +300,8 @@ def test_one_block_is_learnt_again_and_the_others_stay(street, run, tmp_path, ca
     assert json.loads((copy / "eval.json").read_text())["protocol"]["views"] == 3
     assert train(street, "--into", copy, "--blocks", 7) == 2
     assert "There is no block 7; there are 0, 1, 2" in capsys.readouterr().err
+    assert train(street, "--into", tmp_path / "nothing", "--blocks", 1) == 2
+    assert "nothing holds no run in blocks" in capsys.readouterr().err
 
 
 def test_options_of_blocks_are_those_of_block_nerf_alone(capsys):

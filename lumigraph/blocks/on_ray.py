@@ -80,6 +80,7 @@ def connected(ray: Any, workers: Workers) -> Iterator[None]:
     """A cluster: one on this machine for as long as the block lasts, or one that is there already."""
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # nobody is told
     os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")
+    os.environ.setdefault("RAY_BACKEND_LOG_LEVEL", "error")  # what is wrong, our sentence says
     os.environ.setdefault("RAY_worker_niceness", "0")  # else workers get next to nothing of a busy machine
     quiet: dict[str, Any] = {"logging_level": "error", "log_to_driver": False}
     if workers.address is not None:
