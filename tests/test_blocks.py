@@ -76,6 +76,14 @@ def test_crossings_and_corners_of_streets_are_found(rig):
     assert len(found) == 6 and away.min(0).max() < 2.0
 
 
+def test_two_lanes_are_one_street():
+    """A drive along every street once in each direction, as `procedural:city` has it, meets where streets do."""
+    found = crossings.find_crossings(places_of(read_capture("procedural:city,crossings=6,views=420,size=32")).ground)
+    expected = np.array([[x, y] for x in (0, 36, 72) for y in (0, 36)])
+    away = np.linalg.norm(found[:, None] - expected, axis=-1)
+    assert len(found) == 6 and away.min(0).max() < 5.0
+
+
 def test_a_survey_flight_and_a_road_have_no_crossings():
     grid = np.stack(np.meshgrid(np.arange(20) * 3.0, np.arange(20) * 3.0), -1).reshape(-1, 2)
     road = np.stack([np.arange(100.0), np.zeros(100)], -1)
@@ -292,6 +300,8 @@ def test_one_block_is_learnt_again_and_the_others_stay(street, run, tmp_path, ca
     assert json.loads((copy / "eval.json").read_text())["protocol"]["views"] == 3
     assert train(street, "--into", copy, "--blocks", 7) == 2
     assert "There is no block 7; there are 0, 1, 2" in capsys.readouterr().err
+    assert train(street, "--into", tmp_path / "nothing", "--blocks", 1) == 2
+    assert "nothing holds no run in blocks" in capsys.readouterr().err
 
 
 def test_options_of_blocks_are_those_of_block_nerf_alone(capsys):

@@ -474,3 +474,26 @@ def test_one_photograph_is_an_intake_too():
     intake = Intake("x", [photo("a b.jpg"), photo("a_b.jpg")], duplicates={"a b.jpg": "a_b.jpg"})
     safe = reconstruction.with_safe_names(intake)
     assert [p.name for p in safe.photos] == ["a_b.jpg", "_a_b.jpg"] and safe.duplicates == {"a_b.jpg": "_a_b.jpg"}
+
+
+@pytest.mark.parametrize(("asked", "other"), [("incremental", "global"), ("global", "incremental")])
+def test_where_one_mapper_finds_nothing_the_other_is_tried(tmp_path, monkeypatch, asked, other):
+    """A walk straight ahead has no pair to begin with; missing focal lengths leave nothing to place all at once."""
+    tried: list[str] = []
+
+    def mapped(database: Path, models: Path, mapper: str) -> None:
+        tried.append(mapper)
+        assert not any(models.iterdir())
+        (models / "0").mkdir()  # the first leaves a pair behind
+        (models / "0" / mapper).touch()
+
+    def placed(models: Path) -> int:
+        return 2 if (models / "0" / asked).exists() else 8 * (models / "0" / other).exists()
+
+    monkeypatch.setattr(reconstruction, "largest", placed)
+    work = object.__new__(Reconstruction)
+    work.stages, work.models, work.unfolded = Stages(tmp_path), tmp_path / "models", tmp_path / "unfolded"
+    work.database, work.options, work.map = tmp_path / "database.db", Options(mapper=asked), mapped
+    for _ in range(2):  # once it is there it stays
+        work.place("key")
+        assert tried == [asked, other] and (work.models / reconstruction.INSTEAD).exists()

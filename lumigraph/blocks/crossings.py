@@ -16,21 +16,30 @@ APART = np.radians(45)  # between two streets, at least
 CORNER = np.radians(225)  # of the outer side of a corner, at least
 MEETING = 2.5  # steps within which places are of one crossing
 STREETS = 0.4  # share of places that are not along a street, above which it is a field and no streets
+COARSER = (1.0, 1.5, 2.0, 3.0)  # of a step, at which streets are looked for: lanes beside each other are one street
 
 
 def find_crossings(ground: Float[np.ndarray, "photograph 2"]) -> Float[np.ndarray, "crossing 2"]:
-    """The middles of crossings and corners, seen from above; none where there are no streets, or they never meet."""
+    """The middles of crossings and corners, seen from above; none where there are no streets, or they never meet.
+
+    Both lanes of a street are one street only from a step on that is about as long as they are apart. So several are
+    tried, and the one counts at which most streets meet, the finest of equals.
+    """
     step = usual_step(ground)
-    none = np.zeros((0, 2))
     if step == 0:
-        return none
+        return np.zeros((0, 2))
+    return max((crossings_at(ground, scale * step) for scale in COARSER), key=len)
+
+
+def crossings_at(ground: Float[np.ndarray, "photograph 2"], step: float) -> Float[np.ndarray, "crossing 2"]:
+    """Crossings and corners, as far as they show in places that are a step apart."""
     nodes = thinned(ground, step)
     tree = cKDTree(nodes)
     found = [ways(nodes[near] - node, step) for node, near in zip(nodes, near_by(tree, step), strict=True)]
     number, turns = np.array([n for n, _ in found]), np.array([widest > CORNER for _, widest in found])
     at = nodes[(number >= 3) | ((number == 2) & turns)]
     if not (number >= 3).any() or np.isin(number, (1, 2)).mean() < 1 - STREETS:
-        return none
+        return np.zeros((0, 2))
     pairs = cKDTree(at).query_pairs(MEETING * step, output_type="ndarray")
     links = csr_matrix((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), (len(at), len(at)))
     count, label = connected_components(links, directed=False)

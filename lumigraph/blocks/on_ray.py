@@ -28,6 +28,11 @@ ANSWER = 10.0  # seconds that an address has to answer
 LOOKS = 0.5  # seconds between looks at whether to stop
 ENDING = 90.0  # seconds for workers to end their step and save, once they are told to
 STORE = 100 << 20  # bytes of Ray's own store on this machine: results are small
+SETTINGS = {  # that Ray reads as it is loaded, unless the user's environment has them
+    "RAY_USAGE_STATS_ENABLED": "0",  # nobody is told
+    "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0",
+    "RAY_worker_niceness": "0",  # else workers get next to nothing of a busy machine
+}
 
 
 def on_workers(run: Path, folders: dict[str, Path], workers: Workers) -> Conducted:
@@ -78,9 +83,6 @@ def on_worker(folder: str) -> Done | str | None:
 @contextlib.contextmanager
 def connected(ray: Any, workers: Workers) -> Iterator[None]:
     """A cluster: one on this machine for as long as the block lasts, or one that is there already."""
-    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # nobody is told
-    os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")
-    os.environ.setdefault("RAY_worker_niceness", "0")  # else workers get next to nothing of a busy machine
     quiet: dict[str, Any] = {"logging_level": "error", "log_to_driver": False}
     if workers.address is not None:
         answering(workers.address)
@@ -95,7 +97,10 @@ def connected(ray: Any, workers: Workers) -> Iterator[None]:
         ray.init(**place, **quiet)
     except (ConnectionError, RuntimeError, ValueError, TimeoutError) as fault:
         where = workers.address or "this machine"
-        raise LumigraphError(f"Ray on {where} could not be used ({first_line(fault)}); look at `ray status`") from fault
+        raise LumigraphError(
+            f"Ray on {where} could not be used ({first_line(fault)}); look at `ray status`, and where the cluster asks "
+            "for a token, set RAY_AUTH_MODE=token here as well"
+        ) from fault
     try:
         yield
     finally:
@@ -115,6 +120,8 @@ def feasible(nodes: list[dict[str, Any]], workers: Workers) -> None:
 
 def library(option: str) -> Any:
     """Ray itself. Raises LumigraphError, saying how to install it, where it is not."""
+    for name, value in SETTINGS.items():
+        os.environ.setdefault(name, value)
     try:
         import ray
     except ImportError as fault:

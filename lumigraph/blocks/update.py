@@ -36,6 +36,8 @@ def update(
     The new block takes its place when it is done; what is lost before is gone on with. Files of other blocks stay.
     Raises LumigraphError for a block that there is not, and where no photograph is of it.
     """
+    if not files.is_file(run / NAME):
+        raise LumigraphError(f"{run} holds no run in blocks; give --into one that `lumigraph train block-nerf` made")
     with held(run, "trained"):
         plan = Plan.read(run / NAME)
         block = again(plan.block(name), source, places, options, budget)

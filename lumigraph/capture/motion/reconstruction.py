@@ -37,7 +37,8 @@ MAX_SIZE = 1600  # pixels of the longer side at which details are looked for
 FEATURES = ((20, 8192), (60, 4096))  # up to so many photographs so many features each; comparing goes by their square
 FEWEST_FEATURES = 2048
 KEPT = 0.8  # share of the photographs that a model must keep to be preferred for being free of folds
-INSTEAD = "incremental"  # a file among the models: they were not made by the mapper that was asked for
+INSTEAD = "instead"  # a file among the models, empty: they were not made by the mapper that was asked for
+OTHER: dict[str, Literal["incremental", "global"]] = {"incremental": "global", "global": "incremental"}
 UNSAFE = re.compile(r"[\s#]")  # COLMAP's lists of pairs end names at spaces
 SPECIFICATION = 2  # of what is written; another number has everything written again
 
@@ -222,12 +223,16 @@ class Reconstruction:
             self.colmap("Comparing pairs", len(pairs), self.database, stage="matching", pairs=str(listed))
 
     def place(self, key: str) -> None:
-        if self.stages.is_done("mapping", key) and self.models.is_dir():
+        """By the mapper that was asked for; by the other where it finds no model. One by one needs a pair that tells
+        depth to begin with, which a walk straight ahead may lack; all at once needs focal lengths and many pairs."""
+        if self.stages.is_done("mapping", key) and self.models.is_dir() and largest(self.models) >= FEWEST:
             return
         with self.stages.working("mapping", key), replacing_folder(self.models, ours=True) as partial:
             self.map(self.database, partial, self.options.mapper)
-            if self.options.mapper == "global" and not any(partial.iterdir()):
-                self.map(self.database, partial, "incremental")
+            if largest(partial) < FEWEST:
+                for place in partial.iterdir():  # a pair at most
+                    remove(place)
+                self.map(self.database, partial, OTHER[self.options.mapper])
                 (partial / INSTEAD).touch()
 
     def unfold(self, key: str) -> None:
@@ -266,7 +271,8 @@ class Reconstruction:
         """The models, largest first, and what to say of how they came about."""
         found, told = read_models(self.models), []
         if (self.models / INSTEAD).exists():
-            told.append("--mapper global found no model, so photographs were placed one by one")
+            how = "all at once" if self.options.mapper == "incremental" else "one by one"
+            told.append(f"--mapper {self.options.mapper} found no model, so photographs were placed {how}")
         if self.unfolded.is_dir() and (unfolded := read_models(self.unfolded)):
             enough = unfolded[0].num_reg_images() >= KEPT * found[0].num_reg_images()
             if enough and self.leaps(unfolded[0], matches) < self.leaps(found[0], matches):
@@ -367,6 +373,11 @@ def read_models(folder: Path) -> list[pycolmap.Reconstruction]:
     """COLMAP's models in a folder, the largest first."""
     found = [pycolmap.Reconstruction(place) for place in sorted(folder.iterdir()) if place.is_dir()]
     return sorted(found, key=lambda model: (model.num_reg_images(), model.num_points3D()), reverse=True)
+
+
+def largest(folder: Path) -> int:
+    """How many photographs the largest of COLMAP's models in a folder places; 0 if there is none."""
+    return max((model.num_reg_images() for model in read_models(folder)), default=0)
 
 
 def remove_database(path: Path) -> None:
