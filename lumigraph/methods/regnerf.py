@@ -24,9 +24,9 @@ from ..method import RayMethod
 from ..ranges import LearningRate, NonNegative, PositiveShare, Share, Steps, Width, between
 from ..rays import Look, Rays, Rendering
 from ..scene import Batch, Frame, Scene
-from ..volume import composite
+from ..volume import composite, weights_of
 from .instant_ngp import Config as NgpConfig
-from .instant_ngp import InstantNGP
+from .instant_ngp import InstantNGP, huber
 from .mip_nerf import Config as MipConfig
 from .mip_nerf import MipNeRF
 
@@ -57,6 +57,17 @@ class Config(MipConfig):
     base_resolution: Annotated[int, between(1, 4096)] = 16
     max_resolution: Annotated[int, between(1, 1 << 20)] = 2048
     samples_per_step: Annotated[int, between(64, 1 << 24)] = 1 << 18
+    steps_per_diagonal: Annotated[int, between(4, 16_384)] = 1024
+    cone_angle: Share = 1 / 256
+    transmittance_threshold: Share = 1e-4
+    table_occupancy_threshold: NonNegative = 0.05
+    hash_weight_decay: NonNegative = 0.0
+    huber_delta: PositiveShare = 0.1
+    sh_bands: Annotated[int, between(1, 4)] = 4
+    sweep_weight: NonNegative = 0.03  # of what plane sweeps found in the open, at first; it falls to nothing
+    coarse_to_fine: Share = 0.0  # share of the budget in which finer levels of the table join the coarsest; 0: at once
+    occlusion_weight: NonNegative = 0.0  # of what photographs' rays meet right before the camera (Yang 2023, eq. 4)
+    occlusion_share: Share = 0.1  # share of each ray that this is
 
     def check(self) -> None:
         """Raises LumigraphError for numbers that contradict each other."""
@@ -67,7 +78,6 @@ class Config(MipConfig):
         ours = {x.name: getattr(self, x.name) for x in fields(self)}
         if kind is NgpConfig:  # a table learns faster than a network, and asks smaller networks
             ours |= {name: ours[called] for name, called in OF_TABLE.items()}
-            ours |= {name: getattr(NgpConfig, name) for name in ITS_OWN}
         return kind(**{x.name: ours[x.name] for x in fields(kind) if x.name in ours})
 
 
@@ -75,8 +85,9 @@ OF_TABLE = {  # names of Instant-NGP's numbers, and what they are called beside 
     "learning_rate": "table_learning_rate",
     "final_learning_rate": "final_table_learning_rate",
     "hidden_width": "table_width",
+    "occupancy_threshold": "table_occupancy_threshold",
+    "depth_weight": "sweep_weight",
 }
-ITS_OWN = ("depth_weight", "occupancy_threshold")  # numbers of Instant-NGP that mean something else here
 TABLE: dict[str, Any] = {  # of a CPU, as Instant-NGP's preset has it
     "table_learning_rate": 2e-2,
     "table_width": 32,
@@ -85,6 +96,12 @@ TABLE: dict[str, Any] = {  # of a CPU, as Instant-NGP's preset has it
     "log2_hashmap_size": 17,
     "max_resolution": 512,
     "samples_per_step": 1 << 15,
+    "steps_per_diagonal": 384,
+    "cone_angle": 1 / 96,
+    "transmittance_threshold": 1e-3,
+    "table_occupancy_threshold": 0.15,
+    "hash_weight_decay": 0.3,
+    "huber_delta": 0.3,
 }
 FLOWING = 0.05  # of a budget of seconds: the share that learning what is likely may take
 STRIDES = (1, 2, 4)  # pixels between rays of a patch: what is smooth, and what looks like a photograph, is so in each
@@ -187,7 +204,9 @@ class RegNeRF(RayMethod):
         rays = self.marcher.poses(batch.rays) if self.marcher.poses else batch.rays
         rays = rays if unseen is None else joined(rays, unseen)
         looks, terms = self._look(rays, generator)
-        background = backdrop(batch, self.background, generator)
+        table = isinstance(self.marcher, InstantNGP)
+        opaque = table and self.marcher.unbounded is not None and not getattr(self, "clear", 0)
+        background = backdrop(batch, self.background, generator, opaque=opaque)
         for look, weight in looks:
             # Of a patch, the picture before the scene's own background is judged.
             behind = background.expand(len(batch), 3)
@@ -197,8 +216,12 @@ class RegNeRF(RayMethod):
             whole = composite(look.samples, look.density, look.rgb, behind, places=places)
             seen, rest = (part(whole, x) for x in (slice(len(batch)), slice(len(batch), None)))
             residual, self.figures["mse"] = residuals(seen, batch, background)
-            if weight:
+            if table and not getattr(self, "square", 0):
+                terms["huber"] = huber(residual, self.config.huber_delta)
+            elif weight:
                 terms[look.name] = weight * residual.square().mean()
+            if self.config.occlusion_weight:
+                terms["occlusion"] = self.config.occlusion_weight * self._before(look, rays, len(batch))
         if unseen is not None:
             terms |= self._unlike(rest)
         self.figures |= self.marcher.figures | {"mse": self.figures["mse"]}
@@ -212,6 +235,14 @@ class RegNeRF(RayMethod):
             return [(look, 1.0)], terms
         weights = self.marcher.pass_weights
         return [(look, weights.get(look.name, 1.0)) for look in self.marcher.looks(rays, generator)], {}
+
+    def _before(self, look: Look, rays: Rays, count: int) -> Tensor:
+        """How opaque the air right before the cameras of the first so many rays is, mean of them."""
+        near, far = self.marcher.space.interval(rays)
+        share = near.new_full((len(rays), 1), self.config.occlusion_share)
+        end = self.marcher.space.distance(share, rays, near, far)[:, 0]
+        weights = weights_of(look.samples, look.density)
+        return (weights * (look.samples.t < end[look.samples.ray_index])).sum() / len(rays)
 
     def _unlike(self, seen: Rendering) -> dict[str, Tensor]:
         """What patches that nobody photographed cost: how rough their depth is, how unlikely their colours are."""
@@ -238,6 +269,8 @@ class RegNeRF(RayMethod):
         if isinstance(self.marcher, MipNeRF):
             grown = progress / c.annealing if progress < c.annealing else 1.0
             self.marcher.sampled = max(grown, c.annealing_start)
+        else:
+            self.marcher.joined = progress / c.coarse_to_fine if progress < c.coarse_to_fine else 1.0
         self.marcher.before_step(step, progress)
 
     def after_step(self, step: int) -> None:
