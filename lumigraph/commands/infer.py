@@ -64,9 +64,10 @@ class Infer:
 
     def _inferred(self, made_by: Any, prior: Any, output: Path) -> tuple[Any, dict[str, str]]:
         """The run of a scene, and what to say of it."""
-        from ..capture import PROCEDURAL, open_dataset, single_image
+        from ..capture import PROCEDURAL, open_dataset, single_image, sources_of
         from ..capture.assemble import HOLD_OUT
         from ..capture.photos import is_bare
+        from ..collection import Collection
         from ..dataset import check_kind
         from ..run.inferred import infer
         from ..scene import Scene
@@ -80,6 +81,12 @@ class Infer:
             )
         options: dict[str, Any] = {"downscale": self.downscale, "reader": self.reader}
         scene = open_dataset(self.scene, Scene, **options)
+        if isinstance(scene, Collection):
+            member = sources_of(self.scene)[scene.names[scene.splits["test"].tolist()[0]]]
+            raise LumigraphError(
+                f"{name} is told one scene, and {self.scene} is a collection; name one of its scenes: "
+                f"lumigraph infer {self.prior} {member}"
+            )
         check_kind(f"infer by {name}", Scene, type(scene), self.scene)
         assert isinstance(scene, Scene)
         most = self.views or prior.method.evidence_views

@@ -117,6 +117,7 @@ class InstantNGP(RayMethod):
         self.unbounded = unbounded(frame, self.space, config) if config.contraction else None
         if self.unbounded:
             self.rays_per_chunk = RAYS
+        self.sampled = 1.0  # share of each ray of an object, around its middle, that is sampled in training
         self.joined = 1.0  # how far the finer levels have joined the coarsest in training
         self.exposure = Exposure(frame.image_count) if config.exposure_correction else None
         refining, rate = config.refine_cameras, config.pose_learning_rate
@@ -217,6 +218,10 @@ class InstantNGP(RayMethod):
 
     def _march(self, rays: Rays, jitter: Float[Tensor, " ray"] | None = None) -> Look:
         found = self.occupancy.sample(rays, self.frame.near, *self.lattice, jitter=jitter)
+        if self.sampled < 1 and jitter is not None:
+            near, far = self.space.interval(rays)
+            aside = (found.t - (0.5 * (near + far))[found.ray_index]).abs()
+            found = found.keep(aside < (0.5 * self.sampled * (far - near))[found.ray_index])
         samples, asked = reached(rays, found, self.density, self.config.transmittance_threshold)
         points, directions = samples.along(rays)
         density, rgb = self.field(points, directions)

@@ -266,10 +266,9 @@ class RegNeRF(RayMethod):
 
     def before_step(self, step: int, progress: float) -> None:
         c, self._progress = self.config, progress
-        if isinstance(self.marcher, MipNeRF):
-            grown = progress / c.annealing if progress < c.annealing else 1.0
-            self.marcher.sampled = max(grown, c.annealing_start)
-        else:
+        grown = progress / c.annealing if progress < c.annealing else 1.0
+        self.marcher.sampled = max(grown, c.annealing_start)
+        if isinstance(self.marcher, InstantNGP):
             self.marcher.joined = progress / c.coarse_to_fine if progress < c.coarse_to_fine else 1.0
         self.marcher.before_step(step, progress)
 

@@ -12,9 +12,7 @@ FIRST = 1 / 4  # share of the bands that are there from the beginning
 BEGINS, ENDS = 0.05, 0.4  # shares of the budget between which the others join
 
 
-def band_weights(
-    count: int, progress: float, begins: float = BEGINS, ends: float = ENDS
-) -> Float[Tensor, " band"]:
+def band_weights(count: int, progress: float, begins: float = BEGINS, ends: float = ENDS) -> Float[Tensor, " band"]:
     """Weights in [0, 1] of an encoding's bands, the coarsest first (Lin 2021, BARF, eq. 14).
 
         w_k = 0 for alpha < k,  (1 - cos((alpha - k) pi)) / 2 for alpha - k in [0, 1),  1 beyond
