@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import asdict, dataclass, fields
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 import torch
 from jaxtyping import Float
@@ -24,7 +24,7 @@ from ..method import RayMethod
 from ..ranges import LearningRate, NonNegative, PositiveShare, Share, Steps, Width, between
 from ..rays import Look, Rays, Rendering
 from ..scene import Batch, Frame, Scene
-from ..volume import composite, weights_of
+from ..volume import composite
 from .instant_ngp import Config as NgpConfig
 from .instant_ngp import InstantNGP, huber
 from .mip_nerf import Config as MipConfig
@@ -66,8 +66,6 @@ class Config(MipConfig):
     sh_bands: Annotated[int, between(1, 4)] = 4
     sweep_weight: NonNegative = 0.03  # of what plane sweeps found in the open, at first; it falls to nothing
     coarse_to_fine: Share = 0.0  # share of the budget in which finer levels of the table join the coarsest; 0: at once
-    occlusion_weight: NonNegative = 0.0  # of what photographs' rays meet right before the camera (Yang 2023, eq. 4)
-    occlusion_share: Share = 0.1  # share of each ray that this is
 
     def check(self) -> None:
         """Raises LumigraphError for numbers that contradict each other."""
@@ -126,6 +124,7 @@ class RegNeRF(RayMethod):
     """Mip-NeRF or Instant-NGP, which learns as ever from photographs, and is told off for what it shows elsewhere."""
 
     Config = Config
+    before: ClassVar[dict[str, Any]] = {"huber_delta": 1.0}  # a table's loss was square
 
     def __init__(self, frame: Frame, config: Any = None):
         config = config or Config()
@@ -205,7 +204,7 @@ class RegNeRF(RayMethod):
         rays = rays if unseen is None else joined(rays, unseen)
         looks, terms = self._look(rays, generator)
         table = isinstance(self.marcher, InstantNGP)
-        opaque = table and self.marcher.unbounded is not None and not getattr(self, "clear", 0)
+        opaque = table and self.marcher.unbounded is not None
         background = backdrop(batch, self.background, generator, opaque=opaque)
         for look, weight in looks:
             # Of a patch, the picture before the scene's own background is judged.
@@ -216,12 +215,10 @@ class RegNeRF(RayMethod):
             whole = composite(look.samples, look.density, look.rgb, behind, places=places)
             seen, rest = (part(whole, x) for x in (slice(len(batch)), slice(len(batch), None)))
             residual, self.figures["mse"] = residuals(seen, batch, background)
-            if table and not getattr(self, "square", 0):
+            if table:
                 terms["huber"] = huber(residual, self.config.huber_delta)
             elif weight:
                 terms[look.name] = weight * residual.square().mean()
-            if self.config.occlusion_weight:
-                terms["occlusion"] = self.config.occlusion_weight * self._before(look, rays, len(batch))
         if unseen is not None:
             terms |= self._unlike(rest)
         self.figures |= self.marcher.figures | {"mse": self.figures["mse"]}
@@ -235,14 +232,6 @@ class RegNeRF(RayMethod):
             return [(look, 1.0)], terms
         weights = self.marcher.pass_weights
         return [(look, weights.get(look.name, 1.0)) for look in self.marcher.looks(rays, generator)], {}
-
-    def _before(self, look: Look, rays: Rays, count: int) -> Tensor:
-        """How opaque the air right before the cameras of the first so many rays is, mean of them."""
-        near, far = self.marcher.space.interval(rays)
-        share = near.new_full((len(rays), 1), self.config.occlusion_share)
-        end = self.marcher.space.distance(share, rays, near, far)[:, 0]
-        weights = weights_of(look.samples, look.density)
-        return (weights * (look.samples.t < end[look.samples.ray_index])).sum() / len(rays)
 
     def _unlike(self, seen: Rendering) -> dict[str, Tensor]:
         """What patches that nobody photographed cost: how rough their depth is, how unlikely their colours are."""
