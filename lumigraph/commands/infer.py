@@ -64,7 +64,7 @@ class Infer:
 
     def _inferred(self, made_by: Any, prior: Any, output: Path) -> tuple[Any, dict[str, str]]:
         """The run of a scene, and what to say of it."""
-        from ..capture import PROCEDURAL, open_dataset, single_image, sources_of
+        from ..capture import PROCEDURAL, kind_of, open_dataset, single_image, sources_of
         from ..capture.assemble import HOLD_OUT
         from ..capture.photos import is_bare
         from ..collection import Collection
@@ -79,14 +79,13 @@ class Infer:
                 f"{self.scene} holds no poses, and {name} must know where photographs were taken from; "
                 f"find them first: lumigraph capture {self.scene}"
             )
-        options: dict[str, Any] = {"downscale": self.downscale, "reader": self.reader}
-        scene = open_dataset(self.scene, Scene, **options)
-        if isinstance(scene, Collection):
-            member = sources_of(self.scene)[scene.names[scene.splits["test"].tolist()[0]]]
+        if kind_of(self.scene, Scene) is Collection:
             raise LumigraphError(
                 f"{name} is told one scene, and {self.scene} is a collection; name one of its scenes: "
-                f"lumigraph infer {self.prior} {member}"
+                f"lumigraph infer {self.prior} {next(iter(sources_of(self.scene).values()))}"
             )
+        options: dict[str, Any] = {"downscale": self.downscale, "reader": self.reader}
+        scene = open_dataset(self.scene, Scene, **options)
         check_kind(f"infer by {name}", Scene, type(scene), self.scene)
         assert isinstance(scene, Scene)
         most = self.views or prior.method.evidence_views
