@@ -129,7 +129,8 @@ def test_what_is_no_prior_is_refused(prior, ball_run, ball_folder, tmp_path, cap
     assert main(["infer", str(prior.folder), str(ball_folder), "--output", str(tmp_path / "found")]) == 0
     again = said(capsys, "infer", tmp_path / "found", ball_folder, "--output", tmp_path / "other")
     assert "is no prior, for it learnt from photographs" in again
-    assert "a collection" in said(capsys, "infer", prior.folder, "procedural:toys", "--output", tmp_path / "other")
+    many = said(capsys, "infer", prior.folder, "procedural:toys", "--output", tmp_path / "other")
+    assert "is told one scene" in many and "procedural:toys,member=0" in many
 
 
 def test_more_views_than_memory_holds_are_refused(tmp_path, monkeypatch):

@@ -145,7 +145,8 @@ def test_a_table_has_numbers_of_its_own():
     assert (table.learning_rate, table.hidden_width) == (known.learning_rate, known.hidden_width) == (2e-2, 32)
     assert (network.learning_rate, network.hidden_width) == (4e-3, 128)
     assert (table.levels, table.samples_per_step) == (known.levels, known.samples_per_step)
-    assert table.depth_weight == known.depth_weight != config.depth_weight  # of plane sweeps; ours is of roughness
+    assert table == known  # all of them
+    assert table.depth_weight != config.depth_weight  # of plane sweeps; ours is of roughness
 
 
 def test_what_plane_sweeps_found_counts_beside_what_is_smooth():
@@ -171,3 +172,34 @@ def test_samples_spread_from_the_middle():
         hit = far > near
         start = look.samples.t_start.view(64, -1)[:, 0]
         assert torch.allclose((start - near)[hit], ((1 - share) / 2 * (far - near))[hit], atol=1e-4)
+
+
+def test_a_table_by_itself_learns_as_instant_ngp_does():
+    """Without patches that nobody photographed both have the same loss, before an object and in the open."""
+    scene, kept = tiny.scene(), dict(samples_per_step=1024, levels=4, log2_hashmap_size=11, max_resolution=32)
+    for frame in scene.frame, replace(scene.frame, reach=4.0, has_alpha=False):
+        config = replace(RegNeRF.smallest(), field="hash", unseen_patches=0, likelihood_weight=0.0, **kept)
+        method = build(RegNeRF, frame, config, torch.device("cpu"), 0)
+        known = build(InstantNGP, frame, config.numbers_of(NgpConfig), torch.device("cpu"), 0)
+        for one in method, known:
+            one.before_step(0, 1.0)
+        batch = method.batch(scene, chance())
+        assert method.loss(batch, 3) == known.loss(batch, 3)
+
+
+def test_a_table_grows_finer_and_reaches_farther():
+    """At first its coarsest level is there alone, and an object is sampled in the middle of each ray."""
+    scene = tiny.scene()
+    config = replace(
+        RegNeRF.smallest(), field="hash", coarse_to_fine=0.5, annealing=0.5, levels=4, log2_hashmap_size=11
+    )
+    method = build(RegNeRF, scene.frame, config, torch.device("cpu"), 0)
+    rays, points = scene.sample_rays(64, chance()).rays, torch.rand(8, 3, generator=chance()) - 0.5
+    near, far = method.marcher.space.interval(rays)
+    for progress, share, levels in (0.0, 0.5, 1), (1.0, 1.0, 4):
+        method.before_step(0, progress)
+        samples = method.marcher.look_to_learn(rays, chance())[0].samples
+        aside = ((samples.t - (0.5 * (near + far))[samples.ray_index]) / (far - near)[samples.ray_index]).abs()
+        assert 0.35 * share < float(aside.max()) <= 0.5 * share
+        encoded = method.marcher._encoded(points).view(8, 4, -1)
+        assert encoded.abs().amax((0, 2)).gt(0).tolist() == [i < levels for i in range(4)]

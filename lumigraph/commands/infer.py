@@ -64,9 +64,10 @@ class Infer:
 
     def _inferred(self, made_by: Any, prior: Any, output: Path) -> tuple[Any, dict[str, str]]:
         """The run of a scene, and what to say of it."""
-        from ..capture import PROCEDURAL, open_dataset, single_image
+        from ..capture import PROCEDURAL, kind_of, open_dataset, single_image, sources_of
         from ..capture.assemble import HOLD_OUT
         from ..capture.photos import is_bare
+        from ..collection import Collection
         from ..dataset import check_kind
         from ..run.inferred import infer
         from ..scene import Scene
@@ -77,6 +78,11 @@ class Infer:
             raise LumigraphError(
                 f"{self.scene} holds no poses, and {name} must know where photographs were taken from; "
                 f"find them first: lumigraph capture {self.scene}"
+            )
+        if kind_of(self.scene, Scene) is Collection:
+            raise LumigraphError(
+                f"{name} is told one scene, and {self.scene} is a collection; name one of its scenes: "
+                f"lumigraph infer {self.prior} {next(iter(sources_of(self.scene).values()))}"
             )
         options: dict[str, Any] = {"downscale": self.downscale, "reader": self.reader}
         scene = open_dataset(self.scene, Scene, **options)

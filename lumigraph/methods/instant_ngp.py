@@ -29,6 +29,7 @@ from ..components.sampling.marching import FIRST_RAYS, rays_for, reached
 from ..components.sampling.occupancy import OccupancyGrid
 from ..components.sampling.spaces import Box, space_of
 from ..components.sampling.unbounded import RAYS, OpenNumbers, Unbounded, rays_of, unbounded
+from ..components.training.coarse_to_fine import band_weights
 from ..components.training.corrections import Setting
 from ..components.training.distillation import distil
 from ..components.training.exposed import Exposed
@@ -119,6 +120,8 @@ class InstantNGP(Exposed, RayMethod):  # type: ignore[override]  # what is accep
         self.unbounded = unbounded(frame, self.space, config) if config.contraction else None
         if self.unbounded:
             self.rays_per_chunk = RAYS
+        self.sampled = 1.0  # share of each ray of an object, around its middle, that is sampled in training
+        self.joined = 1.0  # how far the finer levels have joined the coarsest in training
         self.expose(frame, config.exposure_correction)
         refining, rate = config.refine_cameras, config.pose_learning_rate
         self.poses = PoseRefinement(frame.image_count, rate) if refining else None
@@ -213,6 +216,10 @@ class InstantNGP(Exposed, RayMethod):  # type: ignore[override]  # what is accep
 
     def _march(self, rays: Rays, jitter: Float[Tensor, " ray"] | None = None) -> Look:
         found = self.occupancy.sample(rays, self.frame.near, *self.lattice, jitter=jitter)
+        if self.sampled < 1 and jitter is not None:
+            near, far = self.space.interval(rays)
+            aside = (found.t - (0.5 * (near + far))[found.ray_index]).abs()
+            found = found.keep(aside < (0.5 * self.sampled * (far - near))[found.ray_index])
         samples, asked = reached(rays, found, self.density, self.config.transmittance_threshold)
         points, directions = samples.along(rays)
         density, rgb = self.field(points, directions)
@@ -235,10 +242,7 @@ class InstantNGP(Exposed, RayMethod):  # type: ignore[override]  # what is accep
         background = backdrop(batch, self.background, generator, opaque=self.unbounded is not None)
         rendering = composite(look.samples, look.density, look.rgb, background)
         residual, self.figures["mse"] = residuals(rendering, batch, background, self.gains)
-        # Divided by delta, so that the linear part has slope 1.
-        delta = self.config.huber_delta
-        huber = nn.functional.huber_loss(residual, torch.zeros_like(residual), delta=delta) / delta
-        return {"huber": huber, **terms}
+        return {"huber": huber(residual, self.config.huber_delta), **terms}
 
     def optimizers(self) -> list[torch.optim.Optimizer]:
         networks = [*self.network.density_network.parameters(), *self.network.colour_network.parameters()]
@@ -291,9 +295,10 @@ class InstantNGP(Exposed, RayMethod):  # type: ignore[override]  # what is accep
 
     def _encoded(self, points: Float[Tensor, "sample 3"]) -> Float[Tensor, "sample width"]:
         """The network's input; while poses are refined, of as many levels as have joined."""
-        return self.network.encode(
-            self.space.warp(points), self.poses.weights(self.config.levels) if self.poses else None
-        )
+        weights = self.poses.weights(self.config.levels) if self.poses else None
+        if self.joined < 1 and weights is None:
+            weights = band_weights(self.config.levels, self.joined, 0.0, 1.0).to(self.device)
+        return self.network.encode(self.space.warp(points), weights)
 
     def storage(self) -> dict[str, Stored]:
         """The table as whole numbers, the networks as halves; of the grid, marks alone are needed for pictures."""
@@ -319,3 +324,8 @@ class InstantNGP(Exposed, RayMethod):  # type: ignore[override]  # what is accep
 
     def refined(self, cameras: Camera) -> Camera:
         return self.poses.refined(cameras) if self.poses else cameras
+
+
+def huber(residual: Float[Tensor, "row 3"], delta: float) -> Float[Tensor, ""]:
+    """The mean of residuals' Huber loss, divided by delta, so that the linear part has slope 1."""
+    return nn.functional.huber_loss(residual, torch.zeros_like(residual), delta=delta) / delta

@@ -8,14 +8,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import asdict, dataclass, fields, replace
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from ..camera import Camera
-from ..components.fields.hash_field import HashNumbers, check_levels
+from ..components.fields.hash_field import TABLE_ON_A_CPU, HashNumbers, check_levels
 from ..components.training.fog import evened
 from ..components.training.patch_flow import SIDE, PatchFlow
 from ..components.training.photometric import backdrop, residuals
@@ -26,7 +26,7 @@ from ..rays import Look, Rays, Rendering
 from ..scene import Batch, Frame, Scene
 from ..volume import composite
 from .instant_ngp import Config as NgpConfig
-from .instant_ngp import InstantNGP
+from .instant_ngp import InstantNGP, huber
 from .mip_nerf import Config as MipConfig
 from .mip_nerf import MipNeRF
 
@@ -52,6 +52,15 @@ class Config(HashNumbers, MipConfig):
     final_table_learning_rate: LearningRate = 1e-3
     table_width: Width = 64  # neurons per hidden layer
     samples_per_step: Annotated[int, between(64, 1 << 24)] = 1 << 18
+    steps_per_diagonal: Annotated[int, between(4, 16_384)] = 1024
+    cone_angle: Share = 1 / 256
+    transmittance_threshold: Share = 1e-4
+    table_occupancy_threshold: NonNegative = 0.05
+    hash_weight_decay: NonNegative = 0.0
+    huber_delta: PositiveShare = 0.1
+    sh_bands: Annotated[int, between(1, 4)] = 4
+    sweep_weight: NonNegative = 0.03  # of what plane sweeps found in the open, at first; it falls to nothing
+    coarse_to_fine: Share = 0.0  # share of the budget in which finer levels of the table join the coarsest; 0: at once
 
     def check(self) -> None:
         """Raises LumigraphError for numbers that contradict each other."""
@@ -62,7 +71,6 @@ class Config(HashNumbers, MipConfig):
         ours = {x.name: getattr(self, x.name) for x in fields(self)}
         if kind is NgpConfig:  # a table learns faster than a network, and asks smaller networks
             ours |= {name: ours[called] for name, called in OF_TABLE.items()}
-            ours |= {name: getattr(NgpConfig, name) for name in ITS_OWN}
         return kind(**{x.name: ours[x.name] for x in fields(kind) if x.name in ours})
 
 
@@ -70,16 +78,20 @@ OF_TABLE = {  # names of Instant-NGP's numbers, and what they are called beside 
     "learning_rate": "table_learning_rate",
     "final_learning_rate": "final_table_learning_rate",
     "hidden_width": "table_width",
+    "occupancy_threshold": "table_occupancy_threshold",
+    "depth_weight": "sweep_weight",
 }
-ITS_OWN = ("depth_weight", "occupancy_threshold")  # numbers of Instant-NGP that mean something else here
 TABLE: dict[str, Any] = {  # of a CPU, as Instant-NGP's preset has it
     "table_learning_rate": 2e-2,
     "table_width": 32,
-    "levels": 8,
-    "features_per_level": 4,
-    "log2_hashmap_size": 17,
-    "max_resolution": 512,
+    **TABLE_ON_A_CPU,
     "samples_per_step": 1 << 15,
+    "steps_per_diagonal": 384,
+    "cone_angle": 1 / 96,
+    "transmittance_threshold": 1e-3,
+    "table_occupancy_threshold": 0.15,
+    "hash_weight_decay": 0.3,
+    "huber_delta": 0.3,
 }
 FLOWING = 0.05  # of a budget of seconds: the share that learning what is likely may take
 STRIDES = (1, 2, 4)  # pixels between rays of a patch: what is smooth, and what looks like a photograph, is so in each
@@ -104,6 +116,7 @@ class RegNeRF(RayMethod):
     """Mip-NeRF or Instant-NGP, which learns as ever from photographs, and is told off for what it shows elsewhere."""
 
     Config = Config
+    before: ClassVar[dict[str, Any]] = {"huber_delta": 1.0}  # a table's loss was square
 
     def __init__(self, frame: Frame, config: Any = None):
         config = config or Config()
@@ -182,7 +195,9 @@ class RegNeRF(RayMethod):
         rays = self.marcher.poses(batch.rays) if self.marcher.poses else batch.rays
         rays = rays if unseen is None else joined(rays, unseen)
         looks, terms = self._look(rays, generator)
-        background = backdrop(batch, self.background, generator)
+        table = isinstance(self.marcher, InstantNGP)
+        opaque = table and self.marcher.unbounded is not None
+        background = backdrop(batch, self.background, generator, opaque=opaque)
         for look, weight in looks:
             # Of a patch, the picture before the scene's own background is judged.
             behind = background.expand(len(batch), 3)
@@ -192,7 +207,9 @@ class RegNeRF(RayMethod):
             whole = composite(look.samples, look.density, look.rgb, behind, places=places)
             seen, rest = (part(whole, x) for x in (slice(len(batch)), slice(len(batch), None)))
             residual, self.figures["mse"] = residuals(seen, batch, background)
-            if weight:
+            if table:
+                terms["huber"] = huber(residual, self.config.huber_delta)
+            elif weight:
                 terms[look.name] = weight * residual.square().mean()
         if unseen is not None:
             terms |= self._unlike(rest)
@@ -230,9 +247,10 @@ class RegNeRF(RayMethod):
 
     def before_step(self, step: int, progress: float) -> None:
         c, self._progress = self.config, progress
-        if isinstance(self.marcher, MipNeRF):
-            grown = progress / c.annealing if progress < c.annealing else 1.0
-            self.marcher.sampled = max(grown, c.annealing_start)
+        grown = progress / c.annealing if progress < c.annealing else 1.0
+        self.marcher.sampled = max(grown, c.annealing_start)
+        if isinstance(self.marcher, InstantNGP):
+            self.marcher.joined = progress / c.coarse_to_fine if progress < c.coarse_to_fine else 1.0
         self.marcher.before_step(step, progress)
 
     def after_step(self, step: int) -> None:
