@@ -30,6 +30,7 @@ CHUNK = 1 << 13  # rays asked at once
 POINTS = 1 << 18  # points asked at once
 PER_CELL = 32  # rays that look, for each cell of one face of the cube
 MOST_RAYS = 1 << 22
+LEAST_PASSING = 1e-6  # share of light that a leaf lets through
 
 Density = Callable[[Float[Tensor, "point 3"]], Float[Tensor, " point"]]
 Harmonics = Callable[[Float[Tensor, "point 3"]], tuple[Float[Tensor, " point"], Float[Tensor, "point basis 3"]]]
@@ -175,11 +176,13 @@ def points_in(
 
 
 def averaged_density(leaves: Leaves, density: Density, count: int, generator: torch.Generator) -> None:
-    """Each leaf's mean over random points."""
+    """Each leaf's, so that it stops as much light over its side as the field does on average over random points."""
     centres, side = leaves.centres
     for rows in torch.arange(len(leaves), device=centres.device).split(max(POINTS // count, 1)):
         points = points_in(centres[rows], side[rows], count, generator)
-        leaves.density.data[rows, 0] = density(points.flatten(0, 1)).view(len(rows), count).mean(1)
+        thickness = density(points.flatten(0, 1)).view(len(rows), count) * side[rows, None]
+        passing = torch.exp(-thickness).mean(1).clamp_min(LEAST_PASSING)
+        leaves.density.data[rows, 0] = -passing.log() / side[rows]
 
 
 def seen(leaves: Leaves, cameras: Camera, numbers: Baking, generator: torch.Generator) -> Bool[Tensor, " row"]:
