@@ -50,6 +50,8 @@ class Canonicaliser(nn.Module):
             for parameter in self.parameters():
                 if parameter.ndim > 1:
                     parameter.normal_(std=parameter.shape[-1] ** -0.5, generator=generator)
+                else:
+                    parameter.zero_()  # a bias, which would be drawn from chance that no seed decides
 
     def forward(self, points: Float[Tensor, "some point 3"], weights: Float[Tensor, "some point"]) -> Canonical:
         """points: centred, of spread one; weights: adding up to one"""
