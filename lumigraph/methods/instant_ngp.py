@@ -14,8 +14,8 @@ from ..camera import Camera
 from ..components.clouds.dense_points import compile_sweep
 from ..components.fields.hash_field import (
     CALM,
-    TABLE_ON_A_CPU,
-    TINY_TABLE,
+    ON_A_CPU,
+    TINY,
     HashField,
     HashNumbers,
     bytes_kept,
@@ -137,14 +137,7 @@ class InstantNGP(Exposed, RayMethod):  # type: ignore[override]  # what is accep
         if device.type == "cuda":
             return Config()
         return Config(
-            **TABLE_ON_A_CPU,
-            hidden_width=32,
-            samples_per_step=1 << 15,
-            steps_per_diagonal=384,
-            transmittance_threshold=1e-3,
-            cone_angle=1 / 96,
-            occupancy_threshold=0.15,
-            learning_rate=2e-2,
+            **ON_A_CPU,
             hash_weight_decay=0.3,
             huber_delta=0.3,
         )
@@ -153,14 +146,7 @@ class InstantNGP(Exposed, RayMethod):  # type: ignore[override]  # what is accep
     def smallest(cls) -> Any:
         """Tiny tables and networks with both corrections and a grid of three sizes, within some twenty quick steps."""
         return Config(
-            **TINY_TABLE,
-            hidden_width=16,
-            geometry_features=8,
-            sh_bands=2,
-            samples_per_step=2048,
-            steps_per_diagonal=128,
-            occupancy_resolution=16,
-            learning_rate=2e-2,
+            **TINY,
             exposure_correction="yes",
             refine_cameras=True,
         )

@@ -14,7 +14,7 @@ from ..components.clouds.dense_points import compile_sweep
 from ..components.fields import hash_field
 from ..components.fields.appearance import PhotographCodes, drawn, fitted
 from ..components.fields.coded_field import of_samples
-from ..components.fields.hash_field import TABLE_ON_A_CPU, TINY_TABLE, HashNumbers
+from ..components.fields.hash_field import ON_A_CPU, TINY, HashNumbers
 from ..components.fields.wild_field import with_passing
 from ..components.fields.wild_hash import WildHash
 from ..components.fields.wild_networks import WildNetworks
@@ -129,16 +129,9 @@ class NeRFW(RayMethod):
             transient_width=32,
             beta_min=0.1,
             transient_start=0.1,
-            hidden_width=32,
-            learning_rate=2e-2,
+            **ON_A_CPU,
             final_learning_rate=1e-3,
             decay_start=0.3,
-            **TABLE_ON_A_CPU,
-            samples_per_step=1 << 15,
-            steps_per_diagonal=384,
-            transmittance_threshold=1e-3,
-            cone_angle=1 / 96,
-            occupancy_threshold=0.15,
         )
 
     @classmethod
@@ -150,15 +143,8 @@ class NeRFW(RayMethod):
             transient_code=4,
             transient_layers=1,
             transient_width=16,
-            hidden_width=16,
-            learning_rate=2e-2,
+            **TINY,
             final_learning_rate=1e-3,
-            **TINY_TABLE,
-            geometry_features=8,
-            sh_bands=2,
-            samples_per_step=2048,
-            steps_per_diagonal=128,
-            occupancy_resolution=16,
         )
 
     @classmethod
