@@ -102,6 +102,8 @@ def test_pictures_are_traced_once(source, tmp_path, monkeypatch):
     monkeypatch.setattr(procedural, "picture", lambda *_: pytest.fail("traced again"))
     again = open_scene(source, cache=tmp_path)
     assert torch.equal(first.photograph(3).rgb, again.photograph(3).rgb)
+    some = open_scene(source, cache=tmp_path, part={"photographs": [first.photograph(i).name for i in (0, 1, 3)]})
+    assert torch.equal(first.photograph(3).rgb, some.photograph(2).rgb)  # whichever scene asks
     with pytest.raises(pytest.fail.Exception):
         open_scene(f"{source},seed=1", cache=tmp_path)
 

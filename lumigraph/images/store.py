@@ -104,21 +104,19 @@ class ImageStore:
         memory: int | None = None,
         cache: Path | None = None,
         progress: Callable[[int], object] = lambda done: None,
-        keep: bool = False,
     ) -> ImageStore:
         """Read pictures in parallel.
 
         memory:   bytes that may stay in memory; None means a share of the machine's
         cache:    where larger captures go; None means the user's cache folder. It may be deleted at any time.
         progress: told how many are done
-        keep:     whether they go to the file even if they fit, so that nobody makes them again
         Raises LumigraphError where the cache's disk is full, and whatever the pictures' `read` raises.
         """
         sizes = torch.tensor([p.size for p in pictures])
         total, memory = int(sizes.prod(-1).sum()), memory_for_images() if memory is None else memory
         nameless = any(p.identity is None for p in pictures)
         called = name_of(pictures)
-        if 4 * total <= memory and not keep:
+        if 4 * total <= memory:
             rgba = np.empty(total, np.int32)
             has_alpha, trusted = fill(rgba, pictures, progress, shuffled=False)
             left, name = memory - 4 * total, None if nameless else f"{called} in order"

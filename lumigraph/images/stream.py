@@ -16,6 +16,7 @@ from ..choice import evenly
 from ..errors import LumigraphError
 from ..memory import memory_for_images
 from .cache import MARK, cache_folder, free_space
+from .kept import kept
 from .store import ImageSource, ImageStore, PixelBatch, name_of
 
 OF_DISK = 0.5  # share of what is free there that a file of photographs may take
@@ -38,14 +39,19 @@ def load(
     keep: bool = False,
 ) -> ImageStore:
     """Photographs in memory, else in a file, else, where that would take more than half of what is free on its disk,
-    read again and again. Arguments and faults as of `ImageStore.load`."""
+    read again and again. Arguments and faults as of `ImageStore.load`.
+
+    keep: whether each picture goes to a file of the cache even if all fit, so that nobody makes it again
+    """
     memory = memory_for_images() if memory is None else memory
     size = 4 * sum(width * height for width, height in (p.size for p in pictures))
-    if size > memory or keep:
+    if keep:
+        pictures = [kept(picture, cache or cache_folder()) for picture in pictures]
+    if size > memory:
         folder = (cache or cache_folder() / "images") / name_of(pictures)
         if not (folder / MARK).exists() and size > OF_DISK * free_space(folder):
             return ImageStream(pictures, memory, cache)
-    return ImageStore.load(pictures, memory, cache, progress, keep)
+    return ImageStore.load(pictures, memory, cache, progress)
 
 
 class ImageStream(ImageStore):
