@@ -1,4 +1,4 @@
-"""Names as people read them: in which order, and which one was meant."""
+"""Names as people read them: in which order, how many, and which one was meant."""
 
 from __future__ import annotations
 
@@ -15,6 +15,11 @@ def natural(name: str) -> tuple[str, str]:
     Names whose numbers have the same number of digits keep the order that `sorted` gives them.
     """
     return re.sub("[0-9]+", lambda number: number[0].zfill(DIGITS), name), name
+
+
+def counted(number: int, noun: str) -> str:
+    """So many of them: "3 photographs", "1 photograph", "no photographs"."""
+    return f"{number or 'no'} {noun}{'' if number == 1 else 's'}"
 
 
 def meant(name: str, known: Sequence[str]) -> str | None:

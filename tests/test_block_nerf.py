@@ -16,7 +16,7 @@ from lumigraph.components.fields.appearance import Appearance
 from lumigraph.components.fields.visibility import Visibility, transmittance
 from lumigraph.components.sampling.spaces import space_of
 from lumigraph.components.training.moving import CELLS, Moving
-from lumigraph.composition import InBlocks, Mixing, Placed, align_appearance
+from lumigraph.composition import InBlocks, Mixing, Nearby, Placed, align_appearance
 from lumigraph.composition.mixing import inverse_distance, seeing, shares
 from lumigraph.errors import LumigraphError
 from lumigraph.evaluate import evaluate
@@ -351,6 +351,28 @@ def test_controls_are_passed_on_and_exposures_are_made_one(exposed):
         both.batch(scene, torch.Generator())
     with pytest.raises(LumigraphError, match="as many centres"):
         InBlocks(scene.frame, parts, CENTRES[:1], RADII[:1])
+
+
+def test_blocks_are_opened_as_a_camera_comes_near():
+    opened = []
+
+    def part(number: int) -> Placed:
+        opened.append(number)
+        return Placed(Witness((number / 20, 0.0, 0.0), 1.0), HERE)
+
+    nearby = Nearby(part, 20, most=3)
+    centres = torch.tensor([[4.0 * i, 0, 0] for i in range(20)])
+    row = InBlocks(WHITE, nearby, centres, torch.full((20,), 5.0))
+    assert opened == list(range(20))  # asked once what they can be told
+    for number in (2, 15, 16):
+        opened.clear()
+        row.weights(eye((4.0 * number, 0.0, 0.0)))
+        assert set(opened) <= {number - 1, number, number + 1}
+    everywhere = row.given().weights(eye((4.0 * 15.5, 0.0, 0.0)))
+    assert everywhere.nonzero()[:, 0].tolist() == [15, 16]
+    opened.clear()
+    assert [nearby[i].method for i in (3, 4, 5, 3)][0] is nearby[3].method and opened == [3, 4, 5]
+    assert nearby[6] is not None and nearby[4] is not None and opened == [3, 4, 5, 6, 4]  # 4 was closed for 6
 
 
 # One light for all

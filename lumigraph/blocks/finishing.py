@@ -8,7 +8,7 @@ from pathlib import Path
 
 from ..capabilities import HasGaussians, can, needs
 from ..components.fields.appearance import Appearance
-from ..composition import align_appearance
+from ..composition import Nearby, align_appearance
 from ..export.splats import export_splats
 from ..run.block_plan import NAME, Plan
 from ..run.block_run import BlockRun
@@ -38,7 +38,7 @@ def aligned(opened: BlockRun, again: Sequence[str]) -> Plan:
     if all(name in known for name in names):
         return opened.plan
     opened.plan = replace(opened.plan, appearance=known)
-    parts = [opened.placed(block) for block in opened.blocks]
+    parts = Nearby(lambda i: opened.placed(opened.blocks[i]), len(names))
     kept = [i for i, name in enumerate(names) if name in known]
     codes = align_appearance(parts, opened.centres, opened.radii, opened.cameras()["train"], kept or None)
     found = {name: code.tolist() for name, code in zip(names, codes, strict=True)}

@@ -17,7 +17,7 @@ from ..errors import LumigraphError, LumigraphWarning
 from ..geometry import RIGID
 from ..images import ImageSource, ImageStore, in_parallel, load
 from ..lens import Equirectangular, Lens, Pinhole
-from ..names import natural
+from ..names import counted, natural
 from ..progress import counting
 from ..scene import Forward, Frame, Scene
 from .beside import make_about, make_layers
@@ -304,7 +304,3 @@ def about_small(source: str, chosen: list[Chosen]) -> list[str]:
         f"{source} holds {counted(len(small), 'photograph')} smaller than asked for, such as {width}x{height} "
         f"instead of {wide}x{high}; using them as they are"
     ]
-
-
-def counted(number: int, noun: str) -> str:
-    return f"{'no' if number == 0 else number} {noun}{'' if number == 1 else 's'}"

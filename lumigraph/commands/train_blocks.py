@@ -11,6 +11,7 @@ from tyro.conf import arg
 
 from .. import methods
 from ..errors import LumigraphError
+from ..names import counted
 from ..ranges import Count
 from .capture import posed
 from .common import choose_device, exit_code, next_free, option, say, scene_name, show, told_budget, typed
@@ -182,11 +183,10 @@ def tell_plan(output: Path, plan: Any, budget: Any) -> None:
     each = " ".join(
         f"{value:g} {name}" if name != "quality" else f"as {value} asks" for name, value in plan.budget.items()
     )
+    least, most = min(counts), counted(max(counts), "photograph")
+    many = most if least == max(counts) else f"{least} to {most}"
     total = f" of {budget}" if budget is not None else ""
-    say(
-        f"{len(plan.blocks)} blocks of {min(counts)} to {max(counts)} photographs, each learnt for {each}{total}; "
-        f"{output / 'blocks.png'} shows them"
-    )
+    say(f"{counted(len(counts), 'block')} of {many}, each learnt for {each}{total}; {output / 'blocks.png'} shows them")
 
 
 def tell_done(output: Path, found: Any) -> None:

@@ -6,6 +6,7 @@ from .blocks import merged as merged
 from .composed import compose as compose
 from .in_blocks import InBlocks as InBlocks
 from .mixing import Mixing as Mixing
+from .nearby import Nearby as Nearby
 from .picked import PickedCloud as PickedCloud
 from .picked import cropped as cropped
 from .placed import Placed as Placed

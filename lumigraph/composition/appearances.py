@@ -14,7 +14,9 @@ from ..choice import evenly
 from ..components.fields.appearance import Appearance
 from ..progress import track
 from ..scene import Batch
-from .exposures import exposed, usual_exposure
+from .asked import Asked
+from .exposures import exposed
+from .nearby import Nearby
 from .placed import Placed
 from .sight import saw
 
@@ -24,7 +26,7 @@ WELL = 0.5  # of the best seen pixel's visibility, from which on pixels belong t
 
 
 def align_appearance(
-    parts: Sequence[Placed],
+    parts: Sequence[Placed] | Nearby,
     centres: Float[Tensor, "block 3"],
     radii: Float[Tensor, " block"],
     cameras: Camera,
@@ -48,8 +50,15 @@ def align_appearance(
     A block that learnt no appearance has an empty code, and is given nothing. To align a block that was trained again,
     give the others their codes first and name them in `kept`.
     """
-    exposure, order = usual_exposure(parts), []
-    lit = [exposed(part, exposure) for part in parts]
+    parts = Nearby.of(parts)
+    exposure, order = Asked.of(parts).usual, []
+    found = dict[int, Appearance]()
+
+    def lit(number: int) -> Placed:
+        """A part in its light, as far as that is found."""
+        part = exposed(parts[number], exposure)
+        return replace(part, method=part.method.given(found[number])) if number in found else part
+
     if kept is None:
         middle = centres.mean(0)
         kept = [int((centres - middle).norm(dim=-1).argmin())]
@@ -62,12 +71,13 @@ def align_appearance(
         order.append((i, reached))
         done.append(i)
     for i, neighbours in track(order, "Aligning blocks", len(order)):
-        if not appearance_of(lit[i]).numel():
+        own = lit(i)
+        if not appearance_of(own).numel():
             continue
-        found = [x for k in neighbours if (x := patch(lit[k], lit[i], centres[[k, i]], radii[[k, i]], cameras))]
-        if found:
-            lit[i] = replace(lit[i], method=lit[i].method.given(joined(found)))
-    return [appearance_of(part) for part in lit]
+        alike = [x for k in neighbours if (x := patch(lit(k), own, centres[[k, i]], radii[[k, i]], cameras))]
+        if alike:
+            found[i] = Appearance(appearance_of(replace(own, method=own.method.given(joined(alike)))))
+    return [appearance_of(lit(i)) for i in range(len(parts))]
 
 
 def appearance_of(part: Placed) -> Float[Tensor, " code"]:

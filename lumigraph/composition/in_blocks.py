@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Any, NoReturn
 
 import torch
@@ -20,8 +21,10 @@ from ..errors import LumigraphError
 from ..method import Method
 from ..rays import Rendering
 from ..scene import Frame, Photograph
-from .exposures import EXPOSURE, exposed, span, usual_exposure
+from .asked import Asked
+from .exposures import EXPOSURE, exposed
 from .mixing import UNSEEN, Mixing, inverse_distance, seeing, shares
+from .nearby import Nearby
 from .placed import Placed
 from .sight import GLANCE, saw
 
@@ -33,9 +36,10 @@ class InBlocks(Method):
     """Several placed methods, each for a part of one large scene. Ready to render, and nothing else.
 
     frame:     the common frame, in which cameras, centres and radii are given
-    parts:     a block each: its method, and the way from its own frame to the common one, which is
-               `frame.to_source.inverse @ part_frame.to_source`. None of them leads: cameras of the common frame belong
-               to no block's photographs
+    parts:     a block each: its method, on the device where it stays, and the way from its own frame to the common one,
+               which is `frame.to_source.inverse @ part_frame.to_source`. None of them leads: cameras of the common
+               frame belong to no block's photographs. `Nearby` opens them where a camera comes near; here each is
+               asked once what it can be told
     centres:   where blocks are
     radii:     how far from its centre a camera may be that a block is asked about. A camera that is in reach of none is
                shown by the nearest block
@@ -54,7 +58,7 @@ class InBlocks(Method):
     def __init__(
         self,
         frame: Frame,
-        parts: Sequence[Placed],
+        parts: Sequence[Placed] | Nearby,
         centres: Float[Tensor, "block 3"],
         radii: Float[Tensor, " block"],
         mixing: Mixing | None = None,
@@ -63,16 +67,14 @@ class InBlocks(Method):
         super().__init__(frame, mixing or Mixing())
         if not len(parts) == len(centres) == len(radii) > 0:
             raise LumigraphError(f"{len(parts)} blocks need as many centres and radii, and at least one block")
-        self.usual = usual_exposure(parts)
+        parts = Nearby.of(parts)
+        self.asked = Asked.of(parts)
+        self.usual = self.asked.usual
         self.register_buffer("centres", centres.float(), persistent=False)
         self.register_buffer("radii", radii.float(), persistent=False)
         self.exposures = exposures
-        self._hold([exposed(part, self.usual) for part in parts])
+        self.parts = parts.each(partial(exposed, exposure=self.usual))
         self.eval()
-
-    def _hold(self, parts: Sequence[Placed]) -> None:
-        self.parts = tuple(parts)
-        self.methods = nn.ModuleList(part.method for part in parts)  # so that they move to devices together
 
     # Being seen
 
@@ -127,10 +129,9 @@ class InBlocks(Method):
         Raises LumigraphError where a block knows none."""
         weights = self._at(points)
         density = torch.zeros_like(points[:, 0])
-        for i, part in enumerate(self.parts):
+        for i in (weights > LITTLE).any(0).nonzero()[:, 0].tolist():
             here = (weights[:, i] > LITTLE).nonzero()[:, 0]
-            if len(here):
-                density = density.index_add(0, here, weights[here, i] * part.density(points[here]))
+            density = density.index_add(0, here, weights[here, i] * self.parts[i].density(points[here]))
         return density
 
     def _at(self, points: Float[Tensor, "point 3"]) -> Float[Tensor, "point block"]:
@@ -142,23 +143,17 @@ class InBlocks(Method):
 
     @property
     def accepts(self) -> tuple[type, ...]:  # type: ignore[override]  # it depends on the blocks
-        every = all(Photograph in part.method.accepts for part in self.parts)
-        return (Photograph,) if every else ()
+        return (Photograph,) if self.asked.photographs else ()
 
     @property
     def controls(self) -> tuple[Control, ...]:
         """Exposure, and what else any block can be told that does not name photographs."""
-        found: dict[str, Control] = {}
-        for part in self.parts:
-            for control in part.method.controls:
-                if not control.of_photographs and control.name != EXPOSURE:
-                    found.setdefault(control.name, control)
-        spanned = span(self.parts)
-        if spanned and self.usual is not None:
-            least, most = (x - self.usual for x in spanned)
+        found = self.asked.controls
+        if self.asked.exposures and self.usual is not None:
+            least, most = (x - self.usual for x in self.asked.exposures)
             about = "As if photographed with so much more or less exposure than usual, within what was photographed."
-            found[EXPOSURE] = Control(EXPOSURE, 0.0, (least, most), unit="stops", about=about)
-        return tuple(found.values())
+            found = (*found, Control(EXPOSURE, 0.0, (least, most), unit="stops", about=about))
+        return found
 
     def given(self, *evidence: Any, **controls: Value) -> Method:
         """The same blocks, each told what it has a control for; or each in the appearance that it finds in a
@@ -167,15 +162,15 @@ class InBlocks(Method):
         told = super().given(*(piece for piece in evidence if not isinstance(piece, self.accepts)), **controls)
         assert isinstance(told, InBlocks)
         passed = {name: value for name, value in told.told.items() if name != EXPOSURE and name in controls}
-        parts = [part.given(passed) for part in self.parts]
+        parts = self.parts.each(lambda part: part.given(passed))
         if EXPOSURE in controls and self.usual is not None:
-            parts = [exposed(part, self.usual + float(told.told[EXPOSURE])) for part in parts]
+            parts = parts.each(partial(exposed, exposure=self.usual + float(told.told[EXPOSURE])))
         for photograph in mine:
             parts = self._seen_in(photograph, parts)
-        told._hold(parts)
+        told.parts = parts
         return told
 
-    def _seen_in(self, photograph: Photograph, parts: Sequence[Placed]) -> list[Placed]:
+    def _seen_in(self, photograph: Photograph, parts: Nearby) -> Nearby:
         """Parts in the light of a photograph, and in its exposure where that is known, those in reach of its camera."""
         camera, exposure = photograph.camera.to(self.device), None
         if self.exposures is not None and camera.image_index is not None:
@@ -183,14 +178,12 @@ class InBlocks(Method):
             exposure = found if abs(found) < float("inf") else None
         distance = (camera.position - self.centres).norm(dim=-1)
         asked = inverse_distance(distance, self.radii, self.config.power, self.config.most) > 0
-        lit = []
-        for part, near in zip(parts, asked.tolist(), strict=True):
-            if near:
-                part = exposed(part, exposure)
-                local = replace(photograph, camera=part.camera(photograph.camera))
-                part = replace(part, method=part.method.given(local))
-            lit.append(part)
-        return lit
+        lit = {}
+        for i in asked.nonzero()[:, 0].tolist():
+            part = exposed(parts[i], exposure)
+            local = replace(photograph, camera=part.camera(photograph.camera))
+            lit[i] = replace(part, method=part.method.given(local))
+        return parts.but(lit)
 
     def batch(self, data: Any, generator: torch.Generator) -> NoReturn:
         raise LumigraphError("A scene in blocks does not learn as a whole; train its blocks, each by itself")

@@ -24,7 +24,7 @@ from .. import files, methods
 from ..camera import Camera
 from ..capabilities import HasGaussians, can
 from ..capture import Before, Part, open_dataset
-from ..composition import InBlocks, PickedCloud, Placed, merged
+from ..composition import InBlocks, Nearby, PickedCloud, Placed, merged
 from ..errors import LumigraphError, LumigraphWarning
 from ..geometry import Similarity
 from ..method import Method
@@ -127,12 +127,13 @@ class BlockRun(Opened):
 
         exposures: of photographs that it will be given, by their `image_index`
         """
-        parts = [self.placed(block, device) for block in self.blocks]
-        if all(can(part.method, HasGaussians) for part in parts):
+        if all(can(methods.find(run.method_name), HasGaussians) for run in self.runs.values()):
+            parts = [self.placed(block, device) for block in self.blocks]
             level = self.centres
             level[:, 2] = level[:, 2].mean()  # so that cells stand upright
             return PickedCloud(self.frame, merged(parts, level)).to(device)
-        return InBlocks(self.frame, parts, self.centres, self.radii, exposures=exposures).to(device)
+        nearby = Nearby(lambda i: self.placed(self.blocks[i], device), len(self.blocks))
+        return InBlocks(self.frame, nearby, self.centres, self.radii, exposures=exposures).to(device)
 
     def placed(self, block: Block, device: torch.device | str = "cpu") -> Placed:
         """A block in its place, in the light that all are shown in where they have been aligned."""

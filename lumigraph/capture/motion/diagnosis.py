@@ -12,7 +12,7 @@ from jaxtyping import Float
 from scipy.spatial import ConvexHull, QhullError
 
 from ...library import pycolmap
-from ...names import natural
+from ...names import counted, natural
 from ..folds import in_steps, jumps
 from ..normalise import where_axes_meet
 from ..photos import Intake, Photo
@@ -310,7 +310,3 @@ def listed(names: Mapping[str, str] | Sequence[str]) -> str:
     found = list(names)
     rest = f" and {len(found) - NAMED} more" if len(found) > NAMED else ""
     return ", ".join(found[:NAMED]) + rest
-
-
-def counted(count: int, noun: str) -> str:
-    return f"{count} {noun}{'' if count == 1 else 's'}"

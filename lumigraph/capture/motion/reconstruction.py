@@ -17,14 +17,14 @@ from ...files import claim as claim_file
 from ...files import read_json, remove, replacing, replacing_folder, write_bytes, write_json
 from ...library import pycolmap
 from ...locks import held
-from ...names import natural
+from ...names import counted, natural
 from ...progress import counting
 from ...ranges import typed
 from ..photos import Intake, Photo, gather
 from ..photos.track import Track, untracked
 from ..raw import REMEMBERED, Remembered
 from ..transforms import Made
-from .diagnosis import FEW_FEATURES, Diagnosis, Matches, counted, diagnose, folds, read_matches
+from .diagnosis import FEW_FEATURES, Diagnosis, Matches, diagnose, folds, read_matches
 from .drawings import draw_capture, draw_photographs
 from .folder import DRAWN, MASKS, RESULT, claim, claim_results, copy_masks, copy_photographs, stamp, write_model
 from .georeference import Georeference, georeference, gps_positions, upright
