@@ -13,7 +13,6 @@ import warnings
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -33,9 +32,8 @@ from ..scene import Frame, Scene
 from .block_plan import FOLDER, NAME, Block, Plan
 from .checkpoint import State
 from .folder import Run
-from .measured import read_evaluation
-from .opened import Opened
-from .settings import Settings
+from .opened import Trained
+from .settings import Settings, Source
 
 LARGEST_REACH = 64.0
 NONE = "it has no block that has learnt anything yet; `lumigraph train` with the same options goes on with it"
@@ -46,7 +44,7 @@ def is_block_run(folder: Path) -> bool:
     return files.is_file(folder / NAME)
 
 
-class BlockRun(Opened):
+class BlockRun(Trained):
     """A folder with a run in blocks. Raises LumigraphError where none of its blocks has a state.
 
     plan:   what blocks.json says
@@ -217,17 +215,8 @@ class BlockRun(Opened):
     # What evaluation says of it
 
     @property
-    def title(self) -> str:
-        source = self.plan.scene.source
-        return Path(source.partition(":")[2]).name if source.startswith("procedural:") else Path(source).name
-
-    @property
-    def renders(self) -> Path:
-        return self.folder / "renders"
-
-    @property
-    def paths(self) -> Path:
-        return self.folder / "paths"
+    def learnt_from(self) -> Source:
+        return self.plan.scene
 
     @property
     def method_name(self) -> str:
@@ -258,11 +247,6 @@ class BlockRun(Opened):
             plan.method, plan.config, self.frame, plan.scene, counts, plan.seed, {}, plan.device, plan.processor,
             plan.versions,
         )  # fmt: skip
-
-    def evaluation(self) -> dict[str, Any] | None:
-        """What eval.json says, if the run has been evaluated."""
-        path = self.folder / "eval.json"
-        return read_evaluation(path) if path.exists() else None
 
 
 def state_of(folder: Path, block: Block) -> Run | None:

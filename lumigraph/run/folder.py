@@ -38,13 +38,13 @@ from ..ranges import check
 from ..scene import Frame, Scene
 from . import cameras
 from .checkpoint import PACKED, Checkpoints, State
-from .measured import read_evaluation, read_rows
+from .measured import read_rows
 from .needs import check_memory
-from .opened import Opened
+from .opened import Trained
 from .settings import Settings, Source
 
 
-class Run(Opened):
+class Run(Trained):
     """A run's folder. `Run.create` makes one, `Run(folder)` opens one; LumigraphError if it is not one of ours.
 
     settings: what was trained on what
@@ -122,18 +122,8 @@ class Run(Opened):
     # What was trained on what
 
     @property
-    def title(self) -> str:
-        """The scene's name."""
-        source = self.settings.scene.source
-        return Path(source.partition(":")[2]).name if source.startswith("procedural:") else Path(source).name
-
-    @property
-    def renders(self) -> Path:
-        return self.folder / "renders"
-
-    @property
-    def paths(self) -> Path:
-        return self.folder / "paths"
+    def learnt_from(self) -> Source:
+        return self.settings.scene
 
     @property
     def method_name(self) -> str:
@@ -281,11 +271,6 @@ class Run(Opened):
         """One view at the steps at which it was taken."""
         found = sorted((self.folder / "previews").glob("*.png"))
         return {int(path.stem): path for path in found if re.fullmatch("[0-9]{6,12}", path.stem)}
-
-    def evaluation(self) -> dict[str, Any] | None:
-        """What eval.json says, if the run has been evaluated."""
-        path = self.folder / "eval.json"
-        return read_evaluation(path) if path.exists() else None
 
 
 def build(

@@ -13,6 +13,8 @@ from ..camera import Camera
 from ..export.sightings import all_around
 from ..method import Method
 from ..scene import Frame, Scene
+from .measured import read_evaluation
+from .settings import Source
 
 
 class Opened(ABC):
@@ -69,3 +71,36 @@ class Opened(ABC):
     def metrics(self) -> list[dict[str, Any]]:
         """What was measured while it was learnt, a row every few steps; none where that is not known."""
         return []
+
+
+class Trained(Opened):
+    """A folder in which something was learnt; films, camera paths and what was measured of it lie there too.
+
+    folder: where it lies
+    """
+
+    folder: Path
+
+    @property
+    @abstractmethod
+    def learnt_from(self) -> Source:
+        """Where its photographs or shapes came from."""
+
+    @property
+    def title(self) -> str:
+        """The scene's name."""
+        source = self.learnt_from.source
+        return Path(source.partition(":")[2]).name if source.startswith("procedural:") else Path(source).name
+
+    @property
+    def renders(self) -> Path:
+        return self.folder / "renders"
+
+    @property
+    def paths(self) -> Path:
+        return self.folder / "paths"
+
+    def evaluation(self) -> dict[str, Any] | None:
+        """What eval.json says, if it has been evaluated."""
+        path = self.folder / "eval.json"
+        return read_evaluation(path) if path.exists() else None
