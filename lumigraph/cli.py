@@ -17,6 +17,7 @@ from typing import Annotated, Any
 import tyro
 
 from . import __version__, methods
+from .allocation import settle_memory
 from .commands.bench import Bench
 from .commands.canonicalise import Canonicalise
 from .commands.capture import CaptureCommand
@@ -42,7 +43,7 @@ from .commands.view import ViewCommand
 from .errors import LumigraphError, LumigraphWarning
 from .files import refusal
 from .signals import exit_code, listening, number_of
-from .threads import considerate, share_one_arena
+from .threads import considerate
 
 COMMANDS: dict[str, type] = {
     "demo": Demo,
@@ -79,7 +80,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if arguments in (["--version"], ["-V"]):
         print(f"lumigraph {__version__}")
         return 0
-    share_one_arena()
+    settle_memory()
     try:
         with listening(), told_warnings(), considerate():
             return parse(arguments).run()

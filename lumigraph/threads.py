@@ -19,7 +19,6 @@ from pathlib import Path
 
 LOOKS = 300_000  # for work, before a thread sleeps: some milliseconds
 OWN = "OMP_WAIT_POLICY", "GOMP_SPINCOUNT"  # by which users say how threads wait
-ARENAS, ARENA_MAX = "MALLOC_ARENA_MAX", -8  # by which users, and programs, say from how many places threads take memory
 EVERY = 0.5  # seconds between looks at how much others hold us up
 WHILE = 20  # such looks that threads then sleep for
 MUCH = 0.25  # of the time that our threads could run: from here on it matters that others have it
@@ -46,17 +45,6 @@ def share_one_pool() -> None:
     if sys.platform == "linux" and "torch" not in sys.modules:
         with contextlib.suppress(OSError):  # a system without it: Numba then has threads of another kind
             ctypes.CDLL("libgomp.so.1.0.0")
-
-
-def share_one_arena() -> None:
-    """Have all threads take their memory from one place, unless the user's environment says from how many.
-
-    GNU's C library gives every thread an arena of its own. What one has given back there, others cannot use: a process
-    that opened six viewers one after the other held 130 MB of it. Ours are few, and ask for memory seldom.
-    """
-    if sys.platform == "linux" and ARENAS not in os.environ:
-        with contextlib.suppress(AttributeError):  # another C library, without arenas
-            ctypes.CDLL(None).mallopt(ARENA_MAX, 1)
 
 
 @contextlib.contextmanager

@@ -13,6 +13,7 @@ import pytest
 import torch
 
 from lumigraph import threads
+from lumigraph.allocation import OWN
 
 LOOP = """
 import lumigraph, torch, numpy
@@ -41,6 +42,25 @@ for taker in takers:
     taker.join()
 libc.malloc_info(0, ctypes.c_void_p.in_dll(libc, "stdout"))
 libc.fflush(None)
+"""
+
+STEPS = """
+import ctypes, resource
+from lumigraph import cli
+cli.main(["methods"])
+libc = ctypes.CDLL(None)
+libc.malloc.restype = ctypes.c_void_p
+def step():
+    taken = [ctypes.c_void_p(libc.malloc(50 << 20)) for _ in range(2)]
+    for place in taken:
+        ctypes.memset(place, 1, 50 << 20)
+    for place in taken:
+        libc.free(place)
+step()
+before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+for _ in range(10):
+    step()
+print(resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before)
 """
 
 LOOKING = """
@@ -151,7 +171,16 @@ def test_crowded_threads_hardly_look_for_work():
 @pytest.mark.skipif(sys.platform != "linux", reason="arenas are of GNU's C library")
 @pytest.mark.parametrize(("own", "most"), [(None, 1), ("3", 3)])
 def test_commands_take_memory_from_one_place_unless_a_user_says_otherwise(own: str | None, most: int) -> None:
-    environment = {name: value for name, value in os.environ.items() if name != threads.ARENAS}
-    environment |= {threads.ARENAS: own} if own else {}
+    environment = {name: value for name, value in os.environ.items() if name not in OWN.values()}
+    environment |= {"MALLOC_ARENA_MAX": own} if own else {}
     done = subprocess.run([sys.executable, "-c", ARENAS], env=environment, capture_output=True, text=True, check=True)
     assert done.stdout.count("<heap nr") == most
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="GNU's C library")
+@pytest.mark.parametrize(("own", "faults"), [(None, (0, 2000)), ("131072", (100_000, 1_000_000))])
+def test_commands_keep_the_memory_that_a_step_gives_back(own: str | None, faults: tuple[int, int]) -> None:
+    environment = {name: value for name, value in os.environ.items() if name not in OWN.values()}
+    environment |= {"MALLOC_MMAP_THRESHOLD_": own} if own else {}
+    done = subprocess.run([sys.executable, "-c", STEPS], env=environment, capture_output=True, text=True, check=True)
+    assert faults[0] <= int(done.stdout.split()[-1]) <= faults[1]

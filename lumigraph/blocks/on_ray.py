@@ -15,6 +15,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+from ..allocation import settle_memory
 from ..errors import LumigraphError
 from ..run.block_plan import Done
 from ..signals import Interrupt
@@ -72,6 +73,7 @@ def on_workers(run: Path, folders: dict[str, Path], workers: Workers) -> Conduct
 
 def on_worker(folder: str) -> Done | str | None:
     """What a worker does with a block: what it took, a sentence if it failed, None if it was stopped."""
+    settle_memory()
     with contextlib.redirect_stderr(sys.stdout):
         try:
             writable(Path(folder))

@@ -6,12 +6,12 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 
 from ..camera import Camera
 from ..choice import evenly
-from ..components.fields.appearance import Appearance
+from ..components.fields.appearance import Appearance, Patches
 from ..progress import track
 from ..scene import Batch
 from .asked import Asked
@@ -20,9 +20,10 @@ from .nearby import Nearby
 from .placed import Placed
 from .sight import saw
 
-TRIED, CHOSEN = 8, 2  # cameras between two blocks that are looked through, and those whose pictures are compared
+TRIED, CHOSEN = 8, 6  # cameras between two blocks that are looked through, and those whose pictures are compared
 WIDTH = 48  # pixels along the longer side of these pictures
-WELL = 0.5  # of the best seen pixel's visibility, from which on pixels belong to the matching patch
+SIDE = 4  # pixels of a patch
+WELL = 0.5  # of the best seen patch's visibility, from which on patches are compared
 
 
 def align_appearance(
@@ -44,7 +45,7 @@ def align_appearance(
 
     A code is stored as a plain list of numbers, `code.tolist()`. When a run opens, it is given back:
 
-        from lumigraph.components.fields.appearance import Appearance
+        from lumigraph.components.fields.appearance import Appearance, Patches
         method = method.given(Appearance(torch.tensor(numbers)))
 
     A block that learnt no appearance has an empty code, and is given nothing. To align a block that was trained again,
@@ -76,7 +77,8 @@ def align_appearance(
             continue
         alike = [x for k in neighbours if (x := patch(lit(k), own, centres[[k, i]], radii[[k, i]], cameras))]
         if alike:
-            found[i] = Appearance(appearance_of(replace(own, method=own.method.given(joined(alike)))))
+            seen = Patches(joined(alike), SIDE * SIDE)
+            found[i] = Appearance(appearance_of(replace(own, method=own.method.given(seen))))
     return [appearance_of(lit(i)) for i in range(len(parts))]
 
 
@@ -93,7 +95,7 @@ def patch(
     two, of pixels that both saw well (section 4.3.3). None where there are no cameras."""
     views = [looked(known, other, camera) for camera in between(centres, radii, cameras)]
     views = sorted(views, key=lambda view: float(view.visibility.mean()), reverse=True)[:CHOSEN]
-    return joined([view.batch(view.visibility >= WELL * view.visibility.max()) for view in views]) if views else None
+    return joined([view.well_seen() for view in views]) if views else None
 
 
 @dataclass(frozen=True)
@@ -104,10 +106,17 @@ class View:
     camera: Camera
     visibility: Float[Tensor, "height width"]
 
-    def batch(self, chosen: Bool[Tensor, "height width"]) -> Batch:
-        """Some of the pixels, as rays of the other block."""
-        rays = self.camera.rays(self.camera.pixels()[chosen.flatten()])
-        return Batch(rays, self.rgb[chosen].clamp(0, 1))
+    def well_seen(self) -> Batch:
+        """Patches of SIDE by SIDE pixels that both saw well, one after the other, as rays of the other block."""
+        height, width = (n // SIDE * SIDE for n in self.visibility.shape)
+        pixel = torch.arange(self.visibility.numel(), device=self.visibility.device).view_as(self.visibility)[
+            :height, :width
+        ]
+        patches = pixel[:height, :width].unfold(0, SIDE, SIDE).unfold(1, SIDE, SIDE).reshape(-1, SIDE * SIDE)
+        visibility = self.visibility.flatten()[patches].mean(-1)
+        chosen = patches[visibility >= WELL * visibility.max()].flatten()
+        rays = self.camera.rays(self.camera.pixels()[chosen])
+        return Batch(rays, self.rgb.flatten(0, 1)[chosen].clamp(0, 1))
 
 
 def looked(known: Placed, other: Placed, camera: Camera) -> View:

@@ -17,7 +17,7 @@ from torch.nn.functional import huber_loss
 from ..camera import Camera
 from ..components.clouds.dense_points import compile_sweep
 from ..components.fields import hash_field
-from ..components.fields.appearance import Appearance, PhotographCodes, drawn, fitted
+from ..components.fields.appearance import Appearance, Patches, PhotographCodes, drawn
 from ..components.fields.coded_field import of_samples
 from ..components.fields.coded_frustums import CodedFrustums
 from ..components.fields.coded_hash import CodedHash
@@ -112,7 +112,7 @@ class Config(HashNumbers, OpenNumbers):
 
 # Finding an appearance: pixels that are looked at, steps and learning rate of Adam, and the weight in its pixel from
 # which on a sample counts.
-FIT_RAYS, FIT_STEPS, FIT_RATE, FIT_WEIGHT = 2048, 100, 0.1, 5e-3
+FIT_RAYS, FIT_WEIGHT = 2048, 5e-3
 SEEING_RATES = 5e-3, 5e-4  # of the visibility network, at first and in the end
 
 
@@ -307,7 +307,7 @@ class BlockNeRF(RayMethod):
     def accepts(self) -> tuple[type, ...]:  # type: ignore[override]  # it depends on the run
         """Photographs, rays with colours, or a code, where it learnt what differs between photographs."""
         if self.appearance:
-            return Photograph, Batch, Appearance
+            return Photograph, Patches, Appearance
         return (Photograph,) if self.usual_exposure is not None else ()
 
     @property
@@ -321,7 +321,7 @@ class BlockNeRF(RayMethod):
 
     def given(self, *evidence: Any, **controls: Value) -> Method:
         """The same block, told its controls, or the appearance of an `Appearance`, or that in which it looks most like
-        a Photograph, by the pixels that are to be trusted, or like a Batch of rays and their colours.
+        a Photograph, by the pixels that are to be trusted, or like Patches of pictures.
 
         A photograph whose exposure is known, by its camera's `image_index`, is shown with it.
         """
@@ -366,7 +366,7 @@ class BlockNeRF(RayMethod):
         return self.exposures.stops_of(int(camera.image_index[0]))
 
     @torch.no_grad()
-    def _appearance_of(self, piece: Photograph | Batch | Appearance) -> Float[Tensor, " code"]:
+    def _appearance_of(self, piece: Photograph | Patches | Appearance) -> Float[Tensor, " code"]:
         """The appearance in which the block looks most like a piece of evidence; that it has, where nothing tells."""
         start = self.shown_in.code
         if isinstance(piece, Appearance):
@@ -376,7 +376,8 @@ class BlockNeRF(RayMethod):
                     f"{len(start)}; give it one that was aligned with this block"
                 )
             return piece.code.to(start)
-        batch = drawn(piece, FIT_RAYS, self.random(0)) if isinstance(piece, Photograph) else piece
+        size = piece.size if isinstance(piece, Patches) else 1
+        batch = drawn(piece, FIT_RAYS, self.random(0)) if isinstance(piece, Photograph) else piece.batch
         batch = batch.to(self.device)
         if not len(batch):
             return start
@@ -389,6 +390,7 @@ class BlockNeRF(RayMethod):
             code = torch.cat([appearance, rest])
             rgb = self.network.colour(places, code.expand(len(places.samples), -1))
             behind = self.network.behind(batch.rays, code.expand(len(batch), -1), background)
-            return (composite(places.samples, places.density, rgb, behind).rgb - target).square().sum(-1).mean()
+            off = composite(places.samples, places.density, rgb, behind).rgb - target
+            return off.view(-1, size, 3).mean(1).square().sum(-1).mean()
 
-        return fitted(start, error, FIT_STEPS, FIT_RATE)
+        return self.appearance.fitted(start, error)

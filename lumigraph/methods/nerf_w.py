@@ -12,7 +12,7 @@ from torch import Tensor
 
 from ..components.clouds.dense_points import compile_sweep
 from ..components.fields import hash_field
-from ..components.fields.appearance import PhotographCodes, drawn, fitted
+from ..components.fields.appearance import PhotographCodes, drawn
 from ..components.fields.coded_field import of_samples
 from ..components.fields.hash_field import ON_A_CPU, TINY, HashNumbers
 from ..components.fields.wild_field import with_passing
@@ -96,7 +96,7 @@ class Config(HashNumbers, OpenNumbers):
 HIDDEN, SHOWN = "hidden", "shown"
 # Finding a photograph's appearance: pixels that are looked at, steps and learning rate of Adam, and the weight in its
 # pixel from which on a sample counts.
-FIT_RAYS, FIT_STEPS, FIT_RATE, FIT_WEIGHT = 1024, 100, 0.1, 5e-3
+FIT_RAYS, FIT_WEIGHT = 1024, 5e-3
 
 
 class NeRFW(RayMethod):
@@ -295,7 +295,7 @@ class NeRFW(RayMethod):
             behind = self.network.behind(batch.rays, code.expand(len(batch), -1), background)
             return squared(composite(places.samples, places.density, rgb, behind).rgb - target).mean()
 
-        return fitted(self.appearance.average, error, FIT_STEPS, FIT_RATE)
+        return self.appearance.fitted(self.appearance.average, error)
 
 
 def squared(residual: Float[Tensor, "ray 3"]) -> Float[Tensor, " ray"]:

@@ -15,6 +15,10 @@ from torch import Tensor, nn
 from ...controls import Control, blend
 from ...scene import Batch, Photograph
 from ..training.corrections import AVERAGE
+from .code_space import axes_of, fitted
+
+FIT_STEPS, FIT_RATE = 100, 0.1  # the rate in deviations of the learnt codes
+FIT_PRIOR = 2e-5  # of squared error, for a deviation from the average
 
 
 @dataclass(frozen=True)
@@ -22,6 +26,21 @@ class Appearance:
     """A code as evidence: `method.given(Appearance(code))` is the scene as it looks with that code."""
 
     code: Float[Tensor, " width"]
+
+
+@dataclass(frozen=True)
+class Patches:
+    """Small patches of pictures as evidence: what they show is compared by the mean colour of each.
+
+    Pixel by pixel, noise in the geometry of either side would look like a lack of contrast, and a code be found that
+    takes contrast away.
+
+    batch: rays patch by patch, with their colours
+    size:  rays of a patch
+    """
+
+    batch: Batch
+    size: int
 
 
 class PhotographCodes(nn.Module):
@@ -49,6 +68,25 @@ class PhotographCodes(nn.Module):
         learnt = self.learnt
         return self.codes[learnt].sum(0) / max(int(learnt.sum()), 1)
 
+    def fitted(
+        self, start: Float[Tensor, " width"], error: Callable[[Float[Tensor, " width"]], Tensor]
+    ) -> Float[Tensor, " width"]:
+        """The code that makes an error small and is like those that were learnt: a mixture of them, not far from their
+        average in deviations of theirs. Elsewhere nobody has learnt what a code stands for. The start, where fewer than
+        two were learnt.
+
+        error: the mean squared error of colours, differentiable in the code
+        """
+        average, axes = self.average.detach(), axes_of(self.codes.detach()[self.learnt])
+        if not len(axes):
+            return start
+
+        def likely(where: Float[Tensor, " axis"]) -> Tensor:
+            return error(average + where @ axes) + FIT_PRIOR * where.square().sum()
+
+        there = (start - average) @ axes.T / axes.square().sum(-1)
+        return average + fitted(there, likely, FIT_STEPS, FIT_RATE) @ axes
+
     def told(self, value: str) -> Float[Tensor, " width"]:
         """The code that a value of `control` stands for: a photograph's, the average, or one between two. A photograph
         that nobody learnt from has the average."""
@@ -63,26 +101,6 @@ class PhotographCodes(nn.Module):
     def _of(self, choice: str) -> Float[Tensor, " width"]:
         known = choice != AVERAGE and bool(self.codes[int(choice)].any())
         return self.codes[int(choice)] if known else self.average
-
-
-def fitted(
-    start: Float[Tensor, " width"],
-    error: Callable[[Float[Tensor, " width"]], Tensor],
-    steps: int,
-    learning_rate: float,
-) -> Float[Tensor, " width"]:
-    """The code that makes an error small, by so many steps of Adam from a start, with all else as it is.
-
-    error: a number that is differentiable in the code
-    """
-    with torch.enable_grad():
-        code = start.detach().clone().requires_grad_()
-        adam = torch.optim.Adam([code], learning_rate)
-        for step in range(steps):
-            (code.grad,) = torch.autograd.grad(error(code), [code])
-            adam.param_groups[0]["lr"] = learning_rate * (1 - step / steps)
-            adam.step()
-    return code.detach()
 
 
 def drawn(photograph: Photograph, count: int, generator: torch.Generator) -> Batch:

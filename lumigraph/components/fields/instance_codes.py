@@ -51,12 +51,7 @@ class InstanceCodes(nn.Module):
     def axes(self) -> Float[Tensor, "axis code"]:
         """Along which the codes that were learnt differ, each as long as their deviation along it: `average + w @ axes`
         is distributed as the Gaussian that fits them, where w is of the standard normal distribution."""
-        known = self.rows.detach()[self.learnt] - self.average
-        if len(known) < 2:
-            return known[:0]
-        _, deviation, along = torch.linalg.svd(known / (len(known) - 1) ** 0.5, full_matrices=False)
-        there = deviation > 1e-4 * deviation[:1].clamp_min(1e-9)
-        return (deviation[:, None] * along)[there]
+        return axes_of(self.rows.detach()[self.learnt])
 
     def along(self, code: Float[Tensor, " code"]) -> Float[Tensor, " axis"]:
         """Where a code is along the axes, in deviations from the average."""
