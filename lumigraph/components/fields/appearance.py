@@ -19,6 +19,7 @@ from .code_space import axes_of, fitted
 
 FIT_STEPS, FIT_RATE = 100, 0.1  # the rate in deviations of the learnt codes
 FIT_PRIOR = 2e-5  # of squared error, for a deviation from the average
+FIT_LEAST = 0.3  # of the usual deviation, also where none of the codes differ
 
 
 @dataclass(frozen=True)
@@ -71,13 +72,13 @@ class PhotographCodes(nn.Module):
     def fitted(
         self, start: Float[Tensor, " width"], error: Callable[[Float[Tensor, " width"]], Tensor]
     ) -> Float[Tensor, " width"]:
-        """The code that makes an error small and is like those that were learnt: a mixture of them, not far from their
-        average in deviations of theirs. Elsewhere nobody has learnt what a code stands for. The start, where fewer than
-        two were learnt.
+        """The code that makes an error small and is like those that were learnt: not far from their average, in
+        deviations of theirs. Elsewhere nobody has learnt what a code stands for. The start, where fewer than two were
+        learnt.
 
         error: the mean squared error of colours, differentiable in the code
         """
-        average, axes = self.average.detach(), axes_of(self.codes.detach()[self.learnt])
+        average, axes = self.average.detach(), axes_of(self.codes.detach()[self.learnt], FIT_LEAST)
         if not len(axes):
             return start
 

@@ -9,12 +9,18 @@ from jaxtyping import Float
 from torch import Tensor
 
 
-def axes_of(codes: Float[Tensor, "known code"]) -> Float[Tensor, "axis code"]:
+def axes_of(codes: Float[Tensor, "known code"], least: float = 0.0) -> Float[Tensor, "axis code"]:
     """Along which codes differ, each as long as their deviation along it: their mean plus `w @ axes` is distributed as
-    the Gaussian that fits them, where w is of the standard normal distribution. None for fewer than two codes."""
+    the Gaussian that fits them, where w is of the standard normal distribution. None for fewer than two codes.
+
+    least: share of their usual deviation that is added to that of every axis; above 0 there are as many axes as numbers
+    """
     if len(codes) < 2:
         return codes[:0]
-    _, deviation, along = torch.linalg.svd((codes - codes.mean(0)) / (len(codes) - 1) ** 0.5, full_matrices=False)
+    off = (codes - codes.mean(0)) / (len(codes) - 1) ** 0.5
+    _, found, along = torch.linalg.svd(off, full_matrices=least > 0)
+    deviation = torch.cat([found, found.new_zeros(len(along) - len(found))]).square()
+    deviation = (deviation + least**2 * off.square().sum() / codes.shape[1]).sqrt()
     return (deviation[:, None] * along)[deviation > 1e-4 * deviation[:1].clamp_min(1e-9)]
 
 
