@@ -49,7 +49,7 @@ def main(options: Options) -> None:
     rows = []
     for index in chosen:
         shot = scene.photograph(index, [name for name in (LIGHT,) if name in scene.layers])
-        pictures, depths = [shot.rgb], []
+        pictures, depths = [shot.before(scene.frame.background)], []
         for method in methods.values():
             told = method.given(left_half(shot)) if judged_by_halves(method) else method
             seen = told.render(method.refined(shot.camera))

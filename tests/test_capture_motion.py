@@ -289,8 +289,10 @@ def test_bad_input_gets_one_sentence(tmp_path, capsys, monkeypatch, what, senten
     for i in range(2):
         draw(look_at(np.array([3.0, 1.0 + i, 1.0])), walls).save(f"two/{i}.jpg")
     Path("taken/notes.txt").write_text("mine")
+    before = sorted(tmp_path.rglob("*"))
     assert cli.main(["capture", *what]) == 2
     assert sentence in capsys.readouterr().err
+    assert [path for path in sorted(tmp_path.rglob("*")) if path.name != "scenes"] == before  # nothing half-written
 
 
 def test_train_captures_what_has_no_poses(tmp_path, monkeypatch, captured, capsys):

@@ -165,7 +165,7 @@ def test_raw_files_among_others_are_refused_and_damaged_ones_named(tmp_path):
     assert also_unreadable(intake).startswith(" (b.raw could not be used: it has 5 bytes")
     assert not also_unreadable(replace(intake, unreadable={}))
     Image.new("RGB", (48, 32)).save(folder / "d.jpg")
-    with pytest.raises(LumigraphError, match=r"3 raw files and 1 other photographs, such as a.raw and d.jpg"):
+    with pytest.raises(LumigraphError, match=r"3 raw files and 1 other photograph, such as a.raw and d.jpg"):
         gather([folder], tmp_path / "other")
 
 

@@ -1,14 +1,20 @@
 """Open captures: samples lie where a grid proposes, and what makes fog costs something."""
 
+import math
+
+import numpy as np
 import pytest
 import torch
+from numba import njit
 
+from lumigraph import loops
 from lumigraph.components.sampling.proposal import Proposal, edges_of, overlooked
 from lumigraph.components.sampling.spaces import NDC, Contraction
-from lumigraph.components.sampling.unbounded import OpenNumbers, Unbounded
+from lumigraph.components.sampling.unbounded import LEAST, OpenNumbers, Unbounded
 from lumigraph.components.training.fog import elsewhere, scaled_by_distance, spread
 from lumigraph.rays import Rays, Samples
 from lumigraph.scene import Forward
+from lumigraph.volume import composite
 
 AHEAD = Forward(((1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0)), (1.0, 1.0), 1.0)
 SPACES = {"contracted": Contraction(0.1, 30.0), "forward": NDC(AHEAD, 0.1)}
@@ -140,6 +146,51 @@ def test_proposals_loop_as_they_are_written(proposal, sharpness, generator):
     some = rays()
     expected = proposal.sample(some).samples
     found = proposal.places(some)
-    torch.testing.assert_close(found.t_start, expected.t_start.detach(), rtol=2e-3, atol=1e-4)
-    torch.testing.assert_close(found.t_end, expected.t_end.detach(), rtol=2e-3, atol=1e-4)
+    for ours, theirs in ((found.t_start, expected.t_start), (found.t_end, expected.t_end)):
+        torch.testing.assert_close(1 / ours, 1 / theirs.detach(), rtol=2e-3, atol=2e-5)  # as pixels tell distances
     assert len(some) * 8 == len(found)
+
+
+def test_a_glance_shows_what_a_look_shows(generator):
+    """Colours that are hardly seen are not asked for, and the picture stays."""
+    unbounded = Unbounded(SPACES["contracted"], OpenNumbers(proposal_samples=32, samples_per_ray=16))
+    unbounded.proposal.grid.values.data = 2 * torch.randn(unbounded.proposal.grid.values.shape, generator=generator)
+    asked = []
+
+    def geometry(points):
+        return 8 * (3 * points).sin().prod(-1).clamp(min=0) + 20 * (points.norm(dim=-1) > 2.5), 5 * points
+
+    def colours(features, directions):
+        asked.append(len(features))
+        return features.sin().square()
+
+    def field(points, directions):
+        density, features = geometry(points)
+        return density, colours(features, directions)
+
+    many = rays(200)
+    with torch.no_grad():
+        whole, part = unbounded.look(field, many), unbounded.glance(geometry, colours, many)
+    seen, expected = (composite(x.samples, x.density, x.rgb, torch.ones(1, 3)) for x in (part, whole))
+    assert asked[1] < 0.8 * asked[0] and len(part.samples) == asked[1]
+    torch.testing.assert_close(seen.rgb, expected.rgb, atol=16 * LEAST, rtol=0)
+    torch.testing.assert_close(seen.opacity, expected.opacity, atol=16 * LEAST, rtol=0)
+    assert (seen.rgb - expected.rgb).square().mean() < 1e-6  # 60 dB
+
+
+def test_loops_have_exponentials_and_cube_roots_of_their_own():
+    x = torch.cat([torch.linspace(-80, 60, 2001), torch.tensor([0.0, -1e-30, -300.0])]).numpy()
+    ours, roots = both(x)
+    np.testing.assert_allclose(ours[:-1], np.exp(x[:-1].astype(np.float64)), rtol=1e-5)
+    assert 0 < ours[-1] < 1e-37
+    np.testing.assert_allclose(roots, np.exp(x.clip(-60).astype(np.float64) / 3), rtol=1e-5)
+
+
+@njit
+def both(x):
+    """Of numbers x their exponential, and the cube root of e^x."""
+    powers, roots = np.empty_like(x), np.empty_like(x)
+    for i in range(len(x)):
+        powers[i] = loops.exponential(x[i])
+        roots[i] = loops.cube_root(np.float32(math.exp(max(x[i], np.float32(-60)))))
+    return powers, roots

@@ -198,7 +198,11 @@ class InstantNGP(Exposed, RayMethod):  # type: ignore[override]  # what is accep
         return composite(look.samples, look.density, look.rgb, background)
 
     def looks(self, rays: Rays) -> list[Look]:
-        return [self.unbounded.look(self.field, rays) if self.unbounded else self._march(rays)]
+        if not self.unbounded:
+            return [self._march(rays)]
+        if torch.is_grad_enabled():
+            return [self.unbounded.look(self.field, rays)]
+        return [self.unbounded.glance(self._geometry, self._colours, rays)]
 
     def _march(self, rays: Rays, jitter: Float[Tensor, " ray"] | None = None) -> Look:
         found = self.occupancy.sample(rays, self.frame.near, *self.lattice, jitter=jitter)
@@ -270,14 +274,23 @@ class InstantNGP(Exposed, RayMethod):  # type: ignore[override]  # what is accep
         self, points: Float[Tensor, "point 3"], directions: Float[Tensor, "point 3"]
     ) -> tuple[Float[Tensor, " point"], Float[Tensor, "point 3"]]:
         """Density per scene unit, and sRGB-encoded colour seen along unit directions."""
-        density, geometry = self.network.density(self._encoded(points))
-        density = density * self.space.stretch(points)
-        rgb = self.network.colour(geometry, directions)
-        return density, self.exposed(rgb)
+        density, geometry = self._geometry(points)
+        return density, self._colours(geometry, directions)
 
     def density(self, points: Float[Tensor, "sample 3"]) -> Float[Tensor, " sample"]:
         """Density per scene unit."""
-        return self.network.density(self._encoded(points))[0] * self.space.stretch(points)
+        return self._geometry(points)[0]
+
+    def _geometry(
+        self, points: Float[Tensor, "point 3"]
+    ) -> tuple[Float[Tensor, " point"], Float[Tensor, "point feature"]]:
+        density, geometry = self.network.density(self._encoded(points))
+        return density * self.space.stretch(points), geometry
+
+    def _colours(
+        self, geometry: Float[Tensor, "point feature"], directions: Float[Tensor, "point 3"]
+    ) -> Float[Tensor, "point 3"]:
+        return self.exposed(self.network.colour(geometry, directions))
 
     def _encoded(self, points: Float[Tensor, "sample 3"]) -> Float[Tensor, "sample width"]:
         """The network's input; while poses are refined, of as many levels as have joined."""

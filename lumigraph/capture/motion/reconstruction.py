@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import shutil
 import sqlite3
 from collections.abc import Sequence
 from contextlib import closing
@@ -77,17 +78,29 @@ def reconstruct(
     for source in sources:
         if not source.exists():
             raise LumigraphError(f"{source} does not exist; check the path")
+    fresh = not folder.exists()
     work = claim(folder, sources)
     with held(work, "worked in"):
-        intake = with_safe_names(gather(sources, work, options.frames, track))
-        photos = [photo for photo in intake.photos if photo.name not in intake.duplicates]
-        if len(photos) < FEWEST:
-            raise LumigraphError(
-                f"{intake.source} has {counted(len(photos), 'photograph')} that can be used, and {FEWEST} are the "
-                f"least{also_unreadable(intake)}; take some from other places"
-            )
+        try:
+            intake, photos = taken_in(sources, work, options, track)
+        except LumigraphError:
+            if fresh:  # nothing in it is anybody's, and nothing can go on from there
+                shutil.rmtree(folder, ignore_errors=True)
+            raise
         work_to_do = Reconstruction(sources, folder, work, options, intake, photos, track)
         return finished(folder, work_to_do.keys["result"]) or work_to_do.run()
+
+
+def taken_in(sources: Sequence[Path], work: Path, options: Options, track: Track) -> tuple[Intake, list[Photo]]:
+    """What there is, and of that what is not there twice. Raises LumigraphError where it is too little."""
+    intake = with_safe_names(gather(sources, work, options.frames, track))
+    photos = [photo for photo in intake.photos if photo.name not in intake.duplicates]
+    if len(photos) < FEWEST:
+        raise LumigraphError(
+            f"{intake.source} has {counted(len(photos), 'photograph')} that can be used, and {FEWEST} are the "
+            f"least{also_unreadable(intake)}; take some from other places"
+        )
+    return intake, photos
 
 
 def check(options: Options) -> None:

@@ -73,10 +73,11 @@ def all_raw(files: Mapping[str, Path], source: str) -> bool:
     """Whether photographs are raw files. Raises LumigraphError where some are and others are not."""
     raw = [name for name, path in files.items() if is_raw(path)]
     if raw and len(raw) < len(files):
-        other = next(name for name in files if name not in raw)
+        other, others = next(name for name in files if name not in raw), len(files) - len(raw)
         raise LumigraphError(
-            f"{source} has {len(raw)} raw files and {len(files) - len(raw)} other photographs, such as {raw[0]} and "
-            f"{other}, whose light is not comparable; name the files of one kind alone"
+            f"{source} has {len(raw)} raw file{'s' * (len(raw) > 1)} and {others} other "
+            f"photograph{'s' * (others > 1)}, such as {raw[0]} and {other}, whose light is not comparable; name the "
+            f"files of one kind alone"
         )
     return bool(raw)
 

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import contextlib
+import os
+import threading
 from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
@@ -26,6 +28,8 @@ TOLD = (
     "ExposureTime", "FNumber", "ISOSpeedRatings", "FocalLength", "FocalLengthIn35mmFilm", "DateTimeOriginal",
     "OffsetTimeOriginal", "SubsecTimeOriginal",
 )  # fmt: skip
+_PRINTING = threading.Lock()
+_silenced, _stderr = 0, -1  # threads that are silent, and where the others' words go afterwards
 
 
 def open_file(path: Path) -> RawPhoto:
@@ -95,6 +99,26 @@ def turned_pattern(pattern: Pattern, size: tuple[int, int], turns: int) -> Patte
 
 
 @contextlib.contextmanager
+def silent() -> Iterator[None]:
+    """Within this block nothing is printed: LibRaw prints of a file cut short what it raises as well."""
+    global _silenced, _stderr
+    with _PRINTING:
+        if not _silenced:
+            _stderr = os.dup(2)
+            with open(os.devnull, "wb") as nothing:
+                os.dup2(nothing.fileno(), 2)
+        _silenced += 1
+    try:
+        yield
+    finally:
+        with _PRINTING:
+            _silenced -= 1
+            if not _silenced:
+                os.dup2(_stderr, 2)
+                os.close(_stderr)
+
+
+@contextlib.contextmanager
 def opened(path: Path) -> Iterator[Any]:
     """A file opened by LibRaw; whatever it raises within the block becomes one sentence."""
     try:
@@ -104,7 +128,7 @@ def opened(path: Path) -> Iterator[Any]:
             f"{path} is a raw photograph, and rawpy, which reads those, is missing; pip install 'lumigraph[raw]'"
         ) from fault
     try:
-        with rawpy.RawPy() as raw:
+        with silent(), rawpy.RawPy() as raw:
             raw.open_file(str(path))
             yield raw
     except rawpy.LibRawFileUnsupportedError as fault:

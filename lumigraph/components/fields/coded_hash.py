@@ -61,7 +61,10 @@ class CodedHash(CodedField):
     def passes(self, rays: Rays, generator: torch.Generator | None = None) -> list[Places]:
         learning, device = generator is not None, rays.origins.device
         jitter = torch.rand(len(rays), 2, generator=generator).to(device) if learning else None
-        if self.unbounded:
+        if self.unbounded and not learning and not torch.is_grad_enabled():
+            samples = self.unbounded.proposal.places(rays)
+            asked = len(samples)
+        elif self.unbounded:
             proposed = self.unbounded.proposal.sample(rays, jitter)
             samples, asked = proposed.samples, len(proposed.samples)
         else:

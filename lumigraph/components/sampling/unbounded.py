@@ -35,12 +35,16 @@ KEPT = 1 << 16  # places known by them that are remembered
 KNOWN = 128  # rays of a step that end at one
 MARGIN = 0.005  # of evened distances: how exactly a place is known
 TAUGHT = 0.5  # share of the budget after which photographs alone say where things are
-RAYS = 4096  # rendered at once: their proposals fit into a cache
+RAYS = 4096  # rendered at once: what their samples take fits into a cache
+LEAST = 5e-4  # share of what a ray sees below which a picture does without a sample
 
 Density = Callable[[Float[Tensor, "sample 3"]], Float[Tensor, " sample"]]
 Field = Callable[
     [Float[Tensor, "sample 3"], Float[Tensor, "sample 3"]], tuple[Float[Tensor, " sample"], Float[Tensor, "sample 3"]]
 ]
+# A field in two parts: density with what it remembers of each place, then colour of that along directions.
+Geometry = Callable[[Float[Tensor, "sample 3"]], tuple[Float[Tensor, " sample"], Float[Tensor, "sample feature"]]]
+Colours = Callable[[Float[Tensor, "seen feature"], Float[Tensor, "seen 3"]], Float[Tensor, "seen 3"]]
 
 
 @dataclass(frozen=True)
@@ -100,6 +104,20 @@ class Unbounded(nn.Module):
         """What a field has along rays."""
         samples = self.proposal.places(rays)
         return Look("samples", samples, *field(*samples.along(rays)))
+
+    def glance(self, geometry: Geometry, colours: Colours, rays: Rays) -> Look:
+        """The same for pictures, of a field in two parts: the second one is asked only where it is seen.
+
+        What is left out has at most LEAST of a ray's weight, and what lies behind it gets that. Without gradients.
+        """
+        samples = self.proposal.places(rays)
+        points, directions = samples.along(rays)
+        density, features = geometry(points)
+        kept = weights_of(samples, density) > LEAST
+        seen = kept.nonzero()[:, 0]
+        features = features.t().index_select(1, seen).t()  # a feature of all samples after another, as networks give it
+        rgb = colours(features, directions.index_select(0, seen))
+        return Look("samples", samples.keep(kept), density.index_select(0, seen), rgb)
 
     def learn(self, field: Field, rays: Rays, jitter: Float[Tensor, "ray 2"]) -> tuple[Look, Proposed]:
         """The same while it learns, and what was proposed. jitter: as for `Proposal.sample`"""

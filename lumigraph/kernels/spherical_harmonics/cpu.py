@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import numpy as np
 import torch
 from numba import njit, prange
 from torch import Tensor
 
 from .._dispatch import empty
 from . import K00, K1, K20, K21, K22, K30, K31, K32, K33
+
+MOST = 16  # coefficients
+BLOCK = 64  # directions whose coefficients go to their places together: far apart, these would not stay in a cache
 
 
 @njit(inline="always")
@@ -57,8 +61,14 @@ def slope(x, y, z, bands, g):
 
 @njit(parallel=True, fastmath=True, cache=True)
 def _forward(directions, bands, out):
-    for r in prange(len(directions)):
-        basis(directions[r, 0], directions[r, 1], directions[r, 2], bands, out[:, r])
+    for part in prange(-(-len(directions) // BLOCK)):
+        first, some = part * BLOCK, np.empty((MOST, BLOCK), np.float32)
+        count = min(BLOCK, len(directions) - first)
+        for r in range(count):
+            at = first + r
+            basis(directions[at, 0], directions[at, 1], directions[at, 2], bands, some[:, r])
+        for k in range(bands**2):
+            out[k, first : first + count] = some[k, :count]
 
 
 @njit(parallel=True, fastmath=True, cache=True)
