@@ -4,9 +4,10 @@
 
 For each category, `--count` members are turned at random. Their density grids are sampled from the shapes themselves,
 and `--runs` of them are trained with `--method` as well and go through what `lumigraph canonicalise` does. The table
-says how far off each instance then is, by the network, by alignment to the mean shape that begins with what the
-network says, by the same that begins with some of the instances, and by the best of these, which is what the command does: up to one rotation for the whole category, for a canonical frame is as good as
-any other, and up to the category's symmetry about the vertical (`SYMMETRY`). FOLDER holds the runs, their canonical
+says how far off each instance then is: by the network; by alignment to the mean shape that begins with what the network
+says; by the same that begins with instances taken for the mean shape; and by the best of these, which is what the
+command does. All of it up to one rotation for the whole category, for a canonical frame is as good as any other, and up
+to the category's symmetry about the vertical (`SYMMETRY`). FOLDER holds the runs, their canonical
 files with a picture before and after, and canonical.json with all figures. The same command goes on where it was
 stopped.
 """
