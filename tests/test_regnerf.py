@@ -140,8 +140,9 @@ def test_a_step_learns_from_patches_nobody_photographed(field):
 
 
 def test_a_table_has_numbers_of_its_own():
-    """It learns five times as fast as a network, and the networks behind it are smaller."""
+    """It learns five times as fast as a network, the networks behind it are smaller, and a plain CPU has it unasked."""
     config = RegNeRF.preset(torch.device("cpu"))
+    assert config.field == "hash" and RegNeRF.preset(torch.device("cuda")).field == "network"
     table, network = config.numbers_of(NgpConfig), config.numbers_of(MipConfig)
     known = InstantNGP.preset(torch.device("cpu"))
     assert (table.learning_rate, table.hidden_width) == (known.learning_rate, known.hidden_width) == (2e-2, 32)

@@ -137,12 +137,13 @@ class RegNeRF(RayMethod):
 
     @classmethod
     def preset(cls, device: torch.device) -> Any:
-        """On a GPU the paper's numbers. On a CPU a smaller network, and fewer patches; what the paper does in its first
-        some hundred steps takes a larger share of the fewer there are."""
+        """On a GPU the paper's numbers. On a CPU a hash table, for after a laptop's minutes a network is still a blur;
+        where a network is asked for all the same, a smaller one. Fewer patches, too; and what the paper does in its
+        first some hundred steps takes a larger share of the fewer there are."""
         if device.type == "cuda":
             return Config()
         own = asdict(MipNeRF.preset(device))
-        return Config(**own, unseen_patches=8, annealing=0.25, depth_settling=0.25, **TABLE)
+        return Config(**own, field="hash", unseen_patches=8, annealing=0.25, depth_settling=0.25, **TABLE)
 
     @classmethod
     def smallest(cls) -> Any:
