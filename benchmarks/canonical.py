@@ -4,8 +4,10 @@
 
 For each category, `--count` members are turned at random. Their density grids are sampled from the shapes themselves,
 and `--runs` of them are trained with `--method` as well and go through what `lumigraph canonicalise` does. The table
-says how far off each instance then is: up to one rotation for the whole category, for a canonical frame is as good as
-any other, and up to the category's symmetry about the vertical (`SYMMETRY`). FOLDER holds the runs, their canonical
+says how far off each instance then is: by the network; by alignment to the mean shape that begins with what the network
+says; by the same that begins with instances taken for the mean shape; and by the best of these, which is what the
+command does. All of it up to one rotation for the whole category, for a canonical frame is as good as any other, and up
+to the category's symmetry about the vertical (`SYMMETRY`). FOLDER holds the runs, their canonical
 files with a picture before and after, and canonical.json with all figures. The same command goes on where it was
 stopped.
 """
@@ -13,7 +15,7 @@ stopped.
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -22,11 +24,13 @@ import torch
 import tyro
 from torch import Tensor
 
-from lumigraph.canonical import PRESETS, Instance, canonicalise, found_in, sampled, solve
+from lumigraph.canonical import PRESETS, Instance, Solution, canonicalise, found_in, sampled, solve
 from lumigraph.canonical.errors import rotation_errors
 from lumigraph.canonical.learning import found_rotations
+from lumigraph.canonical.mean_shape import best_alignment, best_rotations, described
 from lumigraph.capture.procedural import signed_distance
 from lumigraph.capture.procedural.members import member_stage
+from lumigraph.choice import evenly
 from lumigraph.cli import main as command
 from lumigraph.files import write_json
 from lumigraph.run.canonicalised import Canonicalised
@@ -71,6 +75,7 @@ def of_shapes(category: str, options: Options) -> list[dict[str, Any]]:
     return [
         figures(category, "shapes, network alone", solution.predicted, turns),
         figures(category, "shapes, network alone, unseen", unseen, fresh_turns),
+        *by_beginnings(category, "shapes", learnt, solution, turns, options),
         figures(category, "shapes", solution.rotations, turns) | {"seconds": round(seconds, 1)},
     ]
 
@@ -94,8 +99,26 @@ def of_runs(category: str, options: Options) -> list[dict[str, Any]]:
     written = torch.stack([file.place.rotation for file in files])
     return [
         figures(category, "runs, network alone", solution.predicted, to_scene @ turns),
+        *by_beginnings(category, "runs", [one.instance for one in found], solution, to_scene @ turns, options),
         figures(category, "runs", written, to_scene @ turns) | {"seconds": round(seconds, 1)},
     ]
+
+
+def by_beginnings(
+    category: str, what: str, instances: Sequence[Instance], solution: Solution, turns: Tensor, options: Options
+) -> Iterator[dict[str, Any]]:
+    """Figures of alignments to the mean shape that begin with what the network says alone, and without it."""
+    known = described(instances)
+    some = evenly(range(len(instances)), PRESETS[options.preset].templates)
+    for beginning, starts in (
+        ("from the network", [solution.predicted]),
+        ("from instances", [best_rotations(known[i], known) for i in some]),
+    ):
+        begin = time.perf_counter()
+        found = best_alignment(known, starts)
+        seconds = time.perf_counter() - begin
+        row = figures(category, f"{what}, mean shape {beginning}", found.rotations, turns)
+        yield row | {"explained": round(found.explained, 4), "seconds": round(seconds, 1)}
 
 
 def shapes(category: str, members: Sequence[int], cells: int) -> tuple[list[Instance], Tensor]:

@@ -237,3 +237,30 @@ def test_meshes_are_photographed(tmp_path):
 def test_what_a_category_does_not_know_is_refused(asked):
     with pytest.raises(LumigraphError, match="procedural:toys"):
         open_dataset(f"procedural:{asked}")
+
+
+@pytest.mark.parametrize(
+    ("scene", "sentence"),
+    [
+        ("empty", "is empty"),
+        ("nothing", "holds no camera poses"),
+        ("procedural:toyz", "of the collections cars, chairs, toys"),
+    ],
+)
+def test_where_there_is_nothing_it_is_said_to_be_of_no_kind(tmp_path, monkeypatch, capsys, scene, sentence):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "nothing" / "within").mkdir(parents=True)
+    told = said(capsys, "train", "pixelnerf", scene, "--steps", 2, "--output", "run")
+    assert sentence in told and "learns from" not in told and not (tmp_path / "run").exists()
+
+
+def test_a_run_that_cannot_begin_is_taken_back(tmp_path, monkeypatch, capsys):
+    """A file that is found missing once the run has been made leaves nothing behind."""
+    monkeypatch.setattr("lumigraph.train.rehearse", lambda *_: 0.0)
+    asked, output = "procedural:toys,count=2,size=8,views=2", tmp_path / "run"
+    assert (
+        main(["train", "pixelnerf", asked, "--steps", "2", "--encoder-weights", "none.pth", "--output", str(output)])
+        == 2
+    )
+    assert "none.pth does not exist" in capsys.readouterr().err and not output.exists()

@@ -9,6 +9,7 @@ import pytest
 import tiny
 import torch
 
+from lumigraph.components.training.fog import thickness_before
 from lumigraph.components.training.patch_flow import SIDE, PatchFlow, photographed
 from lumigraph.components.training.unseen_views import patches, roughness, unseen_cameras
 from lumigraph.geometry import nearest_to_lines, unit
@@ -16,6 +17,7 @@ from lumigraph.methods.instant_ngp import Config as NgpConfig
 from lumigraph.methods.instant_ngp import InstantNGP
 from lumigraph.methods.mip_nerf import Config as MipConfig
 from lumigraph.methods.regnerf import RegNeRF
+from lumigraph.rays import Samples
 from lumigraph.run import build
 
 
@@ -138,8 +140,9 @@ def test_a_step_learns_from_patches_nobody_photographed(field):
 
 
 def test_a_table_has_numbers_of_its_own():
-    """It learns five times as fast as a network, and the networks behind it are smaller."""
+    """It learns five times as fast as a network, the networks behind it are smaller, and a plain CPU has it unasked."""
     config = RegNeRF.preset(torch.device("cpu"))
+    assert config.field == "hash" and RegNeRF.preset(torch.device("cuda")).field == "network"
     table, network = config.numbers_of(NgpConfig), config.numbers_of(MipConfig)
     known = InstantNGP.preset(torch.device("cpu"))
     assert (table.learning_rate, table.hidden_width) == (known.learning_rate, known.hidden_width) == (2e-2, 32)
@@ -203,3 +206,55 @@ def test_a_table_grows_finer_and_reaches_farther():
         assert 0.35 * share < float(aside.max()) <= 0.5 * share
         encoded = method.marcher._encoded(points).view(8, 4, -1)
         assert encoded.abs().amax((0, 2)).gt(0).tolist() == [i < levels for i in range(4)]
+
+
+def test_octaves_join_one_after_another():
+    """At first the lowest quarter is there alone, in the end all; what was reached is kept with the weights."""
+    scene, points = tiny.scene(), torch.rand(8, 3, generator=chance()) - 0.5
+    config = replace(RegNeRF.smallest(), coarse_to_fine=0.5, position_frequencies=8)
+    method = build(RegNeRF, scene.frame, config, torch.device("cpu"), 0)
+    for progress, octaves in (0.0, 2), (0.25, 5), (0.5, 8), (1.0, 8):
+        method.before_step(0, progress)
+        encoded = method.marcher._encoded(points).view(8, 8, -1)
+        assert encoded.abs().amax((0, 2)).gt(0).tolist() == [i < octaves for i in range(8)]
+    assert float(method.state_dict()["marcher.joined"]) == 1.0
+    plain = build(RegNeRF, scene.frame, RegNeRF.smallest(), torch.device("cpu"), 0)
+    assert "marcher.joined" not in plain.state_dict()  # older runs have none
+
+
+def test_thickness_before_cameras():
+    """Samples up to a distance count, the one that it cuts by its share."""
+    samples = Samples.rows(torch.tensor([[0.0, 1.0, 3.0], [2.0, 3.0, 4.0]]), torch.tensor([4.0, 5.0]))
+    density = torch.tensor([2.0, 3.0, 5.0, 1.0, 1.0, 1.0])
+    assert thickness_before(samples, density, torch.tensor([2.0, 1.0])).tolist() == [2.0 * 1 + 3.0 * 1, 0.0]
+
+
+def test_what_stands_before_cameras_costs():
+    """A field of density one everywhere is as thick as the first share of a ray is long."""
+    scene = tiny.scene()
+    config = replace(RegNeRF.smallest(), occlusion_weight=0.5, occlusion_range=0.25)
+    method = build(RegNeRF, scene.frame, config, torch.device("cpu"), 0)
+    method.before_step(0, 1.0)
+    rays = scene.sample_rays(64, chance()).rays
+    look = method.marcher.looks(rays, chance())[-1]
+    look = replace(look, density=torch.ones_like(look.density))
+    near, far = method.marcher.space.interval(rays)
+    within = look.samples.t_start.view(64, -1)[:, 0] - near  # the fine look begins somewhere in the first bin
+    expected = (0.25 * (far - near) - within).clamp_min(0).mean()
+    assert float(method._before_cameras(rays, look)) == pytest.approx(float(expected), rel=1e-3)
+    assert float(method.loss(method.batch(scene, chance()), 0)["occlusion"].detach()) > 0
+
+
+@pytest.mark.parametrize("random_backdrop", [True, False])
+def test_the_network_learns_the_open_before_random_colours(random_backdrop, monkeypatch):
+    from lumigraph.methods import regnerf
+
+    scene, asked = tiny.scene(), []
+    frame = replace(scene.frame, reach=4.0, has_alpha=False)
+    config = replace(RegNeRF.smallest(), random_backdrop=random_backdrop)
+    method = build(RegNeRF, frame, config, torch.device("cpu"), 0)
+    real = regnerf.backdrop
+    monkeypatch.setattr(regnerf, "backdrop", lambda *given, opaque: asked.append(opaque) or real(*given, opaque=opaque))
+    method.before_step(0, 1.0)
+    method.loss(method.batch(scene, chance()), 0)
+    assert asked == [random_backdrop]

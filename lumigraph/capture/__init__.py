@@ -150,6 +150,18 @@ def open_scene(
     return multiscale(scene, scales, memory, cache)
 
 
+def confirm(source: str | Path) -> None:
+    """Raise LumigraphError where there is nothing at a source that could be learnt from, by whatever method."""
+    if (request := requested(source)) is not None:
+        from . import procedural
+
+        procedural.confirm(request)
+        return
+    path = expanded(source)
+    if path.is_dir() and not list_images(path) and not members_of(path):
+        choose_reader(path)
+
+
 def read_capture(source: str | Path, reader: str | None = None) -> Capture:
     """What a reader finds of photographs with poses: none of their pixels. source, reader: as of `open_scene`"""
     if (request := requested(source)) is not None:

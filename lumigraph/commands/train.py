@@ -73,7 +73,7 @@ class Train:
     """Port that --view listens at."""
 
     def run(self) -> int:
-        from ..capture import kind_of, open_dataset
+        from ..capture import confirm, kind_of, open_dataset
         from ..dataset import check_kind
         from ..run import Run, build, check_new
         from ..train import fit
@@ -85,6 +85,8 @@ class Train:
         if self.output is not None:
             check_new(self.output)
         found = kind_of(self.scene, kind.learns_from)
+        if found is not kind.learns_from:
+            confirm(self.scene)  # what is not there is of no kind
         check_kind(methods.check(self.method), kind.learns_from, found, self.scene, methods.learning_from(found))
         source = posed(self.scene)
         output = self.output or next_free(f"runs/{scene_name(source)}-{methods.check(self.method)}")
@@ -104,7 +106,8 @@ class Train:
             budget = quality_budget(asked, method, data) if asked else Budget(seconds=DEFAULT_SECONDS)
         run = Run.create(output, method, data, seed=seed, options=options, budget=budget.to_json())
         with watching(self.view, method, data, run, self.host, self.port) as watch:
-            outcome = fit(method, data, run, budget=budget, seed=seed, pause_at=self.pause_at, watch=watch)
+            with run.kept_if_learnt():
+                outcome = fit(method, data, run, budget=budget, seed=seed, pause_at=self.pause_at, watch=watch)
             tell_outcome(run, outcome, method, data)
             keep_showing(watch, outcome.signal)
         return exit_code(outcome.signal)

@@ -20,6 +20,7 @@ from ..components.sampling.frustums import blurred, frustums_between
 from ..components.sampling.occupancy_mask import OccupancyMask
 from ..components.sampling.sampling import inverse_transform, stratified
 from ..components.sampling.spaces import space_of
+from ..components.training.coarse_to_fine import band_weights
 from ..components.training.distillation import distil
 from ..components.training.pose_refinement import PoseRefinement
 from ..components.training.schedules import falling
@@ -41,6 +42,7 @@ class Config:
     direction_frequencies: Octaves = 4  # L for directions, as NeRF's
     coarse_samples: RaySamples = 128  # frustums of a ray, section 3.2
     fine_samples: RaySamples = 128  # of a ray, drawn where the first found something, section 3.2
+    coarse_to_fine: Share = 0.0  # share of the budget in which octaves join the coarsest (Yang 2023, eq. 2); 0: at once
     resample_padding: NonNegative = 0.01  # alpha, weight that every frustum has at least, eq. 17
     coarse_loss_weight: NonNegative = 0.1  # lambda, section 3.2; 0: the first look only guides the second
     rays_per_step: BatchSize = 4096  # section 4
@@ -64,6 +66,7 @@ class MipNeRF(RayMethod):
     """One network, evaluated twice on stretches of cones: evenly at first, then where something was found."""
 
     Config = Config
+    joined: Tensor
     formerly: ClassVar[dict[str, str]] = {
         "rejoin": "skip_layer",
         "cell_thickness": "occupancy_threshold",
@@ -88,6 +91,8 @@ class MipNeRF(RayMethod):
         self.network = CoordinateNetwork(*inputs, *shape, exact=not config.bfloat16)
         self.empty = OccupancyMask(config.occupancy_resolution, config.occupancy_threshold)
         self.sampled = 1.0  # share of each ray, around its middle, that is sampled in training
+        if config.coarse_to_fine:  # how far octaves have joined; kept, for a run that stopped early looks as it learnt
+            self.register_buffer("joined", torch.zeros(()))
         refining, rate = config.refine_cameras, config.pose_learning_rate
         self.poses = PoseRefinement(frame.image_count, rate) if refining else None
 
@@ -140,6 +145,8 @@ class MipNeRF(RayMethod):
     def from_field(self, teacher: Any, cameras: Camera) -> None:
         """The network, taught at points by the teacher."""
         known, c, chance = taken_over(teacher, cameras), self.config, self.random(3)
+        if c.coarse_to_fine:
+            self.joined.fill_(1.0)  # what is taken over has its details
         if c.occupancy_resolution:
             occupied = known.occupied(self.space, c.occupancy_resolution, c.occupancy_threshold, chance)
             self.empty.grid.rule_out(occupied[None])
@@ -222,8 +229,12 @@ class MipNeRF(RayMethod):
     def _frustums(
         self, means: Float[Tensor, "point 3"], variances: Float[Tensor, "point 3"]
     ) -> Float[Tensor, "point width"]:
-        """Frustums as waves; while poses are refined, of as many octaves as have joined."""
-        weights = self.poses.weights(self.config.position_frequencies) if self.poses else None
+        """Frustums as waves, of as many octaves as have joined."""
+        octaves, weights = self.config.position_frequencies, None
+        if self.poses:
+            weights = self.poses.weights(octaves)
+        elif self.config.coarse_to_fine and self.joined < 1:
+            weights = band_weights(octaves, float(self.joined), 0.0, 1.0).to(self.device)
         return self.encode_frustum(means, variances, weights)
 
     def optimizers(self) -> list[torch.optim.Optimizer]:
@@ -239,6 +250,8 @@ class MipNeRF(RayMethod):
     def before_step(self, step: int, progress: float) -> None:
         if self.poses:
             self.poses.progress.fill_(progress)
+        if share := self.config.coarse_to_fine:
+            self.joined.fill_(max(float(self.joined), min(progress / share, 1.0)))
         self.empty.look(step, progress, self._density_at, self.random(~step))
 
     def refined(self, cameras: Camera) -> Camera:

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from ..camera import Camera
 from ..components.fields.hash_field import TABLE_ON_A_CPU, HashNumbers, check_levels
-from ..components.training.fog import evened
+from ..components.training.fog import evened, thickness_before
 from ..components.training.patch_flow import SIDE, PatchFlow
 from ..components.training.photometric import backdrop, residuals
 from ..components.training.unseen_views import patches, roughness, unseen_cameras
@@ -43,6 +43,10 @@ class Config(HashNumbers, MipConfig):
     depth_settling: Share = 0.05  # share of the budget in which it falls
     likelihood_weight: NonNegative = 1e-3  # of how unlikely their colours are, eq. 8, in nats a number
     flow_steps: Steps = 400  # in which it is learnt, of 512 patches each, what is likely
+    coarse_to_fine: Share = 0.0  # share of the budget in which finer octaves or levels join the coarsest; 0: at once
+    occlusion_weight: NonNegative = 0.0  # of what stands right before cameras (Yang 2023, eq. 5)
+    occlusion_range: Share = 0.1  # share of each ray that is right before its camera
+    random_backdrop: bool = True  # the network learns open captures before random colours, as a table always does
     annealing: Share = 0.01  # share of the budget in which samples spread from the middle of rays, eq. 10
     annealing_start: PositiveShare = 0.5  # p_s, share of each ray that is sampled at first, eq. 10
     learning_rate: LearningRate = 2e-3
@@ -60,7 +64,6 @@ class Config(HashNumbers, MipConfig):
     huber_delta: PositiveShare = 0.1
     sh_bands: Annotated[int, between(1, 4)] = 4
     sweep_weight: NonNegative = 0.03  # of what plane sweeps found in the open, at first; it falls to nothing
-    coarse_to_fine: Share = 0.0  # share of the budget in which finer levels of the table join the coarsest; 0: at once
 
     def check(self) -> None:
         """Raises LumigraphError for numbers that contradict each other."""
@@ -116,7 +119,7 @@ class RegNeRF(RayMethod):
     """Mip-NeRF or Instant-NGP, which learns as ever from photographs, and is told off for what it shows elsewhere."""
 
     Config = Config
-    before: ClassVar[dict[str, Any]] = {"huber_delta": 1.0}  # a table's loss was square
+    before: ClassVar[dict[str, Any]] = {"huber_delta": 1.0, "random_backdrop": False}  # a table's loss was square
 
     def __init__(self, frame: Frame, config: Any = None):
         config = config or Config()
@@ -134,12 +137,13 @@ class RegNeRF(RayMethod):
 
     @classmethod
     def preset(cls, device: torch.device) -> Any:
-        """On a GPU the paper's numbers. On a CPU a smaller network, and fewer patches; what the paper does in its first
-        some hundred steps takes a larger share of the fewer there are."""
+        """On a GPU the paper's numbers. On a CPU a hash table, for after a laptop's minutes a network is still a blur;
+        where a network is asked for all the same, a smaller one. Fewer patches, too; and what the paper does in its
+        first some hundred steps takes a larger share of the fewer there are."""
         if device.type == "cuda":
             return Config()
         own = asdict(MipNeRF.preset(device))
-        return Config(**own, unseen_patches=8, annealing=0.25, depth_settling=0.25, **TABLE)
+        return Config(**own, field="hash", unseen_patches=8, annealing=0.25, depth_settling=0.25, **TABLE)
 
     @classmethod
     def smallest(cls) -> Any:
@@ -196,7 +200,7 @@ class RegNeRF(RayMethod):
         rays = rays if unseen is None else joined(rays, unseen)
         looks, terms = self._look(rays, generator)
         table = isinstance(self.marcher, InstantNGP)
-        opaque = table and self.marcher.unbounded is not None
+        opaque = self.marcher.unbounded is not None if table else self.config.random_backdrop and self.frame.reach > 1
         background = backdrop(batch, self.background, generator, opaque=opaque)
         for look, weight in looks:
             # Of a patch, the picture before the scene's own background is judged.
@@ -213,6 +217,8 @@ class RegNeRF(RayMethod):
                 terms[look.name] = weight * residual.square().mean()
         if unseen is not None:
             terms |= self._unlike(rest)
+        if self.config.occlusion_weight:
+            terms["occlusion"] = self.config.occlusion_weight * self._before_cameras(rays, looks[-1][0])
         self.figures |= self.marcher.figures | {"mse": self.figures["mse"]}
         return terms
 
@@ -238,6 +244,13 @@ class RegNeRF(RayMethod):
         if self.flow:
             terms["likelihood"] = c.likelihood_weight * self.flow(seen.rgb.view(*shape, 3)).mean()
         return terms
+
+    def _before_cameras(self, rays: Rays, look: Look) -> Tensor:
+        """How thick what stands in the first share of each ray is, mean of all rays."""
+        space = self.marcher.space
+        share = torch.full((len(rays), 1), self.config.occlusion_range, device=rays.origins.device)
+        until = space.distance(share, rays, *space.interval(rays))[:, 0]
+        return thickness_before(look.samples, look.density, until).mean()
 
     def optimizers(self) -> list[torch.optim.Optimizer]:
         return self.marcher.optimizers()

@@ -12,10 +12,11 @@ Nothing in it runs code when opened.
 
 from __future__ import annotations
 
+import contextlib
 import json
 import platform
 import re
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import AbstractContextManager
 from dataclasses import asdict
 from importlib.metadata import PackageNotFoundError, version
@@ -101,6 +102,20 @@ class Run(Trained):
                 files.write_json(folder / "cameras.json", cameras.to_json(data))
             settings.write(folder / "config.json")  # last: a folder with it is a run
         return cls(folder)
+
+    @contextlib.contextmanager
+    def kept_if_learnt(self) -> Iterator[None]:
+        """A block in which a new run is trained. Where a fault ends it that a user can mend, before anything was kept,
+        the run is taken back, so that the same command may name the same folder again."""
+        try:
+            yield
+        except LumigraphError:
+            if not self.has_state:
+                for name in ("config.json", "cameras.json", "metrics.jsonl", LOCK):
+                    files.remove(self.folder / name)
+                with contextlib.suppress(OSError):
+                    self.folder.rmdir()
+            raise
 
     def held(self) -> AbstractContextManager[None]:
         """A block in which no other process trains this run. Raises LumigraphError that says who does."""

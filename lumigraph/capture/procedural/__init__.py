@@ -55,6 +55,12 @@ TURN = "turn"  # of `Scene.about`: rotation from an object's upright frame to th
 TRACER = 1  # of the pictures that are kept: another number traces them anew
 
 
+def confirm(request: str) -> None:
+    """Raise LumigraphError for a name that nothing here has."""
+    if not is_category(request):
+        scenes.scene(request.partition(",")[0])
+
+
 def read(request: str) -> Capture:
     """The capture that a name stands for, with options after commas: "still-life", "still-life,size=400,seed=1".
 

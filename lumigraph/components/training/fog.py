@@ -38,6 +38,16 @@ def elsewhere(
     return 1 - (weights * there).sum() / len(distance)
 
 
+def thickness_before(
+    samples: Samples, density: Float[Tensor, " sample"], until: Float[Tensor, " ray"]
+) -> Float[Tensor, " ray"]:
+    """Optical thickness of what lies on each ray before a distance. Yang 2023, eq. 5, has the mean density of a ray's
+    first samples instead, which depends on how finely it is sampled."""
+    ray = samples.ray_index
+    thickness = density * ((until[ray] - samples.t_start).clamp_min(0)).minimum(samples.length)
+    return torch.zeros_like(until).index_add(0, ray, thickness)
+
+
 class _Scaled(torch.autograd.Function):
     @staticmethod
     def forward(ctx, scale, *values):

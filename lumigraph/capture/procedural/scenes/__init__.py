@@ -7,6 +7,7 @@ import pkgutil
 from types import ModuleType
 
 from ....errors import LumigraphError
+from .. import categories
 from ..options import Pictures
 from ..stage import Stage
 
@@ -31,5 +32,8 @@ def stage(name: str, size: int = 200, views: int = 100, seed: int = 0, **further
 
 def scene(name: str) -> ModuleType:
     if name not in available():
-        raise LumigraphError(f"procedural:{name} does not exist; choose one of {', '.join(available())}")
+        raise LumigraphError(
+            f"procedural:{name} does not exist; choose one of {', '.join(available())}, "
+            f"or of the collections {', '.join(categories.available())}"
+        )
     return importlib.import_module(f".{name.replace('-', '_')}", __name__)
