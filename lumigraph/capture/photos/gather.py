@@ -14,7 +14,7 @@ from PIL import Image, UnidentifiedImageError
 
 from ...errors import LumigraphError
 from ...files import explained
-from ...names import natural
+from ...names import counted, natural
 from ..masks import MASKS, OBJECT_MASKS, find_mask
 from ..pictures import describe, reductions
 from ..raw import Developed, is_raw
@@ -73,11 +73,11 @@ def all_raw(files: Mapping[str, Path], source: str) -> bool:
     """Whether photographs are raw files. Raises LumigraphError where some are and others are not."""
     raw = [name for name, path in files.items() if is_raw(path)]
     if raw and len(raw) < len(files):
-        other, others = next(name for name in files if name not in raw), len(files) - len(raw)
+        other = next(name for name in files if name not in raw)
+        others = counted(len(files) - len(raw), "other photograph")
         raise LumigraphError(
-            f"{source} has {len(raw)} raw file{'s' * (len(raw) > 1)} and {others} other "
-            f"photograph{'s' * (others > 1)}, such as {raw[0]} and {other}, whose light is not comparable; name the "
-            f"files of one kind alone"
+            f"{source} has {counted(len(raw), 'raw file')} and {others}, such as {raw[0]} and {other}, whose light is "
+            f"not comparable; name the files of one kind alone"
         )
     return bool(raw)
 
