@@ -14,7 +14,7 @@ from lumigraph.capture.procedural.shapes import Box, Sphere
 from lumigraph.capture.procedural.textures import Checker, Plain
 from lumigraph.capture.procedural.world import joined
 from lumigraph.errors import LumigraphError
-from lumigraph.images import ImageStore
+from lumigraph.images import ImageSource, load
 
 SMALL = "procedural:city,crossings=2,size=24,views=14"
 
@@ -102,7 +102,8 @@ def test_pictures_are_traced_once(source, tmp_path, monkeypatch):
     monkeypatch.setattr(procedural, "picture", lambda *_: pytest.fail("traced again"))
     again = open_scene(source, cache=tmp_path)
     assert torch.equal(first.photograph(3).rgb, again.photograph(3).rgb)
-    some = open_scene(source, cache=tmp_path, part={"photographs": [first.photograph(i).name for i in (0, 1, 3)]})
+    part = {"photographs": [first.names[i] for i in (0, 1, 3)], "centre": (0.0, 0.0, 0.0), "radius": 1.0}
+    some = open_scene(source, cache=tmp_path, part=part)
     assert torch.equal(first.photograph(3).rgb, some.photograph(2).rgb)  # whichever scene asks
     with pytest.raises(pytest.fail.Exception):
         open_scene(f"{source},seed=1", cache=tmp_path)
@@ -138,11 +139,19 @@ def test_options_are_named():
         open_scene("procedural:city,crossings=1")
 
 
-def test_a_store_that_keeps_goes_to_the_file_even_where_it_fits(tmp_path):
-    from lumigraph.images import ImageSource
+def test_a_picture_that_is_kept_is_made_once_even_where_it_fits(tmp_path):
+    pixels, made = np.arange(5 * 4 * 3, dtype=np.uint8).reshape(5, 4, 3), []
 
-    pixels = np.arange(5 * 4 * 3, dtype=np.uint8).reshape(5, 4, 3)
-    source = ImageSource((4, 5), lambda: (pixels, None), "these")
-    store = ImageStore.load([source], memory=1 << 20, cache=tmp_path, keep=True)
-    assert store.shuffled and torch.equal(store[0], torch.from_numpy(pixels))
-    assert [path.name for path in tmp_path.iterdir()] and store.grant(1 << 19)
+    def make():
+        made.append(True)
+        return pixels, None
+
+    for keep, times in ((False, 1), (True, 2), (True, 2), (False, 3)):
+        store = load([ImageSource((4, 5), make, "these")], memory=1 << 20, cache=tmp_path, keep=keep)
+        assert not store.shuffled and torch.equal(store[0], torch.from_numpy(pixels)) and len(made) == times
+    (file,) = (tmp_path / "pictures").iterdir()
+    file.write_bytes(file.read_bytes()[:40])  # damaged: made again
+    load([ImageSource((4, 5), make, "these")], memory=1 << 20, cache=tmp_path, keep=True)
+    assert len(made) == 4
+    load([ImageSource((4, 5), make, "others")], memory=1 << 20, cache=tmp_path, keep=True)
+    assert len(made) == 5

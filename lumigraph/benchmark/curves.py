@@ -9,7 +9,7 @@ from typing import Any
 
 from .. import methods
 from ..budget import Budget
-from ..figures.charts import Series
+from ..figures.charts import COLOURS, Series
 from ..metrics import scores_of
 from .cell import duration
 from .results import Row
@@ -60,7 +60,7 @@ def curves(
     groups: dict[tuple[str, Any], dict[Any, list[Row]]] = {}
     for row in rows:
         groups.setdefault((row["method"], per(row)), {}).setdefault(point(row), []).append(row)
-    others = sorted({other for _, other in groups})
+    others, drawn = sorted({other for _, other in groups}), colours({method for method, _ in groups})
     series = []
     for (method, other), points in sorted(groups.items()):
         found = sorted(
@@ -69,5 +69,15 @@ def curves(
         )
         name = f"{method}, {other}" if len(others) > 1 else method
         x_of, y_of = [at for at, _ in found], [score for _, score in found]
-        series.append(Series(name, x_of, y_of, methods.colour(method), others.index(other)))
+        series.append(Series(name, x_of, y_of, drawn[method], others.index(other)))
     return series
+
+
+def colours(names: set[str]) -> dict[str, int]:
+    """The colour of each method in a chart of these: its own, or the next that is free where another has that."""
+    chosen: dict[str, int] = {}
+    for name in sorted(names, key=methods.colour):
+        own = methods.colour(name) % COLOURS
+        free = [own, *(colour for colour in range(COLOURS) if colour not in chosen.values())]
+        chosen[name] = free[1] if own in chosen.values() and len(free) > 1 else own
+    return chosen

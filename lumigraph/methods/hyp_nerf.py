@@ -13,7 +13,7 @@ from torch import Tensor
 
 from ..camera import Camera
 from ..collection import Collection
-from ..components.fields.appearance import fitted
+from ..components.fields.code_space import fitted
 from ..components.fields.hash_field import HashNumbers, check_levels
 from ..components.fields.hash_instance import HashInstance, HashShape
 from ..components.fields.hypernetwork import HyperNetwork
