@@ -18,7 +18,7 @@ FLOORS: list[set[str]] = [
     {"console", "errors", "processes", "quality", "signals"},
     {
         *("blending", "choice", "controls", "geometry", "loops", "marks"),
-        *("library", "memory", "names", "partials", "progress", "ranges", "readers", "srgb", "threads"),
+        *("allocation", "library", "memory", "names", "partials", "progress", "ranges", "readers", "srgb", "threads"),
     },
     {"budget", "files", "plain", "lens", "rays"},
     {"camera", "crop", "images", "kernels", "figures", "locks", "metrics", "packing"},

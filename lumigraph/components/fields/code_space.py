@@ -13,14 +13,13 @@ def axes_of(codes: Float[Tensor, "known code"], least: float = 0.0) -> Float[Ten
     """Along which codes differ, each as long as their deviation along it: their mean plus `w @ axes` is distributed as
     the Gaussian that fits them, where w is of the standard normal distribution. None for fewer than two codes.
 
-    least: share of their usual deviation that is added to that of every axis; above 0 there are as many axes as numbers
+    least: deviation that every axis has besides; above 0 there are as many axes as numbers
     """
     if len(codes) < 2:
         return codes[:0]
     off = (codes - codes.mean(0)) / (len(codes) - 1) ** 0.5
     _, found, along = torch.linalg.svd(off, full_matrices=least > 0)
-    deviation = torch.cat([found, found.new_zeros(len(along) - len(found))]).square()
-    deviation = (deviation + least**2 * off.square().sum() / codes.shape[1]).sqrt()
+    deviation = (torch.cat([found, found.new_zeros(len(along) - len(found))]).square() + least**2).sqrt()
     return (deviation[:, None] * along)[deviation > 1e-4 * deviation[:1].clamp_min(1e-9)]
 
 
