@@ -379,7 +379,7 @@ class BlockNeRF(RayMethod):
         size = piece.size if isinstance(piece, Patches) else 1
         batch = drawn(piece, FIT_RAYS, self.random(0)) if isinstance(piece, Photograph) else piece.batch
         batch = batch.to(self.device)
-        if not len(batch):
+        if self.appearance is None or not len(batch):
             return start
         rest, background = self._code[len(start) :], self.background
         target = batch.before(background)
