@@ -85,6 +85,11 @@ class Frame:
     times: tuple[Coordinate, Coordinate] | None = None
 
     @property
+    def is_open(self) -> bool:
+        """Whether the scene has no bounds: a room or the open, not an object."""
+        return self.reach > 1
+
+    @property
     def to_source(self) -> Similarity:
         """The way back to the frame that the capture came in."""
         return Similarity.of(self.source_from_scene)

@@ -140,7 +140,7 @@ def fit(
                 watched += give_way(watch, method, clock, interrupt)
                 continue
             logged = (step + 1) % log_every == 0
-            set_learning_rate(optimizers, method.learning_rate(step, progress))
+            set_learning_rate(optimizers, method.learning_rates(step, progress))
             method.before_step(step, progress)
             batch = method.batch(data, generator)
             terms = method.step(batch, step, Descent(method, optimizers, batch, step, logged, refuse))
@@ -218,13 +218,11 @@ def record(
     return row | {"terms": own, "statistics": statistics}
 
 
-def set_learning_rate(optimizers: Iterable[torch.optim.Optimizer], rate: float | dict[str, float] | None) -> None:
-    """Give groups of parameters what `Method.learning_rate` says."""
-    if rate is None:
-        return
+def set_learning_rate(optimizers: Iterable[torch.optim.Optimizer], rates: dict[str, float]) -> None:
+    """Set the learning rates of groups of parameters by their names; see `Method.learning_rates`."""
     for optimizer in optimizers:
         for group in optimizer.param_groups:
-            own = rate.get(group.get("name", "")) if isinstance(rate, dict) else rate
+            own = rates.get(group.get("name", ""))
             if own is not None:
                 group["lr"] = own * group.get("scale", 1.0)
 
@@ -285,8 +283,8 @@ def rehearse(method: Method, data: Dataset, step: int) -> float:
     double = copy.deepcopy(method).train()
     optimizers = double.optimizers()
     if step == 0:
-        double.rehearse_begin()
-    set_learning_rate(optimizers, double.learning_rate(step, 0.0))
+        double.compile_begin()
+    set_learning_rate(optimizers, double.learning_rates(step, 0.0))
     double.before_step(step, 0.0)
     batch = double.batch(data, torch.Generator().manual_seed(0))
     double.step(batch, step, Descent(double, optimizers, batch, step, False, lambda fault: None))

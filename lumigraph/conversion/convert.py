@@ -125,7 +125,7 @@ def take_over(teacher: Method, student: Method, data: Scene, cameras: Camera, as
     begin = time.perf_counter()
     poses, own = (getattr(method, "poses", None) for method in (teacher, student))
     if own is not None:
-        own.begin(data.cameras, data.frame)
+        own.choose_axes(data.cameras, data.frame)
         if poses is not None and as_taken:
             own.load_state_dict(poses.state_dict())
     if can(student, FromField):

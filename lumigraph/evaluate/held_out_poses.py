@@ -53,7 +53,7 @@ class HeldOutPoses:
             return self.method.refined(self.photographs[index])
         alone = replace(self.scene, splits={"train": torch.tensor([index])})
         poses = PoseRefinement(self.scene.frame.image_count, RATE).to(self.method.device)
-        poses.begin(self.scene.cameras[index], self.scene.frame)
+        poses.choose_axes(self.scene.cameras[index], self.scene.frame)
         self.frozen.poses = poses
         optimizer, generator = poses.optimizer(), torch.Generator().manual_seed(index)
         with torch.enable_grad():

@@ -14,9 +14,9 @@ from torch import Tensor, nn
 
 from ...controls import Control, blend
 from ...scene import Batch, Photograph
-from ..training.corrections import AVERAGE
 from .code_space import axes_of, fitted
 
+AVERAGE = "average"  # the choice of the mean of all learnt codes
 FIT_STEPS, FIT_RATE = 100, 0.1  # the rate in deviations of the learnt codes
 FIT_PRIOR = 2e-5  # of squared error, for a deviation from the average
 FIT_LEAST = 0.03  # deviation also where none of the codes differ; those of trained blocks differ by 0.07 on average

@@ -1,7 +1,8 @@
-"""A field in a multiresolution hash table with two tiny networks (Müller et al. 2022)."""
+"""A field in a multiresolution hash table with two small networks (Müller et al. 2022)."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Annotated, Any
 
@@ -11,117 +12,136 @@ from torch import Tensor, nn
 
 from ... import kernels
 from ...errors import LumigraphError
-from ...ranges import between
-from ..sampling.spaces import Box, Space
+from ...method import Field
+from ...packing import Stored
+from ...ranges import Layers, between
+from ..sampling.spaces import Space
+from ..training.lazy_adam import LazyAdam
 from .activations import truncated_exp
 from .mlp import MLP
 
-CALM = 0.5  # of the table's rate, that of networks in the open: at all of it one seed in three never learns a hue
-WITHIN = 2  # times as fine as asked for, where coordinates are contracted: the box of interest is half as wide in them
+OPEN_RATE = 0.5  # of the table's learning rate, that of networks in the open: at all of it one seed in three never learns a hue
+OPEN_RESOLUTION = 2  # factor on max_resolution where coordinates are contracted: the box of interest is half as wide
+
+Joining = Callable[[int], Tensor | None]  # weights of so many levels or octaves; None where all count fully
 
 
 @dataclass(frozen=True)
 class HashNumbers:
-    """A Config's numbers of the table (Müller 2022, table 1)."""
+    """A Config's numbers of the hash table (Müller 2022, table 1) and of the networks behind it (section 5.4)."""
 
-    levels: Annotated[int, between(1, 32)] = 16  # L
-    features_per_level: Annotated[int, between(1, 16)] = 2  # F
-    log2_hashmap_size: Annotated[int, between(1, 28)] = 19  # log2 T: 14 to 24
-    base_resolution: Annotated[int, between(1, 4096)] = 16  # N_min
-    max_resolution: Annotated[int, between(1, 1 << 20)] = 2048  # N_max, times the reach (section 5.4)
+    levels: Annotated[int, between(1, 32)] = 16  # L, number of levels
+    features_per_level: Annotated[int, between(1, 16)] = 2  # F, features of an entry
+    log2_hashmap_size: Annotated[int, between(1, 28)] = 19  # log2 T, entries of a level: 14 to 24
+    base_resolution: Annotated[int, between(1, 4096)] = 16  # N_min, resolution of the coarsest level
+    max_resolution: Annotated[int, between(1, 1 << 20)] = 2048  # N_max of the finest, times the reach, section 5.4
+    density_layers: Layers = 1  # hidden layers of the density network, section 5.4
+    colour_layers: Layers = 2  # hidden layers of the colour network, section 5.4
+    geometry_features: Annotated[int, between(1, 256)] = 16  # features from density to colour network, section 5.4
+    sh_bands: Annotated[int, between(1, 4)] = 4  # bands of spherical harmonics of the direction, section 5.4
 
+    def check(self) -> None:
+        """Raises LumigraphError for numbers of levels that contradict each other."""
+        if self.base_resolution > self.max_resolution:
+            raise LumigraphError(
+                f"The coarsest level cannot be finer than the finest: --base-resolution {self.base_resolution:,} is "
+                f"above --max-resolution {self.max_resolution:,}"
+            )
+        if self.levels << self.log2_hashmap_size >= 1 << 32:
+            raise LumigraphError(
+                f"--levels {self.levels} with --log2-hashmap-size {self.log2_hashmap_size} make more entries than "
+                f"32 bits count; give a smaller one"
+            )
 
-# Numbers of a Config for a plain CPU, which learn most in a minute (see docs/methods/instant_ngp.md), and for tests.
-TABLE_ON_A_CPU: dict[str, Any] = {"levels": 8, "features_per_level": 4, "log2_hashmap_size": 17, "max_resolution": 512}
-TINY_TABLE: dict[str, Any] = {"levels": 4, "log2_hashmap_size": 11, "base_resolution": 4, "max_resolution": 32}
-ON_A_CPU: dict[str, Any] = {
-    **TABLE_ON_A_CPU,
-    "hidden_width": 32,
-    "samples_per_step": 1 << 15,
-    "steps_per_diagonal": 384,
-    "transmittance_threshold": 1e-3,
-    "cone_angle": 1 / 96,
-    "occupancy_threshold": 0.15,
-    "learning_rate": 2e-2,
-}
-TINY: dict[str, Any] = {
-    **TINY_TABLE,
-    "hidden_width": 16,
-    "geometry_features": 8,
-    "sh_bands": 2,
-    "samples_per_step": 2048,
-    "steps_per_diagonal": 128,
-    "occupancy_resolution": 16,
-    "learning_rate": 2e-2,
-}
+    def activation_bytes(self, samples: int, hidden_width: int) -> int:
+        """Lower bound of the bytes of activations that a step of so many samples keeps for its gradients."""
+        hidden = hidden_width * (self.density_layers + self.colour_layers)
+        return 4 * samples * (self.levels * self.features_per_level + hidden)
 
 
-class HashField(nn.Module):
-    """Density from position, colour from position, direction and a code (Müller 2022, figure 3 and section 5.4).
+# Tables for a plain CPU, which learn most in a minute (docs/methods/instant_ngp.md), and for tests.
+CPU_TABLE = HashNumbers(levels=8, features_per_level=4, log2_hashmap_size=17, max_resolution=512)
+TINY_TABLE = HashNumbers(
+    levels=4, log2_hashmap_size=11, base_resolution=4, max_resolution=32, geometry_features=8, sh_bands=2
+)
 
-    config: names the numbers of levels, table and networks as `methods.instant_ngp.Config` does
-    space:  whose coordinates the table covers
-    reach:  half-size of the cube that a scene lies in as it is, where the space leaves it so
-    code:   numbers beside the direction that colour depends on, such as a photograph's appearance
+
+class HashField(Field):
+    """Density from position; colour from position, direction and a code (Müller 2022, figure 3 and section 5.4).
+
+    numbers: of table and networks
+    space:   whose coordinates the table covers
+    reach:   half-size of the cube that a bounded scene lies in
+    code:    width of a code that colour depends on beside the direction, such as an appearance embedding
+    joining: weights of the levels, where they join from coarse to fine; None where all count fully
     """
 
-    def __init__(self, config: Any, space: Space, reach: float, code: int = 0):
+    def __init__(
+        self,
+        numbers: HashNumbers,
+        hidden_width: int,
+        space: Space,
+        reach: float,
+        code: int = 0,
+        joining: Joining | None = None,
+    ):
         super().__init__()
-        self.extent, finer = (reach, reach) if isinstance(space, Box) else (1.0, WITHIN)
-        self.bands, finest = config.sh_bands, int(config.max_resolution * finer)
+        n = numbers
+        self.space, self.bands, self.joining = space, n.sh_bands, joining
+        self.extent, finer = (1.0, OPEN_RESOLUTION) if space.is_open else (reach, reach)
+        finest = int(n.max_resolution * finer)
         self.levels = kernels.HashLevels(
-            config.levels, config.features_per_level, config.log2_hashmap_size, config.base_resolution, finest
+            n.levels, n.features_per_level, n.log2_hashmap_size, n.base_resolution, finest
         )
-        self.table = nn.Parameter(torch.empty(self.levels.offsets[-1], config.features_per_level).uniform_(-1e-4, 1e-4))
-        hidden = [config.hidden_width] * config.density_layers
-        self.density_network = MLP(config.levels * config.features_per_level, *hidden, config.geometry_features)
-        hidden = [config.hidden_width] * config.colour_layers
-        self.colour_network = MLP(config.geometry_features + self.bands**2 + code, *hidden, 3)
+        self.table = nn.Parameter(torch.empty(self.levels.offsets[-1], n.features_per_level).uniform_(-1e-4, 1e-4))
+        encoded = n.levels * n.features_per_level
+        self.density_network = MLP(encoded, *[hidden_width] * n.density_layers, n.geometry_features)
+        self.colour_network = MLP(n.geometry_features + n.sh_bands**2 + code, *[hidden_width] * n.colour_layers, 3)
 
-    def encode(
-        self, coordinates: Float[Tensor, "sample 3"], weights: Float[Tensor, " level"] | None = None
-    ) -> Float[Tensor, "sample width"]:
-        """Features of all levels, the coarsest first. weights: of the levels, where not all count fully"""
-        encoded = kernels.hash_encode(coordinates * (0.5 / self.extent) + 0.5, self.table, self.levels)
+    def encode(self, points: Float[Tensor, "point 3"]) -> Float[Tensor, "point width"]:
+        """Features of all levels, the coarsest first."""
+        encoded = kernels.hash_encode(self.space.warp(points) * (0.5 / self.extent) + 0.5, self.table, self.levels)
+        weights = self.joining(self.levels.levels) if self.joining else None
         return encoded if weights is None else encoded * weights.repeat_interleave(self.levels.features)
 
-    def density(
-        self, encoded: Float[Tensor, "sample width"]
-    ) -> tuple[Float[Tensor, " sample"], Float[Tensor, "sample geometry"]]:
-        """Density per unit of the coordinates, and the features of each place that the colour network takes."""
+    def geometry(
+        self, points: Float[Tensor, "point 3"], code: Float[Tensor, "point code"] | None = None
+    ) -> tuple[Float[Tensor, " point"], Float[Tensor, "point geometry"]]:
+        return self.decode(points, self.encode(points))
+
+    def decode(
+        self, points: Float[Tensor, "point 3"], encoded: Float[Tensor, "point width"]
+    ) -> tuple[Float[Tensor, " point"], Float[Tensor, "point geometry"]]:
+        """Density per scene unit and geometry features of points that were encoded."""
         geometry = self.density_network(encoded)
-        return truncated_exp(geometry[:, 0]), geometry
+        return truncated_exp(geometry[:, 0]) * self.space.stretch(points), geometry
 
     def colour(
         self,
-        geometry: Float[Tensor, "sample geometry"],
-        directions: Float[Tensor, "sample 3"],
-        *codes: Float[Tensor, "sample code"],
-    ) -> Float[Tensor, "sample 3"]:
-        """sRGB-encoded colour."""
+        features: Float[Tensor, "point geometry"],
+        directions: Float[Tensor, "point 3"],
+        code: Float[Tensor, "point code"] | None = None,
+    ) -> Float[Tensor, "point 3"]:
         harmonics = kernels.spherical_harmonics(directions, self.bands)
-        return torch.sigmoid(self.colour_network(side_by_side(geometry, harmonics, *codes)))
+        codes = [] if code is None else [code]
+        return self.activated(self.colour_network(side_by_side(features, harmonics, *codes)))
 
+    def activated(self, raw: Float[Tensor, "point 3"]) -> Float[Tensor, "point 3"]:
+        """sRGB-encoded colour of the colour network's output."""
+        return raw.sigmoid()
 
-def check_levels(config: Any) -> None:
-    """Raises LumigraphError for numbers of levels that contradict each other."""
-    if config.base_resolution > config.max_resolution:
-        raise LumigraphError(
-            f"The coarsest level cannot be finer than the finest: --base-resolution {config.base_resolution:,} is "
-            f"above --max-resolution {config.max_resolution:,}"
-        )
-    if config.levels << config.log2_hashmap_size >= 1 << 32:
-        raise LumigraphError(
-            f"--levels {config.levels} with --log2-hashmap-size {config.log2_hashmap_size} make more entries than "
-            f"32 bits count; give a smaller one"
-        )
+    def optimizers_at(self, learning_rate: float, weight_decay: float = 0.0) -> list[torch.optim.Optimizer]:
+        """Adam for the table, whose rows are updated where they were looked up, and for the networks (section 4)."""
+        common: dict[str, Any] = {"lr": learning_rate, "betas": (0.9, 0.99), "eps": 1e-15}
+        networks = [*self.density_network.parameters(), *self.colour_network.parameters()]
+        group = {"params": networks, "scale": OPEN_RATE if self.space.is_open else 1.0}
+        table = LazyAdam([self.table], weight_decay=0.0 if self.space.is_open else weight_decay, **common)
+        return [table, torch.optim.Adam([group], foreach=True, **common)]
 
-
-def bytes_kept(config: Any) -> int:
-    """Bytes of activations that a step keeps for its gradients at least."""
-    hidden = config.hidden_width * (config.density_layers + config.colour_layers)
-    return 4 * config.samples_per_step * (config.levels * config.features_per_level + hidden)
-
+    def storage(self) -> dict[str, Stored]:
+        """The table as whole numbers, the networks as halves."""
+        networks = [name for name, _ in self.named_parameters() if name != "table"]
+        return {"table": Stored("scaled"), **dict.fromkeys(networks, Stored("half"))}
 
 def side_by_side(*features: Float[Tensor, "sample _"]) -> Float[Tensor, "sample width"]:
     """Features of samples joined as `kernels.perceptron` reads them quickest, all samples' first one, then the next."""

@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 import torch
@@ -27,7 +28,7 @@ SIDEWAYS = 1e-3  # sine of the angle to the near plane, below which a ray is sai
 
 def space_of(frame: Frame) -> Space:
     """The space that suits a scene."""
-    if frame.reach <= 1:
+    if not frame.is_open:
         return Box(frame.bounds, frame.near)
     if frame.forward is not None:
         return NDC(frame.forward, frame.near)
@@ -43,7 +44,10 @@ class Space(ABC):
     """A map from the scene to coordinates, and the part of each ray that it covers.
 
     Plain numbers, so that it works on any device and in any precision.
+    is_open: whether it covers a scene without bounds
     """
+
+    is_open: ClassVar[bool] = True
 
     @abstractmethod
     def interval(self, rays: Rays) -> tuple[Float[Tensor, " ray"], Float[Tensor, " ray"]]:
@@ -104,6 +108,7 @@ class Box(Space):
 
     bounds: tuple[Vector, Vector]
     near: float
+    is_open: ClassVar[bool] = False
 
     def interval(self, rays):
         enter, leave = rays.through_box(rays.origins.new_tensor(self.bounds))

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from ...rays import Rendering
 from ...scene import Batch
-from .corrections import Exposure
+from .exposure import Exposure
 
 
 def backdrop(

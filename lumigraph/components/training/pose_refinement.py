@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar
 
 import torch
 from jaxtyping import Float
@@ -10,6 +11,8 @@ from torch import Tensor, nn
 
 from ...camera import Camera
 from ...geometry import rotated
+from ...method import Part
+from ...ranges import LearningRate
 from ...rays import Rays
 from ...scene import Frame, Scene
 from .bundle_adjustment import adjusted, pixel_angle, rotation_vector
@@ -27,7 +30,23 @@ FINE = 0.1  # of the rate, where poses were found before the scene
 FALL = 0.02  # of the rate, that is left of it at the end of the budget
 
 
-class PoseRefinement(nn.Module):
+@dataclass(frozen=True)
+class PoseNumbers:
+    """A Config's numbers of pose refinement."""
+
+    refine_cameras: bool = False  # learn the pose of each photograph, coarse to fine (Lin 2021, BARF)
+    pose_learning_rate: LearningRate = 5e-4  # radians by which a step moves a picture, with refine_cameras
+    match_photographs: bool = True  # with refine_cameras, initialise poses from features that photographs share
+
+
+def poses_for(frame: Frame, numbers: PoseNumbers) -> PoseRefinement | None:
+    """A `PoseRefinement` where the numbers ask for one."""
+    if not numbers.refine_cameras:
+        return None
+    return PoseRefinement(frame.image_count, numbers.pose_learning_rate, numbers.match_photographs)
+
+
+class PoseRefinement(Part):
     """A small rotation (radians) and shift (scene units) of each photograph's camera, in the world's frame, 0 at first.
 
     The rotation is about the camera's own place: the exponential map of so(3) by Rodrigues' formula (Lin 2021, BARF,
@@ -37,22 +56,29 @@ class PoseRefinement(nn.Module):
     learning_rate: radians that a step moves a picture by, at most
     progress:      share of the budget spent, by which `weights` lets bands of an encoding join
     found:         whether points that photographs share told the poses to begin at, see `find`
-    whitened:      whether `axes` are there; runs of version 0.1 learnt rotation and shift themselves
+    matching:      whether `begin` matches features that photographs share
     """
 
+    moves_cameras: ClassVar[bool] = True
     axes: Tensor
     progress: Tensor
     found: Tensor
 
-    def __init__(self, image_count: int, learning_rate: float = 1e-3):
+    def __init__(self, image_count: int, learning_rate: float = 1e-3, matching: bool = True):
         super().__init__()
-        self.learning_rate, self.whitened = learning_rate, True
+        self.learning_rate, self.matching = learning_rate, matching
         self.twist = nn.Parameter(torch.zeros(image_count, 6))
         self.register_buffer("axes", torch.eye(6).repeat(image_count, 1, 1))
         self.register_buffer("progress", torch.tensor(1.0))
         self.register_buffer("found", torch.tensor(False))
 
-    def begin(self, cameras: Camera, frame: Frame) -> None:
+    def begin(self, method: Any, data: Scene, seconds: float) -> None:
+        self.find(data, self.matching)
+
+    def before_step(self, method: Any, step: int, progress: float) -> None:
+        self.progress.fill_(progress)
+
+    def choose_axes(self, cameras: Camera, frame: Frame) -> None:
         """Choose the coordinates by what each camera sees. cameras: of photographs, by their `image_index`"""
         if cameras.image_index is not None:
             for i, image in enumerate(cameras.image_index.tolist()):
@@ -62,7 +88,7 @@ class PoseRefinement(nn.Module):
     def find(self, scene: Scene, matching: bool = True) -> None:
         """Begin at the poses as given, or, with matching, at those that points say which photographs share, where these
         are enough; see `adjusted`."""
-        self.begin(scene.cameras, scene.frame)
+        self.choose_axes(scene.cameras, scene.frame)
         if not matching:
             return
         given = scene.cameras[scene.splits["train"]].to("cpu")
@@ -89,6 +115,9 @@ class PoseRefinement(nn.Module):
         omega, shift = self.moves[rays.image_index].split(3, -1)
         return replace(rays, origins=rays.origins + shift, directions=rotated(rays.directions, omega))
 
+    def moved(self, rays: Rays) -> Rays:
+        return self(rays)
+
     @torch.no_grad()
     def refined(self, cameras: Camera) -> Camera:
         """Cameras with the corrections of the photographs that they took; those that were not trained on have none."""
@@ -103,6 +132,12 @@ class PoseRefinement(nn.Module):
         progress = float(self.progress)
         return None if progress >= ENDS else band_weights(bands, progress).to(self.twist)
 
+    def optimizers(self) -> list[torch.optim.Optimizer]:
+        return [self.optimizer()]
+
+    def learning_rates(self, step: int, progress: float) -> dict[str, float]:
+        return {"poses": self.rate(progress)}
+
     def optimizer(self) -> PoseAdam:
         """Fresh; its group is called "poses", and its rate is that of `rate`."""
         return PoseAdam([{"name": "poses", "params": [self.twist]}], self.learning_rate)
@@ -111,12 +146,6 @@ class PoseRefinement(nn.Module):
         """The learning rate at a share of the budget: it grows, then falls exponentially."""
         highest = (FINE if self.found else 1.0) * self.learning_rate
         return falling(highest, FALL * self.learning_rate, progress, WARMUP)
-
-    def _load_from_state_dict(self, state_dict, prefix, *others) -> None:
-        self.whitened = f"{prefix}axes" in state_dict
-        for name in ("axes", "progress", "found"):  # which older runs lack: rotation and shift as they are, all bands
-            state_dict.setdefault(prefix + name, getattr(self, name))
-        super()._load_from_state_dict(state_dict, prefix, *others)
 
 
 def whitening(camera: Camera, frame: Frame) -> Float[Tensor, "6 6"]:

@@ -1,8 +1,9 @@
-"""Method and RayMethod: the only two abstract classes in the house."""
+"""Method: one paper, which learns from a dataset and renders cameras."""
 
 from __future__ import annotations
 
 import copy
+import dataclasses
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
@@ -12,14 +13,14 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from .camera import Camera
-from .capabilities import HasLooks, needs
-from .controls import Control, Value
-from .errors import LumigraphError
-from .quality import BY_PHOTOGRAPH, BY_RAY, Efforts, Quality
-from .rays import Rays, Rendering
-from .scene import Batch, Frame, Scene
-from .volume import composite
+from ..camera import Camera
+from ..controls import Control, Value
+from ..errors import LumigraphError
+from ..packing import Stored
+from ..quality import BY_PHOTOGRAPH, Efforts, Quality
+from ..rays import Rays, Rendering
+from ..scene import Frame, Scene
+from .part import Part
 
 
 @runtime_checkable
@@ -57,9 +58,6 @@ class Method(nn.Module, ABC):
     learns_from: ClassVar[type] = Scene  # the kind of dataset
     accepts: ClassVar[tuple[type, ...]] = ()  # the kinds of evidence that `given` takes
     any_lens: ClassVar[bool] = False  # whether `render` follows every lens, or flat pictures alone
-    formerly_weights: ClassVar[dict[str, str]] = {}  # beginnings of their names in older runs, and those they have now
-    formerly: ClassVar[dict[str, str]] = {}  # names that Config's fields had in older runs, and those they have now
-    before: ClassVar[dict[str, Any]] = {}  # what fields of Config are in runs from before there were any such
     efforts: ClassVar[Efforts] = BY_PHOTOGRAPH  # what each --quality asks for
     _place: Tensor
 
@@ -77,9 +75,10 @@ class Method(nn.Module, ABC):
 
     @classmethod
     def further_bytes(cls, frame: Frame, config: Any, learning: bool) -> int:
-        """Bytes that will be needed at least, beside what is built at first: grids that are refined; where it is
-        learning, what a step keeps for its gradients."""
-        return 0
+        """Lower bound of the bytes needed beside what is built at first: grids that are refined and, with `learning`,
+        activations kept for gradients. By default the sum over the Config's parts that know theirs."""
+        held = (getattr(config, x.name) for x in dataclasses.fields(config))
+        return sum(x.further_bytes(frame, learning) for x in held if hasattr(x, "further_bytes"))
 
     # Learning
 
@@ -108,8 +107,8 @@ class Method(nn.Module, ABC):
         return terms
 
     def optimizers(self) -> list[torch.optim.Optimizer]:
-        """Fresh optimizers over the parameters; the trainer calls this once. None where nothing descends."""
-        return []
+        """Fresh optimizers over the parameters; the trainer calls this once. By default those of the parts."""
+        return [optimizer for part in self.parts for optimizer in part.optimizers()]
 
     def learning_rate(self, step: int, progress: float) -> float | dict[str, float] | None:
         """The learning rate of this step, which the trainer gives to the optimizers: one for all groups of
@@ -118,6 +117,12 @@ class Method(nn.Module, ABC):
         progress: share of the budget (steps or seconds) spent, in [0, 1]
         """
         return None
+
+    def learning_rates(self, step: int, progress: float) -> dict[str, float]:
+        """Learning rates by the names of groups: those of the parts and `learning_rate`, "" for groups without a name."""
+        rates = {name: rate for part in self.parts for name, rate in part.learning_rates(step, progress).items()}
+        own = self.learning_rate(step, progress)
+        return rates if own is None else rates | (own if isinstance(own, dict) else {"": own})
 
     @property
     def complete(self) -> bool:
@@ -129,15 +134,23 @@ class Method(nn.Module, ABC):
 
         seconds: the whole budget, of which a small share may be used; infinite where steps are counted
         """
+        for part in self.parts:
+            part.begin(self, data, seconds)
 
-    def rehearse_begin(self) -> None:
+    def compile_begin(self) -> None:
         """Called on a copy before the clock starts: compile what `begin` needs and no step does."""
+        for part in self.parts:
+            part.compile_begin()
 
     def before_step(self, step: int, progress: float) -> None:
         """Called ahead of each step. progress is the share of the budget (steps or seconds) spent, in [0, 1]."""
+        for part in self.parts:
+            part.before_step(self, step, progress)
 
     def after_step(self, step: int) -> None:
         """Called once the step is done."""
+        for part in self.parts:
+            part.after_step(self, step)
 
     def statistics(self) -> dict[str, float]:
         """Figures of the last step worth a line in metrics.jsonl, e.g. rays and samples."""
@@ -154,12 +167,34 @@ class Method(nn.Module, ABC):
         """The colour behind the scene, one row for all rays."""
         return torch.tensor([self.frame.background], device=self.device)
 
+    # Parts
+
+    @property
+    def parts(self) -> list[Part]:
+        """All submodules with hooks, in the order in which they were assigned."""
+        return [module for module in self.modules() if isinstance(module, Part)]
+
+    @property
+    def moves_cameras(self) -> bool:
+        """Whether a part learns poses; what would follow from given poses is then left out of `begin`."""
+        return any(part.moves_cameras for part in self.parts)
+
+    def storage(self) -> dict[str, Stored]:
+        """Storage of tensors in a compressed run by their names; see `CanCompress`."""
+        parts = ((name, part) for name, part in self.named_modules() if isinstance(part, Part))
+        return {f"{name}.{tensor}": how for name, part in parts for tensor, how in part.storage().items()}
+
     # Being told something
 
     @property
     def controls(self) -> tuple[Control, ...]:
         """What a user may turn, beside the camera."""
-        return ()
+        return tuple(control for part in self.parts for control in part.controls)
+
+    @property
+    def takes(self) -> tuple[type, ...]:
+        """The kinds of evidence that `given` takes now: those of the class, and of the parts as they were trained."""
+        return (*self.accepts, *(kind for part in self.parts for kind in part.accepts))
 
     @property
     def evidence_views(self) -> int | None:
@@ -177,9 +212,13 @@ class Method(nn.Module, ABC):
         A method that takes evidence overrides this, and calls it for its controls.
         Raises LumigraphError for what this method cannot be told.
         """
-        for piece in evidence:
-            kinds = " or ".join(kind.__name__ for kind in self.accepts) or "nothing but its controls"
-            raise LumigraphError(f"{type(self).__name__} cannot be given a {type(piece).__name__}; it takes {kinds}")
+        parts = {name: part for name, part in self.named_children() if isinstance(part, Part)}
+        chosen = [next((n for n, part in parts.items() if isinstance(piece, part.accepts)), None) for piece in evidence]
+        for piece, name in zip(evidence, chosen, strict=True):
+            if name is None:
+                kinds = " or ".join(kind.__name__ for kind in self.takes) or "nothing but its controls"
+                kind = type(piece).__name__
+                raise LumigraphError(f"{type(self).__name__} cannot be given a {kind}; it takes {kinds}")
         known = {control.name: control for control in self.controls}
         for name in controls:
             if name not in known:
@@ -190,6 +229,8 @@ class Method(nn.Module, ABC):
             told.__dict__[held] = dict(self.__dict__[held])
         told.figures = {}
         told.told = self.told | {name: known[name].checked(value) for name, value in controls.items()}
+        for piece, name in zip(evidence, chosen, strict=True):
+            told._modules[name] = parts[name].adapted(told, piece)
         return told
 
     def control(self, name: str) -> Value:
@@ -209,6 +250,8 @@ class Method(nn.Module, ABC):
     def refined(self, cameras: Camera) -> Camera:
         """The cameras of photographs as this method has come to see them, by their `image_index`; as they are where it
         learns no poses. Evaluation, films and exports go by these."""
+        for part in self.parts:
+            cameras = part.refined(cameras)
         return cameras
 
     # Being made of another
@@ -226,58 +269,3 @@ class Method(nn.Module, ABC):
     @property
     def device(self) -> torch.device:
         return self._place.device
-
-
-class RayMethod(Method):
-    """A Method that sees one ray at a time: write `looks` or `render_rays`, inherit the rest."""
-
-    any_lens: ClassVar[bool] = True
-    efforts: ClassVar[Efforts] = BY_RAY
-    rays_per_chunk: int = 16_384
-
-    def steps_per_pass(self, data: Any) -> float:
-        """Steps after which as many rays were seen as the training photographs have pixels to learn from."""
-        if not isinstance(data, Scene):
-            return super().steps_per_pass(data)
-        return data.pixels("train") / self.rays_in_a_step(data)
-
-    def rays_in_a_step(self, data: Scene) -> float:
-        """Rays that a step learns from, about: those of a first one, which a copy draws."""
-        return len(copy.deepcopy(self).batch(data, torch.Generator().manual_seed(0)))
-
-    def batch(self, data: Scene, generator: torch.Generator) -> Batch:
-        return data.sample_rays(self.config.rays_per_step, generator).to(self.device)
-
-    @property
-    def pass_weights(self) -> dict[str, float]:
-        """Weights of the passes' errors in the loss, by the names of their looks; 1 for one that is not named. Nothing
-        is learnt from a pass of weight 0."""
-        return {}
-
-    def loss(self, batch: Batch, step: int) -> dict[str, Tensor]:
-        """The squared error of each pass's picture (Mildenhall 2020, eq. 6), where `looks` takes a generator beside the
-        rays: of the samples' random places in training."""
-        background = self.background
-        target = batch.before(background)
-        terms = {}
-        for look in needs(self, HasLooks).looks(batch.rays, self.random(step)):
-            if weight := self.pass_weights.get(look.name, 1.0):
-                seen = composite(look.samples, look.density, look.rgb, background)
-                error = (seen.rgb - target).square().mean()
-                self.figures["mse"] = float(error.detach())  # of the last pass in the end
-                terms[look.name] = weight * error
-        return terms
-
-    def render_rays(self, rays: Rays, background: Float[Tensor, "#ray 3"]) -> Rendering:
-        """What each ray sees, in front of a background colour: the last look at it, composited."""
-        look = needs(self, HasLooks).looks(rays)[-1]
-        return composite(look.samples, look.density, look.rgb, background)
-
-    @torch.no_grad()
-    def render(self, camera: Camera) -> Rendering:
-        width, height = camera.size[0].tolist()
-        rays = camera.rays(camera.pixels()).to(self.device)
-        background = self.background
-        chunks = [slice(i, i + self.rays_per_chunk) for i in range(0, len(rays), self.rays_per_chunk)]
-        parts = [self.render_rays(rays[chunk], background) for chunk in chunks]
-        return Rendering.cat(parts).reshape(height, width)

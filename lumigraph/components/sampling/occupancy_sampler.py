@@ -1,0 +1,252 @@
+"""Occupancy sampler: samples lie in occupied cells of a grid, as far as light reaches (Müller 2022, appendix E)."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Annotated, Any, NamedTuple
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from ...method import Features, Field, Pass, Sampler
+from ...method.sampler import Density, codes_at
+from ...packing import Stored
+from ...ranges import NonNegative, Share, Steps, between
+from ...rays import Rays, Samples
+from ...scene import Frame, Scene
+from ...volume import visible, weights_of
+from .carving import visual_hull
+from .occupancy import OccupancyGrid
+from .spaces import Space
+
+FIRST_RAYS = 256  # rays of the first step, before the number of samples per ray is known
+MIN_RAYS = 64  # rays of a step
+MAX_GROWTH = 1.5  # factor by which the number of rays may grow from one step to the next
+EARLY_INTERVAL = 4  # steps between updates of the whole grid in the first steps
+CELLS_PER_SAMPLE = 4  # cells updated at most, for each sample of a step
+MIN_RESOLUTION = 4  # cells per axis
+
+
+@dataclass(frozen=True)
+class OccupancyNumbers:
+    """A Config's numbers of the occupancy grid and of the samples in its cells; the paper's (Müller 2022)."""
+
+    samples_per_step: Annotated[int, between(64, 1 << 24)] = 1 << 18  # samples of a step, not rays, section 5.4
+    transmittance_threshold: Share = 1e-4  # transmittance at which a ray terminates, appendix E.1
+    occupancy_resolution: Annotated[int, between(4, 512)] = 128  # cells per axis and cascade, appendix E.2
+    occupancy_threshold: NonNegative = 0.05  # optical thickness across a cell below which it is empty, E.2 at n = 128
+    occupancy_interval: Steps = 16  # steps between updates of the occupancy grid, appendix E.2
+    occupancy_decay: Share = 0.95  # decay of the remembered densities at each update, appendix E.2
+
+    def further_bytes(self, frame: Frame, learning: bool) -> int:
+        """Bytes of the refined grid, of a bounded scene."""
+        return 0 if frame.is_open else OccupancyGrid.bytes_of(1.0, self.occupancy_resolution)
+
+
+@dataclass(frozen=True)
+class StepNumbers:
+    """A Config's numbers of the steps along a ray, where no grid of a field sets them (Müller 2022, appendix E.1)."""
+
+    steps_per_diagonal: Annotated[int, between(4, 16_384)] = 1024  # steps across the diagonal of the unit cascade
+    cone_angle: Share = 1 / 256  # growth of steps with distance, in scenes without bounds
+
+
+class Stage(NamedTuple):
+    """From a share of the budget on: shares of `occupancy_resolution` and of `steps_per_diagonal`."""
+
+    begins: float
+    cells: float
+    steps: float = 1.0
+
+
+@dataclass(frozen=True)
+class GridSchedule:
+    """The updates of an occupancy grid over the budget.
+
+    stages:      resolution of the grid and of the steps along rays, from coarse to fine
+    begins:      share of the budget before which nothing is known to be empty
+    early_steps: steps in which the whole grid is updated, every EARLY_INTERVAL steps
+    probes:      share of all cells, drawn at random, that an update visits besides occupied ones; 1 for all cells
+    max_cells:   cells that an update visits at most; None for CELLS_PER_SAMPLE of each sample
+    """
+
+    stages: tuple[Stage, ...] = (Stage(0.0, 1.0),)
+    begins: float = 0.0
+    early_steps: int = 32
+    probes: float = 0.02
+    max_cells: int | None = None
+
+    def stage(self, progress: float) -> Stage:
+        """The stage at a share of the budget, in [0, 1]."""
+        return max(stage for stage in self.stages if stage.begins <= progress)
+
+
+NGP_SCHEDULE = GridSchedule(
+    (Stage(0.0, 1 / 4, 1 / 4), Stage(0.04, 1 / 2, 1 / 2), Stage(0.12, 1, 2 / 3), Stage(0.75, 1, 1))
+)
+
+
+class OccupancySampler(Sampler):
+    """Samples in occupied cells. A first pass without gradients finds those that light reaches; the field is evaluated
+    with gradients at these alone, because most samples lie behind what their ray sees.
+
+    numbers, schedule: of the grid
+    steps:             lengths of steps along rays; None where the field's own grid sets them
+    samples_per_ray:   samples of a typical ray once empty space is known
+    max_rays:          rays of a step at most
+    adapts:            whether the number of rays follows the number of samples they need
+    sampled_share:     share of each ray, around its middle, that is sampled in training
+    """
+
+    rays_per_step: Tensor
+
+    def __init__(
+        self,
+        frame: Frame,
+        space: Space,
+        numbers: OccupancyNumbers,
+        schedule: GridSchedule,
+        steps: StepNumbers | None = None,
+        samples_per_ray: int = 24,
+        max_rays: int | None = None,
+        adapts: bool = True,
+    ):
+        super().__init__()
+        self.frame, self.space, self.numbers, self.schedule, self.steps = frame, space, numbers, schedule, steps
+        self.samples_per_ray, self.max_rays, self.adapts = samples_per_ray, max_rays or numbers.samples_per_step, adapts
+        first = max(MIN_RESOLUTION, int(numbers.occupancy_resolution * schedule.stages[0].cells))
+        self.grid = OccupancyGrid(frame.reach, first)
+        self.register_buffer("rays_per_step", torch.tensor(min(FIRST_RAYS, self.max_rays) if adapts else self.max_rays))
+        self.step_share, self.sampled_share, self.stale = 1.0, 1.0, False
+
+    @property
+    def batch_size(self) -> int:
+        return int(self.rays_per_step)
+
+    @property
+    def expected_rays(self) -> float:
+        return min(self.max_rays, self.numbers.samples_per_step / self.samples_per_ray) if self.adapts else self.max_rays
+
+    def sample(
+        self,
+        rays: Rays,
+        field: Field,
+        code: Float[Tensor, "ray code"] | None = None,
+        generator: torch.Generator | None = None,
+    ) -> list[Pass]:
+        jitter = None if generator is None else torch.rand(len(rays), generator=generator).to(rays.origins.device)
+        code_of = code if field.deforms else None
+        samples = self.grid.sample(rays, self.frame.near, *self._step(field), jitter=jitter)
+        if generator is not None and self.sampled_share < 1:
+            samples = samples.keep(self._in_the_middle(rays, samples))
+        samples, evaluated = reached(rays, samples, field, code_of, self.numbers.transmittance_threshold)
+        points, directions = samples.along(rays)
+        of_samples = None if code_of is None else codes_at(samples.ray_index, code_of)
+        if generator is not None:
+            self.evaluated = evaluated
+        if field.joint and generator is not None:
+            density, rgb = field(points, directions, of_samples)
+            return [Pass("samples", samples, density, (), directions, rgb=rgb, evaluated=evaluated)]
+        density, features = field.geometry(points, of_samples)
+        if field.cheap_density or field.min_weight is None:
+            return [Pass("samples", samples, density, features, directions, evaluated=evaluated)]
+        coloured = (weights_of(samples, density.detach()) > field.min_weight).nonzero()[:, 0]
+        features, directions = rows_of(features, coloured), directions.index_select(0, coloured)
+        return [Pass("samples", samples, density, features, directions, coloured, evaluated=evaluated)]
+
+    def _step(self, field: Field) -> tuple[float, float]:
+        """Length of a step in scene units, and its growth with distance (appendix E.1)."""
+        if self.steps is None:
+            return field.step_length, 0.0
+        step = 2 * math.sqrt(3) / int(self.steps.steps_per_diagonal * self.step_share)
+        return step, self.steps.cone_angle / self.step_share if self.frame.is_open else 0.0
+
+    def _in_the_middle(self, rays: Rays, samples: Samples) -> Bool[Tensor, " sample"]:
+        near, far = self.space.interval(rays)
+        ray, half = samples.ray_index, 0.5 * self.sampled_share * (far - near)
+        return (samples.t - (0.5 * (near + far))[ray]).abs() < half[ray]
+
+    # Training
+
+    def begin(self, method: Any, data: Scene, seconds: float) -> None:
+        """Rule out cells that the photographs' alpha proves empty, unless poses are learnt."""
+        if data.images.has_alpha and not self.frame.is_open and not method.moves_cameras:
+            self.grid.rule_out(visual_hull(data, self.numbers.occupancy_resolution)[None])
+
+    def begin_from(self, teacher: Any, chance: torch.Generator) -> None:
+        n = self.numbers
+        if not self.frame.is_open:
+            held = teacher.occupied(self.space, n.occupancy_resolution, n.occupancy_threshold, chance)
+            self.grid.rule_out(held[None])
+
+    def settle(self, density: Density, chance: torch.Generator) -> None:
+        self.grid.update(density, self.numbers.occupancy_threshold, chance)
+
+    def before_step(self, method: Any, step: int, progress: float) -> None:
+        """Refine the grid when its stage begins, and update it when that is due (appendix E.2)."""
+        n, schedule = self.numbers, self.schedule
+        stage = schedule.stage(progress)
+        self.step_share = stage.steps
+        if progress < schedule.begins:
+            return
+        while self.grid.resolution < n.occupancy_resolution * stage.cells:
+            self.grid.refine()
+            self.stale = True
+        early = step < schedule.early_steps
+        if self.stale or step % (EARLY_INTERVAL if early else n.occupancy_interval) == 0:
+            whole = self.stale or early or schedule.probes >= 1
+            share, budget = (1.0, None) if whole else (schedule.probes, self._max_cells)
+            chance = method.random(~step)
+            self.grid.update(method.density, n.occupancy_threshold, chance, n.occupancy_decay, share, budget)
+            self.stale = False
+
+    @property
+    def _max_cells(self) -> int:
+        return self.schedule.max_cells or self.numbers.samples_per_step * CELLS_PER_SAMPLE
+
+    def after_step(self, method: Any, step: int) -> None:
+        """Set the next step's number of rays so that it evaluates about `samples_per_step` samples: steps then take the
+        same time and memory however many samples a ray needs (section 5.4)."""
+        if self.adapts:
+            wanted, rays = self.numbers.samples_per_step, int(self.rays_per_step)
+            count = min(max(rays * wanted / max(self.evaluated, 1), MIN_RAYS), MAX_GROWTH * rays, wanted)
+            self.rays_per_step.fill_(min(int(count), self.max_rays))
+
+    def storage(self) -> dict[str, Stored]:
+        """Rendering needs the marks of occupied cells alone."""
+        return {"grid.density": Stored("nothing"), "grid.possible": Stored("nothing", fill=1.0)}
+
+
+@torch.no_grad()
+def reached(
+    rays: Rays, found: Samples, field: Field, code: Float[Tensor, "ray code"] | None, stop: float
+) -> tuple[Samples, int]:
+    """The samples that light reaches, and the number at which density was evaluated for that, without gradients.
+
+    A field with cheap density is evaluated at all samples at once, and those of no more than its least weight are left
+    out. Others are evaluated along each ray from the front until it terminates (see `volume.visible`).
+    stop: transmittance at which a ray terminates
+    """
+    points, _ = found.along(rays)
+    codes = None if code is None else codes_at(found.ray_index, code)
+    if field.cheap_density:
+        return found.keep(weights_of(found, field.density(points, codes), stop) > (field.min_weight or 0.0)), len(found)
+    length, evaluated = found.length, 0
+
+    def thickness_of(asked: Int[Tensor, " asked"]) -> Float[Tensor, " asked"]:
+        nonlocal evaluated
+        evaluated += len(asked)
+        own = None if codes is None else codes.index_select(0, asked)
+        return field.density(points.index_select(0, asked), own) * length.index_select(0, asked)
+
+    seen = visible(found, thickness_of, stop)
+    return found.keep(seen), evaluated
+
+
+def rows_of(features: Features, rows: Int[Tensor, " row"]) -> Features:
+    """Some rows of features. In memory one feature of all rows follows another, as networks give and read them."""
+    if isinstance(features, tuple):
+        return tuple(x.t().index_select(1, rows).t() for x in features)
+    return features.t().index_select(1, rows).t()

@@ -1,0 +1,68 @@
+"""Field: density and colour of a scene at points."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from typing import ClassVar
+
+from jaxtyping import Float
+from torch import Tensor
+
+from .part import Part
+
+Features = Tensor | tuple[Tensor, ...]  # of points, one row each: what `Field.colour` takes of `Field.geometry`
+
+
+class Field(Part):
+    """Density and colour at points, in two steps: a sampler needs density at many points and colour at few.
+
+    A code is a row of numbers for each point that colour, or with `deforms` geometry too, depends on: an appearance, a
+    moment, a shape. A field that needs none ignores it. Fields compose: a field under a deformation is a field.
+
+    deforms:       whether geometry depends on the code
+    cheap_density: whether density is a mere look-up, so that a sampler asks for it at all samples at once
+    joint:         whether density and colour come from one look-up, so that calling the field costs less than
+                   `geometry` and then `colour`
+    """
+
+    deforms: ClassVar[bool] = False
+    cheap_density: ClassVar[bool] = False
+    joint: ClassVar[bool] = False
+
+    @abstractmethod
+    def geometry(
+        self, points: Float[Tensor, "point 3"], code: Float[Tensor, "point code"] | None = None
+    ) -> tuple[Float[Tensor, " point"], Features]:
+        """Density per scene unit, and features for `colour`."""
+
+    @abstractmethod
+    def colour(
+        self, features: Features, directions: Float[Tensor, "point 3"], code: Float[Tensor, "point code"] | None = None
+    ) -> Float[Tensor, "point 3"]:
+        """sRGB-encoded colour seen along unit directions."""
+
+    def density(
+        self, points: Float[Tensor, "point 3"], code: Float[Tensor, "point code"] | None = None
+    ) -> Float[Tensor, " point"]:
+        """Density per scene unit."""
+        return self.geometry(points, code)[0]
+
+    def forward(
+        self,
+        points: Float[Tensor, "point 3"],
+        directions: Float[Tensor, "point 3"],
+        code: Float[Tensor, "point code"] | None = None,
+    ) -> tuple[Float[Tensor, " point"], Float[Tensor, "point 3"]]:
+        """Density per scene unit and sRGB-encoded colour."""
+        density, features = self.geometry(points, code)
+        return density, self.colour(features, directions, code)
+
+    @property
+    def step_length(self) -> float:
+        """Length of a sample, in the field's coordinates, that resolves its grid."""
+        raise NotImplementedError(f"{type(self).__name__} has no grid, so a sampler needs a step length of its own")
+
+    @property
+    def min_weight(self) -> float | None:
+        """Weight in a ray's colour up to which a sample gets no colour; None where every sample gets one."""
+        return None

@@ -1,0 +1,92 @@
+"""FieldMethod: a RayMethod made of a field, a sampler and a loss."""
+
+from __future__ import annotations
+
+from abc import ABC
+from dataclasses import replace
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from ..rays import Look, Rays
+from ..scene import Batch, Scene
+from ..volume import composite
+from .field import Field
+from .ray_method import RayMethod
+from .sampler import Pass, Sampler
+
+
+class FieldMethod(RayMethod, ABC):
+    """A method of radiance fields: assign a Field as `network` and a Sampler as `sampler`, write `optimizers`, and
+    `loss` where it is more than the squared error of each pass."""
+
+    network: Field
+    sampler: Sampler
+
+    # Along rays
+
+    def code(self, rays: Rays) -> Float[Tensor, "#ray code"] | None:
+        """The code that the field depends on, of each ray or one row for all; None without one."""
+        return None
+
+    def looks(self, rays: Rays) -> list[Look]:
+        """Density and colour along rays, one entry for each pass, the one that is composited last."""
+        code = self.code(rays)
+        found = [each.look(self.network, code) for each in self.sampler.sample(rays, self.network, code)]
+        return [replace(look, rgb=self.recoloured(look.rgb)) for look in found]
+
+    def recoloured(self, rgb: Float[Tensor, "point 3"]) -> Float[Tensor, "point 3"]:
+        """Colours of the field under the settings."""
+        for part in self.parts:
+            rgb = part.recoloured(self, rgb)
+        return rgb
+
+    @property
+    def rays_per_chunk(self) -> int:  # type: ignore[override]
+        """Number of rays that are rendered at once."""
+        return self.sampler.rays_per_chunk
+
+    # At points
+
+    def field(
+        self, points: Float[Tensor, "point 3"], directions: Float[Tensor, "point 3"]
+    ) -> tuple[Float[Tensor, " point"], Float[Tensor, "point 3"]]:
+        """Density per scene unit, and sRGB-encoded colour seen along unit directions."""
+        density, rgb = self.network(points, directions)
+        return density, self.recoloured(rgb)
+
+    def density(self, points: Float[Tensor, "point 3"]) -> Float[Tensor, " point"]:
+        """Density per scene unit."""
+        return self.network.density(points)
+
+    # Training
+
+    def rays_in_a_step(self, data: Scene) -> float:
+        return self.sampler.expected_rays
+
+    def batch(self, data: Scene, generator: torch.Generator) -> Batch:
+        return data.sample_rays(self.sampler.batch_size, generator).to(self.device)
+
+    def learn(self, rays: Rays, generator: torch.Generator) -> tuple[list[Pass], dict[str, Tensor]]:
+        """Passes along rays of photographs at random places, and the sampler's loss terms by name."""
+        for part in self.parts:
+            rays = part.moved(rays)
+        passes = self.sampler.sample(rays, self.network, self.code(rays), generator)
+        last = passes[-1]
+        self.figures |= {"rays": len(rays), "samples": last.evaluated, "visible_samples": len(last.samples)}
+        return passes, self.sampler.terms(self.density, last, generator)
+
+    def loss(self, batch: Batch, step: int) -> dict[str, Tensor]:
+        """The squared error of each pass's picture (Mildenhall 2020, eq. 6), and the sampler's terms."""
+        passes, terms = self.learn(batch.rays, self.random(step))
+        target, code = batch.before(self.background), self.code(batch.rays)
+        for each in passes:
+            if weight := self.pass_weights.get(each.name, 1.0):
+                look = each.look(self.network, code)
+                seen = composite(look.samples, look.density, look.rgb, self.background)
+                error = (seen.rgb - target).square().mean()
+                self.figures["mse"] = float(error.detach())  # of the last pass in the end
+                terms[each.name] = weight * error
+        return terms

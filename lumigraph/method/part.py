@@ -1,0 +1,81 @@
+"""Part: a submodule of a Method that takes part in its training, and in what a user may change afterwards."""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from ..camera import Camera
+from ..controls import Control
+from ..packing import Stored
+from ..rays import Rays
+
+
+class Part(nn.Module):
+    """A submodule with hooks that its Method visits, as `nn.Module.train` visits submodules: poses, appearance codes,
+    exposure, samplers. All hooks do nothing by default. `method` is the Method that holds the part.
+
+    moves_cameras: whether it learns poses, so that what other parts derive from given poses would be wrong
+    """
+
+    moves_cameras: ClassVar[bool] = False
+
+    # Training
+
+    def compile_begin(self) -> None:
+        """Compile kernels that `begin` needs and no step does; called on a copy before the clock starts."""
+
+    def begin(self, method: Any, data: Any, seconds: float) -> None:
+        """Initialise from the data ahead of the first step of a new run; see `Method.begin`."""
+
+    def before_step(self, method: Any, step: int, progress: float) -> None:
+        """Follow a schedule ahead of each step. progress: share of the budget spent, in [0, 1]"""
+
+    def after_step(self, method: Any, step: int) -> None:
+        """Finish a step."""
+
+    def optimizers(self) -> list[torch.optim.Optimizer]:
+        """Fresh optimizers over the part's own parameters."""
+        return []
+
+    def learning_rates(self, step: int, progress: float) -> dict[str, float]:
+        """Learning rates of this step by the "name" of the optimizers' groups."""
+        return {}
+
+    def storage(self) -> dict[str, Stored]:
+        """Storage of the part's tensors in a compressed run, by their names in the part."""
+        return {}
+
+    # Rendering
+
+    def moved(self, rays: Rays) -> Rays:
+        """Rays of photographs with their learnt poses."""
+        return rays
+
+    def refined(self, cameras: Camera) -> Camera:
+        """Cameras of photographs, by their `image_index`, with their learnt poses."""
+        return cameras
+
+    def recoloured(self, method: Any, rgb: Float[Tensor, "point 3"]) -> Float[Tensor, "point 3"]:
+        """Colours of a field under the method's settings."""
+        return rgb
+
+    # Settings
+
+    @property
+    def controls(self) -> tuple[Control, ...]:
+        """Settings that a user may change."""
+        return ()
+
+    @property
+    def accepts(self) -> tuple[type, ...]:
+        """Kinds of evidence that `adapted` takes."""
+        return ()
+
+    def adapted(self, method: Any, evidence: Any) -> Part:
+        """The part adapted to a piece of evidence, such as a photograph whose exposure it finds; it shares all tensors
+        with this one. method: the one that is being adapted, a copy"""
+        raise NotImplementedError

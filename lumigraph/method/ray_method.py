@@ -1,0 +1,73 @@
+"""RayMethod: a Method that renders one ray at a time."""
+
+from __future__ import annotations
+
+import copy
+from typing import Any, ClassVar
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from ..camera import Camera
+from ..capabilities import HasLooks, needs
+from ..quality import BY_RAY, Efforts
+from ..rays import Rays, Rendering
+from ..scene import Batch, Scene
+from ..volume import composite
+from .method import Method
+
+
+class RayMethod(Method):
+    """A Method that sees one ray at a time: write `looks` or `render_rays`, inherit the rest."""
+
+    any_lens: ClassVar[bool] = True
+    efforts: ClassVar[Efforts] = BY_RAY
+    rays_per_chunk: int = 16_384
+
+    def steps_per_pass(self, data: Any) -> float:
+        """Steps after which as many rays were seen as the training photographs have pixels to learn from."""
+        if not isinstance(data, Scene):
+            return super().steps_per_pass(data)
+        return data.pixels("train") / self.rays_in_a_step(data)
+
+    def rays_in_a_step(self, data: Scene) -> float:
+        """Rays that a step learns from, about: those of a first one, which a copy draws."""
+        return len(copy.deepcopy(self).batch(data, torch.Generator().manual_seed(0)))
+
+    def batch(self, data: Scene, generator: torch.Generator) -> Batch:
+        return data.sample_rays(self.config.rays_per_step, generator).to(self.device)
+
+    @property
+    def pass_weights(self) -> dict[str, float]:
+        """Weights of the passes' errors in the loss, by the names of their looks; 1 for one that is not named. Nothing
+        is learnt from a pass of weight 0."""
+        return {}
+
+    def loss(self, batch: Batch, step: int) -> dict[str, Tensor]:
+        """The squared error of each pass's picture (Mildenhall 2020, eq. 6), where `looks` takes a generator beside the
+        rays: of the samples' random places in training."""
+        background = self.background
+        target = batch.before(background)
+        terms = {}
+        for look in needs(self, HasLooks).looks(batch.rays, self.random(step)):
+            if weight := self.pass_weights.get(look.name, 1.0):
+                seen = composite(look.samples, look.density, look.rgb, background)
+                error = (seen.rgb - target).square().mean()
+                self.figures["mse"] = float(error.detach())  # of the last pass in the end
+                terms[look.name] = weight * error
+        return terms
+
+    def render_rays(self, rays: Rays, background: Float[Tensor, "#ray 3"]) -> Rendering:
+        """What each ray sees, in front of a background colour: the last look at it, composited."""
+        look = needs(self, HasLooks).looks(rays)[-1]
+        return composite(look.samples, look.density, look.rgb, background)
+
+    @torch.no_grad()
+    def render(self, camera: Camera) -> Rendering:
+        width, height = camera.size[0].tolist()
+        rays = camera.rays(camera.pixels()).to(self.device)
+        background = self.background
+        chunks = [slice(i, i + self.rays_per_chunk) for i in range(0, len(rays), self.rays_per_chunk)]
+        parts = [self.render_rays(rays[chunk], background) for chunk in chunks]
+        return Rendering.cat(parts).reshape(height, width)

@@ -1,0 +1,113 @@
+"""Sampler: the places along rays where a field is evaluated, and Pass, the outcome."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+from torch.nn.functional import embedding
+
+from ..rays import Look, Rays, Samples
+from .field import Features, Field
+from .part import Part
+
+Density = Callable[[Float[Tensor, "point 3"]], Float[Tensor, " point"]]
+
+
+@dataclass(frozen=True)
+class Pass:
+    """Samples along rays with a field's geometry there; colours follow, under any code.
+
+    density:    per scene unit
+    features:   what `Field.colour` takes, of the samples that get a colour
+    directions: of the same samples
+    coloured:   indices of the samples that get a colour; None for all
+    rgb:        of a field that gives density and colour at once
+    evaluated:  number of points at which density was evaluated
+    scale:      applied to colours, to scale their gradients as those of density were
+    proposals:  of a proposal sampler, for its loss
+    """
+
+    name: str
+    samples: Samples
+    density: Float[Tensor, " sample"]
+    features: Features
+    directions: Float[Tensor, "coloured 3"]
+    coloured: Int[Tensor, " coloured"] | None = None
+    rgb: Float[Tensor, "sample 3"] | None = None
+    evaluated: int = 0
+    scale: Callable[[Tensor], Tensor] | None = None
+    proposals: Any = None
+
+    def look(self, field: Field, code: Float[Tensor, "ray code"] | None = None) -> Look:
+        """Density and colour of all samples. code: of each ray"""
+        rgb = self.rgb
+        if rgb is None:
+            rgb = field.colour(self.features, self.directions, self.code_of_samples(code))
+        if self.coloured is not None:
+            rgb = rgb.new_zeros(len(self.samples), 3).index_copy(0, self.coloured, rgb)
+        return Look(self.name, self.samples, self.density, self.scale(rgb) if self.scale else rgb)
+
+    def code_of_samples(self, code: Float[Tensor, "ray code"] | None) -> Float[Tensor, "coloured code"] | None:
+        """The codes of rays, one for each sample that gets a colour."""
+        if code is None:
+            return None
+        rays = self.samples.ray_index
+        return codes_at(rays if self.coloured is None else rays[self.coloured], code)
+
+
+def codes_at(rays: Int[Tensor, " sample"], code: Float[Tensor, "ray code"]) -> Float[Tensor, "sample code"]:
+    """The code of each sample's ray. An embedding's gradient is the fastest of all look-ups."""
+    return code.expand(len(rays), -1) if len(code) == 1 else embedding(rays, code)
+
+
+class Sampler(Part):
+    """Chooses where along rays a field is evaluated, with its start-up, schedule, loss terms, optimizer and storage.
+
+    is_open:        whether it samples rays without an end
+    rays_per_chunk: rays that are rendered at once
+    evaluated:      number of points of the last training step at which density was evaluated
+    """
+
+    is_open: ClassVar[bool] = False
+    rays_per_chunk: int = 16_384
+    evaluated: int = 0
+
+    @property
+    @abstractmethod
+    def batch_size(self) -> int:
+        """Number of rays of the next step."""
+
+    @property
+    @abstractmethod
+    def expected_rays(self) -> float:
+        """Number of rays of a typical step."""
+
+    @abstractmethod
+    def sample(
+        self,
+        rays: Rays,
+        field: Field,
+        code: Float[Tensor, "ray code"] | None = None,
+        generator: torch.Generator | None = None,
+    ) -> list[Pass]:
+        """Passes along rays, the one that is composited last.
+
+        code:      of each ray
+        generator: of random places in training; None in rendering, where samples lie at fixed places
+        """
+
+    def terms(self, density: Density, last: Pass, generator: torch.Generator) -> dict[str, Tensor]:
+        """Loss terms by name. density: of the field, per scene unit. last: the pass that is composited"""
+        return {}
+
+    def begin_from(self, teacher: Any, chance: torch.Generator) -> None:
+        """Initialise from what a teacher holds (`components.fields.taken_over`), in place of `begin`."""
+
+    def settle(self, density: Density, chance: torch.Generator) -> None:
+        """Follow a field that was taught by a teacher. density: per scene unit"""
