@@ -57,9 +57,6 @@ class Method(nn.Module, ABC):
     learns_from: ClassVar[type] = Scene  # the kind of dataset
     accepts: ClassVar[tuple[type, ...]] = ()  # the kinds of evidence that `given` takes
     any_lens: ClassVar[bool] = False  # whether `render` follows every lens, or flat pictures alone
-    formerly_weights: ClassVar[dict[str, str]] = {}  # beginnings of their names in older runs, and those they have now
-    formerly: ClassVar[dict[str, str]] = {}  # names that Config's fields had in older runs, and those they have now
-    before: ClassVar[dict[str, Any]] = {}  # what fields of Config are in runs from before there were any such
     efforts: ClassVar[Efforts] = BY_PHOTOGRAPH  # what each --quality asks for
     _place: Tensor
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Annotated, Any, ClassVar
+from typing import Annotated, Any
 
 import torch
 from jaxtyping import Float
@@ -86,28 +86,6 @@ class InstantNGP(Exposed, RayMethod):  # type: ignore[override]  # what is accep
     """
 
     Config = Config
-    formerly_weights: ClassVar[dict[str, str]] = {"field.": "network."}
-    formerly: ClassVar[dict[str, str]] = {
-        "features": "features_per_level",
-        "log2_entries": "log2_hashmap_size",
-        "coarsest": "base_resolution",
-        "finest": "max_resolution",
-        "width": "hidden_width",
-        "direction_bands": "sh_bands",
-        "lattice": "steps_per_diagonal",
-        "growth": "cone_angle",
-        "stop": "transmittance_threshold",
-        "occupancy": "occupancy_resolution",
-        "cell_thickness": "occupancy_threshold",
-        "grid_every": "occupancy_interval",
-        "grid_decay": "occupancy_decay",
-        "last_learning_rate": "final_learning_rate",
-        "hold": "decay_start",
-        "table_decay": "hash_weight_decay",
-        "huber": "huber_delta",
-        "exposure": "exposure_correction",
-    }
-    before: ClassVar[dict[str, Any]] = {"contraction": False, "exposure_correction": "no"}
     rays_per_step: Tensor
 
     def __init__(self, frame: Frame, config: Any = None):
@@ -237,15 +215,15 @@ class InstantNGP(Exposed, RayMethod):  # type: ignore[override]  # what is accep
     def optimizers(self) -> list[torch.optim.Optimizer]:
         networks = [*self.network.density_network.parameters(), *self.network.colour_network.parameters()]
         groups: list[dict[str, Any]] = [{"params": networks, "scale": CALM if self.unbounded else 1.0}]
-        older = self.poses if self.poses and not self.poses.whitened else None
-        groups += [{"params": [*x.parameters()], "scale": 0.05} for x in (self.exposure, older) if x]
+        if self.exposure:
+            groups.append({"params": [*self.exposure.parameters()], "scale": 0.05})
         common = {"lr": self.config.learning_rate, "betas": (0.9, 0.99), "eps": 1e-15}
         decay = self.config.hash_weight_decay if self.frame.reach == 1 else 0.0
         table = LazyAdam([self.network.table], weight_decay=decay, **common)
         optimizers = [table, torch.optim.Adam(groups, foreach=True, **common)]
         if self.unbounded:
             optimizers.append(self.unbounded.optimizer())
-        return [*optimizers, self.poses.optimizer()] if self.poses and not older else optimizers
+        return [*optimizers, self.poses.optimizer()] if self.poses else optimizers
 
     def learning_rate(self, step: int, progress: float) -> dict[str, float]:
         """Twenty steps of warm-up, then constant, then exponential decay (section 4 decays likewise)."""

@@ -50,10 +50,6 @@ class Exposure(nn.Module):
                 stacklevel=3,
             )
 
-    def _load_from_state_dict(self, state, prefix, *others) -> None:
-        state.setdefault(f"{prefix}differ", torch.tensor(True))  # as runs had it that were told to correct
-        super()._load_from_state_dict(state, prefix, *others)
-
     def forward(self, rgb: Float[Tensor, "ray 3"], image_index: Int[Tensor, " ray"]) -> Float[Tensor, "ray 3"]:
         return rgb * self.log_gain[image_index].exp()
 

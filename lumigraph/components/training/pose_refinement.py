@@ -37,7 +37,6 @@ class PoseRefinement(nn.Module):
     learning_rate: radians that a step moves a picture by, at most
     progress:      share of the budget spent, by which `weights` lets bands of an encoding join
     found:         whether points that photographs share told the poses to begin at, see `find`
-    whitened:      whether `axes` are there; runs of version 0.1 learnt rotation and shift themselves
     """
 
     axes: Tensor
@@ -46,7 +45,7 @@ class PoseRefinement(nn.Module):
 
     def __init__(self, image_count: int, learning_rate: float = 1e-3):
         super().__init__()
-        self.learning_rate, self.whitened = learning_rate, True
+        self.learning_rate = learning_rate
         self.twist = nn.Parameter(torch.zeros(image_count, 6))
         self.register_buffer("axes", torch.eye(6).repeat(image_count, 1, 1))
         self.register_buffer("progress", torch.tensor(1.0))
@@ -111,12 +110,6 @@ class PoseRefinement(nn.Module):
         """The learning rate at a share of the budget: it grows, then falls exponentially."""
         highest = (FINE if self.found else 1.0) * self.learning_rate
         return falling(highest, FALL * self.learning_rate, progress, WARMUP)
-
-    def _load_from_state_dict(self, state_dict, prefix, *others) -> None:
-        self.whitened = f"{prefix}axes" in state_dict
-        for name in ("axes", "progress", "found"):  # which older runs lack: rotation and shift as they are, all bands
-            state_dict.setdefault(prefix + name, getattr(self, name))
-        super()._load_from_state_dict(state_dict, prefix, *others)
 
 
 def whitening(camera: Camera, frame: Frame) -> Float[Tensor, "6 6"]:
