@@ -42,16 +42,6 @@ def unflatten(value: Any, tensors: dict[str, Tensor]) -> Any:
     return value
 
 
-def renamed(value: dict[str, Any], formerly: dict[str, str]) -> dict[str, Any]:
-    """A dictionary under today's keys. Raises ValueError where one has its former name and today's.
-
-    formerly: a key's former name, and today's
-    """
-    if twice := [old for old in value if formerly.get(old) in value]:
-        raise ValueError(f"{twice[0]} is the former name of {formerly[twice[0]]}, and both are given")
-    return {formerly.get(name, name): x for name, x in value.items()}
-
-
 @contextlib.contextmanager
 def understood(path: Path) -> Iterator[None]:
     """Turn the ways in which a file can fail to hold what was expected into one sentence."""

@@ -30,7 +30,6 @@ EACH = 5.0
 SHARES: dict[str, tuple[str, float]] = {
     "test_display": ("runs, commands, benchmark", 8),
     "test_fewer_views": ("runs, commands, benchmark", 8),
-    "test_old_runs": ("runs, commands, benchmark", 10),
     "test_scores": ("runs, commands, benchmark", 10),
     "test_budget": ("runs, commands, benchmark", 8),
     "test_dense_start": ("methods", 8),

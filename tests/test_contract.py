@@ -130,14 +130,6 @@ def test_it_says_what_it_is(name):
     assert dataclasses.is_dataclass(kind.Config) and kind.Config.__dataclass_params__.frozen  # type: ignore[attr-defined]
 
 
-@pytest.mark.parametrize("name", NAMES)
-def test_former_names_of_a_config_lead_to_fields_of_today(name):
-    kind = methods.find(name)
-    fields = {field.name for field in dataclasses.fields(kind.Config)}
-    assert set(kind.formerly.values()) <= fields and not fields & set(kind.formerly)
-    assert len(set(kind.formerly.values())) == len(kind.formerly)
-
-
 @pytest.mark.parametrize("name", OWN)
 def test_a_page_describes_it(name):
     page = DOCS / f"{name.replace('-', '_')}.md"

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import math
 from dataclasses import replace
-from typing import Literal
 
 import numpy as np
 import pytest
@@ -29,7 +28,6 @@ from lumigraph.methods.instant_ngp import Config, InstantNGP
 from lumigraph.paths.keyframes import CameraPath, Keyframe
 from lumigraph.rays import Rays
 from lumigraph.run import Run, build
-from lumigraph.run.settings import in_words
 from lumigraph.scene import Frame
 from lumigraph.train import fit
 
@@ -294,14 +292,6 @@ def test_a_photographs_gain_is_found(generator):
     found = (plain.rgb - behind) * given.found_gain + behind
     assert torch.allclose(given.render(camera).rgb, found, atol=1e-5)
     assert torch.equal(method.given(exposure=1).given(shot).found_gain, method.given(shot).found_gain)
-
-
-def test_older_runs_say_true_and_false():
-    kinds = {"exposure_correction": Literal["auto", "yes", "no"], "contraction": bool}
-    assert in_words({"exposure_correction": True, "contraction": False}, kinds) == {
-        "exposure_correction": "yes",
-        "contraction": False,
-    }
 
 
 def test_the_background_is_not_exposed():

@@ -113,22 +113,6 @@ def test_settings_are_written_as_they_were_read(run):
     assert Settings.read(run.folder / "config.json") == run.settings
 
 
-def test_an_older_run_opens_and_stays_as_it_is(run):
-    def older(said):
-        for name in ("splits", "seed", "budget", "device", "processor", "versions"):
-            del said[name]
-        del said["frame"]["forward"], said["scene"]["options"]
-
-    rewrite(run, older)
-    opened = Run(run.folder)
-    assert opened.settings.seed == 0 and opened.settings.scene.options == {} and opened.frame == run.frame
-    assert opened.settings.agrees(run.frame)
-    opened.set_budget(steps=7)
-    said = json.loads((run.folder / "config.json").read_text())
-    assert said["budget"] == {"steps": 7} and "forward" not in said["frame"]
-    assert Run(run.folder).new_method().config == tiny.method().config
-
-
 def test_what_a_newer_version_says_is_kept(run):
     rewrite(run, lambda said: said.update(weather={"sun": [1, 2]}))
     opened = Run(run.folder)

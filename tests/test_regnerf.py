@@ -219,7 +219,7 @@ def test_octaves_join_one_after_another():
         assert encoded.abs().amax((0, 2)).gt(0).tolist() == [i < octaves for i in range(8)]
     assert float(method.state_dict()["marcher.joined"]) == 1.0
     plain = build(RegNeRF, scene.frame, RegNeRF.smallest(), torch.device("cpu"), 0)
-    assert "marcher.joined" not in plain.state_dict()  # older runs have none
+    assert "marcher.joined" not in plain.state_dict()
 
 
 def test_thickness_before_cameras():

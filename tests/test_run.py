@@ -71,7 +71,7 @@ def test_kills_while_saving_lose_nothing(tmp_path):
 
 def test_half_written_and_half_deleted_states_are_passed_over(run):
     folder = run.folder / "checkpoints"
-    for name in ("000020.partial", "000005.partial"):
+    for name in (".lumigraph-0123456789abcdef.partial", ".lumigraph-fedcba9876543210.partial"):
         (folder / name).mkdir()
         (folder / name / "weights.safetensors").write_bytes(b"half")
     assert run.state.step == 10
@@ -94,47 +94,6 @@ def test_a_full_disk_keeps_the_state_before(run, monkeypatch):
         run.save(State(11, 1.0), method, method.optimizers(), torch.Generator())
     assert [x.name for x in (run.folder / "checkpoints").iterdir()] == ["000010"]
     assert run.state.step == 10 and run.method()
-
-
-OLDER = {  # what `lumigraph train` wrote before fields had the names they have now, numbers changed from the defaults
-    "nerf": {
-        "rejoin": 2,
-        "width": 32,
-        "position_bands": 6,
-        "occupancy": 16,
-        "coarse_loss": 0.5,
-        "stop": 1e-3,
-        "seed": 3,
-    },
-    "mip-nerf": {"rejoin": 2, "width": 32, "blur": 0.02, "warm_up": 0.1, "cell_thickness": 0.02, "fine_samples": 16},
-    "instant-ngp": {
-        "features": 4,
-        "log2_entries": 11,
-        "coarsest": 4,
-        "finest": 32,
-        "hold": 0.5,
-        "refine_cameras": True,
-    },
-    "gaussian-splatting": {"degree": 1, "most": 500, "pull": 1e-3, "means_rate": 1e-4, "smooth": True, "ssim": 0.5},
-    "fourier-features": {"width": 16, "pixels": 64, "frequencies": 8},
-}
-
-
-@pytest.mark.parametrize("name", OLDER)
-def test_runs_with_former_names_open(name, run):
-    """Each number arrives under its name of today, and the rest are defaults."""
-    kind, old = methods.find(name), OLDER[name]
-    write_json(run.folder / "config.json", run.settings.to_json() | {"method": name, "config": old}, ours=True)
-    config = Run(run.folder).new_method().config
-    assert config == kind.Config(**kind.before | {kind.formerly.get(key, key): value for key, value in old.items()})
-    assert list(old.values()) == [getattr(config, kind.formerly.get(key, key)) for key in old]
-
-
-def test_a_number_under_both_its_names_is_refused(run):
-    config = {"method": "nerf", "config": {"width": 32, "hidden_width": 64}}
-    write_json(run.folder / "config.json", run.settings.to_json() | config, ours=True)
-    with pytest.raises(LumigraphError, match="width is the former name of hidden_width, and both are given"):
-        Run(run.folder).new_method()
 
 
 def damage(run: Run, name: str, change) -> None:

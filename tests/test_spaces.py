@@ -5,21 +5,17 @@ from __future__ import annotations
 import json
 import math
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
-import tiny
 import torch
 from captures import Tiny, look_at, write_blender, write_ngp
 
-from lumigraph import files
 from lumigraph.capture import Capture, Shot, open_scene
 from lumigraph.capture.assemble import assemble
 from lumigraph.components.sampling.spaces import INFINITY, NDC, Box, Contraction, space_of
 from lumigraph.lens import Equirectangular, Pinhole
 from lumigraph.rays import Rays
-from lumigraph.run import Run
 from lumigraph.scene import Forward, Frame
 
 POSE = torch.from_numpy(look_at(np.array([0.3, -2.0, 0.4]), np.array([0.1, 0.5, 0.2]))[:3])
@@ -250,18 +246,9 @@ def test_other_captures_are_not_forward_facing(tmp_path):
     assert assemble(facing(shots=wide)).frame.forward is None
 
 
-def test_a_frame_comes_back_from_json_and_older_ones_still_open(tmp_path: Path):
+def test_a_frame_comes_back_from_json():
     frame = FRAMES["ndc"]
     assert Frame.from_json(json.loads(json.dumps(frame.to_json()))) == frame
-    older = {name: value for name, value in frame.to_json().items() if name != "forward"}
-    assert Frame.from_json(json.loads(json.dumps(older))) == replace(frame, forward=None)
-
-    scene = open_scene(tiny.write_blender(tmp_path / "scene"))
-    run = Run.create(tmp_path / "run", tiny.method(scene.frame), scene)
-    config = run.settings.to_json()
-    del config["frame"]["forward"]
-    files.write_json(run.folder / "config.json", config, ours=True)
-    assert len(Run(run.folder).scene()) == len(scene)
 
 
 @each

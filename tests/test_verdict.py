@@ -53,7 +53,7 @@ def test_noise_of_rays_is_not_taken_for_a_trend():
 def test_too_few_lines_say_nothing():
     assert loss_trend([], False) is None and loss_trend(lines(0.2, 0.0)[:6], False) is None
     assert loss_trend(lines(0.2, 0.5, passes=7), by_photograph=True) is None  # three whole passes
-    assert loss_trend([{"step": step, "loss": 1.0} for step in range(99)], False) is None  # as older runs have them
+    assert loss_trend([{"step": step, "loss": 1.0} for step in range(99)], False) is None
 
 
 def test_the_last_psnr_is_the_mean_of_the_last_quarter():

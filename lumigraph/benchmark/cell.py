@@ -169,7 +169,7 @@ def claim(output: Path, cells: Sequence[Cell], settings: Settings) -> None:
     shared = {name: getattr(settings, name) for name in ("downscale", "reader", "scales", "preset", "device")}
     known = asdict(files.read_json(path, Claim) if path.exists() else Claim(shared, {}))
     for name, value in shared.items():
-        begun = known["settings"].get(name, getattr(Settings, name))  # older folders know fewer options
+        begun = known["settings"].get(name)
         if begun != value:
             raise LumigraphError(
                 f"{output} was begun with --{name} {begun}, which is now {value}; choose another --output"

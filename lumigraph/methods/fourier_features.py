@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, Any, Literal
 
 import torch
 from jaxtyping import Bool, Float
@@ -46,10 +46,6 @@ class FourierFeatures(RayMethod):
     """
 
     Config = Config
-    formerly: ClassVar[dict[str, str]] = {
-        "width": "hidden_width",
-        "pixels": "pixels_per_step",
-    }
 
     def __init__(self, frame: Frame, config: Any = None):
         config = config or Config()

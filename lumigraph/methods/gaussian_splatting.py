@@ -124,28 +124,6 @@ class GaussianSplatting(Method):
     """A cloud of Gaussians that learns from one photograph a step; `density_control` changes their number."""
 
     Config = Config
-    before: ClassVar[dict[str, Any]] = {"appearance": "no", "robust": "no", "own_skies": False}
-    formerly: ClassVar[dict[str, str]] = {
-        "degree": "sh_degree",
-        "raise_degree_every": "sh_degree_interval",
-        "raise_degree_share": "sh_degree_interval_share",
-        "ssim": "ssim_weight",
-        "most": "max_gaussians",
-        "initial": "initial_gaussians",
-        "half_until": "half_resolution_until",
-        "pull": "densify_grad_threshold",
-        "reset_every": "opacity_reset_interval",
-        "means_rate": "means_lr",
-        "last_means_rate": "final_means_lr",
-        "harmonics_rate": "sh_lr",
-        "opacities_rate": "opacities_lr",
-        "scales_rate": "scales_lr",
-        "quaternions_rate": "quaternions_lr",
-        "opacity_weight": "opacity_regularization",
-        "scale_weight": "scale_regularization",
-        "stop": "transmittance_threshold",
-        "smooth": "filter_3d",
-    }
     grows: ClassVar[tuple[str, ...]] = ("interval",)
     extent: Tensor
     drawn: Tensor

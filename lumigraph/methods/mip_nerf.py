@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar
+from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -67,18 +67,6 @@ class MipNeRF(RayMethod):
 
     Config = Config
     joined: Tensor
-    formerly: ClassVar[dict[str, str]] = {
-        "rejoin": "skip_layer",
-        "cell_thickness": "occupancy_threshold",
-        "warm_up": "warmup",
-        "last_learning_rate": "final_learning_rate",
-        "position_bands": "position_frequencies",
-        "direction_bands": "direction_frequencies",
-        "occupancy": "occupancy_resolution",
-        "coarse_loss": "coarse_loss_weight",
-        "width": "hidden_width",
-        "blur": "resample_padding",
-    }
 
     def __init__(self, frame: Frame, config: Any = None):
         config = config or Config()

@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Annotated, Any, ClassVar
+from typing import Annotated, Any
 
 import torch
 from jaxtyping import Bool, Float
@@ -88,18 +88,6 @@ class NeRF(RayMethod):
     """Coarse samples evenly along each ray, fine ones where the coarse ones found something (section 5.2)."""
 
     Config = Config
-    formerly: ClassVar[dict[str, str]] = {
-        "rejoin": "skip_layer",
-        "cell_thickness": "occupancy_threshold",
-        "stop": "transmittance_threshold",
-        "warm_up": "warmup",
-        "last_learning_rate": "final_learning_rate",
-        "position_bands": "position_frequencies",
-        "direction_bands": "direction_frequencies",
-        "occupancy": "occupancy_resolution",
-        "coarse_loss": "coarse_loss_weight",
-        "width": "hidden_width",
-    }
 
     def __init__(self, frame: Frame, config: Any = None):
         config = config or Config()

@@ -104,7 +104,6 @@ class NeRFW(RayMethod):
 
     Config = Config
     accepts: ClassVar[tuple[type, ...]] = (Photograph,)
-    before: ClassVar[dict[str, Any]] = {"own_skies": False}
 
     def __init__(self, frame: Frame, config: Any = None):
         config = config or Config()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Annotated, Any, ClassVar
+from typing import Annotated, Any
 
 import torch
 from jaxtyping import Bool, Float
@@ -103,7 +103,6 @@ class Plenoxels(Exposed, RayMethod):  # type: ignore[override]  # what is accept
     forward-facing capture in normalised device coordinates, anything else contracted into a ball."""
 
     Config = Config
-    before: ClassVar[dict[str, Any]] = {"exposure_correction": "no"}
     rays_per_step: Tensor
 
     def __init__(self, frame: Frame, config: Any = None):

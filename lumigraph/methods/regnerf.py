@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import asdict, dataclass, fields, replace
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, Any, Literal
 
 import torch
 from jaxtyping import Float
@@ -119,7 +119,6 @@ class RegNeRF(RayMethod):
     """Mip-NeRF or Instant-NGP, which learns as ever from photographs, and is told off for what it shows elsewhere."""
 
     Config = Config
-    before: ClassVar[dict[str, Any]] = {"huber_delta": 1.0, "random_backdrop": False}  # a table's loss was square
 
     def __init__(self, frame: Frame, config: Any = None):
         config = config or Config()

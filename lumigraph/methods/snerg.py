@@ -6,7 +6,7 @@ import math
 import warnings
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import Annotated, Any, ClassVar, Literal, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple
 
 import torch
 from jaxtyping import Float
@@ -142,7 +142,6 @@ class SNeRG(RayMethod):
     """A field learns from photographs; its values are baked into voxels; the small network learns on with those."""
 
     Config = Config
-    before: ClassVar[dict[str, Any]] = {"whole": False}
     rays_per_step: Tensor
     stage: Tensor
     began: Tensor

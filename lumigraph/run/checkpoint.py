@@ -35,7 +35,6 @@ WEIGHTS, OPTIMIZER, STATE = "weights.safetensors", "optimizer.safetensors", "sta
 PACKED = "weights.packed"  # in the place of both
 STRUCTURE = "optimizers"
 NAME = re.compile(r"\d+")
-OLD_PARTIAL = re.compile(r"\d+(\.partial)+")  # what older versions had begun to write or to delete
 
 
 @dataclass(frozen=True)
@@ -65,7 +64,7 @@ class Sum:
 class Saved:
     """state.json: how far training had come, as in `State`; what all files should sum to; and the optimizers' state.
 
-    files:      by name; newer ones sum up the optimizers' state too
+    files:      by name; the optimizers' state is summed up under the name of its entry
     optimizers: see `flatten`; their tensors lie beside
     """
 
@@ -148,7 +147,6 @@ class Checkpoints:
         """Give a method the latest state's weights."""
         checkpoint = self.latest
         tensors = self._read_tensors(checkpoint, self.weights.name)
-        tensors = renamed_weights(tensors, method.formerly_weights)
         try:
             take_shapes(method, tensors)
             check_kinds(method.state_dict(), tensors)
@@ -167,17 +165,14 @@ class Checkpoints:
         tensors = self._read_tensors(checkpoint, OPTIMIZER)
         about = self._about(checkpoint)
         structure = about.optimizers
-        if about.files.get(STRUCTURE, found := checksum(json.dumps(structure).encode())) != found:
+        if about.files.get(STRUCTURE) != checksum(json.dumps(structure).encode()):
             raise LumigraphError(
                 f"{checkpoint / 'state.json'} is damaged: its optimizers are not those that were saved"
             )
         with understood(checkpoint):
             generator.set_state(tensors["generator"])
             for optimizer, saved in zip(optimizers, unflatten(structure, tensors), strict=True):
-                fresh = [{k: v for k, v in group.items() if k != "params"} for group in optimizer.param_groups]
                 optimizer.load_state_dict(saved)
-                for group, own in zip(optimizer.param_groups, fresh, strict=True):
-                    group |= own | group  # older runs know fewer entries of a group
                 check_moments(optimizer)
 
     def _all(self) -> list[Path]:
@@ -208,15 +203,6 @@ class Checkpoints:
             return safetensors.torch.load(data)
         except Exception as error:  # of a library that keeps no list of them
             raise LumigraphError(f"{path} holds no tensors ({error}); restore it from a copy") from error
-
-
-def renamed_weights(tensors: dict[str, Tensor], formerly: dict[str, str]) -> dict[str, Tensor]:
-    """Tensors by their present names. formerly: how names began in older runs, and how they begin now."""
-    found = {}
-    for name, value in tensors.items():
-        old = next((old for old in formerly if name.startswith(old)), "")
-        found[formerly.get(old, "") + name.removeprefix(old)] = value
-    return found
 
 
 def take_shapes(method: nn.Module, tensors: dict[str, Tensor]) -> None:
@@ -271,8 +257,7 @@ def checksum(data: bytes) -> Sum:
 
 def is_state(path: Path) -> bool:
     """Whether a folder is a state or a part of one, and holds nothing that somebody else has put there."""
-    named = NAME.fullmatch(path.name) or OLD_PARTIAL.fullmatch(path.name)
-    if not named or path.is_symlink() or not path.is_dir():
+    if not NAME.fullmatch(path.name) or path.is_symlink() or not path.is_dir():
         return False
     return all(file.name in (WEIGHTS, OPTIMIZER, STATE, PACKED) and not file.is_dir() for file in path.iterdir())
 

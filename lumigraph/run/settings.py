@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
-from typing import Annotated, Any, get_args, get_type_hints
+from typing import Annotated, Any
 
 from .. import files
 from ..budget import Budget
 from ..capture import Part
 from ..errors import LumigraphError
 from ..method import Method
-from ..plain import alike, renamed
+from ..plain import alike
 from ..ranges import Count, Downscale, Name, Scales, Tally, between, typed
 from ..scene import Frame, Scene
 
@@ -85,32 +85,20 @@ class Settings:
         files.write_json(file, self.to_json(), ours=True)
 
     def to_json(self) -> dict[str, Any]:
-        """What config.json says: under the same names, and a frame as it was read if it is still that one."""
+        """What config.json says, under the same names."""
         own: dict[str, Any] = {x.name: getattr(self, x.name) for x in fields(self) if x.name != "said"}
-        unchanged = "frame" in self.said and Frame.from_json(self.said["frame"]) == self.frame
-        frame = self.said["frame"] if unchanged else self.frame.to_json()
-        return {"format": FORMAT} | self.said | own | {"frame": frame, "scene": self.scene.to_json()}
+        parts = {"frame": self.frame.to_json(), "scene": self.scene.to_json()}
+        return {"format": FORMAT} | self.said | own | parts
 
     def with_budget(self, **budget: Any) -> Settings:
         """The same with another budget."""
         return replace(self, budget=budget)
 
     def method_config(self, kind: type[Method], file: Path) -> Any:
-        """The numbers as the Config of a kind of method; those with a former name arrive under today's, and those that
-        the run is older than are as they were `before`.
-
-        file: to name where a number is unknown, of another type, or beyond its range
-        """
-        said = in_words(renamed(self.config, kind.formerly), get_type_hints(kind.Config))
-        return typed(kind.Config, kind.before | said, file, closed=True)
+        """The numbers as the Config of a kind of method. file: to name where one is unknown, of another type, or beyond
+        its range"""
+        return typed(kind.Config, self.config, file, closed=True)
 
     def agrees(self, frame: Frame) -> bool:
-        """Whether a frame is the run's, up to rounding. Older runs know fewer numbers of a frame than newer ones."""
-        mine, other = self.to_json()["frame"], frame.to_json()
-        return alike({name: other.get(name) for name in mine}, mine)
-
-
-def in_words(config: dict[str, Any], kinds: dict[str, Any]) -> dict[str, Any]:
-    """A Config's fields: "yes" and "no" for true and false, where older runs had these and today there are three."""
-    words = {name: set(get_args(kinds.get(name))) >= {"yes", "no"} for name in config}
-    return {k: ("yes" if v else "no") if isinstance(v, bool) and words[k] else v for k, v in config.items()}
+        """Whether a frame is the run's, up to rounding."""
+        return alike(self.frame.to_json(), frame.to_json())

@@ -98,7 +98,7 @@ class PathPanel:
     def path(self) -> CameraPath:
         """The camera path that is set now. Raises LumigraphError if it has no keyframe."""
         seconds, keys = 0.0, []
-        timed = all(stop.key.time is not None for stop in self._stops)  # keyframes of older files have no time
+        timed = all(stop.key.time is not None for stop in self._stops)  # keyframes of a still scene have no time
         for stop in self._stops:
             keys.append(replace(stop.key, seconds=seconds, time=stop.key.time if timed else None))
             seconds += stop.leg

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from functools import lru_cache
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 import torch
@@ -14,7 +14,7 @@ from torch import Tensor, nn
 
 from ...gaussians import Gaussians
 from ..training.exchange import exchange
-from .witnesses import ALL, marked, witnesses
+from .witnesses import marked, witnesses
 
 NAMES = ("means", "quaternions", "log_scales", "opacities", "harmonics")
 
@@ -76,12 +76,6 @@ class Cloud(nn.Module):
     def seen_by(self) -> Int[Tensor, " gaussian"]:
         """How many photographs saw each Gaussian."""
         return witnesses(self.marks)
-
-    def _load_from_state_dict(self, state: dict[str, Any], prefix: str, *rest: Any) -> None:
-        if f"{prefix}marks" not in state and f"{prefix}means" in state:  # older runs: what they learnt may stay
-            self.marks = torch.full((len(state[f"{prefix}means"]),), ALL, device=self.marks.device)
-            state[f"{prefix}marks"] = self.marks.clone()
-        super()._load_from_state_dict(state, prefix, *rest)
 
 
 class CloudAdam(torch.optim.Optimizer):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -45,7 +44,3 @@ class Rhythm(nn.Module):
         ended = over > int(self.over) >= 0
         self.over.fill_(over)
         return ended
-
-    def _load_from_state_dict(self, state: dict[str, Any], prefix: str, *rest: Any) -> None:
-        state.setdefault(prefix + "over", self.over)  # runs that are older than this count from where they go on
-        super()._load_from_state_dict(state, prefix, *rest)

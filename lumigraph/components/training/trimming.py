@@ -51,10 +51,6 @@ class Trimming(nn.Module):
         """Which pixels count; all of them until `note` was told of some."""
         return inliers(error, self.threshold)
 
-    def _load_from_state_dict(self, state, prefix, *others) -> None:
-        state.setdefault(f"{prefix}counts", self.counts)
-        super()._load_from_state_dict(state, prefix, *others)
-
 
 @torch.no_grad()
 def inliers(error: Float[Tensor, "height width"], threshold: float) -> Bool[Tensor, "height width"]:
