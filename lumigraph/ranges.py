@@ -13,7 +13,7 @@ import re
 import types
 import typing
 from collections.abc import Iterable, Iterator
-from dataclasses import fields, is_dataclass
+from dataclasses import fields, is_dataclass, replace
 from functools import cache
 from pathlib import Path
 from typing import Annotated, Any, Literal, get_args, get_origin
@@ -94,6 +94,24 @@ def hints(kind: Any) -> dict[str, Any]:
     """The fields of a dataclass with what their annotations say."""
     said = typing.get_type_hints(kind, include_extras=True)
     return {field.name: said[field.name] for field in fields(kind)}
+
+
+def changed(value: Any, **numbers: Any) -> Any:
+    """A dataclass with some numbers replaced, by their names in it or in dataclasses that it holds."""
+    own = {field.name for field in fields(value)}
+    for name in own:
+        if is_dataclass(inner := getattr(value, name)):
+            below = {key: new for key, new in numbers.items() if key not in own and holds(inner, key)}
+            value = replace(value, **{name: changed(inner, **below)}) if below else value
+            numbers = {key: new for key, new in numbers.items() if key not in below}
+    return replace(value, **numbers)
+
+
+def holds(value: Any, name: str) -> bool:
+    """Whether a dataclass, or one that it holds, has a field of a name."""
+    found = fields(value)
+    inner = (getattr(value, field.name) for field in found)
+    return name in {field.name for field in found} or any(is_dataclass(x) and holds(x, name) for x in inner)
 
 
 def outside(value: Any) -> Iterator[tuple[str, Any, Any]]:
