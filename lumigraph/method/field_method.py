@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from abc import ABC
 from dataclasses import replace
-from typing import Any
 
 import torch
 from jaxtyping import Float

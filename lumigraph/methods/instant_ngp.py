@@ -13,7 +13,14 @@ from ..camera import Camera
 from ..components.fields.hash_field import CPU_TABLE, TINY_TABLE, HashField, HashNumbers
 from ..components.fields.taken_over import taken_over
 from ..components.sampling.importance import importance
-from ..components.sampling.occupancy_sampler import OccupancyNumbers, StepNumbers
+from ..components.sampling.occupancy_sampler import (
+    CPU_OCCUPANCY,
+    CPU_STEPS,
+    TINY_OCCUPANCY,
+    TINY_STEPS,
+    OccupancyNumbers,
+    StepNumbers,
+)
 from ..components.sampling.proposal_sampler import ProposalNumbers
 from ..components.sampling.samplers import sampler_for
 from ..components.sampling.spaces import Box, space_of
@@ -47,12 +54,6 @@ class Config:
     contraction: bool = True  # contract scenes without bounds (Barron 2022); no: section 5.4's cascades around them
     exposure_correction: Setting = "auto"  # learn a gain per photograph; auto: where they are found to differ
     seed: Seed = 0
-
-
-CPU_OCCUPANCY = OccupancyNumbers(samples_per_step=1 << 15, transmittance_threshold=1e-3, occupancy_threshold=0.15)
-CPU_STEPS = StepNumbers(steps_per_diagonal=384, cone_angle=1 / 96)
-TINY_OCCUPANCY = OccupancyNumbers(samples_per_step=2048, occupancy_resolution=16)
-TINY_STEPS = StepNumbers(steps_per_diagonal=128)
 
 
 class InstantNGP(FieldMethod):

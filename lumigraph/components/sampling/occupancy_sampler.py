@@ -53,6 +53,13 @@ class StepNumbers:
     cone_angle: Share = 1 / 256  # growth of steps with distance, in scenes without bounds
 
 
+# Numbers for a plain CPU, which learn most in a minute (docs/methods/instant_ngp.md), and for tests.
+CPU_OCCUPANCY = OccupancyNumbers(samples_per_step=1 << 15, transmittance_threshold=1e-3, occupancy_threshold=0.15)
+CPU_STEPS = StepNumbers(steps_per_diagonal=384, cone_angle=1 / 96)
+TINY_OCCUPANCY = OccupancyNumbers(samples_per_step=2048, occupancy_resolution=16)
+TINY_STEPS = StepNumbers(steps_per_diagonal=128)
+
+
 class Stage(NamedTuple):
     """From a share of the budget on: shares of `occupancy_resolution` and of `steps_per_diagonal`."""
 
@@ -127,7 +134,9 @@ class OccupancySampler(Sampler):
 
     @property
     def expected_rays(self) -> float:
-        return min(self.max_rays, self.numbers.samples_per_step / self.samples_per_ray) if self.adapts else self.max_rays
+        return (
+            min(self.max_rays, self.numbers.samples_per_step / self.samples_per_ray) if self.adapts else self.max_rays
+        )
 
     def sample(
         self,
@@ -146,7 +155,7 @@ class OccupancySampler(Sampler):
         of_samples = None if code_of is None else codes_at(samples.ray_index, code_of)
         if generator is not None:
             self.evaluated = evaluated
-        if field.joint and generator is not None:
+        if field.joint:
             density, rgb = field(points, directions, of_samples)
             return [Pass("samples", samples, density, (), directions, rgb=rgb, evaluated=evaluated)]
         density, features = field.geometry(points, of_samples)

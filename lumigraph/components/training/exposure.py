@@ -80,9 +80,7 @@ class Exposure(Part):
         about = "The photograph, by number or name, whose brightness and tint are shown; or the average of all."
         return (
             Control("exposure", 0.0, stops, unit="stops", about="Each stop doubles the scene's colours."),
-            Control(
-                "exposed_as", SCENE, choices=(SCENE, AVERAGE, *photographs), about=about, of_photographs=True
-            ),
+            Control("exposed_as", SCENE, choices=(SCENE, AVERAGE, *photographs), about=about, of_photographs=True),
         )
 
     @property
