@@ -16,7 +16,7 @@ from lumigraph.camera import Camera
 from lumigraph.capture import open_scene, procedural
 from lumigraph.capture.procedural.scenes import swing
 from lumigraph.cli import main
-from lumigraph.components.training.corrections import gain_between
+from lumigraph.components.training.exposure import gain_between
 from lumigraph.components.training.lights import spread_of_exposure
 from lumigraph.controls import Control, moment
 from lumigraph.errors import LumigraphError, LumigraphWarning

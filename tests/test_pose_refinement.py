@@ -146,10 +146,10 @@ def test_waves_and_levels_are_weighted_in_their_order():
     method.network.table.data.uniform_(0.1, 1, generator=torch.Generator().manual_seed(0))
     width = method.config.features_per_level
     method.before_step(0, 0.0)
-    coarse = method._encoded(points - 0.5)
+    coarse = method.network.encode(points - 0.5)
     assert (coarse[:, :width] != 0).all() and (coarse[:, width:] == 0).all()
     method.poses.progress.fill_(1.0)
-    assert (method._encoded(points - 0.5) != 0).all() and method.poses.weights(4) is None
+    assert (method.network.encode(points - 0.5) != 0).all() and method.poses.weights(4) is None
 
 
 def test_a_method_that_refines_nothing_has_no_weights_and_one_rate():

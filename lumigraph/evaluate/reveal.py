@@ -13,7 +13,7 @@ from ..scene import Scene
 def reveal(method: Method, data: Dataset) -> Method:
     """The method, told of a dataset if it accepts that kind: of photographs those to learn from, none held out,
     and no more than `Method.evidence_views`."""
-    if not isinstance(data, tuple(method.accepts)):
+    if not isinstance(data, method.takes):
         return method
     if isinstance(data, Scene):
         there = len(data.splits["train"])

@@ -92,6 +92,7 @@ class RawNeRF(FieldMethod):
     over all photographs; the picture is developed afterwards."""
 
     Config = Config
+    looks = None  # type: ignore[assignment]  # samples hold light, and a picture is developed from its sum
     network: LightField
     exposure: Tensor
     group: Tensor
@@ -203,7 +204,8 @@ class RawNeRF(FieldMethod):
 
     def light(self, rays: Rays) -> Rendering:
         """Linear light along rays in the camera's colours, before nothing."""
-        (look,) = self.looks(rays)
+        (samples,) = self.sampler.sample(rays, self.network)
+        look = samples.look(self.network)
         return composite(look.samples, look.density, look.rgb)
 
     def scale(self, rays: Rays) -> Float[Tensor, "ray 3"]:
