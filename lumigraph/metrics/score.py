@@ -34,10 +34,6 @@ class Score:
     def __str__(self) -> str:
         return f"{self.value:.{self.digits}f} {self.unit}".rstrip()
 
-    def beats(self, other: Score) -> bool:
-        """Whether this is the better one of two of the same name."""
-        return self.value > other.value if self.better == "higher" else self.value < other.value
-
     def to_json(self) -> dict[str, Any]:
         return asdict(self)
 
