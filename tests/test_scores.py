@@ -62,9 +62,9 @@ def test_a_score_says_itself():
     )
 
 
-def test_scores_are_read_from_old_files_and_new():
-    old = {"psnr": 30.0, "ssim": 0.9, "lpips": None}
-    assert [(x.name, str(x)) for x in scores_of(old)] == [("PSNR", "30.00 dB"), ("SSIM", "0.9000")]
+def test_scores_are_read_by_key_and_by_name():
+    view = {"psnr": 30.0, "ssim": 0.9, "lpips": None}
+    assert [(x.name, str(x)) for x in scores_of(view)] == [("PSNR", "30.00 dB"), ("SSIM", "0.9000")]
     new = [Score("IoU", 0.7, "", "higher"), Score("chamfer-L1", 0.1, "", "lower")]
     assert scores_of({"scores": [json.loads(json.dumps(x.to_json())) for x in new]}) == new
     assert named(new, "IoU") is new[0] and named(new, "PSNR") is None and scores_of({}) == []
@@ -176,8 +176,8 @@ def test_views_keep_their_keys_and_have_scores(tmp_path):
     assert {"psnr", "ssim", "lpips", "protocol", "seconds_per_view", "views", "training_seconds"} <= result.keys()
     assert [(x.name, x.value) for x in scores_of(result)] == [("PSNR", result["psnr"]), ("SSIM", result["ssim"])]
     assert evaluate_on(method, tiny.scene()).scores == scores_of(result)
-    older = {name: value for name, value in result.items() if name != "scores"}
-    assert scores_of(older) == scores_of(result)
+    keyed = {name: value for name, value in result.items() if name != "scores"}
+    assert scores_of(keyed) == scores_of(result)
 
 
 def test_a_benchmark_of_shapes_has_their_columns(shaped, tmp_path, monkeypatch):

@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 
 from ..ranges import between
 
-# As files have them that were written before scores had names: key, name, unit, better, digits.
+# Of one view, and of views' means: key, name, unit, better, digits.
 KEYS = (
     ("psnr", "PSNR", "dB", "higher", 2),
     ("ssim", "SSIM", "", "higher", 4),
