@@ -22,10 +22,10 @@ from typing import Any, Literal
 
 import torch
 import tyro
+from canonical_errors import rotation_errors
 from torch import Tensor
 
 from lumigraph.canonical import PRESETS, Instance, Solution, canonicalise, found_in, sampled, solve
-from lumigraph.canonical.errors import rotation_errors
 from lumigraph.canonical.learning import found_rotations
 from lumigraph.canonical.mean_shape import best_alignment, best_rotations, described
 from lumigraph.capture.procedural import signed_distance

@@ -91,6 +91,19 @@ class Camera:
         pose = rows(self.pose.reshape(-1, 12), index).view(-1, 3, 4)
         return self.lens.project(rotate(pose[:, :, :3].mT, points - pose[:, :, 3]), index)
 
+    def locate(self, points: Float[Tensor, "point 3"]) -> tuple[Int[Tensor, "point 2"], Bool[Tensor, " point"]]:
+        """Row and column of the pixel that each point lies in, clamped to the picture, and whether it lies in one.
+
+        For a batch of one: the shared projection of cells into silhouettes, masks and superpixels.
+        """
+        pixels, valid = self.project(points)
+        places, last = (
+            pixels.nan_to_num(-1.0, -1.0, -1.0).clamp(-1, 1e6).floor().long().flip(-1),
+            self.size[0].flip(-1) - 1,
+        )
+        inside = valid & (places >= 0).all(-1) & (places <= last).all(-1)
+        return places.clamp_min(0).minimum(last), inside
+
     def resized(self, factor: float) -> Camera:
         """Cameras of pictures scaled by a factor. Sizes are rounded; intrinsics follow the rounded sizes exactly."""
         size = (self.size * factor).round().clamp_min(1).to(self.size.dtype)

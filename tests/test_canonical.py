@@ -9,11 +9,11 @@ from pathlib import Path
 import pytest
 import tiny
 import torch
+from canonical_errors import about_vertical, rotation_errors
 
 from lumigraph import kernels
 from lumigraph.alignment import angles
 from lumigraph.canonical import Config, Instance, sampled, solve
-from lumigraph.canonical.errors import about_vertical, rotation_errors
 from lumigraph.canonical.harmonics import band, harmonics, turning
 from lumigraph.canonical.learning import drawn, learn, losses
 from lumigraph.canonical.mean_shape import best_rotations, described

@@ -15,7 +15,7 @@ from types import ModuleType
 import torch
 from numba.core.dispatcher import Dispatcher
 
-LATE = ("torch._dynamo", "av", "pycolmap", "trimesh", "matplotlib.pyplot", "PIL.ImageFile", "msgspec", "scipy.spatial")
+LATE = ("torch._dynamo", "av", "pycolmap", "trimesh", "PIL.ImageFile", "msgspec", "scipy.spatial")
 
 
 def warm() -> None:

@@ -122,14 +122,10 @@ def carve(
     radius = 0.5 * float(np.linalg.norm(cell))  # so that no part of a cell is overlooked
     seen, missed = torch.zeros(len(points)), torch.zeros(len(points))
     for outline in outlines:
-        pixels, valid = outline.camera.project(points)
-        size = outline.camera.size[0]
-        inside_picture = valid & (pixels >= 0).all(-1) & (pixels < size).all(-1)
+        places, inside_picture = outline.camera.locate(points)
         pooled, times = widened(outline, points.mean(0), radius)
-        x, y = (pixels[inside_picture] / times).long().unbind(-1)
-        hit = pooled[y.clamp(max=pooled.shape[0] - 1), x.clamp(max=pooled.shape[1] - 1)]
         seen += inside_picture
-        missed[inside_picture] += ~hit
+        missed += inside_picture & ~pooled[(places // times).unbind(-1)]
         keep = missed <= slack * len(outlines)
         points, seen, missed = points[keep], seen[keep], missed[keep]
         if not len(points):

@@ -239,8 +239,7 @@ def visible_depths(cameras: Camera, cloud: WeightedPoints) -> Float[np.ndarray, 
     depths = []
     for i in evenly(range(len(cameras)), SAMPLED_CAMERAS):
         camera = cameras[i]
-        pixels, valid = camera.project(sampled)
-        inside = (valid & (pixels >= 0).all(-1) & (pixels < camera.size[0]).all(-1)).numpy()
+        inside = camera.locate(sampled)[1].numpy()
         away = np.linalg.norm(points[inside] - camera.position[0].numpy(), axis=-1)
         depths.append([quantile(away, weights[inside], q) if inside.any() else math.nan for q in (0.02, 0.5)])
     return None if np.isnan(depths).all() else np.array(depths)

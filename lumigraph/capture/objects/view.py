@@ -73,11 +73,8 @@ class View:
         self, points: Float[torch.Tensor, "point 3"]
     ) -> tuple[Int[np.ndarray, "point 2"], Bool[np.ndarray, " point"]]:
         """The (row, column) at which points are seen, clamped to the picture, and whether they are in it."""
-        pixels, valid = self.camera.project(points)
-        height, width = self.lab.shape[:2]
-        places = pixels.nan_to_num(-1, -1, -1).clamp(-1, 1e6).floor().long().numpy()[:, ::-1]
-        inside = valid.numpy() & (places >= 0).all(-1) & (places < (height, width)).all(-1)
-        return places.clip(0, (height - 1, width - 1)), inside
+        places, inside = self.camera.locate(points)
+        return places.numpy(), inside.numpy()
 
     def shadow(self, points: Float[torch.Tensor, "point 3"], size: float) -> Float[np.ndarray, "height width"]:
         """How much of each pixel cubes cover that are `size` large and stand at points: about 1 inside, 0 outside."""

@@ -14,6 +14,7 @@ from torch import Tensor, nn
 
 from ...gaussians import Gaussians
 from ..training.exchange import exchange
+from ..training.row_optimizer import RowOptimizer, adam_moments, adam_rate
 from .witnesses import marked, witnesses
 
 NAMES = ("means", "quaternions", "log_scales", "opacities", "harmonics")
@@ -78,7 +79,7 @@ class Cloud(nn.Module):
         return witnesses(self.marks)
 
 
-class CloudAdam(torch.optim.Optimizer):
+class CloudAdam(RowOptimizer):
     """Adam (Kingma and Ba 2015) that passes over a row while its whole gradient is exactly zero, and catches up later.
 
     Most Gaussians are not on most pictures. Adam would still move them, by what is left of their momentum, for steps
@@ -91,26 +92,15 @@ class CloudAdam(torch.optim.Optimizer):
     def __init__(self, groups, betas: tuple[float, float] = (0.9, 0.999), eps: float = 1e-15):
         super().__init__(groups, {"lr": 0.0, "betas": betas, "eps": eps, "columns": None})
 
-    @torch.no_grad()
-    def step(self, closure=None) -> None:  # type: ignore[override]  # nobody asks for a closure
-        """Take one step with all parameters that have a gradient."""
-        for group in self.param_groups:
-            for p in group["params"]:
-                if p.grad is not None:
-                    self._update(p, group)
+    def moments(self, p):
+        return adam_moments(p) | {"last": torch.zeros(len(p), device=p.device)}  # step at which each row was moved
 
-    def _update(self, p, group):
-        state = self.state[p]
-        if not state:
-            state["step"] = torch.zeros(())
-            state["mean"], state["square"] = torch.zeros_like(p), torch.zeros_like(p)
-            state["last"] = torch.zeros(len(p), device=p.device)  # step at which each row was moved
+    def update(self, p, grad, state, group):
         state["step"] += 1
         (b1, b2), t = group["betas"], float(state["step"])
-        rate = group["lr"] * math.sqrt(1 - b2**t) / (1 - b1**t)
         width = math.prod(p.shape[1:])
-        rates = rate * torch.tensor(group["columns"] or [1.0] * width, device=p.device)
-        given = p, p.grad.contiguous(), state["mean"], state["square"]
+        rates = adam_rate(group, t) * torch.tensor(group["columns"] or [1.0] * width, device=p.device)
+        given = p, grad.contiguous(), state["mean"], state["square"]
         values, grad, mean, square = (x.detach().view(-1, width) for x in given)
         if p.is_cuda:
             _rows(values, grad, mean, square, state["last"], rates, t, b1, b2, group["eps"])

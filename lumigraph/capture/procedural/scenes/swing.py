@@ -41,13 +41,6 @@ def angle(time: float) -> float:
     return -WIDEST * math.cos(math.pi * time)
 
 
-def ball_centre(time: float) -> tuple[float, float, float]:
-    """Where the ball's centre is at a moment."""
-    x, y, z = PIVOT
-    swung = math.radians(angle(time))
-    return x + LENGTH * math.sin(swung), y, z - LENGTH * math.cos(swung)
-
-
 def world(time: float) -> World:
     """Everything at a moment in [0, 1]."""
     swung = Pose(PIVOT) @ Pose.about((0.0, 1.0, 0.0), -angle(time))
