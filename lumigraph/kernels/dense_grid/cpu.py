@@ -7,7 +7,7 @@ import torch
 from numba import get_num_threads, njit, prange
 
 from .._dispatch import empty
-from .lanes import BLOCK, blend, spread
+from ..hash_encode.cpu import BLOCK, blend, spread
 
 FAST = {"fastmath": True, "cache": True, "error_model": "numpy"}
 ZERO, ONE = np.float32(0), np.float32(1)

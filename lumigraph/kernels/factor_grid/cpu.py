@@ -10,11 +10,11 @@ import torch
 from numba import njit, prange
 
 from .._dispatch import empty
-from .._lanes import fetch, put
-from .._vectors import LANES
+from .._lanes import LANES, fetch, put, totals
 from . import MODES
 
-FAST = {"parallel": True, "fastmath": True, "cache": True}
+# All but "reassoc": sums over corners stay in their order.
+FAST = {"parallel": True, "fastmath": {"nnan", "ninf", "nsz", "arcp", "contract", "afn"}, "cache": True}
 ZERO, ONE = np.float32(0), np.float32(1)
 NONE = np.zeros(LANES, np.float32)
 SHARE = 1 << 10  # samples that a thread takes at a time
@@ -44,15 +44,6 @@ def _on_plane(table, at, down, width, f, g):
 @njit(inline="always")
 def _add(table, at, x):
     put(table, at, fetch(table, at) + x)
-
-
-@njit(inline="always")
-def _total(x, scratch):
-    put(scratch, 0, x)
-    total = ZERO
-    for k in range(LANES):
-        total += scratch[k]
-    return total
 
 
 @njit(**FAST)
@@ -86,7 +77,8 @@ def _look_up(points, table, nodes, starts, vm, width, summed, out):
                 else:
                     put(out, i * width + c, a * b * d)
             if summed:
-                out[i] = _total(total, scratch)
+                put(scratch, 0, totals((total,)))
+                out[i] = scratch[0]
 
 
 @njit(**FAST)

@@ -11,6 +11,7 @@ import triton.language as tl
 from torch import Tensor
 
 from .._dispatch import empty
+from .._rows_gpu import load_row
 from . import SLOW as _SLOW
 from . import Tree
 
@@ -21,12 +22,8 @@ BLOCK = 32  # rays; they go together, so a program is as slow as its slowest
 @triton.jit
 def ray_of(origins, directions, r, here):
     """Origins, directions and one over these, of a block of rays."""
-    ox = tl.load(origins + 3 * r, mask=here, other=0.0)
-    oy = tl.load(origins + 3 * r + 1, mask=here, other=0.0)
-    oz = tl.load(origins + 3 * r + 2, mask=here, other=0.0)
-    dx = tl.load(directions + 3 * r, mask=here, other=1.0)
-    dy = tl.load(directions + 3 * r + 1, mask=here, other=0.0)
-    dz = tl.load(directions + 3 * r + 2, mask=here, other=0.0)
+    ox, oy, oz = load_row(origins, r, here)
+    dx, dy, dz = load_row(directions, r, here, 1.0)
     ix = 1.0 / tl.where(tl.abs(dx) < SLOW, SLOW, dx)
     iy = 1.0 / tl.where(tl.abs(dy) < SLOW, SLOW, dy)
     iz = 1.0 / tl.where(tl.abs(dz) < SLOW, SLOW, dz)

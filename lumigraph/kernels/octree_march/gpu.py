@@ -8,51 +8,12 @@ import triton.language as tl
 from torch import Tensor
 
 from .._dispatch import empty
+from .._rows_gpu import load_row, store_row
 from ..octree_cells import Tree
 from ..octree_cells.gpu import cell_at, inside, leaf, leave, ray_of, row_in, through_cube
-from ..spherical_harmonics import K00, K1, K20, K21, K22, K30, K31, K32, K33
+from ..spherical_harmonics.gpu import harmonic
 
-Y00, Y1, Y20, Y21, Y22 = (tl.constexpr(k) for k in (K00, K1, K20, K21, K22))
-Y30, Y31, Y32, Y33 = (tl.constexpr(k) for k in (K30, K31, K32, K33))
 BLOCK = 32  # rays
-
-
-@triton.jit
-def _harmonic(k: tl.constexpr, x, y, z):
-    """One of the sixteen harmonics of directions."""
-    if k == 0:
-        found = tl.zeros_like(x) + Y00
-    elif k == 1:
-        found = y * -Y1
-    elif k == 2:
-        found = z * Y1
-    elif k == 3:
-        found = x * -Y1
-    elif k == 4:
-        found = x * y * Y21
-    elif k == 5:
-        found = y * z * -Y21
-    elif k == 6:
-        found = (3 * z * z - 1) * Y20
-    elif k == 7:
-        found = x * z * -Y21
-    elif k == 8:
-        found = (x * x - y * y) * Y22
-    elif k == 9:
-        found = y * (3 * x * x - y * y) * -Y33
-    elif k == 10:
-        found = x * y * z * (2 * Y32)
-    elif k == 11:
-        found = y * (5 * z * z - 1) * -Y31
-    elif k == 12:
-        found = z * (5 * z * z - 3) * Y30
-    elif k == 13:
-        found = x * (5 * z * z - 1) * -Y31
-    elif k == 14:
-        found = z * (x * x - y * y) * Y32
-    else:
-        found = x * (x * x - 3 * y * y) * -Y33
-    return found
 
 
 @triton.jit
@@ -62,7 +23,7 @@ def _colour(harmonics, row, held, x, y, z, BASIS: tl.constexpr):
     green = tl.zeros_like(x)
     blue = tl.zeros_like(x)
     for k in tl.static_range(BASIS):
-        basis = _harmonic(k, x, y, z)
+        basis = harmonic(k, x, y, z)
         at = harmonics + row * (3 * BASIS) + 3 * k
         red += basis * tl.load(at, mask=held, other=0.0)
         green += basis * tl.load(at + 1, mask=held, other=0.0)
@@ -105,9 +66,7 @@ def _forward(
         spent += weight
         going = going & inside(u, v, w, DEPTH) & (through >= stop)
         x, y, z, t = tl.where(going, u, 0), tl.where(going, v, 0), tl.where(going, w, 0), end
-    tl.store(rgb + 3 * r, red, mask=here)
-    tl.store(rgb + 3 * r + 1, green, mask=here)
-    tl.store(rgb + 3 * r + 2, blue, mask=here)
+    store_row(rgb, r, (red, green, blue), here)
     tl.store(distance + r, way, mask=here)
     tl.store(opacity + r, spent, mask=here)
 
@@ -127,9 +86,7 @@ def _backward(
     x = cell_at(ox + t * dx, 0, 1 << DEPTH, 2.0**DEPTH)
     y = cell_at(oy + t * dy, 0, 1 << DEPTH, 2.0**DEPTH)
     z = cell_at(oz + t * dz, 0, 1 << DEPTH, 2.0**DEPTH)
-    g_red = tl.load(d_rgb + 3 * r, mask=here, other=0.0)
-    g_green = tl.load(d_rgb + 3 * r + 1, mask=here, other=0.0)
-    g_blue = tl.load(d_rgb + 3 * r + 2, mask=here, other=0.0)
+    g_red, g_green, g_blue = load_row(d_rgb, r, here)
     g_distance = tl.load(d_distance + r, mask=here, other=0.0)
     g_opacity = tl.load(d_opacity + r, mask=here, other=0.0)
     behind = g_distance * tl.load(distance + r, mask=here, other=0.0)
@@ -156,7 +113,7 @@ def _backward(
         g_g = weight * g_green * green * (1 - green)
         g_b = weight * g_blue * blue * (1 - blue)
         for k in tl.static_range(BASIS):
-            basis = _harmonic(k, dx, dy, dz)
+            basis = harmonic(k, dx, dy, dz)
             at = to_harmonics + row * (3 * BASIS) + 3 * k
             tl.atomic_add(at, basis * g_r, mask=held, sem="relaxed")
             tl.atomic_add(at + 1, basis * g_g, mask=held, sem="relaxed")

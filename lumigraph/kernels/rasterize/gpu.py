@@ -12,6 +12,7 @@ import triton.language as tl
 from torch import Tensor
 
 from .._dispatch import empty
+from .._rows_gpu import load_row, store_row
 from ..project import FAINTEST as _FAINTEST
 from ..project import OPAQUEST as _OPAQUEST
 from ..tile import Tiles
@@ -39,12 +40,8 @@ def _gaussians(i, here, order, centres, conics, opacities, colours, depths):
     """Numbers, centres, conics, opacities and values of the tile's Gaussians at i; opacity 0 after the last."""
     n = tl.load(order + i, mask=here, other=0).to(tl.int64)
     cx, cy = tl.load(centres + 2 * n, mask=here, other=0.0), tl.load(centres + 2 * n + 1, mask=here, other=0.0)
-    a = tl.load(conics + 3 * n, mask=here, other=0.0)
-    b = tl.load(conics + 3 * n + 1, mask=here, other=0.0)
-    c = tl.load(conics + 3 * n + 2, mask=here, other=0.0)
-    red = tl.load(colours + 3 * n, mask=here, other=0.0)
-    green = tl.load(colours + 3 * n + 1, mask=here, other=0.0)
-    blue = tl.load(colours + 3 * n + 2, mask=here, other=0.0)
+    a, b, c = load_row(conics, n, here)
+    red, green, blue = load_row(colours, n, here)
     opacity, depth = tl.load(opacities + n, mask=here, other=0.0), tl.load(depths + n, mask=here, other=0.0)
     return n, (cx, cy), (a, b, c), opacity, (red, green, blue, depth)
 
@@ -74,9 +71,7 @@ def _light(dx, dy, conic, opacity, through, stop):
 @triton.jit
 def _of_pixel(picture, depth, weight, at, inside):
     """What the outputs, or their gradients, hold for each pixel."""
-    red = tl.load(picture + 3 * at, mask=inside, other=0.0)
-    green = tl.load(picture + 3 * at + 1, mask=inside, other=0.0)
-    blue = tl.load(picture + 3 * at + 2, mask=inside, other=0.0)
+    red, green, blue = load_row(picture, at, inside)
     return red, green, blue, tl.load(depth + at, mask=inside, other=0.0), tl.load(weight + at, mask=inside, other=0.0)
 
 
@@ -116,9 +111,7 @@ def _forward(
         sum_w += tl.sum(w, 0)
         through = tl.min(behind, 0)  # it only ever grows darker
         first += GAUSSIANS
-    tl.store(picture + 3 * at, red, mask=inside)
-    tl.store(picture + 3 * at + 1, green, mask=inside)
-    tl.store(picture + 3 * at + 2, blue, mask=inside)
+    store_row(picture, at, (red, green, blue), inside)
     tl.store(depth + at, sum_depth, mask=inside)
     tl.store(weight + at, sum_w, mask=inside)
 

@@ -19,7 +19,7 @@ BLOCK = 64
 def _after(index, rows, x, y, z, row, X, Y, Z):
     """Rows of the nodes at (x, y, z), or each node's own `row` where there is none, from which nothing differs then."""
     inside = (row >= 0) & (x < X) & (y < Y) & (z < Z)
-    after = row_of(index, rows, x, y, z, inside, Y, Z)
+    after = row_of(index, rows, (x, y, z), inside, Y, Z)
     return tl.where(after >= 0, after, row)
 
 
@@ -44,7 +44,7 @@ def _vary(
     c = tl.arange(0, WIDTH)[None, :]
     number = tl.load(chosen + i, mask=i < K, other=0)
     x, y, z = number // (Y * Z), number // Z % Y, number % Z
-    row = row_of(index, rows, x, y, z, i < K, Y, Z)
+    row = row_of(index, rows, (x, y, z), i < K, Y, Z)
     right = _after(index, rows, x + 1, y, z, row, X, Y, Z)
     down = _after(index, rows, x, y + 1, z, row, X, Y, Z)
     ahead = _after(index, rows, x, y, z + 1, row, X, Y, Z)
