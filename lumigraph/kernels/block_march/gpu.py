@@ -5,9 +5,8 @@ from __future__ import annotations
 import torch
 import triton
 import triton.language as tl
-from torch import Tensor
 
-from .._dispatch import empty
+from .._dispatch import differentiable, empty
 from .._rows_gpu import load_row
 from ..sparse_grid.gpu import corner_of, weight_of
 from . import ALPHA, CHANNELS, Blocks
@@ -257,45 +256,40 @@ def _backward(
         alive &= s >= first
 
 
-class _BlockMarch(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx, origins, directions, enter, leave, blocks: Blocks, values, stop: float):
-        device, rays = origins.device, len(origins)
-        ctx.given = blocks.index.contiguous(), blocks.rows.contiguous()
-        ctx.sizes = rays, *blocks.index.shape, float(blocks.ball)
-        ctx.options = {"CURVED": blocks.ball > 0, "BLOCK": BLOCK, "B": blocks.block}
-        ctx.options |= {"num_warps": 1, "enable_fp_fusion": False}
-        ctx.stop = float(stop)
-        totals, distance = empty(rays, CHANNELS, device=device), empty(rays, device=device)
-        lengths = torch.zeros(rays, dtype=torch.int32, device=device)
-        if rays:
-            out = totals, distance, lengths, lengths, distance, distance  # the last three are only noted into
-            rest = *out, *ctx.sizes, ctx.stop
-            _march[(triton.cdiv(rays, BLOCK),)](
-                origins, directions, enter, leave, *ctx.given, values, *rest, NOTE=False, **ctx.options
-            )
-        ctx.save_for_backward(origins, directions, enter, leave, values, totals, distance, lengths)
-        return totals, distance
-
-    @staticmethod
-    @torch.autograd.function.once_differentiable
-    def backward(ctx, g_totals, g_distance):
-        origins, directions, enter, leave, values, totals, distance, lengths = ctx.saved_tensors
-        starts = torch.nn.functional.pad(lengths.long().cumsum(0), (1, 0))
-        steps = torch.zeros(int(starts[-1]), device=values.device)
-        lights, to_values = empty(len(steps), device=values.device), torch.zeros_like(values)
-        if len(origins):
-            grid = (triton.cdiv(len(origins), BLOCK),)
-            out = totals, distance, lengths, starts, steps, lights
-            rest = *out, *ctx.sizes, ctx.stop
-            _march[grid](origins, directions, enter, leave, *ctx.given, values, *rest, NOTE=True, **ctx.options)
-            grads = g_totals.contiguous(), g_distance.contiguous()
-            noted = starts, steps, lights, to_values
-            given = origins, directions, *ctx.given, values
-            _backward[grid](*grads, *given, *noted, *ctx.sizes, **ctx.options)
-        return None, None, None, None, None, to_values, None
+def forward(ctx, origins, directions, enter, leave, blocks: Blocks, values, stop: float):
+    device, rays = origins.device, len(origins)
+    ctx.given = blocks.index.contiguous(), blocks.rows.contiguous()
+    ctx.sizes = rays, *blocks.index.shape, float(blocks.ball)
+    ctx.options = {"CURVED": blocks.ball > 0, "BLOCK": BLOCK, "B": blocks.block}
+    ctx.options |= {"num_warps": 1, "enable_fp_fusion": False}
+    ctx.stop = float(stop)
+    totals, distance = empty(rays, CHANNELS, device=device), empty(rays, device=device)
+    lengths = torch.zeros(rays, dtype=torch.int32, device=device)
+    if rays:
+        out = totals, distance, lengths, lengths, distance, distance  # the last three are only noted into
+        rest = *out, *ctx.sizes, ctx.stop
+        _march[(triton.cdiv(rays, BLOCK),)](
+            origins, directions, enter, leave, *ctx.given, values, *rest, NOTE=False, **ctx.options
+        )
+    ctx.save_for_backward(origins, directions, enter, leave, values, totals, distance, lengths)
+    return totals, distance
 
 
-def run(origins, directions, enter, leave, blocks: Blocks, values: Tensor, stop: float):
-    given = (x.contiguous() for x in (origins, directions, enter, leave))
-    return _BlockMarch.apply(*given, blocks, values.contiguous(), stop)
+def backward(ctx, g_totals, g_distance):
+    origins, directions, enter, leave, values, totals, distance, lengths = ctx.saved_tensors
+    starts = torch.nn.functional.pad(lengths.long().cumsum(0), (1, 0))
+    steps = torch.zeros(int(starts[-1]), device=values.device)
+    lights, to_values = empty(len(steps), device=values.device), torch.zeros_like(values)
+    if len(origins):
+        grid = (triton.cdiv(len(origins), BLOCK),)
+        out = totals, distance, lengths, starts, steps, lights
+        rest = *out, *ctx.sizes, ctx.stop
+        _march[grid](origins, directions, enter, leave, *ctx.given, values, *rest, NOTE=True, **ctx.options)
+        grads = g_totals.contiguous(), g_distance.contiguous()
+        noted = starts, steps, lights, to_values
+        given = origins, directions, *ctx.given, values
+        _backward[grid](*grads, *given, *noted, *ctx.sizes, **ctx.options)
+    return None, None, None, None, None, to_values, None
+
+
+run = differentiable(forward, backward)

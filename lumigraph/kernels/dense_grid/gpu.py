@@ -5,9 +5,8 @@ from __future__ import annotations
 import torch
 import triton
 import triton.language as tl
-from torch import Tensor
 
-from .._dispatch import empty
+from .._dispatch import differentiable, empty
 from .._rows_gpu import load_row, store_row
 from ..sparse_grid.gpu import corner_of, slope_of, weight_of
 
@@ -92,34 +91,30 @@ def _backward_points(
     store_row(d_points, i, (dx, dy, dz), here)
 
 
-class _Lookup(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx, points, grid, box):
-        (X, Y, Z, C), S = grid.shape, len(points)
-        ctx.sizes = {"S": S, "X": X, "Y": Y, "Z": Z, "C": C, "CHANNELS": triton.next_power_of_2(C), "BLOCK": BLOCK}
-        ctx.box = torch.stack([box[0], (torch.tensor([X, Y, Z], device=box.device) - 1) / (box[1] - box[0])])
-        out = empty(S, C, device=points.device)
-        if S:
-            _forward[(triton.cdiv(S, BLOCK),)](points, grid, ctx.box, out, **ctx.sizes)
-        ctx.save_for_backward(points, grid)
-        return out
-
-    @staticmethod
-    @torch.autograd.function.once_differentiable
-    def backward(ctx, grad):
-        points, grid = ctx.saved_tensors
-        grad, blocks = grad.contiguous(), triton.cdiv(len(points), BLOCK)
-        d_points = d_grid = None
-        if ctx.needs_input_grad[0]:
-            d_points = empty(*points.shape, device=points.device)
-            if blocks:
-                _backward_points[(blocks,)](grad, points, grid, ctx.box, d_points, **ctx.sizes)
-        if ctx.needs_input_grad[1]:
-            d_grid = torch.zeros_like(grid)
-            if blocks:
-                _backward_grid[(blocks,)](grad, points, ctx.box, d_grid, **ctx.sizes)
-        return d_points, d_grid, None
+def forward(ctx, points, grid, box):
+    (X, Y, Z, C), S = grid.shape, len(points)
+    ctx.sizes = {"S": S, "X": X, "Y": Y, "Z": Z, "C": C, "CHANNELS": triton.next_power_of_2(C), "BLOCK": BLOCK}
+    ctx.box = torch.stack([box[0], (torch.tensor([X, Y, Z], device=box.device) - 1) / (box[1] - box[0])])
+    out = empty(S, C, device=points.device)
+    if S:
+        _forward[(triton.cdiv(S, BLOCK),)](points, grid, ctx.box, out, **ctx.sizes)
+    ctx.save_for_backward(points, grid)
+    return out
 
 
-def run(points: Tensor, grid: Tensor, box: Tensor) -> Tensor:
-    return _Lookup.apply(points.contiguous(), grid.contiguous(), box)
+def backward(ctx, grad):
+    points, grid = ctx.saved_tensors
+    grad, blocks = grad.contiguous(), triton.cdiv(len(points), BLOCK)
+    d_points = d_grid = None
+    if ctx.needs_input_grad[0]:
+        d_points = empty(*points.shape, device=points.device)
+        if blocks:
+            _backward_points[(blocks,)](grad, points, grid, ctx.box, d_points, **ctx.sizes)
+    if ctx.needs_input_grad[1]:
+        d_grid = torch.zeros_like(grid)
+        if blocks:
+            _backward_grid[(blocks,)](grad, points, ctx.box, d_grid, **ctx.sizes)
+    return d_points, d_grid, None
+
+
+run = differentiable(forward, backward)

@@ -5,11 +5,9 @@ from __future__ import annotations
 import torch
 import triton
 import triton.language as tl
-from torch import Tensor
 
-from .._dispatch import empty
+from .._dispatch import differentiable, empty
 from .._rows_gpu import load_row
-from ..sparse_grid import Nodes
 from ..sparse_grid.gpu import cell_of, corner_of, row_of, weight_of
 from ..spherical_harmonics.gpu import harmonic
 
@@ -65,29 +63,24 @@ def _backward(d_sigma, d_rgb, points, directions, index, rows, d_density, d_harm
         tl.atomic_add(d_harmonics + row[:, None] * WIDTH + c[None, :], weight[:, None] * g, mask=there, sem="relaxed")
 
 
-class _HarmonicGrid(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx, points, directions, nodes, density, harmonics):
-        ctx.index, ctx.shapes = (nodes.index.contiguous(), nodes.named), (density.shape, harmonics.shape)
-        ctx.sizes = (len(points), *nodes.index.shape)
-        ctx.save_for_backward(points, directions)
-        out = empty(len(points), device=points.device), empty(len(points), 3, device=points.device)
-        if len(points):
-            blocks = (triton.cdiv(len(points), BLOCK),)
-            _forward[blocks](points, directions, *ctx.index, density, harmonics, *out, *ctx.sizes, BLOCK=BLOCK)
-        return out
-
-    @staticmethod
-    @torch.autograd.function.once_differentiable
-    def backward(ctx, d_sigma, d_rgb):
-        points, directions = ctx.saved_tensors
-        out = [torch.zeros(shape, device=points.device) for shape in ctx.shapes]
-        if len(points):
-            blocks, grads = (triton.cdiv(len(points), BLOCK),), (d_sigma.contiguous(), d_rgb.contiguous())
-            _backward[blocks](*grads, points, directions, *ctx.index, *out, *ctx.sizes, BLOCK=BLOCK)
-        return None, None, None, *out
+def forward(ctx, points, directions, nodes, density, harmonics):
+    ctx.index, ctx.shapes = (nodes.index.contiguous(), nodes.named), (density.shape, harmonics.shape)
+    ctx.sizes = (len(points), *nodes.index.shape)
+    ctx.save_for_backward(points, directions)
+    out = empty(len(points), device=points.device), empty(len(points), 3, device=points.device)
+    if len(points):
+        blocks = (triton.cdiv(len(points), BLOCK),)
+        _forward[blocks](points, directions, *ctx.index, density, harmonics, *out, *ctx.sizes, BLOCK=BLOCK)
+    return out
 
 
-def run(points: Tensor, directions: Tensor, nodes: Nodes, density: Tensor, harmonics: Tensor) -> tuple[Tensor, Tensor]:
-    given = points.contiguous(), directions.contiguous(), nodes, density.contiguous(), harmonics.contiguous()
-    return _HarmonicGrid.apply(*given)
+def backward(ctx, d_sigma, d_rgb):
+    points, directions = ctx.saved_tensors
+    out = [torch.zeros(shape, device=points.device) for shape in ctx.shapes]
+    if len(points):
+        blocks, grads = (triton.cdiv(len(points), BLOCK),), (d_sigma.contiguous(), d_rgb.contiguous())
+        _backward[blocks](*grads, points, directions, *ctx.index, *out, *ctx.sizes, BLOCK=BLOCK)
+    return None, None, None, *out
+
+
+run = differentiable(forward, backward)

@@ -9,7 +9,7 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from .._dispatch import empty
+from .._dispatch import differentiable, empty
 from .._rows_gpu import store_row
 from ..sparse_grid.gpu import cell_of, corner_of, slope_of, weight_of
 from . import PRIMES, HashLevels
@@ -130,34 +130,30 @@ def _pyramid(levels: HashLevels, device: torch.device) -> Tensor:
     return torch.tensor(rows, device=device)
 
 
-class _HashEncode(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx, points, table, levels):
-        L, F = levels.levels, levels.features
-        out = empty(len(points), L * F, device=points.device)
-        ctx.sizes = {"S": len(points), "L": L, "F": F, "FEATURES": triton.next_power_of_2(F), "BLOCK": BLOCK}
-        ctx.pyramid = _pyramid(levels, points.device)
-        if len(points):
-            _forward[(triton.cdiv(len(points), BLOCK), L)](points, table, ctx.pyramid, out, **ctx.sizes)
-        ctx.save_for_backward(points, table)
-        return out
-
-    @staticmethod
-    @torch.autograd.function.once_differentiable
-    def backward(ctx, grad):
-        points, table = ctx.saved_tensors
-        grad, blocks = grad.contiguous(), triton.cdiv(len(points), BLOCK)
-        d_points = d_table = None
-        if ctx.needs_input_grad[0]:
-            d_points = empty(*points.shape, device=points.device)
-            if blocks:
-                _backward_points[(blocks,)](grad, points, table, ctx.pyramid, d_points, **ctx.sizes)
-        if ctx.needs_input_grad[1]:
-            d_table = torch.zeros_like(table)
-            if blocks:
-                _backward_table[(blocks, ctx.sizes["L"])](grad, points, ctx.pyramid, d_table, **ctx.sizes)
-        return d_points, d_table, None
+def forward(ctx, points, table, levels):
+    L, F = levels.levels, levels.features
+    out = empty(len(points), L * F, device=points.device)
+    ctx.sizes = {"S": len(points), "L": L, "F": F, "FEATURES": triton.next_power_of_2(F), "BLOCK": BLOCK}
+    ctx.pyramid = _pyramid(levels, points.device)
+    if len(points):
+        _forward[(triton.cdiv(len(points), BLOCK), L)](points, table, ctx.pyramid, out, **ctx.sizes)
+    ctx.save_for_backward(points, table)
+    return out
 
 
-def run(points: Tensor, table: Tensor, levels: HashLevels) -> Tensor:
-    return _HashEncode.apply(points.contiguous(), table.contiguous(), levels)
+def backward(ctx, grad):
+    points, table = ctx.saved_tensors
+    grad, blocks = grad.contiguous(), triton.cdiv(len(points), BLOCK)
+    d_points = d_table = None
+    if ctx.needs_input_grad[0]:
+        d_points = empty(*points.shape, device=points.device)
+        if blocks:
+            _backward_points[(blocks,)](grad, points, table, ctx.pyramid, d_points, **ctx.sizes)
+    if ctx.needs_input_grad[1]:
+        d_table = torch.zeros_like(table)
+        if blocks:
+            _backward_table[(blocks, ctx.sizes["L"])](grad, points, ctx.pyramid, d_table, **ctx.sizes)
+    return d_points, d_table, None
+
+
+run = differentiable(forward, backward)

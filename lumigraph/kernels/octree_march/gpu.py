@@ -5,11 +5,9 @@ from __future__ import annotations
 import torch
 import triton
 import triton.language as tl
-from torch import Tensor
 
-from .._dispatch import empty
+from .._dispatch import differentiable, empty
 from .._rows_gpu import load_row, store_row
-from ..octree_cells import Tree
 from ..octree_cells.gpu import cell_at, inside, leaf, leave, ray_of, row_in, through_cube
 from ..spherical_harmonics.gpu import harmonic
 
@@ -122,34 +120,27 @@ def _backward(
         x, y, z, t = tl.where(going, u, 0), tl.where(going, v, 0), tl.where(going, w, 0), end
 
 
-class _OctreeMarch(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx, origins, directions, tree, density, harmonics, near, stop):
-        rays, device = len(origins), origins.device
-        out = empty(rays, 3, device=device), empty(rays, device=device), empty(rays, device=device)
-        ctx.numbers = rays, float(near), float(stop)
-        ctx.sizes = {"DEPTH": tree.depth, "BASIS": harmonics.shape[1], "BLOCK": BLOCK, "num_warps": 1}
-        ctx.tree = tree.cells.contiguous(), tree.named
-        if rays:
-            grid = (triton.cdiv(rays, BLOCK),)
-            _forward[grid](origins, directions, *ctx.tree, density, harmonics, *out, *ctx.numbers, **ctx.sizes)
-        ctx.save_for_backward(origins, directions, density, harmonics, *out)
-        return out
-
-    @staticmethod
-    @torch.autograd.function.once_differentiable
-    def backward(ctx, *grads):
-        origins, directions, density, harmonics, *out = ctx.saved_tensors
-        to_density, to_harmonics = torch.zeros_like(density), torch.zeros_like(harmonics)
-        if rays := len(origins):
-            given = origins, directions, *ctx.tree, density, harmonics, *out, to_density, to_harmonics
-            grid, slopes = (triton.cdiv(rays, BLOCK),), [g.contiguous() for g in grads]
-            _backward[grid](*slopes, *given, *ctx.numbers, **ctx.sizes)
-        return None, None, None, to_density, to_harmonics, None, None
+def forward(ctx, origins, directions, tree, density, harmonics, near, stop):
+    rays, device = len(origins), origins.device
+    out = empty(rays, 3, device=device), empty(rays, device=device), empty(rays, device=device)
+    ctx.numbers = rays, float(near), float(stop)
+    ctx.sizes = {"DEPTH": tree.depth, "BASIS": harmonics.shape[1], "BLOCK": BLOCK, "num_warps": 1}
+    ctx.tree = tree.cells.contiguous(), tree.named
+    if rays:
+        grid = (triton.cdiv(rays, BLOCK),)
+        _forward[grid](origins, directions, *ctx.tree, density, harmonics, *out, *ctx.numbers, **ctx.sizes)
+    ctx.save_for_backward(origins, directions, density, harmonics, *out)
+    return out
 
 
-def run(
-    origins: Tensor, directions: Tensor, tree: Tree, density: Tensor, harmonics: Tensor, near: float, stop: float
-) -> tuple[Tensor, Tensor, Tensor]:
-    given = origins.contiguous(), directions.contiguous(), tree, density.contiguous(), harmonics.contiguous()
-    return _OctreeMarch.apply(*given, near, stop)
+def backward(ctx, *grads):
+    origins, directions, density, harmonics, *out = ctx.saved_tensors
+    to_density, to_harmonics = torch.zeros_like(density), torch.zeros_like(harmonics)
+    if rays := len(origins):
+        given = origins, directions, *ctx.tree, density, harmonics, *out, to_density, to_harmonics
+        grid, slopes = (triton.cdiv(rays, BLOCK),), [g.contiguous() for g in grads]
+        _backward[grid](*slopes, *given, *ctx.numbers, **ctx.sizes)
+    return None, None, None, to_density, to_harmonics, None, None
+
+
+run = differentiable(forward, backward)

@@ -18,16 +18,13 @@ C = T T^T + blur I = (a b; b c), K = C^-1 the conic; T_0 and T_1 are a matrix's 
 
 from __future__ import annotations
 
-import torch
 import triton
 import triton.language as tl
-from torch import Tensor
 
-from .._dispatch import empty
+from .._dispatch import differentiable, empty
 from .._rows_gpu import load_row, store_row
 from ..spherical_harmonics.gpu import harmonic, harmonic_slope
 from . import FAINTEST as _FAINTEST
-from . import View
 
 FAINTEST, LEAST_SHARE = tl.constexpr(_FAINTEST), tl.constexpr(1e-8)
 # Where the parts of a view begin in View.numbers()
@@ -377,39 +374,24 @@ def _backward(
     tl.store(d_opacities + i, tl.where(seen, d_opacity, 0.0), mask=here)
 
 
-class _Project(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx, means, quaternions, scales, opacities, harmonics, camera, bands, blur, compensate):
-        inputs = means, quaternions, scales, opacities, harmonics, camera
-        count, device = len(means), means.device
-        outputs = [empty(*shape, device=device) for shape in ((count, 2), (count, 3), (count,), (count, 3), (count,))]
-        options = {"K": harmonics.shape[1], "BANDS": bands, "COMPENSATE": compensate, "BLOCK": BLOCK}
-        ctx.grid, ctx.rest, ctx.options = (triton.cdiv(count, BLOCK),), (count, float(blur)), options
-        if count:
-            _forward[ctx.grid](*inputs, *outputs, *ctx.rest, **options)
-        ctx.save_for_backward(*inputs, outputs[2], outputs[3])
-        return tuple(outputs)
-
-    @staticmethod
-    @torch.autograd.function.once_differentiable
-    def backward(ctx, *grads):
-        saved = ctx.saved_tensors
-        found = [empty(*x.shape, device=x.device) for x in saved[:5]]
-        if len(saved[0]):
-            _backward[ctx.grid](*(g.contiguous() for g in grads), *saved, *found, *ctx.rest, **ctx.options)
-        return *found, None, None, None, None
+def forward(ctx, means, quaternions, scales, opacities, harmonics, view, bands, blur, compensate):
+    inputs = means, quaternions, scales, opacities, harmonics, view.numbers().to(means)
+    count, device = len(means), means.device
+    outputs = [empty(*shape, device=device) for shape in ((count, 2), (count, 3), (count,), (count, 3), (count,))]
+    options = {"K": harmonics.shape[1], "BANDS": bands, "COMPENSATE": compensate, "BLOCK": BLOCK}
+    ctx.grid, ctx.rest, ctx.options = (triton.cdiv(count, BLOCK),), (count, float(blur)), options
+    if count:
+        _forward[ctx.grid](*inputs, *outputs, *ctx.rest, **options)
+    ctx.save_for_backward(*inputs, outputs[2], outputs[3])
+    return tuple(outputs)
 
 
-def run(
-    means: Tensor,
-    quaternions: Tensor,
-    scales: Tensor,
-    opacities: Tensor,
-    harmonics: Tensor,
-    view: View,
-    bands: int,
-    blur: float,
-    compensate: bool,
-) -> tuple[Tensor, ...]:
-    tensors = (x.contiguous() for x in (means, quaternions, scales, opacities, harmonics))
-    return _Project.apply(*tensors, view.numbers().to(means), bands, blur, compensate)
+def backward(ctx, *grads):
+    saved = ctx.saved_tensors
+    found = [empty(*x.shape, device=x.device) for x in saved[:5]]
+    if len(saved[0]):
+        _backward[ctx.grid](*(g.contiguous() for g in grads), *saved, *found, *ctx.rest, **ctx.options)
+    return *found, None, None, None, None
+
+
+run = differentiable(forward, backward)

@@ -9,13 +9,11 @@ from __future__ import annotations
 import torch
 import triton
 import triton.language as tl
-from torch import Tensor
 
-from .._dispatch import empty
+from .._dispatch import differentiable, empty
 from .._rows_gpu import load_row, store_row
 from ..project import FAINTEST as _FAINTEST
 from ..project import OPAQUEST as _OPAQUEST
-from ..tile import Tiles
 
 FAINTEST, OPAQUEST = tl.constexpr(_FAINTEST), tl.constexpr(_OPAQUEST)
 SQUARE = 16  # pixels along a program's share of a tile, at most
@@ -182,31 +180,24 @@ def _backward(
         first += GAUSSIANS
 
 
-class _Rasterize(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx, centres, conics, opacities, colours, depths, tiles, stop):
-        (width, height), device = tiles.size, centres.device
-        inputs = centres, conics, opacities, colours, depths, tiles.order, tiles.starts
-        outputs = [empty(*shape, device=device) for shape in ((height, width, 3), (height, width), (height, width))]
-        square = min(tiles.side, SQUARE)
-        ctx.grid = (tiles.across * tiles.down * (tiles.side // square) ** 2,)
-        ctx.rest = width, height, max(float(stop), DARK)
-        ctx.options = {"SIDE": tiles.side, "SQUARE": square, "GAUSSIANS": GAUSSIANS}
-        _forward[ctx.grid](*inputs, *outputs, *ctx.rest, **ctx.options)
-        ctx.save_for_backward(*inputs, *outputs)
-        return tuple(outputs)
-
-    @staticmethod
-    @torch.autograd.function.once_differentiable
-    def backward(ctx, *grads):
-        saved = ctx.saved_tensors
-        found = [torch.zeros_like(x) for x in saved[:5]]
-        _backward[ctx.grid](*(g.contiguous() for g in grads), *saved, *found, *ctx.rest, **ctx.options)
-        return *found, None, None
+def forward(ctx, centres, conics, opacities, colours, depths, tiles, stop):
+    (width, height), device = tiles.size, centres.device
+    inputs = centres, conics, opacities, colours, depths, tiles.order, tiles.starts
+    outputs = [empty(*shape, device=device) for shape in ((height, width, 3), (height, width), (height, width))]
+    square = min(tiles.side, SQUARE)
+    ctx.grid = (tiles.across * tiles.down * (tiles.side // square) ** 2,)
+    ctx.rest = width, height, max(float(stop), DARK)
+    ctx.options = {"SIDE": tiles.side, "SQUARE": square, "GAUSSIANS": GAUSSIANS}
+    _forward[ctx.grid](*inputs, *outputs, *ctx.rest, **ctx.options)
+    ctx.save_for_backward(*inputs, *outputs)
+    return tuple(outputs)
 
 
-def run(
-    centres: Tensor, conics: Tensor, opacities: Tensor, colours: Tensor, depths: Tensor, tiles: Tiles, stop: float
-) -> tuple[Tensor, Tensor, Tensor]:
-    tensors = (x.contiguous() for x in (centres, conics, opacities, colours, depths))
-    return _Rasterize.apply(*tensors, tiles, stop)
+def backward(ctx, *grads):
+    saved = ctx.saved_tensors
+    found = [torch.zeros_like(x) for x in saved[:5]]
+    _backward[ctx.grid](*(g.contiguous() for g in grads), *saved, *found, *ctx.rest, **ctx.options)
+    return *found, None, None
+
+
+run = differentiable(forward, backward)

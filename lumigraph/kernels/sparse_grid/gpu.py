@@ -5,11 +5,9 @@ from __future__ import annotations
 import torch
 import triton
 import triton.language as tl
-from torch import Tensor
 
-from .._dispatch import empty
+from .._dispatch import differentiable, empty
 from .._rows_gpu import load_row, store_row
-from . import Nodes
 
 BLOCK = 64
 
@@ -122,35 +120,31 @@ def _backward_points(
     store_row(d_points, i, (dx, dy, dz), here)
 
 
-class _SparseGrid(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx, points, nodes, values):
-        channels = values.shape[1]
-        ctx.index = nodes.index.contiguous(), nodes.named
-        ctx.sizes = (len(points), *nodes.index.shape)
-        ctx.meta = {"C": channels, "WIDTH": triton.next_power_of_2(max(channels, 1)), "BLOCK": BLOCK}
-        ctx.save_for_backward(points, values)
-        out = empty(len(points), channels, device=points.device)
+def forward(ctx, points, nodes, values):
+    channels = values.shape[1]
+    ctx.index = nodes.index.contiguous(), nodes.named
+    ctx.sizes = (len(points), *nodes.index.shape)
+    ctx.meta = {"C": channels, "WIDTH": triton.next_power_of_2(max(channels, 1)), "BLOCK": BLOCK}
+    ctx.save_for_backward(points, values)
+    out = empty(len(points), channels, device=points.device)
+    if len(points):
+        _forward[(triton.cdiv(len(points), BLOCK),)](points, *ctx.index, values, out, *ctx.sizes, **ctx.meta)
+    return out
+
+
+def backward(ctx, grad):
+    points, values = ctx.saved_tensors
+    grad, blocks = grad.contiguous(), (triton.cdiv(len(points), BLOCK),)
+    d_points = d_values = None
+    if ctx.needs_input_grad[0]:
+        d_points = empty(*points.shape, device=points.device)
         if len(points):
-            _forward[(triton.cdiv(len(points), BLOCK),)](points, *ctx.index, values, out, *ctx.sizes, **ctx.meta)
-        return out
-
-    @staticmethod
-    @torch.autograd.function.once_differentiable
-    def backward(ctx, grad):
-        points, values = ctx.saved_tensors
-        grad, blocks = grad.contiguous(), (triton.cdiv(len(points), BLOCK),)
-        d_points = d_values = None
-        if ctx.needs_input_grad[0]:
-            d_points = empty(*points.shape, device=points.device)
-            if len(points):
-                _backward_points[blocks](grad, points, *ctx.index, values, d_points, *ctx.sizes, **ctx.meta)
-        if ctx.needs_input_grad[2]:
-            d_values = torch.zeros_like(values)
-            if len(points):
-                _backward_values[blocks](grad, points, *ctx.index, d_values, *ctx.sizes, **ctx.meta)
-        return d_points, None, d_values
+            _backward_points[blocks](grad, points, *ctx.index, values, d_points, *ctx.sizes, **ctx.meta)
+    if ctx.needs_input_grad[2]:
+        d_values = torch.zeros_like(values)
+        if len(points):
+            _backward_values[blocks](grad, points, *ctx.index, d_values, *ctx.sizes, **ctx.meta)
+    return d_points, None, d_values
 
 
-def run(points: Tensor, nodes: Nodes, values: Tensor) -> Tensor:
-    return _SparseGrid.apply(points.contiguous(), nodes, values.contiguous())
+run = differentiable(forward, backward)

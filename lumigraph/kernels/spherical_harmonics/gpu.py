@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import torch
 import triton
 import triton.language as tl
-from torch import Tensor
 
-from .._dispatch import empty
+from .._dispatch import differentiable, empty
 from .._rows_gpu import load_row, store_row
 from . import K00, K1, K20, K21, K22, K30, K31, K32, K33
 
@@ -115,26 +113,22 @@ def _backward(grad, directions, d_directions, R, BANDS: tl.constexpr, BLOCK: tl.
     store_row(d_directions, r, (dx, dy, dz), here)
 
 
-class _SphericalHarmonics(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx, directions, bands):
-        ctx.save_for_backward(directions)
-        ctx.bands = bands
-        out = empty(len(directions), bands**2, device=directions.device)
-        if len(out):
-            _forward[(triton.cdiv(len(out), BLOCK),)](directions, out, len(out), BANDS=bands, BLOCK=BLOCK)
-        return out
-
-    @staticmethod
-    @torch.autograd.function.once_differentiable
-    def backward(ctx, grad):
-        (directions,) = ctx.saved_tensors
-        d_directions = empty(*directions.shape, device=directions.device)
-        if len(grad):
-            grid = (triton.cdiv(len(grad), BLOCK),)
-            _backward[grid](grad.contiguous(), directions, d_directions, len(grad), BANDS=ctx.bands, BLOCK=BLOCK)
-        return d_directions, None
+def forward(ctx, directions, bands):
+    ctx.save_for_backward(directions)
+    ctx.bands = bands
+    out = empty(len(directions), bands**2, device=directions.device)
+    if len(out):
+        _forward[(triton.cdiv(len(out), BLOCK),)](directions, out, len(out), BANDS=bands, BLOCK=BLOCK)
+    return out
 
 
-def run(directions: Tensor, bands: int) -> Tensor:
-    return _SphericalHarmonics.apply(directions.contiguous(), bands)
+def backward(ctx, grad):
+    (directions,) = ctx.saved_tensors
+    d_directions = empty(*directions.shape, device=directions.device)
+    if len(grad):
+        grid = (triton.cdiv(len(grad), BLOCK),)
+        _backward[grid](grad.contiguous(), directions, d_directions, len(grad), BANDS=ctx.bands, BLOCK=BLOCK)
+    return d_directions, None
+
+
+run = differentiable(forward, backward)
