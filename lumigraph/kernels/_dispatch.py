@@ -48,7 +48,7 @@ def differentiable(forward: Callable, backward: Callable) -> Callable:
     """
     once = torch.autograd.function.once_differentiable(backward)
     ways = {"forward": staticmethod(forward), "backward": staticmethod(once)}
-    function = type(forward.__module__.split(".")[-2], (torch.autograd.Function,), ways)
+    function: Any = type(forward.__module__.split(".")[-2], (torch.autograd.Function,), ways)
 
     def run(*inputs: Any) -> Any:
         return function.apply(*(x.contiguous() if isinstance(x, Tensor) else x for x in inputs))

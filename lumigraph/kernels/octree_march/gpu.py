@@ -8,18 +8,17 @@ import triton.language as tl
 
 from .._dispatch import differentiable, empty
 from .._rows_gpu import load_row, store_row
-from ..octree_cells.gpu import cell_at, inside, leaf, leave, ray_of, row_in, through_cube
+from ..octree_cells.gpu import enter, inside, leaf, leave, row_in
 from ..spherical_harmonics.gpu import harmonic
 
 BLOCK = 32  # rays
 
 
 @triton.jit
-def _colour(harmonics, row, held, x, y, z, BASIS: tl.constexpr):
+def _colour(harmonics, row, held, direction, BASIS: tl.constexpr):
     """What cells show along directions."""
-    red = tl.zeros_like(x)
-    green = tl.zeros_like(x)
-    blue = tl.zeros_like(x)
+    x, y, z = direction
+    red, green, blue = tl.zeros_like(x), tl.zeros_like(x), tl.zeros_like(x)
     for k in tl.static_range(BASIS):
         basis = harmonic(k, x, y, z)
         at = harmonics + row * (3 * BASIS) + 3 * k
@@ -36,12 +35,8 @@ def _forward(
 ):  # fmt: skip
     r = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
     here = r < R
-    ox, oy, oz, dx, dy, dz, ix, iy, iz = ray_of(origins, directions, r, here)
-    t, far = through_cube(ox, oy, oz, ix, iy, iz, near)
-    going = here & (t < far)
-    x = cell_at(ox + t * dx, 0, 1 << DEPTH, 2.0**DEPTH)
-    y = cell_at(oy + t * dy, 0, 1 << DEPTH, 2.0**DEPTH)
-    z = cell_at(oz + t * dz, 0, 1 << DEPTH, 2.0**DEPTH)
+    ray, t, going, cell = enter(origins, directions, r, here, near, DEPTH)
+    x, y, z = cell
     red = tl.zeros([BLOCK], tl.float32)
     green = tl.zeros([BLOCK], tl.float32)
     blue = tl.zeros([BLOCK], tl.float32)
@@ -50,13 +45,13 @@ def _forward(
     through = tl.zeros([BLOCK], tl.float32) + 1.0
     while tl.max(going.to(tl.int32), 0) > 0:
         value, shift = leaf(cells, x, y, z, going, DEPTH)
-        end, u, v, w = leave(x, y, z, shift, ox, oy, oz, dx, dy, dz, ix, iy, iz, t, DEPTH)
+        end, u, v, w = leave(x, y, z, shift, ray, t, DEPTH)
         row = row_in(named, value, going).to(tl.int64)
         held = row >= 0
         keep = tl.exp(-tl.load(density + row, mask=held, other=0.0) * tl.where(held, end - t, 0.0))
         weight = through * (1 - keep)
         through *= keep
-        r_, g_, b_ = _colour(harmonics, row, held, dx, dy, dz, BASIS)
+        r_, g_, b_ = _colour(harmonics, row, held, ray[1], BASIS)
         red += weight * r_
         green += weight * g_
         blue += weight * b_
@@ -78,12 +73,9 @@ def _backward(
     """dL/dtau_i = g_i T_{i+1} - sum_{j>i} g_j w_j, where g_i is what one unit of weight i is worth to the loss."""
     r = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
     here = r < R
-    ox, oy, oz, dx, dy, dz, ix, iy, iz = ray_of(origins, directions, r, here)
-    t, far = through_cube(ox, oy, oz, ix, iy, iz, near)
-    going = here & (t < far)
-    x = cell_at(ox + t * dx, 0, 1 << DEPTH, 2.0**DEPTH)
-    y = cell_at(oy + t * dy, 0, 1 << DEPTH, 2.0**DEPTH)
-    z = cell_at(oz + t * dz, 0, 1 << DEPTH, 2.0**DEPTH)
+    ray, t, going, cell = enter(origins, directions, r, here, near, DEPTH)
+    x, y, z = cell
+    dx, dy, dz = ray[1]
     g_red, g_green, g_blue = load_row(d_rgb, r, here)
     g_distance = tl.load(d_distance + r, mask=here, other=0.0)
     g_opacity = tl.load(d_opacity + r, mask=here, other=0.0)
@@ -95,14 +87,14 @@ def _backward(
     through = tl.zeros([BLOCK], tl.float32) + 1.0
     while tl.max(going.to(tl.int32), 0) > 0:
         value, shift = leaf(cells, x, y, z, going, DEPTH)
-        end, u, v, w = leave(x, y, z, shift, ox, oy, oz, dx, dy, dz, ix, iy, iz, t, DEPTH)
+        end, u, v, w = leave(x, y, z, shift, ray, t, DEPTH)
         row = row_in(named, value, going).to(tl.int64)
         held = row >= 0
         length = tl.where(held, end - t, 0.0)
         keep = tl.exp(-tl.load(density + row, mask=held, other=0.0) * length)
         weight = through * (1 - keep)
         through *= keep
-        red, green, blue = _colour(harmonics, row, held, dx, dy, dz, BASIS)
+        red, green, blue = _colour(harmonics, row, held, ray[1], BASIS)
         worth = g_opacity + g_distance * (0.5 * (t + end)) + g_red * red + g_green * green + g_blue * blue
         behind -= tl.where(held, worth * weight, 0.0)
         slope = (worth * through - behind) * length
