@@ -10,21 +10,13 @@ from numba import get_num_threads, njit, prange
 
 from .._dispatch import empty
 from .._lanes import LANES, fetch, fetch_like, gather, highest, lowest, put, real, scatter, whole
+from ..sparse_grid.cpu import cell_of
 from . import PRIMES
 
 P1, P2 = np.uint32(PRIMES[1]), np.uint32(PRIMES[2])
 ZERO, ONE = np.float32(0), np.float32(1)
 BLOCK = 64  # points whose corners are worked out together; entries and weights are laid out corner by corner
 CHUNK = 1 << 16  # points a thread takes at most at a time: many, so that a level's table is fetched once
-
-
-@njit(inline="always")
-def _cell(x, resolution):
-    """Cell and place within it along one axis; what lies outside is clamped onto the border."""
-    s = min(max(x, ZERO), ONE) * np.float32(resolution)
-    cell = min(np.int32(s), np.int32(resolution - 1))
-    cell = max(cell, np.int32(0))  # also where x is no number
-    return cell, s - np.float32(cell)
 
 
 @njit(inline="always")
@@ -145,9 +137,9 @@ def _point_gradient(grad, points, table, resolutions, offsets, masks, out):
             row = np.uint32(resolution + 1)
             step_y = P1 if mask else row
             step_z = P2 if mask else np.uint32(row * row)
-            cx, fx = _cell(points[0, i], resolution)
-            cy, fy = _cell(points[1, i], resolution)
-            cz, fz = _cell(points[2, i], resolution)
+            cx, fx = cell_of(points[0, i], resolution)
+            cy, fy = cell_of(points[1, i], resolution)
+            cz, fz = cell_of(points[2, i], resolution)
             for corner in range(8):
                 bx, by, bz = corner & 1, corner >> 1 & 1, corner >> 2
                 x, y = np.uint32(cx + bx), np.uint32(np.uint32(cy + by) * step_y)

@@ -1,7 +1,4 @@
-"""Faults that the tests write into a copy of an engine, one at a time, to see their comparison turn red.
-
-By name: the engine, the function, what stands there, and what is put in its place.
-"""
+"""Seeded faults by name: the engine, the function, a piece of it, and what is put in its place."""
 
 FAULTS = {
     "corner forgotten": ("gpu", "_backward_table", "tl.static_range(8)", "tl.static_range(7)"),
@@ -17,5 +14,5 @@ FAULTS = {
 # These let an index leave its array.
 ASTRAY = {
     "the entry after the last": ("cpu", "_corners", "(entry + np.uint32(base))", "(entry + np.uint32(base + 1))"),
-    "the point 1.0, a cell too far": ("cpu", "_cell", "np.int32(resolution - 1))\n", "np.int32(resolution))\n"),
+    "the point 1.0, a cell too far": ("cpu", "_along", "np.uint32(resolution - 1)", "np.uint32(resolution)"),
 }
