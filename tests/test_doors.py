@@ -24,6 +24,7 @@ GRID, RESAMPLING = torch.rand(2, 2, 2), kernels.Resampling(4, 2, 1.0, 0.01, 1e-5
 def drawn(tiles):
     return rasterize(*FOOTPRINTS, torch.rand(4, 3), DEPTHS, tiles)
 
+
 REFUSED = {
     "no levels": lambda: HashLevels(levels=0),
     "a million levels": lambda: HashLevels(levels=1_000_000),
