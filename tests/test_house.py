@@ -17,7 +17,7 @@ import lumigraph
 FLOORS: list[set[str]] = [
     {"console", "errors", "processes", "quality", "signals"},
     {
-        *("blending", "choice", "controls", "geometry", "loops", "marks"),
+        *("blending", "choice", "controls", "geometry", "marks"),
         *("allocation", "library", "memory", "names", "partials", "progress", "ranges", "readers", "srgb", "threads"),
     },
     {"budget", "files", "plain", "lens", "rays"},

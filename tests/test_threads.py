@@ -17,9 +17,9 @@ from lumigraph.allocation import OWN
 
 LOOP = """
 import lumigraph, torch, numpy
-from lumigraph.loops import unbend
+from lumigraph.lens.undistortion import undistort
 none = numpy.zeros((0, 2), numpy.float32)
-unbend(none, numpy.zeros(0, int), none, none, none, none, 1, 0.1, numpy.zeros((0, 3), numpy.float32))
+undistort(none, numpy.zeros(0, int), none, none, none, none, 1, 0.1, numpy.zeros((0, 3), numpy.float32))
 print(torch.ones(1 << 18).exp().sum())
 """
 

@@ -7,12 +7,12 @@ import pytest
 import torch
 from numba import njit
 
-from lumigraph import loops
 from lumigraph.components.sampling.proposal import Proposal, edges_of, overlooked
 from lumigraph.components.sampling.proposal_sampler import MIN_WEIGHT, ProposalNumbers, ProposalSampler
 from lumigraph.components.sampling.spaces import NDC, Contraction
 from lumigraph.components.training.fog import elsewhere, scaled_by_distance, spread
 from lumigraph.method import Field
+from lumigraph.kernels.sample_proposals.cpu import cube_root, exponential
 from lumigraph.rays import Rays, Samples
 from lumigraph.scene import Forward
 from lumigraph.volume import composite
@@ -201,6 +201,6 @@ def both(x):
     """Of numbers x their exponential, and the cube root of e^x."""
     powers, roots = np.empty_like(x), np.empty_like(x)
     for i in range(len(x)):
-        powers[i] = loops.exponential(x[i])
-        roots[i] = loops.cube_root(np.float32(math.exp(max(x[i], np.float32(-60)))))
+        powers[i] = exponential(x[i])
+        roots[i] = cube_root(np.float32(math.exp(max(x[i], np.float32(-60)))))
     return powers, roots

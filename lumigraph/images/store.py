@@ -16,10 +16,10 @@ from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
 from ..files import read_json
-from ..loops import look_up
 from ..memory import memory_for_images
 from .cache import MARK, cache_folder, check_size, filled, in_parallel, key, new_file
 from .order import Runs, shuffled_order, spread
+from .pixel_sampling import sample_pixels
 
 PIECES = 64  # a batch from a file comes in about so many reads
 SHORTEST_PIECE, LONGEST_PIECE = 64, 1024  # pixels; the longest fills a page
@@ -200,7 +200,7 @@ class ImageStore:
         position = torch.empty(count, dtype=torch.int64) if positions else nothing
         runs = (nothing,) * 4 if self._trusted is None else self._trusted.columns()
         inputs = (chance, images, self._first, self._count, self._stride, self._width, *runs, self._rgba)
-        look_up(piece, *(x.numpy() for x in (*inputs, image, xy, rgba.view(torch.int32)[:, 0], position)))
+        sample_pixels(piece, *(x.numpy() for x in (*inputs, image, xy, rgba.view(torch.int32)[:, 0], position)))
         return PixelBatch(image, xy, rgba, position if positions else None)
 
 

@@ -18,9 +18,9 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from . import loops
-from .errors import LumigraphError
-from .ranges import Tally, typed
+from ..errors import LumigraphError
+from ..ranges import Tally, typed
+from . import undistortion
 
 FOLD_SAMPLES = 1024  # angles from the axis at which a distortion is tested for folding over
 WIDEST_FLAT = math.radians(89.0)  # flat image planes end here: tan is still harmless in float32
@@ -260,13 +260,14 @@ class OpenCV(Lens):
         which = NO_INDEX if index is None else index
         inputs = (pixels, which, self.focal, self.centre, self.distortion, self.fold)
         # Each ray stops by itself here, so one beside a fold, where steps merely halve, gets no company's extra steps.
-        loops.unbend(*(x.numpy() for x in inputs), NEWTON_STEPS, 0.03 * SMALL_STEP, directions.numpy())
+        undistortion.undistort(*(x.numpy() for x in inputs), NEWTON_STEPS, 0.03 * SMALL_STEP, directions.numpy())
         return directions
 
     def _solid_angle_by_loop(self, directions: Tensor, index: Tensor | None) -> Tensor:
         angle = torch.empty(len(directions))
         which = NO_INDEX if index is None else index
-        loops.bent_solid_angle(*(x.numpy() for x in (directions, which, self.focal, self.distortion, angle)))
+        tensors = directions, which, self.focal, self.distortion, angle
+        undistortion.solid_angle(*(x.numpy() for x in tensors))
         return angle
 
 

@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from . import loops
+from .midpoints import fill_midpoints
 
 
 @dataclass(frozen=True)
@@ -107,7 +107,7 @@ class Samples:
         if not rays.origins.is_cuda and not (torch.is_grad_enabled() and any(x.requires_grad for x in given)):
             positions, directions = (self.t_start.new_empty(len(self), 3) for _ in range(2))
             tensors = *given, self.ray_starts, positions, directions
-            loops.along(*(x.detach().contiguous().numpy() for x in tensors))
+            fill_midpoints(*(x.detach().contiguous().numpy() for x in tensors))
             return positions, directions
         ray = self.ray_index
         directions = rays.directions.index_select(0, ray)
