@@ -85,6 +85,30 @@ class RefinesPoses(Protocol):
 
 
 @runtime_checkable
+class HasVisibility(Protocol):
+    """Knows which places its photographs saw."""
+
+    def visibility(
+        self, points: Float[Tensor, "point 3"], directions: Float[Tensor, "point 3"]
+    ) -> Float[Tensor, " point"]:
+        """Share of the photographs' view of each place along a unit direction, in [0, 1]."""
+
+
+@runtime_checkable
+class HasExposure(Protocol):
+    """Knows the exposures of its photographs."""
+
+    usual_exposure: float | None  # log2 of their median; None where it is not known
+
+
+@runtime_checkable
+class HasAppearance(Protocol):
+    """Renders in the light of one appearance code, which it accepts as evidence."""
+
+    shown_in: Any  # the `Appearance`; of no numbers where none was learnt
+
+
+@runtime_checkable
 class CanPrune(Protocol):
     """Is a cloud of Gaussians that can lose some and go on learning."""
 
@@ -150,10 +174,11 @@ LACKING = {
 
 def can(method: object, capability: type[Any]) -> bool:
     """Whether a method, or all of a class, has a capability. Its class must have the functions: a network may be called
-    `field` too."""
+    `field` too. Values must be there and not None; `isinstance` does not find those that are submodules."""
     kind = method if isinstance(method, type) else type(method)
-    names = [name for name in vars(capability) if not name.startswith("_")]
-    return all(callable(getattr(kind, name, None)) for name in names)
+    functions = [name for name in vars(capability) if not name.startswith("_")]
+    values = [getattr(method, name, None) for name in capability.__annotations__]
+    return all(callable(getattr(kind, name, None)) for name in functions) and all(x is not None for x in values)
 
 
 def needs(method: object, capability: type[Any]) -> Any:

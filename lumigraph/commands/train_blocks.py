@@ -53,8 +53,8 @@ class TrainBlocks(Train):
             return super().run()
         if self.blocks == "1" and self._own:
             return super().run()
-        from ..blocks.layout import LARGE
-        from ..blocks.planning import survey
+        from ..large.layout import LARGE
+        from ..large.planning import survey
 
         places = survey(source, self.reader)
         many = places.splits.count("train") >= LARGE
@@ -74,10 +74,9 @@ class TrainBlocks(Train):
         return self._field == IN_BLOCKS
 
     def _all(self, source: str, places: Any) -> int:
-        from ..blocks.conduct import conduct
-        from ..blocks.finishing import finish
-        from ..blocks.planning import begin, make_plan
-        from ..blocks.workers import Workers
+        from ..large.training import conduct, finish
+        from ..large.planning import begin, make_plan
+        from ..large.on_ray import Workers
         from ..memory import free_memory
 
         budget = told_budget(self.steps, self.seconds, self.quality)
@@ -121,8 +120,8 @@ class TrainBlocks(Train):
         return torch.device("cuda" if self.device == "gpu" else self.device)
 
     def _again(self, run: Path) -> int:
-        from ..blocks.planning import survey
-        from ..blocks.update import update
+        from ..large.planning import survey
+        from ..large.update import update
 
         if self.blocks is None or not self.blocks.isdigit():
             raise LumigraphError("--into needs the name of the block to learn again; give it as --blocks 3")
@@ -165,8 +164,8 @@ def with_options_of_blocks(field: str, device: str, preset: str) -> type[Any]:
 
 def unfinished(prefix: str, plan: Any) -> Path:
     """The latest run of this name, if it is the same and not done; else the next name that is free."""
-    from ..blocks.planning import difference, place_of
-    from ..run.block_plan import DONE, NAME, Plan
+    from ..large.planning import difference, place_of
+    from ..large.plan import DONE, NAME, Plan
 
     free = next_free(prefix)
     number = int(free.name.rpartition("-")[2])

@@ -54,7 +54,7 @@ class Run(Trained):
     def __init__(self, folder: Path | str):
         self.path = self.folder = Path(folder)
         if not files.is_file(self._config):
-            if files.is_file(self.folder / "blocks.json"):
+            if is_block_run(self.folder):
                 raise LumigraphError(
                     f"{self.folder} is a run in blocks, and this is for one of them at a time: name "
                     f"{self.folder / 'blocks' / '0'}, or another block"
@@ -302,6 +302,11 @@ def build(
         torch.manual_seed(seed)
         method = kind(frame, config)
     return method.to(device)
+
+
+def is_block_run(folder: Path) -> bool:
+    """Whether a folder holds a run in blocks; see `large`."""
+    return files.is_file(folder / "blocks.json")
 
 
 def check_new(folder: Path) -> None:

@@ -10,11 +10,13 @@ from typing import Any
 import torch
 
 from ..camera import Camera
+from ..dataset import Dataset
 from ..export.sightings import all_around
 from ..method import Method
 from ..scene import Frame, Scene
+from .checkpoint import State
 from .measured import read_evaluation
-from .settings import Source
+from .settings import Settings, Source
 
 
 class Opened(ABC):
@@ -76,15 +78,31 @@ class Opened(ABC):
 class Trained(Opened):
     """A folder in which something was learnt; films, camera paths and what was measured of it lie there too.
 
-    folder: where it lies
+    folder:   where it lies
+    settings: what was trained on what
     """
 
     folder: Path
+    settings: Settings
 
     @property
     @abstractmethod
     def learnt_from(self) -> Source:
         """Where its photographs or shapes came from."""
+
+    @property
+    @abstractmethod
+    def method_name(self) -> str:
+        """The method that learnt, as the user types it."""
+
+    @property
+    @abstractmethod
+    def state(self) -> State:
+        """How far the latest complete state has come. Raises LumigraphError if there is none."""
+
+    @abstractmethod
+    def dataset(self, source: str | None = None) -> Dataset:
+        """What it learnt from again. source: where that is now, if it has moved."""
 
     @property
     def title(self) -> str:

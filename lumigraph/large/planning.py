@@ -16,11 +16,11 @@ from ..errors import LumigraphError
 from ..figures import save_picture
 from ..plain import alike
 from ..run import check_new, processor
-from ..run.block_plan import FOLDER, NAME, TASK, Block, Plan, Task
 from ..run.folder import versions
 from ..run.settings import Source
 from .drawing import draw_plan
 from .layout import lay_out
+from .plan import FOLDER, NAME, TASK, Block, Plan, Task
 
 BY_BLOCK = 60.0  # seconds, where nobody says
 PICTURE = "blocks.png"

@@ -16,17 +16,16 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from ..camera import Camera
+from ..composition import Placed
 from ..controls import Control, Value
 from ..errors import LumigraphError
 from ..method import Method
 from ..rays import Rendering
 from ..scene import Frame, Photograph
-from .asked import Asked
-from .exposures import EXPOSURE, exposed
-from .mixing import UNSEEN, Mixing, inverse_distance, seeing, shares
-from .nearby import Nearby
-from .placed import Placed
-from .sight import GLANCE, saw
+from .block_cache import Nearby
+from .exposure_alignment import EXPOSURE, Asked, exposed
+from .visibility import GLANCE, saw
+from .weights import UNSEEN, Mixing, inverse_distance, seeing, shares
 
 LITTLE = 1e-3  # share of a picture below which a block is not rendered: a quarter of a step of 8 bits
 ENTERED = 0.02  # share of a picture from which on a block counts fully where pixels are mixed one by one

@@ -22,7 +22,7 @@ from ..budget import Budget
 from ..console import console, is_live
 from ..errors import LumigraphError
 from ..progress import clock, tell
-from ..run.block_plan import DONE
+from .plan import DONE
 
 EVERY = 1.0  # seconds between looks
 TAIL = 4096  # bytes of a log's end that hold its last line

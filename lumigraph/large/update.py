@@ -14,13 +14,13 @@ from ..budget import Budget
 from ..capture import Places
 from ..errors import LumigraphError
 from ..locks import held
-from ..run.block_plan import NAME, TASK, Block, Plan, Task
 from ..run.settings import Source
-from .finishing import finish
 from .layout import Disc, members
+from .monitor import Watching
+from .plan import NAME, TASK, Block, Plan, Task
 from .planning import place_of, write_task
-from .task import Ended, finished, train_block
-from .watch import Watching
+from .training import finish
+from .worker import Ended, finished, train_block
 
 NEW = "updates"  # folder in the run where a block is learnt before it takes its place
 

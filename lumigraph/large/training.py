@@ -1,4 +1,5 @@
-"""What comes after all blocks are learnt: one light for all of them, and one cloud, where they are splats."""
+"""Train all blocks of a run, in this process one after another or on the workers of a Ray cluster; then align their
+appearances, or merge their clouds."""
 
 from __future__ import annotations
 
@@ -8,12 +9,49 @@ from pathlib import Path
 
 from ..capabilities import HasGaussians, can, needs
 from ..components.fields.appearance import Appearance
-from ..composition import Nearby, align_appearance
+from ..errors import LumigraphError
 from ..export.splats import export_splats
-from ..run.block_plan import NAME, Plan
-from ..run.block_run import BlockRun
+from ..locks import held
+from .appearance_alignment import align_appearance
+from .block_cache import Nearby
+from .block_run import BlockRun
+from .monitor import Watching, in_order
+from .on_ray import Workers, on_workers
+from .plan import NAME, Done, Plan
+from .planning import place_of
+from .worker import Conducted, train_block
 
 CLOUD = "cloud.ply"
+
+
+def conduct(run: Path, plan: Plan, workers: Workers, show: bool = True, only: Sequence[str] | None = None) -> Conducted:
+    """Learn all blocks of a run that are not done yet.
+
+    only: names of some of them
+    A block that fails leaves the others alone. Raises LumigraphError where another process works in the run, and where
+    workers cannot be had.
+    """
+    folders = {block.name: place_of(run, block) for block in plan.blocks if only is None or block.name in only}
+    with held(run, "trained"), Watching(run, folders, show):
+        if workers.count is None and workers.address is None:
+            return one_by_one(folders)
+        return on_workers(run, folders, workers)
+
+
+def one_by_one(folders: dict[str, Path]) -> Conducted:
+    """In this process."""
+    done: dict[str, Done] = {}
+    failed: dict[str, str] = {}
+    for name in in_order(folders):
+        try:
+            ended = train_block(folders[name])
+        except LumigraphError as fault:
+            failed[name] = str(fault)
+            continue
+        if ended.done is None:
+            return Conducted(done, failed, ended.signal)
+        done[name] = ended.done
+    return Conducted(done, failed)
 
 
 def finish(folder: Path, again: Sequence[str] = ()) -> Plan:

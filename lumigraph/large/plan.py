@@ -23,7 +23,7 @@ from .. import files
 from ..capture import Part
 from ..errors import LumigraphError
 from ..ranges import Point, Positive, between, typed
-from .settings import Source
+from ..run.settings import Source
 
 FORMAT = "lumigraph blocks 1"
 NAME, FOLDER, TASK, DONE = "blocks.json", "blocks", "task.json", "done.json"

@@ -30,9 +30,9 @@ from ..locks import held
 from ..method import Method
 from ..ranges import typed
 from ..run import Run, build
-from ..run.block_plan import DONE, Done, Task
 from ..scene import Scene
 from ..train import fit
+from .plan import DONE, Done, Task
 
 PATIENCE = 60.0  # seconds to wait for a process that was told to end, and still holds the folder
 SAVE_EVERY = 30.0  # seconds of training that a lost worker costs at most
@@ -43,6 +43,16 @@ class Ended:
     """How a call ended: with what the block took, or by a signal before it was done."""
 
     done: Done | None
+    signal: int | None = None
+
+
+@dataclass(frozen=True)
+class Conducted:
+    """How training all blocks ended: what blocks took by name, a sentence for each that failed, and the signal that
+    stopped it."""
+
+    done: dict[str, Done]
+    failed: dict[str, str]
     signal: int | None = None
 
 

@@ -6,7 +6,7 @@ import threading
 from collections import OrderedDict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 
-from .placed import Placed
+from ..composition import Placed
 
 AT_HAND = 8  # parts that stay open; a picture asks for three
 

@@ -20,8 +20,8 @@ from ..capture import Places
 from ..errors import LumigraphError, LumigraphWarning
 from ..files import read_json
 from ..ranges import Point, Positive, typed
-from ..run.block_plan import Block
 from .crossings import find_crossings
+from .plan import Block
 
 LARGE = 200  # photographs from which on a capture is divided where nobody says
 PER_BLOCK = 64  # photographs in a cell, about

@@ -1,7 +1,7 @@
 """A run in blocks, opened as one scene: every block in its place, those in reach of a camera in its picture.
 
 RUN/
-├── blocks.json    see `block_plan`;  blocks.png  the plan seen from above
+├── blocks.json    see `plan`;  blocks.png  the plan seen from above
 ├── blocks/0/      an ordinary run for each block, in a frame of its own
 └── eval.json, eval.png, renders/ ...   as of any run
 """
@@ -23,25 +23,23 @@ from .. import files, methods
 from ..camera import Camera
 from ..capabilities import HasGaussians, can
 from ..capture import Before, Part, open_dataset
-from ..composition import InBlocks, Nearby, PickedCloud, Placed, merged
+from ..composition import PickedCloud, Placed
 from ..errors import LumigraphError, LumigraphWarning
 from ..geometry import Similarity
 from ..method import Method
 from ..names import natural
+from ..run.checkpoint import State
+from ..run.folder import Run
+from ..run.opened import Trained
+from ..run.settings import Settings, Source
 from ..scene import Frame, Scene
-from .block_plan import FOLDER, NAME, Block, Plan
-from .checkpoint import State
-from .folder import Run
-from .opened import Trained
-from .settings import Settings, Source
+from .block_cache import Nearby
+from .compositing import InBlocks
+from .merging import merged
+from .plan import FOLDER, NAME, Block, Plan
 
 LARGEST_REACH = 64.0
 NONE = "it has no block that has learnt anything yet; `lumigraph train` with the same options goes on with it"
-
-
-def is_block_run(folder: Path) -> bool:
-    """Whether a folder holds a run in blocks."""
-    return files.is_file(folder / NAME)
 
 
 class BlockRun(Trained):
@@ -237,7 +235,7 @@ class BlockRun(Trained):
     def model_bytes(self) -> int:
         return sum(run.model_bytes for run in self.runs.values())
 
-    @property
+    @cached_property
     def settings(self) -> Settings:
         """What an ordinary run of the whole would say of itself."""
         plan, counts = self.plan, dict[str, int]()
