@@ -10,7 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ..camera import Camera
-from ..capabilities import HasAppearance, can
+from ..capabilities import HasAppearance, can, needs
 from ..choice import evenly
 from ..components.fields.appearance import Appearance, Patches
 from ..composition import Placed
@@ -84,7 +84,9 @@ def align_appearance(
 
 def appearance_of(part: Placed) -> Float[Tensor, " code"]:
     """The code that a part is shown in; empty where it has none."""
-    return part.method.shown_in.code.detach().cpu() if can(part.method, HasAppearance) else torch.zeros(0)
+    if not can(part.method, HasAppearance):
+        return torch.zeros(0)
+    return needs(part.method, HasAppearance).shown_in.code.detach().cpu()
 
 
 def patch(

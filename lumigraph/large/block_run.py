@@ -185,6 +185,10 @@ class BlockRun(Trained):
     def photographed(self) -> bool:
         return True
 
+    @property
+    def conversion_fault(self) -> str:
+        return f"is a run in blocks; convert each by itself: {self.folder / FOLDER / self.blocks[0].name}"
+
     def dataset(self, source: str | None = None, split: str | None = None) -> Scene:
         """The photographs again, in the frame.
 
@@ -235,8 +239,8 @@ class BlockRun(Trained):
     def model_bytes(self) -> int:
         return sum(run.model_bytes for run in self.runs.values())
 
-    @cached_property
-    def settings(self) -> Settings:
+    @property
+    def settings(self) -> Settings:  # type: ignore[override]  # from all blocks, when it is asked for
         """What an ordinary run of the whole would say of itself."""
         plan, counts = self.plan, dict[str, int]()
         for _, split in self._photographs.values():

@@ -6,7 +6,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from statistics import median
 
-from ..capabilities import HasExposure, can
+from ..capabilities import HasExposure, can, needs
 from ..composition import Placed
 from ..controls import Control
 from ..scene import Photograph
@@ -16,7 +16,7 @@ EXPOSURE = "exposure"  # the control's name
 
 def own_exposure(part: Placed) -> float | None:
     """log2 of the exposure that is usual in one part; None where it knows of none."""
-    return part.method.usual_exposure if can(part.method, HasExposure) else None
+    return needs(part.method, HasExposure).usual_exposure if can(part.method, HasExposure) else None
 
 
 def exposed(part: Placed, exposure: float | None) -> Placed:

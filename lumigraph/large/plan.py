@@ -32,6 +32,12 @@ Turn = tuple[Point, Point, Point]  # rows of a rotation
 Number = Annotated[float, between(-1e6, 1e6)]
 
 
+def source_of(source: str, options: dict[str, Any]) -> Source:
+    """The photographs of a scene or a block, and the options to open them with that say something."""
+    path, said = Path(source), {name: value for name, value in options.items() if value is not None}
+    return Source(str(path.resolve()) if path.exists() else source, said)
+
+
 @dataclass(frozen=True)
 class Block:
     """A place and the photographs of it.

@@ -7,10 +7,10 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from ..capabilities import HasGaussians, can, needs
+from ..capabilities import HasGaussians, can
 from ..components.fields.appearance import Appearance
 from ..errors import LumigraphError
-from ..export.splats import export_splats
+from ..exchange import write_gaussians
 from ..locks import held
 from .appearance_alignment import align_appearance
 from .block_cache import Nearby
@@ -65,7 +65,7 @@ def finish(folder: Path, again: Sequence[str] = ()) -> Plan:
     if Appearance in first.accepts:
         return aligned(opened, again)
     if can(first, HasGaussians):
-        export_splats(needs(opened.method(), HasGaussians).gaussians(), opened.frame, folder / CLOUD)
+        write_gaussians(folder / CLOUD, opened.source_gaussians())
     return opened.plan
 
 

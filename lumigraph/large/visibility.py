@@ -7,7 +7,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ..camera import Camera
-from ..capabilities import HasVisibility, can
+from ..capabilities import HasVisibility, can, needs
 from ..composition import Placed
 from ..rays import Rendering
 
@@ -25,8 +25,9 @@ def saw(part: Placed, camera: Camera, seen: Rendering) -> Float[Tensor, "height 
     """
     if not can(part.method, HasVisibility):
         return torch.ones_like(seen.depth)
+    visibility = needs(part.method, HasVisibility).visibility
     local, scale = part.camera(camera), part.place.scale
     rays = local.rays(local.pixels())
     depth = (seen.depth.reshape(-1) / scale).clamp(max=part.method.frame.reach)
-    found = [part.method.visibility(rays.at(share * depth), rays.directions) for share in STATIONS]
+    found = [visibility(rays.at(share * depth), rays.directions) for share in STATIONS]
     return torch.stack(found).mean(0).view(seen.depth.shape)

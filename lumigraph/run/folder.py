@@ -173,8 +173,12 @@ class Run(Trained):
         return self.kind == Scene.kind
 
     @property
-    def open_scene(self) -> Callable[[], Scene] | None:
+    def open_scene(self) -> Callable[..., Scene] | None:
         return self.scene if self.photographed else None
+
+    @property
+    def conversion_fault(self) -> str | None:
+        return None if self.photographed else f"learnt from {self.kind}, so it has no colours that could be taken over"
 
     def dataset(self, source: str | None = None) -> Dataset:
         """What it learnt from again. source: where that is now, if it has moved.
