@@ -211,6 +211,11 @@ def test_a_run_in_blocks_opens_as_one_scene(street, run):
     assert seen.rgb.shape == (16, 16, 3) and bool(seen.rgb.isfinite().all())
 
 
+def test_a_run_in_blocks_is_not_converted_as_a_whole(run, tmp_path, capsys):
+    assert main(["convert", str(run), "voxel-grid", "--output", str(tmp_path / "new")]) == 2
+    assert f"is a run in blocks; convert each by itself: {run / 'blocks' / '0'}" in capsys.readouterr().err
+
+
 def test_eval_and_render_take_a_run_in_blocks(run, tmp_path, capsys):
     copy = shutil.copytree(run, tmp_path / "copy")
     assert main(["eval", str(copy), "--views", "2"]) == 0
