@@ -1,4 +1,4 @@
-"""One light for all blocks: the appearance of each is fitted to that of its neighbours (Tancik 2022, section 4.3.3)."""
+"""Appearance alignment: the code of each block is fitted to the pictures of its neighbours (Tancik 2022, 4.3.3)."""
 
 from __future__ import annotations
 

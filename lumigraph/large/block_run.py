@@ -70,13 +70,13 @@ class BlockRun(Trained):
 
     @property
     def centres(self) -> Float[Tensor, "block 3"]:
-        """Of the blocks, in the frame."""
+        """Centres of the blocks, in the frame."""
         source = torch.tensor([block.centre for block in self.blocks], dtype=torch.float64)
         return self.frame.to_source.inverse.points(source).float()
 
     @property
     def radii(self) -> Float[Tensor, " block"]:
-        """Of the blocks, in the frame's units."""
+        """Radii of the blocks, in the frame's units."""
         return torch.tensor([block.radius for block in self.blocks]) / self.frame.to_source.scale
 
     @cached_property
@@ -241,7 +241,7 @@ class BlockRun(Trained):
 
     @property
     def settings(self) -> Settings:  # type: ignore[override]  # from all blocks, when it is asked for
-        """What an ordinary run of the whole would say of itself."""
+        """Settings that an ordinary run of the whole would have."""
         plan, counts = self.plan, dict[str, int]()
         for _, split in self._photographs.values():
             counts[split] = counts.get(split, 0) + 1

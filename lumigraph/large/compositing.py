@@ -1,4 +1,4 @@
-"""In blocks: a scene too large for one field, shown by those of many that have seen what a camera looks at.
+"""Compositing of blocks: a scene too large for one field, rendered by the blocks that saw what a camera looks at.
 
 Tancik et al. 2022 (Block-NeRF, arXiv 2202.05263), section 4.3: blocks within reach of a camera, without those that do
 not see what it sees (4.3.1), each rendered by itself, their pictures mixed by how near the camera is to each (4.3.2).
@@ -89,7 +89,7 @@ class InBlocks(Method):
 
     @torch.no_grad()
     def weights(self, camera: Camera) -> Float[Tensor, " block"]:
-        """How much each block has a say in what a camera sees; they sum up to 1. By pixel it is then told apart where
+        """Weight of each block in the picture of a camera; they sum up to 1. Pixels have weights of their own where
         mixing is not by the camera."""
         c = self.config
         distance = (camera.position.to(self.centres) - self.centres).norm(dim=-1)

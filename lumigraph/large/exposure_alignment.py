@@ -1,4 +1,4 @@
-"""One exposure for all blocks: each counts stops from the median exposure of its own photographs."""
+"""Exposure alignment: all blocks are rendered with one exposure. Stops count from the median of its photographs."""
 
 from __future__ import annotations
 

@@ -88,7 +88,7 @@ def on_workers(run: Path, folders: dict[str, Path], workers: Workers) -> Conduct
 
 
 def on_worker(folder: str) -> Done | str | None:
-    """What a worker does with a block: what it took, a sentence if it failed, None if it was stopped."""
+    """Train a block on a worker. Returns what it took, a sentence if it failed, None if it was stopped."""
     settle_memory()
     with contextlib.redirect_stderr(sys.stdout):
         try:

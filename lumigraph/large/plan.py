@@ -85,7 +85,7 @@ class Task:
 
     @staticmethod
     def read(folder: Path) -> Task:
-        """What a block's folder says. Raises LumigraphError, naming the file, where it says nothing sound."""
+        """The task in a block's folder. Raises LumigraphError, naming the file, where it is missing or damaged."""
         return files.read_json(folder / TASK, Task)
 
 
@@ -109,7 +109,7 @@ class Done:
 
 @dataclass(frozen=True)
 class Plan:
-    """What blocks.json says.
+    """The contents of blocks.json.
 
     budget:  of each block
     appearance: the code that each block is shown in, once they are aligned
@@ -129,7 +129,7 @@ class Plan:
 
     @staticmethod
     def read(path: Path) -> Plan:
-        """What the file says. Raises LumigraphError, naming it, where it is none of ours or damaged."""
+        """The plan in a file. Raises LumigraphError, naming it, where it is none of ours or damaged."""
         said = files.read_json(path)
         if not isinstance(said, dict) or said.get("format") != FORMAT:
             raise LumigraphError(f"{path} was not written by this version of Lumigraph; open it with the one that did")
@@ -152,7 +152,7 @@ class Plan:
         raise LumigraphError(f"There is no block {name}; there are {there}")
 
     def task(self, block: Block) -> Task:
-        """What a block is to learn."""
+        """The task of a block."""
         scene = block.scene or self.scene
         part = asdict(Part(block.photographs, block.centre, block.radius))
         told = replace(scene, options={**scene.options, "part": part})

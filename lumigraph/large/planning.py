@@ -1,4 +1,4 @@
-"""A run of many blocks begins: its folder, with every block's task, before anything is learnt."""
+"""Begin a run of many blocks: its folder, with the task of every block, before anything is trained."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ PICTURE = "blocks.png"
 
 
 def survey(source: str, reader: str | None = None) -> Places:
-    """Where the photographs of a source were taken; no pixel is read."""
+    """Positions of the photographs of a source; no pixel is read."""
     return places_of(read_capture(source, reader))
 
 
@@ -107,7 +107,7 @@ def write_task(folder: Path, task: Task) -> None:
 
 
 def place_of(run: Path, block: Block) -> Path:
-    """Where a block of a run is learnt."""
+    """Folder of a block in a run."""
     return run / FOLDER / block.name
 
 

@@ -24,14 +24,13 @@ from .worker import Conducted, train_block
 CLOUD = "cloud.ply"
 
 
-def conduct(run: Path, plan: Plan, workers: Workers, show: bool = True, only: Sequence[str] | None = None) -> Conducted:
-    """Learn all blocks of a run that are not done yet.
+def conduct(run: Path, plan: Plan, workers: Workers, show: bool = True) -> Conducted:
+    """Train all blocks of a run that are not done yet.
 
-    only: names of some of them
     A block that fails leaves the others alone. Raises LumigraphError where another process works in the run, and where
     workers cannot be had.
     """
-    folders = {block.name: place_of(run, block) for block in plan.blocks if only is None or block.name in only}
+    folders = {block.name: place_of(run, block) for block in plan.blocks}
     with held(run, "trained"), Watching(run, folders, show):
         if workers.count is None and workers.address is None:
             return one_by_one(folders)

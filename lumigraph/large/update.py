@@ -1,4 +1,4 @@
-"""One block is learnt again from other photographs, of a place that has changed; the others stay as they are."""
+"""Train one block again from other photographs, of a place that has changed; the others stay as they are."""
 
 from __future__ import annotations
 

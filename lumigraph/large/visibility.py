@@ -1,4 +1,4 @@
-"""Whether a block has seen what it shows (Tancik et al. 2022, Block-NeRF, section 4.3.1)."""
+"""Visibility of what a block renders to its own photographs (Tancik et al. 2022, Block-NeRF, section 4.3.1)."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ STATIONS = (0.125, 0.375, 0.625, 0.875)  # of the way to what a pixel shows, whe
 
 @torch.no_grad()
 def saw(part: Placed, camera: Camera, seen: Rendering) -> Float[Tensor, "height width"]:
-    """How much of the way to what each pixel shows the block's photographs saw, in [0, 1]; 1 for a method that does not
-    know.
+    """Share of the way to what each pixel shows that the block's photographs saw, in [0, 1]; 1 for a method that does
+    not know.
 
     camera: in the picture's frame
     seen:   what the part rendered for it; where nothing is, the way goes to the end of the block's frame

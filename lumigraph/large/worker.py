@@ -1,4 +1,4 @@
-"""One block of a large scene is learnt: a plain function over a folder, the same on every machine.
+"""Train one block of a large scene: a function over the folder of the block, the same on every machine.
 
     RUN/blocks/3/
     ├── task.json     what it is made of, all of it
@@ -40,7 +40,7 @@ SAVE_EVERY = 30.0  # seconds of training that a lost worker costs at most
 
 @dataclass(frozen=True)
 class Ended:
-    """How a call ended: with what the block took, or by a signal before it was done."""
+    """End of a call: with what the block took, or by a signal before it was done."""
 
     done: Done | None
     signal: int | None = None
@@ -48,7 +48,7 @@ class Ended:
 
 @dataclass(frozen=True)
 class Conducted:
-    """How training all blocks ended: what blocks took by name, a sentence for each that failed, and the signal that
+    """Outcome of all blocks: what blocks took by name, a sentence for each that failed, and the signal that
     stopped it."""
 
     done: dict[str, Done]
@@ -84,7 +84,7 @@ def train_block(folder: Path, save_every: float = SAVE_EVERY) -> Ended:
 
 
 def finished(folder: Path, task: Task) -> Done | None:
-    """What a block took, where it is done. Raises LumigraphError for one that was another task's."""
+    """Cost of a block that is done, None of any other. Raises LumigraphError for one that was another task's."""
     if not (folder / DONE).exists():
         return None
     done: Done = files.read_json(folder / DONE, Done)
