@@ -100,12 +100,7 @@ class Train:
         source = posed(self.scene)
         output = self.output or next_free(f"runs/{scene_name(source)}-{methods.check(self.method)}")
         check_new(output)
-        options: dict[str, Any] = {
-            "downscale": self.downscale,
-            "reader": self.reader,
-            "views": self.views,
-            "scales": self.scales,
-        }
+        options: dict[str, Any] = {name: getattr(self, name) for name in ("downscale", "reader", "views", "scales")}
         data = open_dataset(source, kind.learns_from, **options)
         config = method_config(self, self.method)
         seed = getattr(config, "seed", self.seed)

@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from .train import Train
 
 MEMORY = 2 << 30  # bytes that a block asks of its machine
+OPTIONS = "downscale", "reader", "scales"  # of `open_dataset`, for the whole scene
 
 
 @dataclass(frozen=True)
@@ -77,16 +78,24 @@ class Blocks:
         return self._all(train, source, places)
 
     def _all(self, train: Train, source: str, places: Any) -> int:
+        import torch
+
         from ..large.on_ray import Workers
         from ..large.planning import Recipe, begin, make_plan
         from ..large.training import conduct, finish
         from ..memory import free_memory
 
+        here = self.address is None
         budget = told_budget(train.steps, train.seconds, train.quality)
-        method, device = methods.check(self.field or train.method), self._device(train.device)
-        config, here = method_config(train, method), self.address is None
+        if here or train.device == "auto":
+            device = choose_device(train.device)
+        else:  # of the cluster's machines
+            device = torch.device("cuda" if train.device == "gpu" else train.device)
+        method = methods.check(self.field or train.method)
+        config = method_config(train, method)
         seed = getattr(config, "seed", train.seed)
-        recipe = Recipe(method, config, opened_by(train), budget, train.quality, seed, str(device), here)
+        options = {name: getattr(train, name) for name in OPTIONS}
+        recipe = Recipe(method, config, options, budget, train.quality, seed, str(device), here)
         plan = make_plan(source, places, self.blocks or "auto", recipe)
         output = train.output or unfinished(f"runs/{scene_name(source)}-{methods.check(train.method)}", plan)
         cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
@@ -109,14 +118,6 @@ class Blocks:
         tell_done(output, found)
         return 0
 
-    def _device(self, name: str) -> Any:
-        """The device of each block: of this machine, or as --device names it of the cluster's."""
-        import torch
-
-        if self.address is None or name == "auto":
-            return choose_device(name)
-        return torch.device("cuda" if name == "gpu" else name)
-
     def _again(self, train: Train, run: Path) -> int:
         from ..large.planning import survey
         from ..large.update import update
@@ -124,18 +125,14 @@ class Blocks:
         if self.blocks is None or not self.blocks.isdigit():
             raise LumigraphError("--into needs the name of the block to learn again; give it as --blocks 3")
         source, budget = posed(train.scene), told_budget(train.steps, train.seconds, train.quality)
-        ended = update(run, self.blocks, source, survey(source, train.reader), opened_by(train), budget)
+        options = {name: getattr(train, name) for name in OPTIONS}
+        ended = update(run, self.blocks, source, survey(source, train.reader), options, budget)
         if ended.done is None:
             say("Stopped and saved; the same command goes on")
             return exit_code(ended.signal)
         took = f"{ended.done.steps} steps in {ended.done.seconds:.1f} s, from {ended.done.photographs} photographs"
         show({"run": str(run), f"block {self.blocks}": took} | onward(run, source))
         return 0
-
-
-def opened_by(train: Train) -> dict[str, Any]:
-    """Options of `open_dataset` for the whole scene."""
-    return {"downscale": train.downscale, "reader": train.reader, "scales": train.scales}
 
 
 def unfinished(prefix: str, plan: Any) -> Path:
