@@ -6,7 +6,7 @@ from __future__ import annotations
 import os
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 from tyro.conf import arg
 
@@ -27,9 +27,6 @@ from .common import (
     told_budget,
     typed,
 )
-
-if TYPE_CHECKING:
-    from .train import Train
 
 MEMORY = 2 << 30  # bytes that a block asks of its machine
 OPTIONS = "downscale", "reader", "scales"  # of `open_dataset`, for the whole scene
@@ -56,8 +53,11 @@ class Blocks:
     """Learn one block of this run again, from other photographs, as the run's own were learnt; the rest stays."""
     field: Annotated[str, arg(metavar="METHOD", help="The method that learns each block.")] = ""
 
-    def run(self, train: Train) -> int | None:
-        """Train all blocks of a scene. Returns the exit code; None for a scene that `train` learns as a whole."""
+    def run(self, train: Any) -> int | None:
+        """Train all blocks of a scene. Returns the exit code; None for a scene that `train` learns as a whole.
+
+        train: the command's other options, a `Train`
+        """
         from ..capture import kind_of
         from ..large.layout import LARGE
         from ..large.planning import survey
@@ -77,7 +77,7 @@ class Blocks:
                 raise LumigraphError(f"--{name.replace('_', '-')} is for one block; leave it out, or give --blocks 1")
         return self._all(train, source, places)
 
-    def _all(self, train: Train, source: str, places: Any) -> int:
+    def _all(self, train: Any, source: str, places: Any) -> int:
         import torch
 
         from ..large.on_ray import Workers
@@ -118,7 +118,7 @@ class Blocks:
         tell_done(output, found)
         return 0
 
-    def _again(self, train: Train, run: Path) -> int:
+    def _again(self, train: Any, run: Path) -> int:
         from ..large.planning import survey
         from ..large.update import update
 
