@@ -85,6 +85,30 @@ class RefinesPoses(Protocol):
 
 
 @runtime_checkable
+class HasVisibility(Protocol):
+    """Knows which places its photographs saw."""
+
+    def visibility(
+        self, points: Float[Tensor, "point 3"], directions: Float[Tensor, "point 3"]
+    ) -> Float[Tensor, " point"]:
+        """Share of the photographs' view of each place along a unit direction, in [0, 1]."""
+
+
+@runtime_checkable
+class HasExposure(Protocol):
+    """Knows the exposures of its photographs."""
+
+    usual_exposure: float | None  # log2 of their median; None where it is not known
+
+
+@runtime_checkable
+class HasAppearance(Protocol):
+    """Renders in the light of one appearance code, which it accepts as evidence."""
+
+    shown_in: Any  # the `Appearance`; of no numbers where none was learnt
+
+
+@runtime_checkable
 class CanPrune(Protocol):
     """Is a cloud of Gaussians that can lose some and go on learning."""
 
@@ -140,6 +164,10 @@ LACKING = {
     HasAtlas: "is no atlas of baked values; `lumigraph convert` makes one of it, as snerg",
     HasDistance: "holds no distance to surfaces; a method that learns from shapes does",
     HasGaussians: "holds no Gaussians, so no splats can be made of it; train gaussian-splatting",
+    RefinesPoses: "learns no poses of photographs; give --refine-cameras to a method that can",
+    HasVisibility: "does not know which places its photographs saw; block-nerf does",
+    HasExposure: "knows no exposures of its photographs",
+    HasAppearance: "learns no appearance of its photographs; block-nerf does",
     CanPrune: "cannot learn on with fewer Gaussians; write a splat file instead, by an --output that ends in .ply",
     HasMesh: "is no mesh; `lumigraph export mesh` makes one of what it renders",
     CanDraw: "knows scenes by their photographs and draws none of its own; name a scene, or a prior of hyp-nerf",
@@ -150,10 +178,11 @@ LACKING = {
 
 def can(method: object, capability: type[Any]) -> bool:
     """Whether a method, or all of a class, has a capability. Its class must have the functions: a network may be called
-    `field` too."""
+    `field` too. Values must be there and not None; `isinstance` does not find those that are submodules."""
     kind = method if isinstance(method, type) else type(method)
-    names = [name for name in vars(capability) if not name.startswith("_")]
-    return all(callable(getattr(kind, name, None)) for name in names)
+    functions = [name for name in vars(capability) if not name.startswith("_")]
+    values = [getattr(method, name, None) for name in capability.__annotations__]
+    return all(callable(getattr(kind, name, None)) for name in functions) and all(x is not None for x in values)
 
 
 def needs(method: object, capability: type[Any]) -> Any:

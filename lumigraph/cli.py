@@ -38,7 +38,6 @@ from .commands.render import Render
 from .commands.report import Report
 from .commands.resume import Resume
 from .commands.train import Train, with_options_of
-from .commands.train_blocks import IN_BLOCKS, with_options_of_blocks
 from .commands.view import ViewCommand
 from .errors import LumigraphError, LumigraphWarning
 from .files import refusal
@@ -148,19 +147,4 @@ def with_method(command: type, arguments: list[str]) -> type:
     """`train` or `convert` with the options of the method that the arguments name, if they name one."""
     there = methods.available()
     named = [x for x in arguments if x.replace("_", "-") in there]
-    if not named:
-        return command
-    device, preset = value_of("--device", arguments, "auto"), value_of("--preset", arguments, "auto")
-    if command is Train and methods.check(named[0]) == IN_BLOCKS:
-        return with_options_of_blocks(value_of("--field", arguments, ""), device, preset)
-    return with_options_of(named[0], device, preset, command)
-
-
-def value_of(name: str, arguments: list[str], default: str) -> str:
-    """What follows an option, before all options are known."""
-    for i, argument in enumerate(arguments):
-        if argument.startswith(f"{name}="):
-            return argument.partition("=")[2]
-        if argument == name and i + 1 < len(arguments):
-            return arguments[i + 1]
-    return default
+    return with_options_of(named[0], arguments, command) if named else command

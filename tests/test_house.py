@@ -31,7 +31,7 @@ FLOORS: list[set[str]] = [
     {"run"},
     {"canonical", "evaluate"},
     {"train", "report", "compression"},
-    {"benchmark", "blocks", "conversion", "explain"},
+    {"benchmark", "conversion", "explain", "large"},
     {"commands"},
     {"cli"},
     {"__main__"},

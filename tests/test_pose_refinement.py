@@ -14,6 +14,7 @@ from PIL import Image
 from lumigraph import methods
 from lumigraph.alignment import aligning, moves
 from lumigraph.camera import Camera
+from lumigraph.capabilities import RefinesPoses, can
 from lumigraph.capture import open_scene
 from lumigraph.capture.capture import Shot
 from lumigraph.capture.folds import about_fold
@@ -51,6 +52,15 @@ def slopes(value, twist: torch.nn.Parameter, image: int, step: float) -> torch.T
                 twist[image, i] -= way * step
         found.append((ends[0] - ends[1]) / (2 * step))
     return torch.tensor(found)
+
+
+def test_poses_are_a_capability_that_is_a_submodule():
+    """`inspect.getattr_static`, by which `isinstance` looks for a protocol's values, does not see submodules."""
+    method = refining("instant-ngp")
+    assert "poses" in method._modules and can(method, RefinesPoses)
+    method.poses = None
+    assert not can(method, RefinesPoses) and not can(tiny.method(), RefinesPoses)
+    assert not can(type(method), RefinesPoses)
 
 
 # Gradients

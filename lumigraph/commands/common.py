@@ -5,12 +5,13 @@ from __future__ import annotations
 import itertools
 import shlex
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
+from .. import methods
 from ..budget import Budget
 from ..console import console, dim
 from ..errors import LumigraphError
@@ -67,6 +68,34 @@ def choose_device(name: str) -> Any:
         reason = str(error).partition("\n")[0].rstrip(".")
         raise LumigraphError(f"Device {name!r} is not usable here ({reason}); try --device cpu") from error
     return device
+
+
+def option_group(name: str) -> str:
+    """The field that holds a method's own numbers; help shows its name above them."""
+    return methods.check(name).replace("-", "_")
+
+
+def method_config(command: Any, name: str) -> Any:
+    """A method's Config, which the command line adds as another field; see `with_options_of`."""
+    given = getattr(command, option_group(name), None)
+    return given or methods.find(name).preset(preset_device(command.device, command.preset))
+
+
+def preset_device(device: str, preset: str) -> Any:
+    """The kind of machine whose defaults are wanted; it need not be here."""
+    import torch
+
+    return choose_device(device) if preset == "auto" else torch.device("cuda" if preset == "paper" else "cpu")
+
+
+def value_of(name: str, arguments: Sequence[str], default: str) -> str:
+    """The value of an option, before all options are known."""
+    for i, argument in enumerate(arguments):
+        if argument.startswith(f"{name}="):
+            return argument.partition("=")[2]
+        if argument == name and i + 1 < len(arguments):
+            return arguments[i + 1]
+    return default
 
 
 def told_budget(steps: int | None, seconds: float | None, quality: Quality | None = None) -> Budget | None:

@@ -12,9 +12,8 @@ from ..console import console
 from ..errors import LumigraphError
 from ..quality import Quality
 from ..ranges import Count, Seconds, Seed, Steps
-from .common import about_quality, choose_device, option, show, told_budget, typed
+from .common import about_quality, choose_device, method_config, option, show, told_budget, typed
 from .compress import size
-from .train import option_group, preset_device
 
 DEFAULT_SECONDS = 30.0
 LONG = 4096  # letters; a table cuts its lines where the console ends
@@ -73,7 +72,7 @@ class Convert:
         name, device = methods.check(self.method), choose_device(self.device)
         counted = self.steps is not None or self.quality is not None
         aim = Aim(
-            config=self.method_config(name),
+            config=method_config(self, name),
             steps=self.steps,
             seconds=None if counted else self.seconds or DEFAULT_SECONDS,
             quality=self.quality,
@@ -89,13 +88,6 @@ class Convert:
         rows |= {"learnt from": made.learnt_from, "saved": str(self.output)}
         show(rows | {"next": typed("view", self.output)})
         return 0
-
-    def method_config(self, name: str) -> Any:
-        """The method's Config, which the command line adds as another field; see `train.with_options_of`."""
-        from .. import methods
-
-        given = getattr(self, option_group(name), None)
-        return given or methods.find(name).preset(preset_device(self.device, self.preset))
 
 
 def table(made: Any) -> Any:

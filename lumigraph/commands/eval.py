@@ -48,8 +48,9 @@ class Eval:
 
     def run(self) -> int:
         from ..evaluate import claim_evaluation, evaluate_run, stem
+        from ..large import BlockRun
         from ..metrics import scores_of
-        from ..run import BlockRun, open_run
+        from ..run import open_run
         from ..verdict import last_psnr
         from .outcome import next_commands
 

@@ -28,7 +28,8 @@ class Info:
     def run(self) -> int:
         from ..capture import open_dataset
         from ..exchange import is_splat_file, read_gaussians, snerg
-        from ..run.block_run import BlockRun, is_block_run
+        from ..large import BlockRun
+        from ..run import is_block_run
         from .info_tree import (
             atlas_tree,
             blocks_tree,

@@ -14,9 +14,10 @@ from ..dataset import Dataset
 from ..errors import LumigraphError
 from ..exchange import size_of
 from ..gaussians import Gaussians
+from ..large import BlockRun
 from ..metrics import scores_of
 from ..names import natural
-from ..run import BlockRun, Run
+from ..run import Run
 from ..run.compressed import Compressed
 from ..run.converted import Converted
 from ..run.inferred import Inferred
@@ -74,8 +75,8 @@ def run_tree(run: Run) -> Tree:
 
 def blocks_tree(run: BlockRun) -> Tree:
     """A run in blocks, with a line for each."""
-    from ..blocks.planning import place_of
-    from ..blocks.watch import described, stand_of
+    from ..large.monitor import described, stand_of
+    from ..large.planning import place_of
 
     tree, plan = Tree(bold(run.folder) + f"  a run of {run.method_name} in {len(run.plan.blocks)} blocks"), run.plan
     branch(tree, "scene", {"source": plan.scene.source, **run.settings.splits, **plan.scene.options})

@@ -45,8 +45,7 @@ class Resume:
     """Port that --view listens at."""
 
     def run(self) -> int:
-        from ..run import Run
-        from ..run.block_run import is_block_run
+        from ..run import Run, is_block_run
 
         if is_block_run(self.run_folder):
             raise LumigraphError(

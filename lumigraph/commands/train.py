@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -18,13 +19,18 @@ from .common import (
     about_quality,
     choose_device,
     exit_code,
+    method_config,
     needed,
     next_free,
     option,
+    option_group,
+    preset_device,
     quality_budget,
     scene_name,
     told_budget,
+    value_of,
 )
+from .train_blocks import Blocks
 
 DEFAULT_SECONDS = 60.0
 
@@ -80,6 +86,9 @@ class Train:
         from .outcome import tell_outcome
         from .view import keep_showing, watching
 
+        blocks: Blocks | None = getattr(self, "blocks", None)
+        if blocks is not None and (code := blocks.run(self)) is not None:
+            return code
         budget = told_budget(self.steps, self.seconds, self.quality)
         kind, device = methods.find(self.method), choose_device(self.device)
         if self.output is not None:
@@ -91,14 +100,9 @@ class Train:
         source = posed(self.scene)
         output = self.output or next_free(f"runs/{scene_name(source)}-{methods.check(self.method)}")
         check_new(output)
-        options: dict[str, Any] = {
-            "downscale": self.downscale,
-            "reader": self.reader,
-            "views": self.views,
-            "scales": self.scales,
-        }
+        options: dict[str, Any] = {name: getattr(self, name) for name in ("downscale", "reader", "views", "scales")}
         data = open_dataset(source, kind.learns_from, **options)
-        config = self.method_config(kind)
+        config = method_config(self, self.method)
         seed = getattr(config, "seed", self.seed)
         method = build(kind, data.frame, config, device, seed, learning=True)
         if budget is None:
@@ -112,35 +116,30 @@ class Train:
             keep_showing(watch, outcome.signal)
         return exit_code(outcome.signal)
 
-    def method_config(self, kind: Any) -> Any:
-        """The method's Config, which the command line adds as another field; see `with_options_of`."""
-        return getattr(self, option_group(self.method), None) or kind.preset(preset_device(self.device, self.preset))
 
-
-def option_group(name: str) -> str:
-    """The field that holds a method's own numbers; help shows its name above them."""
-    return methods.check(name).replace("-", "_")
-
-
-def with_options_of(name: str, device: str, preset: str, command: type = Train) -> type[Any]:
-    """A command, `train` or one like it, with a method's own numbers among its options."""
+def with_options_of(name: str, arguments: Sequence[str], command: type = Train) -> type[Any]:
+    """A command, `train` or one like it, with a method's own numbers among its options. Where the method is trained in
+    blocks, `train` has the options of `Blocks` too, and the numbers of the method that --field names for each block."""
+    in_blocks = command is Train and methods.find(name).in_blocks
+    if in_blocks and (field := value_of("--field", arguments, "").replace("_", "-")) in methods.available():
+        name = field
     kind = methods.find(name)
-    default = kind.preset(preset_device(device, preset))
-    extra: list[Any] = [
-        (option_group(name), Annotated[kind.Config, OmitArgPrefixes], dataclasses.field(default=default))
-    ]
-    for common in dataclasses.fields(command):  # where a method has a number of that name, it is the one to ask for
-        if common.name in {field.name for field in dataclasses.fields(kind.Config)}:
-            extra.append((common.name, Annotated[Any, Fixed, Suppress], dataclasses.field(default=common.default)))
+    device, preset = value_of("--device", arguments, "auto"), value_of("--preset", arguments, "auto")
     asked = option("draft|good|best", "as long as --seconds", about_quality(kind))
-    extra.append(("quality", Annotated[Quality | None, asked], dataclasses.field(default=None)))
-    made = dataclasses.make_dataclass(command.__name__, extra, bases=(command,), frozen=True)
-    made.__doc__ = command.__doc__
+    extra: dict[str, tuple[Any, Any]] = {"quality": (Annotated[Quality | None, asked], None)}
+    if in_blocks:
+        blocks = derived(Blocks, kind.Config, {})
+        extra["blocks"] = Annotated[blocks, OmitArgPrefixes], blocks()
+    extra[option_group(name)] = Annotated[kind.Config, OmitArgPrefixes], kind.preset(preset_device(device, preset))
+    return derived(command, kind.Config, extra)
+
+
+def derived(base: type, config: type, extra: dict[str, tuple[Any, Any]]) -> type[Any]:
+    """A dataclass of options with further ones, annotation and default by name. Options that a method's Config has too
+    are hidden, for the Config's are asked for."""
+    names = {x.name for x in dataclasses.fields(config)}
+    hidden = {x.name: (Annotated[Any, Fixed, Suppress], x.default) for x in dataclasses.fields(base) if x.name in names}
+    options = [(name, kind, dataclasses.field(default=default)) for name, (kind, default) in (hidden | extra).items()]
+    made = dataclasses.make_dataclass(base.__name__, options, bases=(base,), frozen=True)
+    made.__doc__ = base.__doc__
     return made
-
-
-def preset_device(device: str, preset: str) -> Any:
-    """The kind of machine whose defaults are wanted; it need not be here."""
-    import torch
-
-    return choose_device(device) if preset == "auto" else torch.device("cuda" if preset == "paper" else "cpu")

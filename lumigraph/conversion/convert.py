@@ -14,9 +14,8 @@ import torch
 from .. import files, methods
 from ..budget import Budget
 from ..camera import Camera
-from ..capabilities import FromField, can, needs
+from ..capabilities import FromField, RefinesPoses, can, needs
 from ..errors import LumigraphError, LumigraphWarning
-from ..exchange import size_of
 from ..method import Method
 from ..quality import Quality
 from ..run import Opened, Run, State, build, check_new
@@ -98,7 +97,7 @@ def convert(
         source=begun.source,
         how=how,
         learnt_from=begun.learnt_from,
-        teacher=Held(methods.name_of(teacher), bytes_in(source), seen[0].seconds, seen[0].psnr),
+        teacher=Held(methods.name_of(teacher), source.model_bytes, seen[0].seconds, seen[0].psnr),
         student=Held(name, run.model_bytes, seen[1].seconds, seen[1].psnr),
         psnr=likeness(*seen),
         views=len(seen[0].views),
@@ -123,11 +122,11 @@ def take_over(teacher: Method, student: Method, data: Scene, cameras: Camera, as
     as_taken: whether the data's cameras are as they were given, rather than as the teacher has refined them
     """
     begin = time.perf_counter()
-    poses, own = (getattr(method, "poses", None) for method in (teacher, student))
-    if own is not None:
+    if can(student, RefinesPoses):
+        own = needs(student, RefinesPoses).poses
         own.choose_axes(data.cameras, data.frame)
-        if poses is not None and as_taken:
-            own.load_state_dict(poses.state_dict())
+        if can(teacher, RefinesPoses) and as_taken:
+            own.load_state_dict(needs(teacher, RefinesPoses).poses.state_dict())
     if can(student, FromField):
         needs(student, FromField).from_field(teacher, cameras)
     return time.perf_counter() - begin
@@ -177,9 +176,8 @@ def photographs(source: Opened, where: str | None) -> Scene | None:
     """The photographs again; None where they are not at hand, and no other place is named."""
     if source.open_scene is None:
         return None
-    assert isinstance(source, Run)
     try:
-        return source.scene(where)
+        return source.open_scene(where)
     except LumigraphError as error:
         if where is not None:
             raise
@@ -189,11 +187,4 @@ def photographs(source: Opened, where: str | None) -> Scene | None:
 
 def seen_as(teacher: Method, student: Method, scene: Scene) -> Scene:
     """Photographs, from where the teacher has come to see them, unless the student learns that too."""
-    if getattr(student, "poses", None) is not None:
-        return scene
-    return replace(scene, cameras=teacher.refined(scene.cameras).to("cpu"))
-
-
-def bytes_in(source: Opened) -> int:
-    """What the model takes, as it is stored."""
-    return source.model_bytes if isinstance(source, Run) else size_of(source.path)
+    return scene if can(student, RefinesPoses) else replace(scene, cameras=teacher.refined(scene.cameras).to("cpu"))

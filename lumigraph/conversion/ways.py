@@ -9,9 +9,7 @@ from ..capabilities import FromField, HasDensity, HasField, HasGaussians, HasLoo
 from ..dataset import check_kind
 from ..errors import LumigraphError
 from ..method import Method
-from ..run import Opened, Run
-from ..run.canonicalised import Canonicalised
-from ..run.composition import Composition
+from ..run import Opened
 from ..scene import Scene
 
 Way = Literal["field", "gaussians", "depth", "pictures"]
@@ -40,16 +38,8 @@ def ways() -> dict[str, dict[str, Way | None]]:
 def check(source: Opened, student: type[Method]) -> None:
     """Raise LumigraphError, in one sentence, unless what was opened can become a student."""
     name = methods.name_of(student)
-    if isinstance(source, Composition):
-        raise LumigraphError(
-            f"{source.path} is a composition of several; convert its parts, and compose what comes of it"
-        )
-    if isinstance(source, Canonicalised):
-        raise LumigraphError(
-            f"{source.path} is a run at another place; convert {source.run.path}, and align that again"
-        )
-    if isinstance(source, Run) and not source.photographed:
-        raise LumigraphError(f"{source.path} learnt from {source.kind}, so it has no colours that could be taken over")
+    if (reason := source.conversion_fault) is not None:
+        raise LumigraphError(f"{source.path} {reason}")
     if source.frame.times is not None:
         raise LumigraphError(f"{source.path} is of a scene that moves, and what is converted stands still")
     check_kind(name, student.learns_from, Scene, str(source.path), methods.learning_from(Scene))

@@ -15,7 +15,7 @@ import torch
 
 from ..alignment import Moves, aligning, moves
 from ..camera import Camera
-from ..capabilities import RefinesPoses
+from ..capabilities import RefinesPoses, can
 from ..components.training.pose_refinement import PoseRefinement
 from ..geometry import Similarity
 from ..method import Method
@@ -68,8 +68,7 @@ class HeldOutPoses:
 
 def held_out_poses(method: Method, scene: Scene) -> HeldOutPoses | None:
     """For a method that refined poses; None for any other, which sees photographs from where they were taken."""
-    refines = isinstance(method, RefinesPoses) and method.poses is not None
-    return HeldOutPoses(method, scene) if refines else None
+    return HeldOutPoses(method, scene) if can(method, RefinesPoses) else None
 
 
 def against_truth(method: Method, scene: Scene) -> Moves | None:

@@ -17,7 +17,7 @@ from ..metrics import Score
 from ..metrics.lpips import Lpips
 from ..progress import counting
 from ..rays import Rendering
-from ..run import BlockRun, Run
+from ..run import Trained
 from ..scene import Scene
 from ..shapes import Shapes
 from .collection import evaluate_collection
@@ -68,7 +68,7 @@ def evaluate_on(
 
 
 def evaluate_run(
-    run: Run | BlockRun,
+    run: Trained,
     method: Method,
     data: Dataset,
     split: str = "test",
@@ -104,7 +104,7 @@ def evaluate_run(
     return result
 
 
-def claim_evaluation(run: Run | BlockRun, split: str, save_images: bool, overwrite: bool | None = None) -> None:
+def claim_evaluation(run: Trained, split: str, save_images: bool, overwrite: bool | None = None) -> None:
     """Raise LumigraphError unless what an evaluation writes may be written into its run; see `files.claim`."""
     for ending in (".json", ".png"):
         claim(run.folder / f"{stem(split)}{ending}", "evaluation", overwrite)
@@ -112,7 +112,7 @@ def claim_evaluation(run: Run | BlockRun, split: str, save_images: bool, overwri
         claim(image_of(run, name), "rendering", overwrite)
 
 
-def image_of(run: Run | BlockRun, name: str) -> Path:
+def image_of(run: Trained, name: str) -> Path:
     """Where the rendering of a view is kept."""
     return run.folder / "eval" / f"{file_name(name)}.png"
 

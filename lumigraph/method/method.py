@@ -57,6 +57,7 @@ class Method(nn.Module, ABC):
     Config: ClassVar[type]
     learns_from: ClassVar[type] = Scene  # the kind of dataset
     accepts: ClassVar[tuple[type, ...]] = ()  # the kinds of evidence that `given` takes
+    in_blocks: ClassVar[bool] = False  # whether `train` divides a large scene into blocks, each a run of its own
     any_lens: ClassVar[bool] = False  # whether `render` follows every lens, or flat pictures alone
     efforts: ClassVar[Efforts] = BY_PHOTOGRAPH  # what each --quality asks for
     _place: Tensor

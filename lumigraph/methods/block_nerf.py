@@ -1,6 +1,6 @@
 """Block-NeRF: one block of a city, in the light of each photograph (Tancik et al. 2022, arXiv 2202.05263).
 
-The field of one block learns from any scene. `composition.in_blocks` makes one picture of many.
+The field of one block learns from any scene. `large.compositing` makes one picture of many.
 """
 
 from __future__ import annotations
@@ -120,6 +120,7 @@ class BlockNeRF(RayMethod):
     """Colours that depend on a photograph's appearance and exposure, and a network that knows what was seen."""
 
     Config = Config
+    in_blocks = True
 
     def __init__(self, frame: Frame, config: Any = None):
         config = config or Config()

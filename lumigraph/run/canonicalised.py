@@ -70,6 +70,10 @@ class Canonicalised(Opened):
         return {split: cameras.transformed(self.place.matrix) for split, cameras in self.run.cameras().items()}
 
     @property
+    def conversion_fault(self) -> str:
+        return f"is a run at another place; convert {self.run.path}, and align that again"
+
+    @property
     def photographed(self) -> bool:
         return self.run.photographed
 

@@ -101,6 +101,10 @@ class Composition(Opened):
         return self.opened[self.lead].cameras()
 
     @property
+    def conversion_fault(self) -> str:
+        return "is a composition of several; convert its parts, and compose what comes of it"
+
+    @property
     def photographed(self) -> bool:
         return self.opened[self.lead].photographed
 

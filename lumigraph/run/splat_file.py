@@ -39,6 +39,9 @@ class SplatFile(Opened):
         method.cloud.replace(self._in_scene)
         return method.to(device).eval()
 
+    def source_gaussians(self) -> Gaussians:
+        return self.gaussians
+
     def cameras(self) -> dict[str, Camera]:
         """A ring of cameras around the middle, looking at it."""
         return {"train": ring(self.frame.bounds)}

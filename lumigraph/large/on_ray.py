@@ -12,16 +12,16 @@ import socket
 import sys
 import time
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from ..allocation import settle_memory
 from ..errors import LumigraphError
-from ..run.block_plan import Done
 from ..signals import Interrupt
-from .task import train_block, writable
-from .watch import in_order
-from .workers import Conducted, Workers
+from .monitor import in_order
+from .plan import Done
+from .worker import Conducted, train_block, writable
 
 INSTALL = "Ray is not installed, which shares blocks out to workers: pip install 'lumigraph[ray]', or leave out"
 LOST = 30  # times that a block's worker may be lost before the block is given up
@@ -34,6 +34,22 @@ SETTINGS = {  # that Ray reads as it is loaded, unless the user's environment ha
     "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0",
     "RAY_worker_niceness": "0",  # else workers get next to nothing of a busy machine
 }
+
+
+@dataclass(frozen=True)
+class Workers:
+    """Workers that train blocks.
+
+    count:   blocks at a time on this machine, each in a process of its own; None for this process alone
+    address: of a Ray cluster that is there already, HOST:PORT
+    cpus, gpus, memory: what a block asks of its machine: processors, GPUs, bytes
+    """
+
+    count: int | None = None
+    address: str | None = None
+    cpus: int = 1
+    gpus: float = 0.0
+    memory: int = 2 << 30
 
 
 def on_workers(run: Path, folders: dict[str, Path], workers: Workers) -> Conducted:
@@ -72,7 +88,7 @@ def on_workers(run: Path, folders: dict[str, Path], workers: Workers) -> Conduct
 
 
 def on_worker(folder: str) -> Done | str | None:
-    """What a worker does with a block: what it took, a sentence if it failed, None if it was stopped."""
+    """Train a block on a worker. Returns what it took, a sentence if it failed, None if it was stopped."""
     settle_memory()
     with contextlib.redirect_stderr(sys.stdout):
         try:

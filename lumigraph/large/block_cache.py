@@ -1,4 +1,4 @@
-"""Parts of a scene that is too large for memory: opened as a camera comes near, closed when others are asked for."""
+"""Cache of the blocks of a scene that is too large for memory: opened when a camera comes near, the oldest closed."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import threading
 from collections import OrderedDict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 
-from .placed import Placed
+from ..composition import Placed
 
 AT_HAND = 8  # parts that stay open; a picture asks for three
 

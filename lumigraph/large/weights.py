@@ -1,4 +1,4 @@
-"""How much each block has a say in a picture or at a place (Tancik et al. 2022, Block-NeRF, section 4.3)."""
+"""Weights of blocks in a picture and at a point (Tancik et al. 2022, Block-NeRF, section 4.3)."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ UNSEEN = 1e-12  # of its weight, that a block keeps which does not see: where no
 
 @dataclass(frozen=True)
 class Mixing:
-    """How blocks are chosen for a picture and mixed in it (section 4.3 and its comparison of ways).
+    """Options for choosing the blocks of a picture and mixing them (section 4.3 and its comparison of ways).
 
     by: "camera", inverse distance from the camera to the blocks' centres, one weight for all pixels (the paper's);
         "points", from what each pixel shows; "visibility", how much a block saw of what each pixel shows;
@@ -52,8 +52,8 @@ def inverse_distance(
 
 
 def seeing(visibility: Float[Tensor, "*place block"], threshold: float) -> Float[Tensor, "*place block"]:
-    """How much blocks count by the mean visibility of what they show (section 4.3.1): nothing up to a threshold, fully
-    from twice that on, so that none leaves a film at once."""
+    """Weights of blocks by the mean visibility of what they show (section 4.3.1): 0 up to a threshold, 1 from twice
+    that on, so that none leaves a film at once."""
     return (visibility / max(threshold, UNSEEN) - 1).clamp(UNSEEN, 1)
 
 

@@ -13,9 +13,9 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from ..composition import Placed
 from ..errors import LumigraphError
 from ..gaussians import Gaussians, joined
-from .placed import Placed
 
 
 @torch.no_grad()

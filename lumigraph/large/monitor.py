@@ -1,4 +1,4 @@
-"""How far all blocks are: one display for the terminal, and a file in the run's folder, whoever computes them.
+"""Progress of all blocks: one display for the terminal, and a file in the run's folder, whoever computes them.
 
 What is shown is read from the blocks' own folders, so that it needs no word from workers on other machines.
 """
@@ -22,7 +22,7 @@ from ..budget import Budget
 from ..console import console, is_live
 from ..errors import LumigraphError
 from ..progress import clock, tell
-from ..run.block_plan import DONE
+from .plan import DONE
 
 EVERY = 1.0  # seconds between looks
 TAIL = 4096  # bytes of a log's end that hold its last line
@@ -32,7 +32,7 @@ PROGRESS = "progress.json"
 
 @dataclass(frozen=True)
 class Stand:
-    """How far one block is: the share of its budget, seconds of training, and the PSNR of what it learns from."""
+    """Progress of one block: the share of its budget, seconds of training, and the PSNR of what it learns from."""
 
     state: str = "waiting"
     share: float = 0.0
@@ -41,7 +41,7 @@ class Stand:
 
 
 def stand_of(folder: Path) -> Stand:
-    """What a block's folder says of how far it is."""
+    """Progress of a block, read from its folder."""
     try:
         row = last_line(folder / "metrics.jsonl")
         if (folder / DONE).exists():

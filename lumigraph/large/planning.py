@@ -1,80 +1,80 @@
-"""A run of many blocks begins: its folder, with every block's task, before anything is learnt."""
+"""Begin a run of many blocks: its folder, with the task of every block, before anything is trained."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import torch
 
-from .. import files, methods
+from .. import files
 from ..budget import Budget
 from ..capture import Places, places_of, read_capture
 from ..errors import LumigraphError
 from ..figures import save_picture
 from ..plain import alike
 from ..run import check_new, processor
-from ..run.block_plan import FOLDER, NAME, TASK, Block, Plan, Task
 from ..run.folder import versions
-from ..run.settings import Source
 from .drawing import draw_plan
 from .layout import lay_out
+from .plan import FOLDER, NAME, TASK, Block, Plan, Task, source_of
 
 BY_BLOCK = 60.0  # seconds, where nobody says
 PICTURE = "blocks.png"
 
 
 def survey(source: str, reader: str | None = None) -> Places:
-    """Where the photographs of a source were taken; no pixel is read."""
+    """Positions of the photographs of a source; no pixel is read."""
     return places_of(read_capture(source, reader))
 
 
-def make_plan(
-    source: str,
-    places: Places,
-    wish: str,
-    kind: type[Any],
-    config: Any,
-    options: dict[str, Any],
-    budget: Budget | None,
-    quality: str | None = None,
-    seed: int = 0,
-    device: Any = "cpu",
-    here: bool = True,
-) -> Plan:
-    """What all blocks of a source will learn.
+@dataclass(frozen=True)
+class Recipe:
+    """Training of every block.
 
-    wish:    see `lay_out`
+    options: what `open_dataset` is told of the whole scene
     budget:  of all blocks together, shared out evenly; None for a minute each, or a quality
-    options: what `open_dataset` is told of the whole
     here:    whether the device is this machine's
     """
-    path = Path(source)
-    said = {name: value for name, value in options.items() if value is not None}
-    scene = Source(str(path.resolve()) if path.exists() else source, said)
+
+    method: str
+    config: Any
+    options: dict[str, Any]
+    budget: Budget | None = None
+    quality: str | None = None
+    seed: int = 0
+    device: str = "cpu"
+    here: bool = True
+
+    def budget_of_each(self, blocks: int) -> dict[str, Any]:
+        """Budget of one of so many blocks."""
+        if self.quality:
+            return {"quality": self.quality}
+        if self.budget is None:
+            return {"seconds": BY_BLOCK}
+        if self.budget.steps is not None:
+            return {"steps": max(1, math.ceil(self.budget.steps / blocks))}
+        return {"seconds": self.budget.total / blocks}
+
+
+def make_plan(source: str, places: Places, wish: str, recipe: Recipe) -> Plan:
+    """The plan of a scene: its blocks, see `lay_out`, and what each of them learns."""
     blocks = lay_out(places, wish, source)
     turn: Any = tuple(tuple(float(x) for x in row) for row in places.upright)
     return Plan(
-        methods.name_of(kind),
-        asdict(config),
-        scene,
+        recipe.method,
+        asdict(recipe.config),
+        source_of(source, recipe.options),
         turn,
         blocks,
-        {"quality": quality} if quality else shared(budget or Budget(seconds=BY_BLOCK * len(blocks)), len(blocks)),
-        seed,
-        str(device),
-        processor(torch.device(device)) if here else "machines of a cluster",
+        recipe.budget_of_each(len(blocks)),
+        recipe.seed,
+        recipe.device,
+        processor(torch.device(recipe.device)) if recipe.here else "machines of a cluster",
         versions(),
     )
-
-
-def shared(budget: Budget, blocks: int) -> dict[str, Any]:
-    """Each block's part of a budget for all."""
-    if budget.steps is not None:
-        return {"steps": max(1, math.ceil(budget.steps / blocks))}
-    return {"seconds": budget.total / blocks}
 
 
 def begin(folder: Path, plan: Plan, places: Places | None = None, threads: int | None = None) -> Plan:
@@ -107,7 +107,7 @@ def write_task(folder: Path, task: Task) -> None:
 
 
 def place_of(run: Path, block: Block) -> Path:
-    """Where a block of a run is learnt."""
+    """Folder of a block in a run."""
     return run / FOLDER / block.name
 
 

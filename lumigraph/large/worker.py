@@ -1,4 +1,4 @@
-"""One block of a large scene is learnt: a plain function over a folder, the same on every machine.
+"""Train one block of a large scene: a function over the folder of the block, the same on every machine.
 
     RUN/blocks/3/
     ├── task.json     what it is made of, all of it
@@ -30,9 +30,9 @@ from ..locks import held
 from ..method import Method
 from ..ranges import typed
 from ..run import Run, build
-from ..run.block_plan import DONE, Done, Task
 from ..scene import Scene
 from ..train import fit
+from .plan import DONE, Done, Task
 
 PATIENCE = 60.0  # seconds to wait for a process that was told to end, and still holds the folder
 SAVE_EVERY = 30.0  # seconds of training that a lost worker costs at most
@@ -40,9 +40,19 @@ SAVE_EVERY = 30.0  # seconds of training that a lost worker costs at most
 
 @dataclass(frozen=True)
 class Ended:
-    """How a call ended: with what the block took, or by a signal before it was done."""
+    """End of a call: with what the block took, or by a signal before it was done."""
 
     done: Done | None
+    signal: int | None = None
+
+
+@dataclass(frozen=True)
+class Conducted:
+    """Outcome of all blocks: what blocks took by name, a sentence for each that failed, and the signal that
+    stopped it."""
+
+    done: dict[str, Done]
+    failed: dict[str, str]
     signal: int | None = None
 
 
@@ -74,7 +84,7 @@ def train_block(folder: Path, save_every: float = SAVE_EVERY) -> Ended:
 
 
 def finished(folder: Path, task: Task) -> Done | None:
-    """What a block took, where it is done. Raises LumigraphError for one that was another task's."""
+    """Cost of a block that is done, None of any other. Raises LumigraphError for one that was another task's."""
     if not (folder / DONE).exists():
         return None
     done: Done = files.read_json(folder / DONE, Done)

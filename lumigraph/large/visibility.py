@@ -1,4 +1,4 @@
-"""Whether a block has seen what it shows (Tancik et al. 2022, Block-NeRF, section 4.3.1)."""
+"""Visibility of what a block renders to its own photographs (Tancik et al. 2022, Block-NeRF, section 4.3.1)."""
 
 from __future__ import annotations
 
@@ -7,8 +7,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ..camera import Camera
+from ..capabilities import HasVisibility, can, needs
+from ..composition import Placed
 from ..rays import Rendering
-from .placed import Placed
 
 GLANCE = 16  # pixels along the longer side of a picture that tells whether a block sees what a camera looks at
 STATIONS = (0.125, 0.375, 0.625, 0.875)  # of the way to what a pixel shows, where visibility is asked
@@ -16,15 +17,15 @@ STATIONS = (0.125, 0.375, 0.625, 0.875)  # of the way to what a pixel shows, whe
 
 @torch.no_grad()
 def saw(part: Placed, camera: Camera, seen: Rendering) -> Float[Tensor, "height width"]:
-    """How much of the way to what each pixel shows the block's photographs saw, in [0, 1]; 1 for a method that does not
-    say (it lacks `visibility`).
+    """Share of the way to what each pixel shows that the block's photographs saw, in [0, 1]; 1 for a method that does
+    not know.
 
     camera: in the picture's frame
     seen:   what the part rendered for it; where nothing is, the way goes to the end of the block's frame
     """
-    visibility = getattr(part.method, "visibility", None)
-    if visibility is None:
+    if not can(part.method, HasVisibility):
         return torch.ones_like(seen.depth)
+    visibility = needs(part.method, HasVisibility).visibility
     local, scale = part.camera(camera), part.place.scale
     rays = local.rays(local.pixels())
     depth = (seen.depth.reshape(-1) / scale).clamp(max=part.method.frame.reach)

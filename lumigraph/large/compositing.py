@@ -1,4 +1,4 @@
-"""In blocks: a scene too large for one field, shown by those of many that have seen what a camera looks at.
+"""Compositing of blocks: a scene too large for one field, rendered by the blocks that saw what a camera looks at.
 
 Tancik et al. 2022 (Block-NeRF, arXiv 2202.05263), section 4.3: blocks within reach of a camera, without those that do
 not see what it sees (4.3.1), each rendered by itself, their pictures mixed by how near the camera is to each (4.3.2).
@@ -16,17 +16,16 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from ..camera import Camera
+from ..composition import Placed
 from ..controls import Control, Value
 from ..errors import LumigraphError
 from ..method import Method
 from ..rays import Rendering
 from ..scene import Frame, Photograph
-from .asked import Asked
-from .exposures import EXPOSURE, exposed
-from .mixing import UNSEEN, Mixing, inverse_distance, seeing, shares
-from .nearby import Nearby
-from .placed import Placed
-from .sight import GLANCE, saw
+from .block_cache import Nearby
+from .exposure_alignment import EXPOSURE, Asked, exposed
+from .visibility import GLANCE, saw
+from .weights import UNSEEN, Mixing, inverse_distance, seeing, shares
 
 LITTLE = 1e-3  # share of a picture below which a block is not rendered: a quarter of a step of 8 bits
 ENTERED = 0.02  # share of a picture from which on a block counts fully where pixels are mixed one by one
@@ -90,7 +89,7 @@ class InBlocks(Method):
 
     @torch.no_grad()
     def weights(self, camera: Camera) -> Float[Tensor, " block"]:
-        """How much each block has a say in what a camera sees; they sum up to 1. By pixel it is then told apart where
+        """Weight of each block in the picture of a camera; they sum up to 1. Pixels have weights of their own where
         mixing is not by the camera."""
         c = self.config
         distance = (camera.position.to(self.centres) - self.centres).norm(dim=-1)

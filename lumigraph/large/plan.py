@@ -23,13 +23,19 @@ from .. import files
 from ..capture import Part
 from ..errors import LumigraphError
 from ..ranges import Point, Positive, between, typed
-from .settings import Source
+from ..run.settings import Source
 
 FORMAT = "lumigraph blocks 1"
 NAME, FOLDER, TASK, DONE = "blocks.json", "blocks", "task.json", "done.json"
 LABEL = Annotated[str, msgspec.Meta(pattern=r"\A[0-9]{1,6}\Z")]  # of a block, and of its folder
 Turn = tuple[Point, Point, Point]  # rows of a rotation
 Number = Annotated[float, between(-1e6, 1e6)]
+
+
+def source_of(source: str, options: dict[str, Any]) -> Source:
+    """The photographs of a scene or a block, and the options to open them with that say something."""
+    path, said = Path(source), {name: value for name, value in options.items() if value is not None}
+    return Source(str(path.resolve()) if path.exists() else source, said)
 
 
 @dataclass(frozen=True)
@@ -79,7 +85,7 @@ class Task:
 
     @staticmethod
     def read(folder: Path) -> Task:
-        """What a block's folder says. Raises LumigraphError, naming the file, where it says nothing sound."""
+        """The task in a block's folder. Raises LumigraphError, naming the file, where it is missing or damaged."""
         return files.read_json(folder / TASK, Task)
 
 
@@ -103,7 +109,7 @@ class Done:
 
 @dataclass(frozen=True)
 class Plan:
-    """What blocks.json says.
+    """The contents of blocks.json.
 
     budget:  of each block
     appearance: the code that each block is shown in, once they are aligned
@@ -123,7 +129,7 @@ class Plan:
 
     @staticmethod
     def read(path: Path) -> Plan:
-        """What the file says. Raises LumigraphError, naming it, where it is none of ours or damaged."""
+        """The plan in a file. Raises LumigraphError, naming it, where it is none of ours or damaged."""
         said = files.read_json(path)
         if not isinstance(said, dict) or said.get("format") != FORMAT:
             raise LumigraphError(f"{path} was not written by this version of Lumigraph; open it with the one that did")
@@ -146,7 +152,7 @@ class Plan:
         raise LumigraphError(f"There is no block {name}; there are {there}")
 
     def task(self, block: Block) -> Task:
-        """What a block is to learn."""
+        """The task of a block."""
         scene = block.scene or self.scene
         part = asdict(Part(block.photographs, block.centre, block.radius))
         told = replace(scene, options={**scene.options, "part": part})

@@ -1,4 +1,4 @@
-"""Where blocks are, and which photographs each learns from (Tancik 2022, section 3 and 4.1).
+"""Layout of blocks, and the photographs that each learns from (Tancik 2022, section 3 and 4.1).
 
 A block is a disc on the ground. At crossings, where photographs were taken along streets that meet; otherwise where
 k-means puts so many of them. Each photograph is nearest to one centre, and a block's radius is 4/3 of how far its
@@ -20,8 +20,8 @@ from ..capture import Places
 from ..errors import LumigraphError, LumigraphWarning
 from ..files import read_json
 from ..ranges import Point, Positive, typed
-from ..run.block_plan import Block
 from .crossings import find_crossings
+from .plan import Block
 
 LARGE = 200  # photographs from which on a capture is divided where nobody says
 PER_BLOCK = 64  # photographs in a cell, about
@@ -169,7 +169,7 @@ def cells(
 
 
 def members(places: Places, disc: Disc) -> Bool[np.ndarray, " photograph"]:
-    """Which photographs are of a block: those taken within its radius, and those from near by that look at it."""
+    """Mask of the photographs of a block: those taken within its radius, and those from near by that look at it."""
     way = np.array(disc.centre) - places.positions
     flat = np.linalg.norm((way @ places.upright.T)[:, :2], axis=-1)
     towards = (way * places.forwards).sum(-1) > TOWARDS * np.linalg.norm(way, axis=-1)

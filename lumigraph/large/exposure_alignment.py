@@ -1,20 +1,45 @@
-"""What many parts can be told, found out by asking each of them once."""
+"""Exposure alignment: all blocks are rendered with one exposure. Stops count from the median of its photographs."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from statistics import median
 
+from ..capabilities import HasExposure, can, needs
+from ..composition import Placed
 from ..controls import Control
 from ..scene import Photograph
-from .exposures import EXPOSURE, own_exposure, own_range
-from .placed import Placed
+
+EXPOSURE = "exposure"  # the control's name
+
+
+def own_exposure(part: Placed) -> float | None:
+    """log2 of the exposure that is usual in one part; None where it knows of none."""
+    return needs(part.method, HasExposure).usual_exposure if can(part.method, HasExposure) else None
+
+
+def exposed(part: Placed, exposure: float | None) -> Placed:
+    """The same part as if photographed with an exposure, log2 of it, or as near to it as it learnt from."""
+    usual, reach = own_exposure(part), own_range(part)
+    if usual is None or reach is None or exposure is None:
+        return part
+    stops = min(max(exposure, reach[0]), reach[1]) - usual
+    return replace(part, method=part.method.given(**{EXPOSURE: stops}))
+
+
+def own_range(part: Placed) -> tuple[float, float] | None:
+    """The least and the most exposure, log2 of it, that one part learnt from; None where it has no choice."""
+    control = next((x for x in part.method.controls if x.name == EXPOSURE), None)
+    own = own_exposure(part)
+    if control is None or control.range is None or own is None:
+        return None
+    return own + control.range[0], own + control.range[1]
 
 
 @dataclass(frozen=True)
 class Asked:
-    """What parts say of themselves.
+    """Controls and exposures of many parts, each of which is asked once.
 
     photographs: whether each finds its own appearance in a photograph
     controls:    that any of them has, the first of each name, but for exposure and those that name photographs

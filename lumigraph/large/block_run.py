@@ -1,7 +1,7 @@
 """A run in blocks, opened as one scene: every block in its place, those in reach of a camera in its picture.
 
 RUN/
-├── blocks.json    see `block_plan`;  blocks.png  the plan seen from above
+├── blocks.json    see `plan`;  blocks.png  the plan seen from above
 ├── blocks/0/      an ordinary run for each block, in a frame of its own
 └── eval.json, eval.png, renders/ ...   as of any run
 """
@@ -23,25 +23,23 @@ from .. import files, methods
 from ..camera import Camera
 from ..capabilities import HasGaussians, can
 from ..capture import Before, Part, open_dataset
-from ..composition import InBlocks, Nearby, PickedCloud, Placed, merged
+from ..composition import PickedCloud, Placed
 from ..errors import LumigraphError, LumigraphWarning
 from ..geometry import Similarity
 from ..method import Method
 from ..names import natural
+from ..run.checkpoint import State
+from ..run.folder import Run
+from ..run.opened import Trained
+from ..run.settings import Settings, Source
 from ..scene import Frame, Scene
-from .block_plan import FOLDER, NAME, Block, Plan
-from .checkpoint import State
-from .folder import Run
-from .opened import Trained
-from .settings import Settings, Source
+from .block_cache import Nearby
+from .compositing import InBlocks
+from .merging import merged
+from .plan import FOLDER, NAME, Block, Plan
 
 LARGEST_REACH = 64.0
 NONE = "it has no block that has learnt anything yet; `lumigraph train` with the same options goes on with it"
-
-
-def is_block_run(folder: Path) -> bool:
-    """Whether a folder holds a run in blocks."""
-    return files.is_file(folder / NAME)
 
 
 class BlockRun(Trained):
@@ -72,13 +70,13 @@ class BlockRun(Trained):
 
     @property
     def centres(self) -> Float[Tensor, "block 3"]:
-        """Of the blocks, in the frame."""
+        """Centres of the blocks, in the frame."""
         source = torch.tensor([block.centre for block in self.blocks], dtype=torch.float64)
         return self.frame.to_source.inverse.points(source).float()
 
     @property
     def radii(self) -> Float[Tensor, " block"]:
-        """Of the blocks, in the frame's units."""
+        """Radii of the blocks, in the frame's units."""
         return torch.tensor([block.radius for block in self.blocks]) / self.frame.to_source.scale
 
     @cached_property
@@ -187,6 +185,10 @@ class BlockRun(Trained):
     def photographed(self) -> bool:
         return True
 
+    @property
+    def conversion_fault(self) -> str:
+        return f"is a run in blocks; convert each by itself: {self.folder / FOLDER / self.blocks[0].name}"
+
     def dataset(self, source: str | None = None, split: str | None = None) -> Scene:
         """The photographs again, in the frame.
 
@@ -238,8 +240,8 @@ class BlockRun(Trained):
         return sum(run.model_bytes for run in self.runs.values())
 
     @property
-    def settings(self) -> Settings:
-        """What an ordinary run of the whole would say of itself."""
+    def settings(self) -> Settings:  # type: ignore[override]  # from all blocks, when it is asked for
+        """Settings that an ordinary run of the whole would have."""
         plan, counts = self.plan, dict[str, int]()
         for _, split in self._photographs.values():
             counts[split] = counts.get(split, 0) + 1

@@ -8,7 +8,7 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from ..capture import Places
-from ..run.block_plan import Block
+from .plan import Block
 
 WIDE, FINE = 1000, 3  # pixels of the longer side, and how many times finer it is drawn
 MARGIN, HEAD = 40, 60

@@ -1,4 +1,4 @@
-"""One light for all blocks: the appearance of each is fitted to that of its neighbours (Tancik 2022, section 4.3.3)."""
+"""Appearance alignment: the code of each block is fitted to the pictures of its neighbours (Tancik 2022, 4.3.3)."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ..camera import Camera
+from ..capabilities import HasAppearance, can, needs
 from ..choice import evenly
 from ..components.fields.appearance import Appearance, Patches
+from ..composition import Placed
 from ..progress import track
 from ..scene import Batch
-from .asked import Asked
-from .exposures import exposed
-from .nearby import Nearby
-from .placed import Placed
-from .sight import saw
+from .block_cache import Nearby
+from .exposure_alignment import Asked, exposed
+from .visibility import saw
 
 TRIED, CHOSEN = 8, 6  # cameras between two blocks that are looked through, and those whose pictures are compared
 WIDTH = 48  # pixels along the longer side of these pictures
@@ -84,8 +84,9 @@ def align_appearance(
 
 def appearance_of(part: Placed) -> Float[Tensor, " code"]:
     """The code that a part is shown in; empty where it has none."""
-    shown = getattr(part.method, "shown_in", Appearance(torch.zeros(0)))
-    return shown.code.detach().cpu()
+    if not can(part.method, HasAppearance):
+        return torch.zeros(0)
+    return needs(part.method, HasAppearance).shown_in.code.detach().cpu()
 
 
 def patch(

@@ -1,4 +1,4 @@
-"""One block is learnt again from other photographs, of a place that has changed; the others stay as they are."""
+"""Train one block again from other photographs, of a place that has changed; the others stay as they are."""
 
 from __future__ import annotations
 
@@ -14,13 +14,12 @@ from ..budget import Budget
 from ..capture import Places
 from ..errors import LumigraphError
 from ..locks import held
-from ..run.block_plan import NAME, TASK, Block, Plan, Task
-from ..run.settings import Source
-from .finishing import finish
 from .layout import Disc, members
+from .monitor import Watching
+from .plan import NAME, TASK, Block, Plan, Task, source_of
 from .planning import place_of, write_task
-from .task import Ended, finished, train_block
-from .watch import Watching
+from .training import finish
+from .worker import Ended, finished, train_block
 
 NEW = "updates"  # folder in the run where a block is learnt before it takes its place
 
@@ -67,7 +66,5 @@ def again(block: Block, source: str, places: Places, options: dict[str, Any], bu
             "the frame of the run's own photographs, so capture them together with some of those"
         )
     names = [places.names[i] for i in np.flatnonzero(chosen)]
-    path = Path(source)
-    said = {name: value for name, value in options.items() if value is not None}
-    scene = Source(str(path.resolve()) if path.exists() else source, said)
-    return replace(block, photographs=names, scene=scene, budget=budget.to_json() if budget else block.budget)
+    told = budget.to_json() if budget else block.budget
+    return replace(block, photographs=names, scene=source_of(source, options), budget=told)

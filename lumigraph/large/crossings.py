@@ -1,4 +1,4 @@
-"""Where streets meet, found from where photographs were taken: places from which three ways or more leave, and corners
+"""Street crossings, found from where photographs were taken: places from which three ways or more leave, and corners
 between them."""
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ def crossings_at(ground: Float[np.ndarray, "photograph 2"], step: float) -> Floa
 
 
 def usual_step(ground: Float[np.ndarray, "photograph 2"]) -> float:
-    """How far it is from one place to the next along the way; 0 where all places are one."""
+    """Distance from one place to the next along the way; 0 where all places are one."""
     if len(ground) < 3:
         return 0.0
     distance, index = cKDTree(ground).query(ground, min(NEIGHBOURS, len(ground)))
