@@ -55,6 +55,17 @@ class Comparison(NamedTuple):
     distance: Float[Tensor, " point"]
 
 
+def back_project(
+    camera: Camera, pixels: Float[Tensor, "point 2"], depth: Float[Tensor, " point"], along_axis: bool = False
+) -> Float[Tensor, "point 3"]:
+    """Points o + t d in the world, of pixels (x, y) of one camera and their depths t in scene units.
+
+    along_axis: depth is measured along the optical axis (z-depth): t = z / cos, with the angle of ray and axis
+    """
+    rays = camera.rays(pixels)
+    return rays.at((depth / cosines(rays.directions, camera.forward)).to(depth) if along_axis else depth)
+
+
 @dataclass(frozen=True)
 class SurfacePoints:
     """Points of surfaces in the frame of the cameras that saw them.
@@ -113,19 +124,14 @@ class DepthMap:
 
     @staticmethod
     def measured(
-        camera: Camera,
-        depth: Float[Tensor, "height width"],
-        rgb: Float[Tensor, "height width 3"],
-        along_axis: bool = False,
+        camera: Camera, depth: Float[Tensor, "height width"], rgb: Float[Tensor, "height width 3"]
     ) -> DepthMap:
         """Depth map of a sensor, a depth file or a plane sweep. Opacity is 1 where something was measured, else 0.
 
-        depth:      scene units; infinity where nothing is, NaN where nobody measured
-        along_axis: whether it is measured along the optical axis (z-depth), rather than along each pixel's ray
+        depth: along rays, scene units, as a photograph's layer has it (`Photograph.extra["depth"]`); infinity where
+               nothing is, NaN where nobody measured
         """
-        if along_axis:
-            depth = depth / cosines(camera.rays(camera.pixels()).directions, camera.forward).view(depth.shape)
-        return DepthMap(camera, depth.float(), depth.isfinite().float(), rgb)
+        return DepthMap(camera, depth, depth.isfinite().float(), rgb)
 
     @cached_property
     def solid(self) -> Bool[Tensor, "height width"]:
@@ -157,12 +163,12 @@ class DepthMap:
         return normals * facing.sign()[..., None], facing.abs() * self.solid
 
     def positions(self, chosen: Tensor | None = None) -> Float[Tensor, "point 3"]:
-        """Back-projection: where pixels' rays meet the surface, o + depth d, in the world.
+        """Points in the world where pixels' rays meet the surface (`back_project`).
 
         chosen: a mask of pixels or their numbers, row by row; None for those that show a surface
         """
         index = (self.solid if chosen is None else chosen).flatten()
-        return self.camera.rays(self.camera.pixels()[index]).at(self.depth.flatten()[index])
+        return back_project(self.camera, self.camera.pixels()[index], self.depth.flatten()[index])
 
     def points(self, chosen: Tensor | None = None) -> SurfacePoints:
         """Back-projected points with normals and colours; chosen as for `positions`."""
