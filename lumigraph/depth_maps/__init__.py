@@ -12,6 +12,7 @@ and `sees(points)`. Several maps give `surface_points`, `hidden`, `free`, `fused
 points of which marching cubes takes the zero level. A `Tolerance` is a length that may grow with the distance.
 """
 
+from .depth_map import DEPTH_EDGE as DEPTH_EDGE
 from .depth_map import Comparison as Comparison
 from .depth_map import DepthMap as DepthMap
 from .depth_map import SurfacePoints as SurfacePoints

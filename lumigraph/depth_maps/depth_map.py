@@ -36,7 +36,7 @@ class Tolerance:
 
 
 VISIBLE = Tolerance(per_distance=0.02)  # behind a rendered surface, where a point still counts as seen
-EDGE = Tolerance(per_distance=0.1)  # between neighbouring pixels, where one surface ends before another
+DEPTH_EDGE = Tolerance(per_distance=0.1)  # between neighbouring pixels, where one surface ends before another
 
 
 class Comparison(NamedTuple):
@@ -183,7 +183,7 @@ class DepthMap:
         pixels, valid = self.camera.project(points)
         return pixels, valid, (points - self.camera.position).norm(dim=-1)
 
-    def compare(self, points: Float[Tensor, "point 3"], edge: Tolerance = EDGE) -> Comparison:
+    def compare(self, points: Float[Tensor, "point 3"], edge: Tolerance = DEPTH_EDGE) -> Comparison:
         """Points beside the surface that the camera sees, whose depth is interpolated between pixels.
 
         edge: difference in depth between neighbouring pixels from which on there is an edge. There a point counts as
@@ -197,7 +197,7 @@ class DepthMap:
         return Comparison(ahead, smooth, pixels, away)
 
     def sees(
-        self, points: Float[Tensor, "point 3"], tolerance: Tolerance = VISIBLE, edge: Tolerance = EDGE
+        self, points: Float[Tensor, "point 3"], tolerance: Tolerance = VISIBLE, edge: Tolerance = DEPTH_EDGE
     ) -> Bool[Tensor, " point"]:
         """Mask of visible points: inside the picture, and no farther than the tolerance behind its surface."""
         compared = self.compare(points, edge)

@@ -45,10 +45,12 @@ class TSDF:
     over cameras at o, each with the depth that it sees in the direction of x and the truncation t. Its weight is the
     cosine at which it sees the surface over the area of its pixel there (section 4). A camera with d < -1 is left out:
     what lies deeper behind its surface is unknown to it. Distances are along rays, in scene units.
+    edge: difference in depth between neighbouring pixels from which on they show two surfaces; None for the truncation
     """
 
     depth_maps: Sequence[DepthMap]
     truncation: Tolerance
+    edge: Tolerance | None = None
 
     def __call__(self, points: Float[Tensor, "point 3"]) -> SignedDistance:
         # Each thread takes whole pieces: beside other programs dozens of shared operations for each camera would wait,
@@ -61,7 +63,8 @@ class TSDF:
     def _fused(self, points: Float[Tensor, "point 3"]) -> SignedDistance:
         total, weight, truncation = (torch.zeros(len(points)) for _ in range(3))
         pictured = torch.zeros(len(points), dtype=torch.bool)
-        spans = self.truncation.constant, self.truncation.per_distance
+        edge = self.edge or self.truncation
+        spans = (edge.constant, edge.per_distance), (self.truncation.constant, self.truncation.per_distance)
         for seen in self.depth_maps:
             given = *seen.project(points), seen.surface_depth, seen.facing
             sums = total, weight, truncation, pictured

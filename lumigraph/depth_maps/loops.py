@@ -45,14 +45,15 @@ def compare(pixels, valid, away, depth, edge, edge_per_distance, ahead, smooth):
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
-def fuse(pixels, valid, away, depth, facing, least, constant, per_distance, total, weight, truncated, pictured):
-    """TSDF: one camera's distances, added to those of the others. The truncation is constant + per_distance away."""
+def fuse(pixels, valid, away, depth, facing, least, edges, truncations, total, weight, truncated, pictured):
+    """TSDF: one camera's distances, added to those of the others. edges and truncations are
+    tolerances (constant, per distance)."""
     height, width = depth.shape
     for i in range(len(away)):
         x, y = pixels[i, 0], pixels[i, 1]
         if valid[i] and 0 <= x < width and 0 <= y < height:
-            truncation = constant + per_distance * away[i]
-            surface, smooth = depth_at(depth, x, y, truncation)
+            truncation = truncations[0] + truncations[1] * away[i]
+            surface, smooth = depth_at(depth, x, y, edges[0] + edges[1] * away[i])
             ahead = surface - away[i]
             if not math.isnan(ahead):
                 pictured[i] = True

@@ -19,7 +19,7 @@ from torch import Tensor
 from ...camera import Camera
 from ...capabilities import HasDensity, HasField, can
 from ...choice import evenly
-from ...depth_maps import TSDF, DepthMap, SurfacePoints, Tolerance, free, render_depth_maps, surface_points
+from ...depth_maps import DEPTH_EDGE, TSDF, DepthMap, SurfacePoints, Tolerance, free, render_depth_maps, surface_points
 from ...geometry import unit
 from ...kernels import spherical_harmonics
 from ...progress import track
@@ -186,7 +186,7 @@ class OfDepthMaps(TakenOver):
     device = torch.device("cpu")
 
     def _density(self, points):
-        distance, truncation, _ = TSDF(self.depth_maps, TRUNCATION)(points)
+        distance, truncation, _ = TSDF(self.depth_maps, TRUNCATION, DEPTH_EDGE)(points)
         return ((0.5 - distance).clamp(0, 1) * SPENT / truncation).nan_to_num(0.0)
 
     @torch.no_grad()
