@@ -15,6 +15,7 @@ from .lens import Lens, Pinhole, one_or_more, rows
 from .rays import Rays
 
 RING, ELEVATION = 24, 15.0  # cameras of a ring, and degrees that they stand above its middle
+ELEVATIONS = (0.0, 30.0, 60.0)  # degrees, of the rings of a dome
 # A disc of this radius varies as much as a square pixel of side one (Barron 2021, section 3.1).
 PIXEL_RADIUS = 2 / math.sqrt(12)
 
@@ -153,6 +154,19 @@ def ring(
     focal = 0.5 * size / math.tan(0.5 * math.radians(angle))
     lens = Pinhole(torch.full((count, 2), focal), torch.full((count, 2), size / 2))
     return Camera(pose, lens, torch.full((count, 2), size))
+
+
+def dome(ring: Camera) -> Camera:
+    """Cameras over a whole dome, at the distances and azimuths of a ring around the origin."""
+    parts = []
+    for degrees in ELEVATIONS:
+        angle = torch.full((len(ring),), math.radians(degrees))
+        flat = torch.nn.functional.normalize(ring.position[:, :2], dim=-1)
+        outward = torch.cat([angle.cos()[:, None] * flat, angle.sin()[:, None]], -1)
+        position = ring.position.norm(dim=-1, keepdim=True) * outward
+        pose = look_at(position, -outward, torch.tensor([0.0, 0.0, 1.0]))
+        parts.append(replace(ring, pose=pose))
+    return Camera.cat(parts)
 
 
 def rotate(matrix: Float[Tensor, "#ray 3 _"], vectors: Float[Tensor, "ray 3"]) -> Float[Tensor, "ray 3"]:

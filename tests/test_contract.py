@@ -27,12 +27,12 @@ from lumigraph.capabilities import CanCompress, HasDensity, HasDistance, HasFiel
 from lumigraph.cli import main
 from lumigraph.compression import LADDER
 from lumigraph.compression.model import Model
+from lumigraph.depth_maps import depth_map
 from lumigraph.errors import LumigraphError
 from lumigraph.evaluate import evaluate
 from lumigraph.exchange import read_gaussians
 from lumigraph.explain.ray import along_ray
 from lumigraph.export import points as export_points
-from lumigraph.export import sightings
 from lumigraph.export.film import film
 from lumigraph.export.mesh import extract_mesh
 from lumigraph.export.page import opening_of_scene, splats_page, views_page
@@ -333,10 +333,10 @@ def test_it_can_be_told_what_it_says(taught):
 @pytest.fixture
 def lenient(taught, monkeypatch) -> Taught:
     """A method whose scene is but half solid counts as solid to exports."""
-    monkeypatch.setattr(sightings, "SOLID", HALF_SOLID * float(taught.seen.opacity.max()))
+    monkeypatch.setattr(depth_map, "SURFACE_OPACITY", HALF_SOLID * float(taught.seen.opacity.max()))
     monkeypatch.setattr(export_points, "SQUARELY", 0.0)
     monkeypatch.setattr(export_points, "TOLERANCE", HALF_AGREED)
-    monkeypatch.setattr(export_points, "WITNESSES", 1)
+    monkeypatch.setattr(export_points, "MIN_VIEWS", 1)
     return taught
 
 

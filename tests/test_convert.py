@@ -16,7 +16,7 @@ from lumigraph.camera import ring
 from lumigraph.capabilities import FromField, HasField, can
 from lumigraph.cli import main
 from lumigraph.components.clouds.at_surfaces import facing
-from lumigraph.components.fields.taken_over import OfField, OfSights, logit, taken_over
+from lumigraph.components.fields.taken_over import OfDepthMaps, OfField, logit, taken_over
 from lumigraph.components.sampling.spaces import space_of
 from lumigraph.conversion import Aim, convert, ways
 from lumigraph.conversion.renderings import between, rendered_scene
@@ -127,14 +127,14 @@ def test_surfaces_are_where_cameras_see_them(known):
 
 
 def test_pictures_with_depth_become_a_shell(ball, known, generator):
-    shell = OfSights(known.sights)
+    shell = OfDepthMaps(known.depth_maps)
     ways = unit(torch.randn(500, 3, generator=generator))
     ways = ways[(ways[:, 2].abs() < 0.6)]  # where the ring of cameras looks squarely
     thickness = sum(shell.density(r * ways) * 0.01 for r in torch.linspace(1.2, 0.4, 81).tolist())
     before = sum(shell.density(r * ways) * 0.01 for r in torch.linspace(1.2, 0.75, 46).tolist())
     assert thickness.median() > 2 and before.max() < 0.5
-    colour = torch.stack([shell.glance(RADIUS * ways, sight) for sight in shell.sights])
-    sees = torch.stack([sight.sees(RADIUS * ways) for sight in shell.sights])
+    colour = torch.stack([shell.glance(RADIUS * ways, seen) for seen in shell.depth_maps])
+    sees = torch.stack([seen.sees(RADIUS * ways) for seen in shell.depth_maps])
     error = (colour - (0.5 + RADIUS * ways / 1.2)).abs().mean(-1)
     assert error[sees].median() < 0.06
     density, rgb = shell.field(RADIUS * ways, -ways)
@@ -145,9 +145,9 @@ def test_pictures_with_depth_become_a_shell(ball, known, generator):
 def test_harmonics_are_found_again(known, generator):
     wanted = 0.3 * torch.randn(9, 3, generator=generator)
     points = 0.1 * torch.randn(50, 3, generator=generator)
-    sights = [replace(sight, depth=torch.full_like(sight.depth, torch.inf)) for sight in known.sights]
-    found = OfField(sights, Painted(wanted)).harmonics(points, 3, logit)
-    directions = unit(points - known.sights[3].camera.position)
+    depth_maps = [replace(seen, depth=torch.full_like(seen.depth, torch.inf)) for seen in known.depth_maps]
+    found = OfField(depth_maps, Painted(wanted)).harmonics(points, 3, logit)
+    directions = unit(points - known.depth_maps[3].camera.position)
     seen = (spherical_harmonics(directions, 3)[:, None] @ found)[:, 0]
     torch.testing.assert_close(seen, spherical_harmonics(directions, 3) @ wanted, atol=0.05, rtol=0)
 

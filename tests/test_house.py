@@ -23,7 +23,7 @@ FLOORS: list[set[str]] = [
     {"budget", "files", "plain", "lens", "rays"},
     {"camera", "crop", "images", "kernels", "figures", "locks", "metrics", "packing"},
     {"volume", "scene"},
-    {"alignment", "baked", "dataset", "gaussians", "mesh"},
+    {"alignment", "baked", "dataset", "depth_maps", "gaussians", "mesh"},
     {"capabilities", "collection", "shapes"},
     {"announce", "components", "capture", "exchange", "method", "paths"},
     {"composition", "display", "prior", "verdict"},

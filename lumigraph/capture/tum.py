@@ -17,8 +17,8 @@ from ..errors import LumigraphError
 from ..files import is_file
 from ..geometry import to_matrix
 from ..lens import Lens, OpenCV, Pinhole
+from .beside import with_depth_points
 from .capture import Capture, Plane, Shot
-from .depth_points import depth_points
 
 LOOKED_FOR = "rgb.txt and groundtruth.txt (TUM's RGB-D benchmark)"
 APART = 0.02  # seconds that two moments may differ by and still be one, as in the benchmark's own tools
@@ -64,10 +64,7 @@ def read(folder: Path) -> Capture:
         shots.append(
             Shot(name, read_pose(poses[pose]), lens, SIZE, {1: folder / name}, time=float(moment), planes=planes)
         )
-    points = depth_points(shots)
-    if points is None:
-        return Capture(str(folder), shots, missing=missing)
-    return Capture(str(folder), shots, points.positions, points.colours, points.sightings, missing)
+    return with_depth_points(Capture(str(folder), shots, missing=missing))
 
 
 def read_rows(path: Path, columns: int) -> list[list[str]]:

@@ -11,13 +11,12 @@ from jaxtyping import Float
 from PIL import Image
 from torch import Tensor
 
-from ..camera import Camera, ring
+from ..camera import Camera, dome, ring
 from ..capabilities import HasDistance, HasMesh, can
 from ..choice import evenly
 from ..crop import Box
 from ..errors import LumigraphError
 from ..export.mesh import AT_ONCE, TRUNCATION, extract_mesh, find_surface, make_grid
-from ..export.sightings import all_around
 from ..figures import Row, contact_sheet
 from ..mesh import Mesh
 from ..method import Method
@@ -165,7 +164,7 @@ def surface_of(method: Method, frame: Frame, cells: int) -> Mesh:
     box = Box(*frame.bounds)
     cell = max(b - a for a, b in zip(box.lower, box.upper, strict=True)) / cells
     if not can(method, HasDistance):
-        return extract_mesh(method, all_around(ring(frame.bounds)), cell=cell, smooth=0)
+        return extract_mesh(method, dome(ring(frame.bounds)), cell=cell, smooth=0)
 
     def value(points: Float[Tensor, "point 3"]) -> Float[Tensor, " point"]:
         return (-distances(method, points) / (TRUNCATION * cell)).clamp(-1, 1)

@@ -9,11 +9,10 @@ from typing import Any
 
 import torch
 
-from ..camera import Camera
+from ..camera import Camera, dome
 from ..capabilities import HasGaussians, needs
 from ..dataset import Dataset
 from ..exchange import size_of
-from ..export.sightings import all_around
 from ..gaussians import Gaussians
 from ..method import Method
 from ..scene import Frame, Scene
@@ -86,7 +85,7 @@ class Opened(ABC):
 
     def survey(self, cameras: Camera) -> Camera:
         """The cameras that surfaces are looked at with, for meshes and points: its own, or a dome above its ring."""
-        return cameras if self.photographed else all_around(cameras)
+        return cameras if self.photographed else dome(cameras)
 
     def metrics(self) -> list[dict[str, Any]]:
         """What was measured while it was learnt, a row every few steps; none where that is not known."""
