@@ -1,4 +1,4 @@
-"""`lumigraph train block-nerf`: a scene too large for one field becomes many, here or on the machines of a cluster."""
+"""`lumigraph train block-nerf`: train a large scene as blocks, on this machine or on a cluster."""
 
 from __future__ import annotations
 
@@ -18,28 +18,28 @@ from .common import choose_device, exit_code, next_free, option, say, scene_name
 from .train import Train, option_group, preset_device, with_options_of
 
 IN_BLOCKS = "block-nerf"
-MEMORY = 2 << 30  # bytes that a block asks of its machine
+MEMORY = 2 << 30  # bytes that a block requests from its machine
 
 
 @dataclass(frozen=True)
 class TrainBlocks(Train):
-    """Learn a large scene in blocks, each a run of its own; from few photographs one block, an ordinary run.
+    """Train a large scene in blocks, each a separate run; with few photographs one block, an ordinary run.
 
-    --steps and --seconds are for all blocks together and shared out evenly; a minute each, if nothing is said. What is
-    done stays done: after Ctrl-C, a crash or a lost machine the same command goes on. RUN/blocks.png shows the plan.
-    `eval`, `render`, `view` and `export` open the run as one scene. --field METHOD, such as gaussian-splatting, has
-    each block learnt by another method; of clouds each block then gives its own cell to one file, RUN/cloud.ply.
+    --steps and --seconds are for all blocks together and divided evenly; the default is a minute for each block. After
+    Ctrl-C, a crash or a lost machine the same command continues; finished blocks are kept. RUN/blocks.png shows the
+    plan. `eval`, `render`, `view` and `export` open the run as one scene. --field METHOD, such as gaussian-splatting,
+    trains each block with another method; for clouds, RUN/cloud.ply joins each block's own cell.
     """
 
     blocks: Annotated[str | None, option("auto|N|FILE", "auto from 200 photographs on, else one block")] = None
-    """Where blocks are: at street crossings or spread evenly, so many of them, or as a JSON file says, in the frame of
-    the photographs: {"blocks": [{"centre": [x, y, z], "radius": r}, ...]}. With --into, a block's name."""
+    """Positions of blocks: auto (street crossings, or evenly spread), a number of evenly spread ones, or a JSON file in
+    the frame of the photographs: {"blocks": [{"centre": [x, y, z], "radius": r}, ...]}. With --into, a block's name."""
     workers: Annotated[Count | None, option("N", "1, in this process")] = None
-    """Learn so many blocks at a time on this machine, by Ray."""
+    """Number of blocks to train at a time on this machine, with Ray."""
     address: Annotated[str | None, option("HOST:PORT", "this machine")] = None
-    """Learn blocks on a Ray cluster that is there already; --output lies on storage that all its machines share."""
+    """Train blocks on an existing Ray cluster; --output must be on storage that all its machines share."""
     into: Annotated[Path | None, option("RUN", "a new run")] = None
-    """Learn one block of this run again, from other photographs, as the run's own were learnt; the rest stays."""
+    """Train one block of this run again, from other photographs, with the run's own settings; the rest stays."""
 
     def run(self) -> int:
         from ..capture import kind_of
@@ -113,7 +113,7 @@ class TrainBlocks(Train):
         return 0
 
     def _device(self) -> Any:
-        """Where blocks learn: of this machine, or as --device says of the cluster's."""
+        """The device of blocks: of this machine, or --device of the cluster's machines."""
         import torch
 
         if self.address is None or self.device == "auto":
@@ -140,9 +140,9 @@ class TrainBlocks(Train):
 
 @dataclass(frozen=True)
 class TrainOthers(TrainBlocks):
-    """As TrainBlocks, with blocks of another method."""
+    """TrainBlocks with blocks of another method."""
 
-    field: Annotated[str, arg(metavar="METHOD", help="The method that learns each block.")] = ""
+    field: Annotated[str, arg(metavar="METHOD", help="Method to train each block with.")] = ""
 
     @property
     def _field(self) -> str:
@@ -153,9 +153,9 @@ TrainOthers.__doc__ = TrainBlocks.__doc__
 
 
 def with_options_of_blocks(field: str, device: str, preset: str) -> type[Any]:
-    """The command, with the numbers of what learns each block among its options.
+    """The command, with the options of each block's method.
 
-    field: what --field says: another method, or else a kind of Block-NeRF's own
+    field: value of --field: another method, or else a kind of Block-NeRF's own
     """
     name = field.replace("_", "-")
     if name in methods.available():
@@ -178,7 +178,7 @@ def unfinished(prefix: str, plan: Any) -> Path:
 
 
 def tell_plan(output: Path, plan: Any, budget: Any) -> None:
-    """What is about to be learnt."""
+    """Print the plan before training."""
     counts = [len(block.photographs) for block in plan.blocks]
     each = " ".join(
         f"{value:g} {name}" if name != "quality" else f"as {value} asks" for name, value in plan.budget.items()
@@ -190,7 +190,7 @@ def tell_plan(output: Path, plan: Any, budget: Any) -> None:
 
 
 def tell_done(output: Path, found: Any) -> None:
-    """What it took."""
+    """Print the cost of all blocks."""
     done = list(found.done.values())
     rows = {"run": str(output), "blocks": f"{len(done)}, {sum(x.bytes for x in done) / 1e6:.1f} MB of weights"}
     steps, seconds = sum(x.steps for x in done), sum(x.seconds for x in done)
@@ -201,7 +201,7 @@ def tell_done(output: Path, found: Any) -> None:
 
 
 def onward(run: Path, source: str | None = None) -> dict[str, str]:
-    """What to type next."""
+    """Next commands."""
     again = ["--scene", source] if source else []
     return {
         "compare with what it has not seen": typed("eval", run, *again),

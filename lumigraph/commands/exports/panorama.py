@@ -1,4 +1,4 @@
-"""`lumigraph export panorama`: the whole sphere around a place, on one picture."""
+"""`lumigraph export panorama`: a panorama of the whole sphere around a point."""
 
 from __future__ import annotations
 
@@ -19,31 +19,31 @@ Place = Annotated[
     arg(
         name="from",
         metavar="X Y Z",
-        help_behavior_hint="(default: where the camera in the middle of all stood)",
+        help_behavior_hint="(default: the position of the middle camera)",
     ),
 ]
 
 
 @dataclass(frozen=True)
 class ExportPanorama:
-    """All that is seen from one place, as an equirectangular picture that viewers and headsets show as a sphere.
+    """Export an equirectangular panorama from one point, for panorama viewers and headsets.
 
-    The horizon is level, the photographs' main direction in the middle. The ending says which format: .png or .jpg.
+    The horizon is level, the photographs' main direction in the middle. The ending chooses the format: .png or .jpg.
     """
 
     source: Annotated[Positional[Path], needed("RUN_OR_FILE")]
-    """Folder of a run, a splat file, or a composition."""
+    """Folder of a run, a splat file (.ply, .spz ...), or a composition (.json)."""
     output: Annotated[Positional[Path], needed("FILE")]
     """The new picture."""
     place: Place = None
-    """Where to stand, in the frame of the photographs."""
+    """Position of the camera, in the frame of the photographs."""
     size: Annotated[SphereSize, option("PIXELS")] = 2048
-    """Width; the height is half of it."""
+    """Width in pixels; the height is half of it."""
     overwrite: Overwrite = False
     part: OmitArgPrefixes[Keeping] = Keeping()
     told: Set = ()
     device: Annotated[str, option("NAME")] = "auto"
-    """auto, cpu, cuda, cuda:1."""
+    """Device to compute on: auto (a GPU if there is one), cpu, cuda, cuda:1."""
 
     def run(self) -> int:
         from ...export.panorama import panorama, picture_format, save_sphere, sphere_size, standpoint

@@ -19,28 +19,28 @@ from .panorama import Place
 
 @dataclass(frozen=True)
 class ExportStereo:
-    """An omnidirectional stereo pair on one square picture, the left eye on top.
+    """Export an omnidirectional stereo pair as one square picture, the left eye on top.
 
-    The horizon is level, the photographs' main direction in the middle. The ending says which format: .png or .jpg.
-    Photographs seldom tell how large a scene is; where yours do (GPS, a measured model), give --interpupillary 0.064 in
-    metres, and sizes will feel real.
+    The horizon is level, the photographs' main direction in the middle. The ending chooses the format: .png or .jpg.
+    Photographs seldom determine the scale of a scene. If yours is in metres (GPS, a measured model), real sizes need
+    the option --interpupillary 0.064.
     """
 
     source: Annotated[Positional[Path], needed("RUN_OR_FILE")]
-    """Folder of a run, a splat file, or a composition."""
+    """Folder of a run, a splat file (.ply, .spz ...), or a composition (.json)."""
     output: Annotated[Positional[Path], needed("FILE")]
     """The new picture."""
     place: Place = None
-    """Where the middle between the eyes is, in the frame of the photographs."""
-    interpupillary: Annotated[Positive | None, option("LENGTH", "1/50 of the median distance to what is around")] = None
-    """Distance between the eyes, in the units of the photographs' frame."""
+    """Position of the middle between the eyes, in the frame of the photographs."""
+    interpupillary: Annotated[Positive | None, option("LENGTH", "1/50 of the median depth around")] = None
+    """Distance between the eyes, in units of the photographs' frame; larger makes the scene look smaller and deeper."""
     size: Annotated[SphereSize, option("PIXELS")] = 2048
-    """Width, and height of both halves together."""
+    """Width in pixels, and height of both halves together."""
     overwrite: Overwrite = False
     part: OmitArgPrefixes[Keeping] = Keeping()
     told: Set = ()
     device: Annotated[str, option("NAME")] = "auto"
-    """auto, cpu, cuda, cuda:1."""
+    """Device to compute on: auto (a GPU if there is one), cpu, cuda, cuda:1."""
 
     def run(self) -> int:
         from ...export.panorama import picture_format, save_sphere, sphere_size, standpoint
