@@ -118,7 +118,7 @@ def find_cameras(what: tuple[Path, ...], folder: Path, options: Any = None) -> d
 
 
 def tell(folder: Path, result: dict[str, Any], onward: str | None = None) -> None:
-    """What became of the photographs, and what to do next: results to stdout, warnings to stderr."""
+    """Print the result for the photographs and the next command: results to stdout, warnings to stderr."""
     show(rows(folder, result) | ({"next": onward} if onward else {}))
     for sentence in result["warnings"]:
         say(f"warning: {sentence}")

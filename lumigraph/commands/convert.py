@@ -112,7 +112,7 @@ def table(made: Any) -> Any:
 
 
 def listed() -> Any:
-    """What goes into what: a row for each method as it is, a column for each that it may become."""
+    """Table of conversions: a row for each source method, a column for each target."""
     from rich.table import Table
 
     from ..conversion import ways

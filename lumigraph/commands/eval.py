@@ -93,7 +93,7 @@ def chosen_lpips(given: Sequence[Path]) -> Any:
 
 
 def compared(result: dict[str, Any]) -> dict[str, str]:
-    """What was compared, for people: views of which size and how fast, or shapes."""
+    """Compared views with their size and rendering time, or shapes, as text."""
     protocol = result["protocol"]
     what = "views" if "views" in protocol else "shapes"
     count, there = protocol[what], protocol["of"]

@@ -135,7 +135,7 @@ class BenchViews(Cells):
                     yield cell
 
     def there(self, source: str) -> int:
-        """How many photographs a scene has to learn from."""
+        """Number of a scene's training photographs."""
         from ...benchmark.cell import reduced
         from ...capture import open_scene
 
@@ -143,7 +143,7 @@ class BenchViews(Cells):
         return len(open_scene(source, downscale=downscale, reader=self.reader).splits["train"])
 
     def possible(self, source: str, there: int) -> list[int | None]:
-        """Those of the numbers that a scene has photographs for; None is all."""
+        """The numbers of views that a scene has photographs for; `None` is all."""
         left_out = [views for views in self.views if views != "all" and views > there]
         if left_out:
             say(f"{source} has {there} photographs to learn from; leaving out {', '.join(map(str, left_out))}")
@@ -151,7 +151,7 @@ class BenchViews(Cells):
 
 
 def learns_across(name: str) -> bool:
-    """Whether a method learns from collections, and is told a scene."""
+    """True if a method learns from collections and takes a scene as input."""
     from ...collection import Collection
 
     return methods.find(name).learns_from is Collection

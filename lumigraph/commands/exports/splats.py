@@ -29,7 +29,7 @@ class Levels:
     """With --lod: largest number of Gaussians in a chunk; smaller makes more files."""
 
     def output(self, path: Path) -> Path:
-        """Where lod-meta.json goes, or the path itself. Raises LumigraphError for options that need --lod."""
+        """Path of lod-meta.json, or the path itself. Raises LumigraphError for options that need --lod."""
         if path.name == "lod-meta.json":
             return path
         if self.lod and path.suffix:

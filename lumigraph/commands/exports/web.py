@@ -116,7 +116,7 @@ class ExportWeb:
         return "volume" if is_baked(method) or (not self.told and can_be_baked(opened, method)) else "views"
 
     def _baked(self, opened: Any, method: Any) -> tuple[Any, dict[str, str]]:
-        """What can be shown as a volume, and what it took to make."""
+        """A volume for the page, and the cost of its conversion."""
         if self.part.crops:
             raise LumigraphError("A volume is shown as a whole; leave out --box and --sphere, or give --as views")
         if is_baked(method):
