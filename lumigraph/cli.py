@@ -1,7 +1,7 @@
-"""The command line. Exit code 0 means done, 2 that the input was at fault: one sentence on stderr says how to mend it.
-130 and 143 say that Ctrl-C or SIGTERM ended the command.
+"""The command line. Exit code 0: done. 2: a fault in the input; one sentence on stderr gives the fault and its remedy.
+130 and 143: Ctrl-C or SIGTERM ended the command.
 
-LUMIGRAPH_DEBUG=1 shows where in the code a fault was noticed.
+LUMIGRAPH_DEBUG=1 shows the traceback of a fault.
 """
 
 from __future__ import annotations
@@ -65,12 +65,12 @@ COMMANDS: dict[str, type] = {
     "methods": Methods,
     "bench": Bench,
 }
-DESCRIPTION = """Photographs become radiance fields, and radiance fields become new views.
+DESCRIPTION = """Train radiance fields from photographs, and render films, meshes and web pages from them.
 
-  lumigraph demo                        everything once, in a few minutes
-  lumigraph capture PHOTOS_OR_VIDEO     find where photographs were taken from
-  lumigraph train instant-ngp PHOTOS    learn a scene from a folder of photographs or a video
-  lumigraph eval runs/PHOTOS-instant-ngp-1"""
+  lumigraph demo                        run every step on a procedural scene, in a few minutes
+  lumigraph capture PHOTOS_OR_VIDEO     find the camera poses of photographs
+  lumigraph train instant-ngp PHOTOS    train on a folder of photographs or a video
+  lumigraph eval runs/PHOTOS-instant-ngp-1     compare with held-out photographs"""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -103,7 +103,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 @contextlib.contextmanager
 def told_warnings() -> Iterator[None]:
-    """Say our own warnings in a line each; those of libraries are for developers."""
+    """Print each of our own warnings on one line; suppress those of libraries."""
     debugging = bool(os.environ.get("LUMIGRAPH_DEBUG"))
     with warnings.catch_warnings():
         if not debugging:

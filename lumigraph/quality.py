@@ -9,9 +9,9 @@ from typing import Literal, get_args
 Quality = Literal["draft", "good", "best"]
 QUALITIES: tuple[Quality, ...] = get_args(Quality)
 MEANS: Mapping[Quality, str] = {
-    "draft": "to see whether the capture works",
-    "good": "for most of what can be had",
-    "best": "until it has settled, which may take hours on a plain CPU",
+    "draft": "to check the capture",
+    "good": "for most of the possible PSNR",
+    "best": "until PSNR stops improving (hours on a CPU)",
 }
 
 

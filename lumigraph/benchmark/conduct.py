@@ -92,7 +92,7 @@ def unfinished(cell: Cell, output: Path, settings: Settings) -> bool:
 
 
 class Patience:
-    """How long the rest will take, by what cells have needed beside their seconds of training so far."""
+    """Estimate of the remaining time, from the overhead of past cells beyond their training seconds."""
 
     def __init__(self) -> None:
         self.needed: list[float] = []

@@ -1,4 +1,4 @@
-"""What came of a cell, in one row; and all rows of a benchmark in a file."""
+"""Results of a cell as one row, and all rows of a benchmark in a file."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ MEASURED = (
 
 @dataclass(frozen=True)
 class Begun:
-    """What results.json says of every cell, as far as anybody relies on it. run: its folder, within the output's"""
+    """Validated fields of every cell in results.json. run: its folder, within the output's"""
 
     method: str
     scene: str
@@ -53,7 +53,7 @@ class Begun:
 
 @dataclass(frozen=True)
 class Measured:
-    """And of those that did not fail."""
+    """Validated fields of cells that did not fail."""
 
     protocol: Protocol
     train_views: Tally

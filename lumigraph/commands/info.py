@@ -1,4 +1,4 @@
-"""`lumigraph info`: what a run, a folder of photographs, a mesh, a file of splats or a composition is."""
+"""`lumigraph info`: contents of a run, a folder of photographs, a mesh, a splat file or a composition."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ LONG = 4096  # letters; a tree cuts its lines where the console ends, and folder
 
 @dataclass(frozen=True)
 class Info:
-    """Say what a run, a scene, meshes, a splat file or a composition hold."""
+    """Show the contents of a run, scene, mesh, splat file or composition."""
 
     what: Annotated[Positional[str], needed("RUN_OR_SCENE")]
     """Folder of a run, of photographs or of meshes, a picture, a mesh, procedural:NAME, a splat file, a composition."""
-    downscale: Annotated[Downscale | None, option("N", "none, or what suits the photographs")] = None
-    """Shrink a scene's photographs by a whole number."""
+    downscale: Annotated[Downscale | None, option("N", "to at most about 1000 pixels")] = None
+    """Reduce a scene's photographs by this whole number before reading."""
     reader: ReaderOption = None
 
     def run(self) -> int:

@@ -1,4 +1,4 @@
-"""`lumigraph resume`: training goes on where it stopped."""
+"""`lumigraph resume`: continue training."""
 
 from __future__ import annotations
 
@@ -17,31 +17,31 @@ from .common import choose_device, exit_code, needed, option, quality_budget, to
 
 @dataclass(frozen=True)
 class Resume:
-    """Go on with a run that was interrupted, exactly as if it had not been; or give it a larger budget.
+    """Continue an interrupted run as if it had not been interrupted, or extend a run with a larger budget.
 
-    A run that is done may get a larger budget too. Its schedules then follow the new total: learning rates rise again
-    and fall anew, and clouds may grow; what is coarse at the beginning of a run is not repeated.
+    A finished run may get a larger budget too. Its schedules then follow the new total: learning rates rise again and
+    decay again, and clouds may grow; coarse stages at the beginning of a run are not repeated.
     """
 
     run_folder: Annotated[Positional[Path], needed("RUN")]
     """Folder of the run."""
-    seconds: Annotated[Seconds | None, option("S", "as begun")] = None
-    """New total of seconds, those already trained included."""
-    steps: Annotated[Steps | None, option("N", "as begun")] = None
-    """New total of steps, those already done included."""
-    quality: Annotated[Quality | None, option("draft|good|best", "as begun")] = None
+    seconds: Annotated[Seconds | None, option("S", "unchanged")] = None
+    """New total training time in seconds, including the time already trained."""
+    steps: Annotated[Steps | None, option("N", "unchanged")] = None
+    """New total of steps, including the steps already done."""
+    quality: Annotated[Quality | None, option("draft|good|best", "unchanged")] = None
     """New total of steps, as for `lumigraph train`."""
-    scene: Annotated[str | None, option("SCENE", "where they were")] = None
-    """Where what it learns from is now, if it has moved."""
-    device: Annotated[str, option("NAME", "the one it began on")] = "same"
-    """auto, cpu, cuda, cuda:1."""
+    scene: Annotated[str | None, option("SCENE", "the path used in training")] = None
+    """Path of the training data, if it was moved since training."""
+    device: Annotated[str, option("NAME", "the one of its training")] = "same"
+    """Device to compute on: auto (a GPU if there is one), cpu, cuda, cuda:1."""
     pause_at: Annotated[Steps | None, option("STEP", "never")] = None
-    """Stop at this step as if interrupted."""
+    """Stop at this step as if interrupted. The schedule still follows the whole budget."""
     view: bool = False
-    """Show the scene in the browser while it is learnt, and afterwards until Ctrl-C."""
-    host: Annotated[str, option("ADDRESS", "127.0.0.1, this machine alone")] = "127.0.0.1"
-    """Where --view listens; 0.0.0.0 lets other machines look too."""
-    port: Annotated[Port | None, option("N", "8080, or the next that is free")] = None
+    """Show the scene in the browser during training, and afterwards until Ctrl-C."""
+    host: Annotated[str, option("ADDRESS", "127.0.0.1, this machine only")] = "127.0.0.1"
+    """Address that --view listens at; 0.0.0.0 gives access to other machines."""
+    port: Annotated[Port | None, option("N", "8080, or the next free port")] = None
     """Port that --view listens at."""
 
     def run(self) -> int:
@@ -86,7 +86,7 @@ class Resume:
 
 
 def budget_from_now(run: Any, told: Budget | None) -> Budget:
-    """The run's own budget, or another total that it was told. Raises LumigraphError where nothing is left of it."""
+    """The run's own budget, or another given total. Raises LumigraphError if nothing is left of it."""
     said = run.settings.budget
     budget = told or Budget.from_json(said)
     if not run.has_state:

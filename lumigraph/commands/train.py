@@ -1,4 +1,4 @@
-"""`lumigraph train`: photographs, or whatever else a method learns from, become a trained method."""
+"""`lumigraph train`: train a method on photographs or other data."""
 
 from __future__ import annotations
 
@@ -37,45 +37,45 @@ DEFAULT_SECONDS = 60.0
 
 @dataclasses.dataclass(frozen=True)
 class Train:
-    """Learn a scene from its photographs.
+    """Train a method on the photographs of a scene.
 
     The scene is a folder of photographs, a video, a single picture, or procedural:NAME. Methods that learn from shapes
-    take a mesh or a folder of meshes, those that learn from a collection a folder of scenes, or procedural:toys. Where
+    take a mesh or a folder of meshes, those that learn from a collection a folder of scenes, or procedural:toys. If
     photographs have no poses, `lumigraph capture` finds them first. `lumigraph train METHOD --help` adds the method's
-    own options, `lumigraph methods` lists the methods. Ctrl-C saves; `lumigraph resume` goes on.
+    own options, `lumigraph methods` lists the methods. Ctrl-C saves; `lumigraph resume` continues.
     """
 
     method: Annotated[Positional[str], needed("METHOD")]
-    """What to train, for example instant-ngp."""
+    """Method to train, for example instant-ngp."""
     scene: Annotated[Positional[str], needed("SCENE")]
-    """What to train it on."""
+    """Photographs, a video, or other data to train on."""
     output: Annotated[Path | None, option("RUN", "runs/SCENE-METHOD-N")] = None
     """New folder for the run."""
     seconds: Annotated[Seconds | None, option("S", f"{DEFAULT_SECONDS:.0f}")] = None
-    """Train for so long. Compiling kernels on first use comes before and is reported beside."""
+    """Training time in seconds; longer gives a higher PSNR. Compiling kernels on first use is not counted."""
     steps: Annotated[Steps | None, option("N", "as long as --seconds")] = None
-    """Train for so many steps instead."""
+    """Train for this number of steps instead."""
     quality: Annotated[Quality | None, option("draft|good|best", "as long as --seconds", about_quality())] = None
-    downscale: Annotated[Downscale | None, option("N", "none, or what suits the photographs")] = None
-    """Shrink photographs by a whole number."""
+    downscale: Annotated[Downscale | None, option("N", "to at most about 1000 pixels")] = None
+    """Reduce photographs by this whole number; a larger one trains faster and loses detail."""
     reader: ReaderOption = None
     views: Annotated[Count | None, option("N", "all")] = None
-    """Learn from so many photographs only, spread evenly over the cameras."""
+    """Train on only this number of photographs, spread evenly over the cameras."""
     scales: Annotated[Scales, option("N")] = 1
-    """Have every photograph so many times, each half as large as the one before; evaluation counts them all."""
+    """Number of resolutions of every photograph, each half of the one before; evaluation averages over all."""
     seed: Annotated[Seed, option("N")] = 0
-    """Of all random choices."""
+    """Seed of all random choices."""
     device: Annotated[str, option("NAME")] = "auto"
-    """auto, cpu, cuda, cuda:1."""
+    """Device to compute on: auto (a GPU if there is one), cpu, cuda, cuda:1."""
     preset: Literal["auto", "laptop", "paper"] = "auto"
-    """The method's own defaults: the paper's, or what learns most on a plain CPU; auto looks at --device."""
+    """Defaults of the method's options: the paper's, or those tuned for a CPU; auto decides by --device."""
     pause_at: Annotated[Steps | None, option("STEP", "never")] = None
     """Stop at this step as if interrupted. The schedule still follows the whole budget."""
     view: bool = False
-    """Show the scene in the browser while it is learnt, and afterwards until Ctrl-C."""
-    host: Annotated[str, option("ADDRESS", "127.0.0.1, this machine alone")] = "127.0.0.1"
-    """Where --view listens; 0.0.0.0 lets other machines look too."""
-    port: Annotated[Port | None, option("N", "8080, or the next that is free")] = None
+    """Show the scene in the browser during training, and afterwards until Ctrl-C."""
+    host: Annotated[str, option("ADDRESS", "127.0.0.1, this machine only")] = "127.0.0.1"
+    """Address that --view listens at; 0.0.0.0 gives access to other machines."""
+    port: Annotated[Port | None, option("N", "8080, or the next free port")] = None
     """Port that --view listens at."""
 
     def run(self) -> int:
@@ -95,7 +95,7 @@ class Train:
             check_new(self.output)
         found = kind_of(self.scene, kind.learns_from)
         if found is not kind.learns_from:
-            confirm(self.scene)  # what is not there is of no kind
+            confirm(self.scene)  # a missing path has no kind
         check_kind(methods.check(self.method), kind.learns_from, found, self.scene, methods.learning_from(found))
         source = posed(self.scene)
         output = self.output or next_free(f"runs/{scene_name(source)}-{methods.check(self.method)}")

@@ -36,19 +36,19 @@ OPTIONS = "downscale", "reader", "scales"  # of `open_dataset`, for the whole sc
 class Blocks:
     """A large scene is trained in blocks, each a run of its own; from few photographs one block, an ordinary run.
 
-    --steps and --seconds are for all blocks together and shared out evenly; a minute each, if nothing is said. What is
-    done stays done: after Ctrl-C, a crash or a lost machine the same command goes on. RUN/blocks.png shows the plan.
-    `eval`, `render`, `view` and `export` open the run as one scene. --field METHOD, such as gaussian-splatting, has
-    each block learnt by another method; of clouds each block then gives its own cell to one file, RUN/cloud.ply.
+    --steps and --seconds are for all blocks together and divided evenly; the default is a minute for each block. After
+    Ctrl-C, a crash or a lost machine the same command continues; finished blocks are kept. RUN/blocks.png shows the
+    plan. `eval`, `render`, `view` and `export` open the run as one scene. --field METHOD, such as gaussian-splatting,
+    trains each block with another method; for clouds, RUN/cloud.ply joins each block's own cell.
     """
 
     blocks: Annotated[str | None, option("auto|N|FILE", "auto from 200 photographs on, else one block")] = None
-    """Where blocks are: at street crossings or spread evenly, so many of them, or as a JSON file says, in the frame of
-    the photographs: {"blocks": [{"centre": [x, y, z], "radius": r}, ...]}. With --into, a block's name."""
+    """Positions of blocks: auto (street crossings, or evenly spread), a number of evenly spread ones, or a JSON file in
+    the frame of the photographs: {"blocks": [{"centre": [x, y, z], "radius": r}, ...]}. With --into, a block's name."""
     workers: Annotated[Count | None, option("N", "1, in this process")] = None
-    """Learn so many blocks at a time on this machine, by Ray."""
+    """Number of blocks to train at a time on this machine, with Ray."""
     address: Annotated[str | None, option("HOST:PORT", "this machine")] = None
-    """Learn blocks on a Ray cluster that is there already; --output lies on storage that all its machines share."""
+    """Train blocks on an existing Ray cluster; --output must be on storage that all its machines share."""
     into: Annotated[Path | None, option("RUN", "a new run")] = None
     """Learn one block of this run again, from other photographs, as the run's own were learnt; the rest stays."""
     field: Annotated[str, arg(metavar="METHOD", help="The method that learns each block.")] = ""
@@ -150,7 +150,7 @@ def unfinished(prefix: str, plan: Any) -> Path:
 
 
 def tell_plan(output: Path, plan: Any, budget: Any) -> None:
-    """What is about to be learnt."""
+    """Print the plan before training."""
     counts = [len(block.photographs) for block in plan.blocks]
     each = " ".join(
         f"{value:g} {name}" if name != "quality" else f"as {value} asks" for name, value in plan.budget.items()
@@ -162,7 +162,7 @@ def tell_plan(output: Path, plan: Any, budget: Any) -> None:
 
 
 def tell_done(output: Path, found: Any) -> None:
-    """What it took."""
+    """Print the cost of all blocks."""
     done = list(found.done.values())
     rows = {"run": str(output), "blocks": f"{len(done)}, {sum(x.bytes for x in done) / 1e6:.1f} MB of weights"}
     steps, seconds = sum(x.steps for x in done), sum(x.seconds for x in done)

@@ -89,7 +89,7 @@ class Palette:
 
 @dataclass(frozen=True)
 class Meta:
-    """What meta.json says in version 2. antialias: an earlier word for a model that is "antialiased"."""
+    """Content of meta.json in version 2. antialias: earlier name of the model "antialiased"."""
 
     count: Tally
     means: Means
@@ -134,7 +134,7 @@ class OldPalette:
 
 @dataclass(frozen=True)
 class OldMeta:
-    """What it said before it said its version."""
+    """Content of meta.json in version 1, which has no version number."""
 
     means: OldMeans
     scales: OldScales
@@ -144,7 +144,7 @@ class OldMeta:
 
 
 def recognises(folder: Path) -> bool:
-    """Whether a folder has a meta.json that speaks of pictures of means; a run's folder has none."""
+    """True if a folder has a meta.json with pictures of means; a run's folder has none."""
     try:
         return b'"means"' in (folder / META).read_bytes()
     except OSError:

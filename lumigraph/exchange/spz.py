@@ -72,7 +72,7 @@ def read(path: Path) -> Gaussians:
 
 @contextlib.contextmanager
 def _told(path: Path) -> Iterator[None]:
-    """What goes wrong in unpacking, as one sentence."""
+    """Raise faults of unpacking as a LumigraphError of one sentence."""
     try:
         yield
     except (EOFError, zlib.error, gzip.BadGzipFile, zstandard.ZstdError) as fault:

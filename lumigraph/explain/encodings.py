@@ -76,7 +76,7 @@ class Comparison:
 
     @property
     def peak_inside(self) -> bool:
-        """Whether the best scale of Gaussian features is neither the smallest nor the largest that was tried."""
+        """True if the best scale of Gaussian features is neither the smallest nor the largest one."""
         return self.best("gaussian") not in (self.of("gaussian")[0], self.of("gaussian")[-1])
 
     def to_json(self) -> dict[str, Any]:

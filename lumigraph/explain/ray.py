@@ -120,7 +120,7 @@ def triple(rgb: Float[Tensor, " 3"]) -> str:
 
 @torch.no_grad()
 def along_ray(method: Method, camera: Camera, pixel: tuple[int, int]) -> Sight:
-    """What a method in eval mode finds along the ray through the middle of a camera's pixel (column, row).
+    """Samples and passes of a method in eval mode along the ray through the middle of a pixel (column, row).
 
     Raises LumigraphError if the method does not march along rays, the pixel lies outside the picture, or there are no
     samples on its ray.

@@ -1,4 +1,4 @@
-"""What lies behind an open scene where no photograph looked: its own colours; and a floor to stay above."""
+"""Background of an open scene in unobserved directions, from its own colours; and its floor, for camera limits."""
 
 from __future__ import annotations
 
@@ -34,9 +34,9 @@ class Backdrop:
 
 @torch.no_grad()
 def backdrop(method: Method, cameras: Camera) -> Backdrop | None:
-    """What some of the photographs' cameras see of the sky, the horizon and the ground.
+    """Colours of sky, horizon and ground from some of the photographs' cameras.
 
-    None for an object alone, and where they see through the scene: then its background belongs to it.
+    `None` for an object, and for a scene that is not opaque: its background belongs to the picture.
     """
     frame = method.frame
     if frame.has_alpha or frame.reach == 1:

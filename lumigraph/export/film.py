@@ -85,7 +85,7 @@ def claim_film(path: Path, overwrite: bool | None = None, reads: Collection[Path
 
 
 def depth_beside(path: Path) -> Path:
-    """Where the film of depth goes."""
+    """Path of the depth film."""
     return path.with_stem(f"{path.stem}-depth")
 
 

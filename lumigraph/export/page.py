@@ -154,7 +154,7 @@ def volume_page(path: Path, volume: Browsable, opening: Opening) -> None:
 
 
 def volume_bytes(volume: Browsable, opening: Opening) -> bytes:
-    """What `volume_page` writes."""
+    """Bytes of the page of `volume_page`."""
     packed = gzip.compress(volume.data, 6, mtime=0)
     if (size := len(packed) * 4 / 3) > LARGEST:
         smaller = f"give --degree {volume.degree - 1}" if volume.degree else "bake larger voxels, or give --as views"
@@ -214,7 +214,7 @@ def write_page(path: Path, program: str, settings: dict[str, Any], data: bytes) 
 
 
 def page_bytes(program: str, settings: dict[str, Any], data: bytes) -> bytes:
-    """What `write_page` writes."""
+    """Bytes of the page of `write_page`."""
     mouse, touch = AROUND if settings["inward"] else ON_THE_SPOT
     bright = float(np.dot(settings["background"], (0.299, 0.587, 0.114))) > 0.5
     ink, edge = ("#16181c", "#ffffff") if bright else ("#ffffff", "#000000")

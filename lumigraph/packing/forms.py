@@ -37,7 +37,7 @@ class Form(ABC):
 
     @abstractmethod
     def learning(self) -> list[tuple[Tensor, float]]:
-        """What learns, each with the error that storing it made: the natural unit of its steps."""
+        """Trainable tensors, each with its storage error: the natural unit of its steps."""
 
     @abstractmethod
     def streams(self) -> list[np.ndarray]:
@@ -168,7 +168,7 @@ FORMS: dict[str, tuple[type[Half] | type[Scaled] | type[Coded], int]] = {  # and
 
 
 def straight(exact: Float[Tensor, "*shape"], rounded: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
-    """What was rounded, with the gradient of what it was rounded from."""
+    """The rounded tensor with the gradient of the exact one (straight-through)."""
     return exact + (rounded - exact).detach() if exact.requires_grad else rounded
 
 

@@ -1,4 +1,4 @@
-"""Stored: what a method says of one of its tensors, so that it can be stored in fewer bytes."""
+"""Stored: a method's declaration of the storage format of one tensor, for compression."""
 
 from __future__ import annotations
 
@@ -10,16 +10,16 @@ Layout = Literal["rows", "cells", "channels"]
 
 @dataclass(frozen=True)
 class Stored:
-    """How a tensor may be stored. It is a table of rows and columns.
+    """Storage format of a tensor, seen as a table of rows and columns.
 
     how:   "scaled", as whole numbers with a scale for each column; "coded", as rows of a codebook, the most important
-           ones scaled; "half", as float16; "nothing", because pictures do not need it: `fill` comes back.
-           A tensor that nothing is said of is stored to the bit; of marks (bool) that is one bit each
+           ones scaled; "half", as float16; "nothing", because rendering does not need it: it reads as `fill`.
+           A tensor without a declaration is stored to the bit; a mask (bool) as one bit each
     bits:  of a whole number
-    layout: what is a row: "rows", whatever the first axis counts; "cells", of (..., channel); "channels", the cells of
+    layout: meaning of a row: "rows", the first axis; "cells", of (..., channel); "channels", the cells of
            (grid, channel, x, y, z)
     plain: columns at the front that are scaled, also where the others are coded
-    fill:  what every number of a row is where there is nothing; such rows are not stored
+    fill:  the value of all numbers in an empty row; such rows are not stored
     """
 
     how: Literal["scaled", "coded", "half", "nothing"]

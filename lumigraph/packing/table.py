@@ -20,11 +20,11 @@ LEAST_BITS = 2
 
 @dataclass(frozen=True)
 class Recipe:
-    """How hard to press.
+    """Strength of the compression.
 
-    codebook: rows of it, at most
+    codebook: largest number of its rows
     apart:    share of importance that stays out of it, see `forms.Coded`
-    coarser:  bits that whole numbers have fewer than their method asks for
+    coarser:  bits to take off the method's own number of bits
     """
 
     codebook: int = 4096
@@ -74,7 +74,7 @@ class Table:
             rows[self.kept.view(rows.shape[:-1]).to(tensor.device)] = values
 
     def taken(self, tensor: Float[Tensor, "*shape"]) -> Float[Tensor, "row column"]:
-        """What a tensor of the same shape, a gradient for instance, holds in the rows that are kept."""
+        """Kept rows of a tensor of the same shape, such as a gradient."""
         rows = as_rows(tensor, self.layout)
         if self.kept is None:
             return rows.reshape(-1, rows.shape[-1]).cpu()

@@ -87,7 +87,7 @@ class PathPanel:
 
     @property
     def drawn(self) -> bool:
-        """Whether keyframes are drawn beside the scene."""
+        """True if keyframes are drawn in the scene."""
         return bool(self._nodes)
 
     @property

@@ -46,7 +46,7 @@ class Subject:
 
     @cached_property
     def around(self) -> Surroundings:
-        """Where all the cameras stand and look."""
+        """Positions and directions of all cameras."""
         return Surroundings(Camera.cat(list(self.cameras.values())).to("cpu"), self.frame)
 
     @cached_property

@@ -45,7 +45,7 @@ class ViewRequest:
 
     @property
     def part(self) -> bool:
-        """Whether less than the whole scene is shown."""
+        """True if a part of the scene is hidden by a crop or as floaters."""
         return self.crop is not None or bool(self.floaters)
 
     @property

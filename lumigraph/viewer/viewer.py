@@ -70,7 +70,7 @@ class Viewer:
 
     @property
     def asked(self) -> bool:
-        """Whether training should give way now."""
+        """True if training must give way to a rendering."""
         return self.turns.asked
 
     def give_way(self, stopping: Callable[[], object]) -> None:

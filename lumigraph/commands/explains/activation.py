@@ -12,18 +12,18 @@ from ..common import Overwrite, option, show
 
 @dataclass(frozen=True)
 class ExplainActivation:
-    """Learn a sharp edge with a coarse grid in three orders: activation before, within and after interpolation.
+    """Fit a sharp edge with a coarse grid in three orders: activation before, within and after interpolation.
 
-    One picture shows what each makes of it, with its PSNR.
+    One picture shows the result of each, with its PSNR.
     """
 
     output: Annotated[Path, option("FILE.png")] = Path("explained/activation.png")
-    """Where the picture goes."""
+    """File of the picture."""
     overwrite: Overwrite = False
     cells: Annotated[int, between(2, 128), option("N")] = 10
-    """Of the grid, along each axis."""
+    """Cells of the grid along each axis; more reduce the differences."""
     steps: Annotated[Steps, option("N")] = 1500
-    """Of learning, for each order."""
+    """Training steps for each order."""
 
     def run(self) -> int:
         from ...explain.activation import draw, fits

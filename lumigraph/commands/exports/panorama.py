@@ -1,4 +1,4 @@
-"""`lumigraph export panorama`: the whole sphere around a place, on one picture."""
+"""`lumigraph export panorama`: a panorama of the whole sphere around a point."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ Place = Annotated[
     arg(
         name="from",
         metavar="X Y Z",
-        help_behavior_hint="(default: where the camera in the middle of all stood)",
+        help_behavior_hint="(default: the position of the middle camera)",
     ),
 ]
 
@@ -29,18 +29,18 @@ class SphereExport:
     """Base of exports of the whole sphere around a place."""
 
     source: Annotated[Positional[Path], needed("RUN_OR_FILE")]
-    """Folder of a run, a splat file, or a composition."""
+    """Folder of a run, a splat file (.ply, .spz ...), or a composition (.json)."""
     output: Annotated[Positional[Path], needed("FILE")]
     """The new picture."""
     place: Place = None
-    """Where to stand, in the frame of the photographs; of two eyes, the middle between them."""
+    """Position of the camera, or of the middle between two eyes, in the frame of the photographs."""
     size: Annotated[SphereSize, option("PIXELS")] = 2048
-    """Width; the height of each sphere is half of it."""
+    """Width in pixels; the height of each sphere is half of it."""
     overwrite: Overwrite = False
     part: OmitArgPrefixes[Keeping] = Keeping()
     told: Set = ()
     device: Annotated[str, option("NAME")] = "auto"
-    """auto, cpu, cuda, cuda:1."""
+    """Device to compute on: auto (a GPU if there is one), cpu, cuda, cuda:1."""
 
     def stand(self) -> tuple[Any, Any, Any, Any, str]:
         """Open the source and find the standpoint: the source, its method, place and heading in the scene's frame, and

@@ -15,13 +15,13 @@ from .panorama import SphereExport
 class ExportStereo(SphereExport):
     """An omnidirectional stereo pair on one square picture, the left eye on top.
 
-    The horizon is level, the photographs' main direction in the middle. The ending says which format: .png or .jpg.
-    Photographs seldom tell how large a scene is; where yours do (GPS, a measured model), give --interpupillary 0.064 in
-    metres, and sizes will feel real.
+    The horizon is level, the photographs' main direction in the middle. The ending chooses the format: .png or .jpg.
+    Photographs seldom determine the scale of a scene. If yours is in metres (GPS, a measured model), real sizes need
+    the option --interpupillary 0.064.
     """
 
     interpupillary: Annotated[Positive | None, option("LENGTH", "1/50 of the median distance to what is around")] = None
-    """Distance between the eyes, in the units of the photographs' frame."""
+    """Distance between the eyes, in units of the photographs' frame; larger makes the scene look smaller and deeper."""
 
     def run(self) -> int:
         from ...export.panorama import save_sphere

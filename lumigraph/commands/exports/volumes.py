@@ -1,4 +1,4 @@
-"""What a page of a volume holds: an octree or an atlas, or a field that becomes an octree first."""
+"""Volumes of web pages: an octree or an atlas, or a field converted to an octree first."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def is_baked(method: Any) -> bool:
 
 
 def browsable(method: Any, degree: int = 3) -> tuple[Any, str]:
-    """A baked method's volume for browsers, and in words what it holds. degree: of an octree's harmonics, at most"""
+    """A baked method's volume for browsers, and its description. degree: largest degree of an octree's harmonics"""
     from ...baked.browser import atlas_for_browser, octree_for_browser
     from ...capabilities import HasAtlas, HasOctree, can, needs
 
@@ -31,7 +31,7 @@ def browsable(method: Any, degree: int = 3) -> tuple[Any, str]:
 
 
 def can_be_baked(opened: Any, method: Any) -> bool:
-    """Whether a method's field can become an octree, which holds objects only."""
+    """True if a method's field can be converted to an octree, which supports objects only."""
     from ...conversion.ways import check, way
     from ...methods import find
 
@@ -43,7 +43,7 @@ def can_be_baked(opened: Any, method: Any) -> bool:
 
 
 def converted(opened: Any, seconds: float, device: Any) -> tuple[Any, str]:
-    """An octree's method made of what was opened, and in words what that took. seconds: of learning on"""
+    """The opened method converted to an octree, and the cost as text. seconds: training time after initialisation"""
     from ...conversion import Aim, convert
     from ...run import open_any
 
