@@ -35,7 +35,7 @@ class Score:
         return f"{self.value:.{self.digits}f} {self.unit}".rstrip()
 
     def beats(self, other: Score) -> bool:
-        """Whether this is the better one of two of the same name."""
+        """True if this is the better of two scores of the same name."""
         return self.value > other.value if self.better == "higher" else self.value < other.value
 
     def to_json(self) -> dict[str, Any]:

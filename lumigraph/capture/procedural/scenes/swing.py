@@ -42,7 +42,7 @@ def angle(time: float) -> float:
 
 
 def ball_centre(time: float) -> tuple[float, float, float]:
-    """Where the ball's centre is at a moment."""
+    """Position of the ball's centre at a moment."""
     x, y, z = PIVOT
     swung = math.radians(angle(time))
     return x + LENGTH * math.sin(swung), y, z - LENGTH * math.cos(swung)
