@@ -54,7 +54,7 @@ Tally = Annotated[int, between(0, 100_000)]
 
 @dataclass(frozen=True)
 class Config(HashNumbers):
-    """The paper's numbers where it or its published code gives them; `HypNeRF.preset` says what a plain CPU does."""
+    """The paper's numbers where it or its published code gives them; `HypNeRF.preset` has those of a plain CPU."""
 
     shape_code: Width = 512  # numbers of the code of table and density, section 3.2; more hold more shapes
     colour_code: Width = 512  # numbers of the code of the colour network, section 3.2; more hold more colours

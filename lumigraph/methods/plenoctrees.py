@@ -61,7 +61,7 @@ DensityRate = Annotated[float, between(1e-6, 1e4)]
 
 @dataclass(frozen=True)
 class Config(HashNumbers):
-    """The paper's numbers, with where it or its release gives them; `PlenOctrees.preset` says what a CPU does."""
+    """The paper's numbers, with where it or its release gives them; `PlenOctrees.preset` has those of a plain CPU."""
 
     field: Literal["hash", "network"] = "network"  # first field: the paper's network, or a faster hash table
     depth: Depth = 8  # hidden layers of the network, as in NeRF; more hold more detail, and cost time

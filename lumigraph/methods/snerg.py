@@ -60,7 +60,7 @@ from ..volume import composite, weights_of
 
 @dataclass(frozen=True)
 class Config(HashNumbers, OpenNumbers):
-    """The paper's numbers, with where it gives them; `SNeRG.preset` says what a plain CPU does otherwise."""
+    """The paper's numbers, with where it gives them, but for huber_delta; `SNeRG.preset` has those of a plain CPU."""
 
     field: Literal["hash", "network"] = "network"  # field to bake: the paper's network, or a faster hash table
     view_width: Width = 16  # channels of the view-dependence network, section 4.2; wider is slower in a browser
