@@ -11,8 +11,8 @@ from torch import Tensor
 
 @dataclass(frozen=True)
 class ViewNetwork:
-    """What adds to a pixel's diffuse colour what depends on direction (section 4.2): three layers, ReLU between them, a
-    sigmoid at the end. Inputs are the direction encoded at four frequencies (27), diffuse colour (3), features (4).
+    """Network that adds the view-dependent colour to a pixel's diffuse one (section 4.2): three layers, ReLU between
+    them, a sigmoid at the end. Inputs: direction encoded at four frequencies (27), diffuse colour (3), features (4).
 
         colour = diffuse + (1 - opacity) background + opacity network(gamma(d), diffuse, features)
         gamma(d) = (d, sin d, sin 2d, sin 4d, sin 8d, cos d, cos 2d, cos 4d, cos 8d), each x, y, z
@@ -50,7 +50,7 @@ class Atlas:
     contracted: bool = False
 
     def voxels(self) -> tuple[Int[Tensor, "voxel 3"], UInt8[Tensor, "voxel 8"]]:
-        """Where in the grid the voxels are that hold anything, and what they hold."""
+        """Positions in the grid of the occupied voxels, and their values."""
         inner = self.values[:, 1:-1, 1:-1, 1:-1]
         number, *inside = inner.any(-1).nonzero().unbind(-1)
         there = (self.index >= 0).nonzero()

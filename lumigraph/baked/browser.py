@@ -24,7 +24,7 @@ HALF = 65504.0  # the largest number that half precision has
 
 @dataclass(frozen=True)
 class Browsable:
-    """What a page is given.
+    """Data of a page.
 
     settings: what JSON can hold
     data:     little-endian, not compressed
@@ -79,7 +79,7 @@ def breadth_first(octree: Octree) -> tuple[UInt8[Tensor, " cell"], Tensor, int]:
 
 
 def filled(octree: Octree, level: int) -> Bool[Tensor, "x y z"]:
-    """Which cells of a level hold anything, or are part of a larger one that does."""
+    """Mask of a level's cells that are occupied, or part of a larger occupied one."""
     child, solid = octree.child.cpu().long(), octree.density.detach().cpu() > 0
     nodes, corners = torch.zeros(1, dtype=torch.long), torch.zeros(1, 3, dtype=torch.long)
     grid = torch.zeros((2**level,) * 3, dtype=torch.bool)
@@ -123,7 +123,7 @@ def atlas_for_browser(atlas: Atlas) -> Browsable:
 
 
 def touched(atlas: Atlas, cell: int) -> Bool[Tensor, "x y z"]:
-    """Which cells of so many voxels have a place where trilinear lookups find anything."""
+    """Mask of cells of so many voxels in which trilinear lookups find anything."""
     block, grid = atlas.block, torch.tensor(atlas.index.shape)
     shape = (-(-block * grid // cell)).tolist()
     found = torch.zeros(shape, dtype=torch.bool)
@@ -159,7 +159,7 @@ def rounded(values: Tensor) -> Any:
 
 
 def x_first(grid: Tensor) -> Tensor:
-    """Of a grid [x, y, z], with x running quickest, as graphics want it."""
+    """Grid [x, y, z] in memory order with x fastest, as graphics APIs need it."""
     return grid.permute(2, 1, 0)
 
 

@@ -1,4 +1,4 @@
-"""What lies beside photographs becomes a scene's layers: of one kind for all of them, at the size they are used in."""
+"""Layers from files beside photographs: one kind for all photographs, at the size in which they are used."""
 
 from __future__ import annotations
 
@@ -157,7 +157,7 @@ def with_depth_points(capture: Capture) -> Capture:
 
 
 def make_about(shots: list[Shot]) -> dict[str, Tensor]:
-    """What is known of each photograph, by name; NaN where it is not. The first axis is the photograph."""
+    """Facts of each photograph, by name; NaN where unknown. The first axis is the photograph."""
     found = in_parallel(lambda i: taken(shots[i]) | shots[i].about, range(len(shots)))
     about = {}
     for name in dict.fromkeys(name for facts in found for name in facts):

@@ -176,7 +176,7 @@ def check_text(path: Path) -> None:
 
 
 def positions(model: pycolmap.Reconstruction) -> dict[str, np.ndarray]:
-    """Where each photograph was taken."""
+    """Camera position of each photograph."""
     return {i.name: i.cam_from_world().inverse().translation for i in model.images.values() if i.has_pose}
 
 

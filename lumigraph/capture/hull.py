@@ -1,4 +1,4 @@
-"""Where an object is, from its silhouettes: the box around a coarse visual hull (Laurentini 1994)."""
+"""Bounding box of an object from its silhouettes, by a coarse visual hull (Laurentini 1994)."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ SLACKS = (0.0, 0.1)  # share of the views that may disagree: first none, then so
 
 @dataclass(frozen=True)
 class Silhouette:
-    """Where one camera sees the object."""
+    """Silhouette of the object in one camera."""
 
     camera: Camera
     inside: Bool[Tensor, "height width"]
@@ -107,7 +107,7 @@ def hull_box(
 
 
 def ends_inside(found: tuple[np.ndarray, np.ndarray, np.ndarray], low: np.ndarray, high: np.ndarray) -> bool:
-    """Whether a found box keeps a cell's distance from the walls of the box that was searched."""
+    """True if a found box is at least a cell away from the walls of the searched box."""
     inner_low, inner_high, cell = found
     return bool((inner_low > low + cell).all() and (inner_high < high - cell).all())
 

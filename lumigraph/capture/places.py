@@ -1,4 +1,4 @@
-"""Where photographs of a capture were taken from, without any of their pixels."""
+"""Camera poses of a capture, without any pixels."""
 
 from __future__ import annotations
 

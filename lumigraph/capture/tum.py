@@ -108,7 +108,7 @@ def read_lens(folder: Path) -> Lens:
 
 
 def nearest(moments: np.ndarray, moment: float) -> int | None:
-    """Which moment is the nearest, if one is near enough."""
+    """Index of the nearest moment, if one is near enough."""
     if not len(moments):
         return None
     found = int(np.abs(moments - moment).argmin())

@@ -1,4 +1,4 @@
-"""How well a trained method does what it learnt, under a stated protocol for each kind of dataset."""
+"""Evaluate trained methods, under a stated protocol for each kind of dataset."""
 
 from .collection import evaluate_collection as evaluate_collection
 from .run import claim_evaluation as claim_evaluation

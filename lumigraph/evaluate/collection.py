@@ -1,4 +1,4 @@
-"""How well a method does on members of a collection that it has not learnt from, told what it may see of each."""
+"""Evaluate a method on unseen members of a collection, given the evidence that it may use of each."""
 
 from __future__ import annotations
 

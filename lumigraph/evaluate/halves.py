@@ -18,14 +18,14 @@ RIGHT_ALONE = "right halves are compared; nothing is told of left ones"
 
 
 def judged_by_halves(method: Method) -> bool:
-    """Whether a method that learns from a Scene takes single photographs as evidence, and was told of none by a
-    control."""
+    """True if a method of Scenes accepts single photographs as evidence, and no control already selects a photograph's
+    appearance."""
     takes = issubclass(method.learns_from, Scene) and Photograph in method.takes
     return takes and not any(control.of_photographs and control.name in method.told for control in method.controls)
 
 
 def definition(method: Method, right_halves: bool) -> str | None:
-    """What an evaluation says of halves; None where photographs are compared as a whole."""
+    """Definition of halves in an evaluation; None if photographs are compared as a whole."""
     return DEFINITION if judged_by_halves(method) else RIGHT_ALONE if right_halves else None
 
 

@@ -32,7 +32,7 @@ PROTOCOL = (
 
 
 class HeldOutPoses:
-    """Where a method that refines poses sees a scene's photographs from.
+    """Camera poses of a scene's photographs for a method that refines poses.
 
     `camera(i)` is photograph i's camera: as it was learnt, or if it was not learnt from, as it is found here. A copy of
     the method learns it by the method's own loss, with nothing but this pose free.
@@ -72,7 +72,7 @@ def held_out_poses(method: Method, scene: Scene) -> HeldOutPoses | None:
 
 
 def against_truth(method: Method, scene: Scene) -> Moves | None:
-    """How far training poses, as the method has them, are from true ones, aligned; None where nobody knows these."""
+    """Errors of the method's training poses against true ones, aligned; None if these are unknown."""
     if TRUE_POSE not in scene.about:
         return None
     learnt = scene.splits["train"]

@@ -1,4 +1,4 @@
-"""What an evaluation lets a method see of a dataset that it has not learnt from."""
+"""Evidence that an evaluation gives a method of a dataset that it has not learnt from."""
 
 from __future__ import annotations
 

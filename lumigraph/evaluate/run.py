@@ -27,7 +27,7 @@ from .views import evaluate, file_name
 
 @runtime_checkable
 class Evaluated(Protocol):
-    """What every protocol gives.
+    """Result of every protocol.
 
     scores:   means over all that was compared, the headline first
     compared: what that was, in a few words
@@ -113,10 +113,10 @@ def claim_evaluation(run: Trained, split: str, save_images: bool, overwrite: boo
 
 
 def image_of(run: Trained, name: str) -> Path:
-    """Where the rendering of a view is kept."""
+    """Path of the rendering of a view."""
     return run.folder / "eval" / f"{file_name(name)}.png"
 
 
 def stem(split: str) -> str:
-    """What the files of a split are called, without their endings."""
+    """Stem of the file names of a split."""
     return "eval" if split == "test" else f"eval-{split}"

@@ -1,4 +1,4 @@
-"""How near a trained method's surface comes to the shapes that it learnt, under a stated protocol."""
+"""Evaluate a trained method's surface against the shapes that it learnt, under a stated protocol."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How well a trained method shows views that it has not seen, under a stated protocol."""
+"""Evaluate a trained method on held-out views, under a stated protocol."""
 
 from __future__ import annotations
 
@@ -91,7 +91,7 @@ class Evaluation:
 
     @property
     def compared(self) -> str:
-        """What was compared, in a title."""
+        """Title of the comparison."""
         parts = "right halves of " if self.protocol["halves"] else ""
         return f"{parts}{len(self.views)} {self.protocol['split']} views"
 

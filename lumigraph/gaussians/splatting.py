@@ -70,7 +70,7 @@ def render(
     bands: int = 4,
     blur: float = BLUR,
 ) -> Rendering:
-    """What one camera sees of a cloud, in front of a background colour."""
+    """Render a cloud for one camera over a background colour."""
     seen = splat(cloud, view_of(camera, near).to(cloud.means.device), bands, blur=blur)
     rgb = over(seen.rgb, seen.opacity, torch.tensor(background, device=seen.rgb.device))
     # Depth along the optical axis, of what is opaque, becomes distance along each pixel's ray.

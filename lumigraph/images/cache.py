@@ -25,7 +25,7 @@ Found = TypeVar("Found")
 
 
 def cache_folder() -> Path:
-    """Where this user's programs keep what can be made again."""
+    """Folder of this user for data that can be made again."""
     if chosen := os.environ.get("LUMIGRAPH_CACHE"):
         return Path(chosen)
     if sys.platform == "darwin":
@@ -106,7 +106,7 @@ def full_disk_told(path: Path, size: int) -> Iterator[None]:
 def in_parallel(
     read: Callable[[int], Found], numbers: Sequence[int], progress: Callable[[int], object] = lambda done: None
 ) -> list[Found]:
-    """What `read` gives for each number, read by several threads. progress: told how many are done."""
+    """Results of `read` for each number, from several threads. progress: called with the number that is done."""
     with ThreadPoolExecutor(min(os.cpu_count() or 1, 16)) as pool:
         tasks = [pool.submit(read, number) for number in numbers]
         found = []

@@ -35,7 +35,7 @@ UNNAMED = -1  # an index that is not known
 
 @dataclass(frozen=True)
 class LayerSource:
-    """How to get one photograph's values of a layer.
+    """Source of one photograph's values of a layer.
 
     read:     makes the stored numbers, (height, width) or (height, width, channels), of the photograph's size
     identity: says all that they depend on, as in `ImageSource`
@@ -101,8 +101,8 @@ class Layer:
         return self._hold(images.numpy())[position.numpy()]
 
     def decoded(self, stored: np.ndarray, cosine: Callable[[], Tensor]) -> Tensor:
-        """What stored numbers mean, in the house's units: float32 with NaN where nobody knows and infinity where
-        nothing is; whole numbers for an index, -1 where nobody knows.
+        """Values of stored numbers, in the project's units: float32 with NaN for unknown and infinity for empty; whole
+        numbers for an index, -1 for unknown.
 
         cosine: of the angle between each pixel's ray and the optical axis; asked for where lengths lie along the axis
         """
@@ -120,7 +120,7 @@ class Layer:
         return values.float()
 
     def known(self, stored: np.ndarray) -> Bool[np.ndarray, "*pixels"]:
-        """Which pixels' numbers say something."""
+        """Mask of the pixels with a known value."""
         return known(stored, self.unknown, self.channels)
 
     def reduced(self, image: int, factor: int) -> np.ndarray:
@@ -193,12 +193,12 @@ class Layer:
 
 
 def cosines(directions: Float[Tensor, "*pixels 3"], forward: Float[Tensor, "*#pixels 3"]) -> Float[Tensor, "*pixels"]:
-    """Of the angle between rays and the optical axes of the cameras that see along them."""
+    """Cosine of the angle between rays and the optical axes of their cameras."""
     return (directions.double() * forward.double()).sum(-1)
 
 
 def known(stored: np.ndarray, unknown: tuple[float, ...], channels: int) -> Bool[np.ndarray, "*pixels"]:
-    """Which pixels' stored numbers say something; see `Layer`."""
+    """Mask of the pixels with a known value; see `Layer`."""
     numbers = stored if channels > 1 else stored[..., None]
     sure = np.ones(numbers.shape[:-1], bool)
     for number in unknown:

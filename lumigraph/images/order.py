@@ -56,7 +56,7 @@ def spread(count: int) -> int:
 
 
 def shuffled_order(pixels: int, mask: Tensor | np.ndarray | None) -> Int[np.ndarray, " pixel"]:
-    """Which pixel lies at each position of the file: trusted ones shuffled, then the others."""
+    """Pixel at each position of the file: unmasked ones shuffled, then the others."""
     trusted = np.arange(pixels) if mask is None else np.flatnonzero(np.asarray(mask))
     shuffled = trusted[np.arange(len(trusted)) * spread(len(trusted)) % max(len(trusted), 1)]
     return shuffled if mask is None else np.concatenate([shuffled, np.flatnonzero(~np.asarray(mask).ravel())])

@@ -95,8 +95,8 @@ def picked(own: Size, size: Size, known: Bool[np.ndarray, "height width"] | None
 
 
 def middles(own: int, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Of each of `count` pixels that share out `own`: the one at its centre, and those whose centres it holds, first
-    and one past the last."""
+    """Source pixels of each of `count` pixels that share out `own`: the one at its centre, and those whose centres it
+    holds, first and one past the last."""
     edges = np.arange(count + 1) * (own / count)
     first = np.ceil(edges - 0.5).astype(np.int64)
     centre = np.minimum(((edges[:-1] + edges[1:]) / 2).astype(np.int64), own - 1)

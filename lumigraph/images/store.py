@@ -27,7 +27,7 @@ SHORTEST_PIECE, LONGEST_PIECE = 64, 1024  # pixels; the longest fills a page
 
 @dataclass(frozen=True)
 class Mark:
-    """What the mark of a store in a file says."""
+    """Contents of the mark of a store in a file."""
 
     has_alpha: bool
     trusted: bool
@@ -35,7 +35,7 @@ class Mark:
 
 @dataclass(frozen=True)
 class ImageSource:
-    """How to get one photograph.
+    """Source of one photograph.
 
     size:     (width, height) that `read` will give
     read:     makes the pixels, uint8 (height, width, 3 or 4), and which of them to trust (None: all)
@@ -159,7 +159,7 @@ class ImageStore:
         return rgba.view(torch.uint8).view(height, width, 4)[..., : 4 if self.has_alpha else 3]
 
     def mask(self, index: int) -> Bool[Tensor, "height width"] | None:
-        """Which pixels of an image to trust; None if no image of the store has a mask."""
+        """Mask of an image's pixels to use; None if no image of the store has a mask."""
         if self._trusted is None:
             return None
         width, height = self.sizes[index].tolist()
@@ -167,11 +167,11 @@ class ImageStore:
 
     @property
     def trusted_pixels(self) -> Int[Tensor, " image"]:
-        """How many pixels of each image may be learnt from."""
+        """Number of pixels of each image to learn from."""
         return self._count
 
     def order(self, index: int) -> Int[np.ndarray, " pixel"] | None:
-        """Which pixel of an image, row by row, lies at each of its positions; None if they lie row by row."""
+        """Pixel of an image, row by row, at each of its positions; None if they lie row by row."""
         return shuffled_order(int(self.sizes[index].prod()), self.mask(index)) if self.shuffled else None
 
     def span(self, index: int) -> slice:
@@ -180,7 +180,7 @@ class ImageStore:
         return slice(first, first + int(self.sizes[index].prod()))
 
     def grant(self, size: int) -> bool:
-        """Whether so many more bytes may stay in memory; they count as taken from then on."""
+        """True if so many more bytes may stay in memory; they count as taken from then on."""
         granted = size <= self._memory
         self._memory -= size if granted else 0
         return granted
@@ -205,7 +205,7 @@ class ImageStore:
 
 
 def name_of(pictures: Sequence[ImageSource]) -> str:
-    """What a file of these pictures is called."""
+    """File name for these pictures."""
     return key(p.identity and f"{p.size} {p.identity}" for p in pictures)
 
 

@@ -85,7 +85,7 @@ class ImageStream(ImageStore):
         return torch.from_numpy(pixels)[..., : 4 if self.has_alpha else 3]
 
     def mask(self, index: int) -> Bool[Tensor, "height width"] | None:
-        """Which pixels of an image to trust, read now; None if all."""
+        """Mask of an image's pixels to use, read now; None if all."""
         _, trusted = whole(self._pictures[index])
         return None if trusted is None else torch.from_numpy(trusted)
 

@@ -86,7 +86,7 @@ class Shape:
 
     @cached_property
     def closed(self) -> bool:
-        """Whether it has an inside: its winding number is whole nearly everywhere. Closed parts may go through each
+        """True if it has an inside: its winding number is whole nearly everywhere. Closed parts may go through each
         other, which a mesh that is called watertight may not."""
         if self.is_cloud:
             return False
@@ -103,7 +103,7 @@ class Shape:
         return torch.where(self.inside(points), -distance, distance) if self.closed else distance
 
     def inside(self, points: Float[Tensor, "point 3"]) -> Bool[Tensor, " point"]:
-        """Where the winding number is above a half. Nothing is inside of a cloud of points."""
+        """True for points with a winding number above a half. Nothing is inside of a point cloud."""
         if self.is_cloud:
             return torch.zeros(len(points), dtype=torch.bool)
         return torch.from_numpy(self._triangles.winding(points.detach().cpu().double().numpy()) > 0.5)
@@ -133,7 +133,7 @@ class Shape:
         return PointBatch(torch.from_numpy(points).float(), members, zero, None, normals)
 
     def normals_near(self, points: Float[Tensor, "point 3"]) -> Float[Tensor, "point 3"]:
-        """Of the surface, where it is nearest to points; upwards where a cloud has none."""
+        """Normals of the surface nearest to points; upwards where a cloud has none."""
         places = points.detach().cpu().double().numpy()
         if not self.is_cloud:
             return torch.from_numpy(self._facing[1][self._triangles.nearest(places)[1]]).float()
@@ -192,6 +192,6 @@ def normalised(
 
 
 def volume(mesh: Mesh) -> float:
-    """Of what the mesh encloses; negative if its triangles face inwards."""
+    """Volume that the mesh encloses; negative if its triangles face inwards."""
     a, b, c = mesh.vertices[mesh.faces].transpose(1, 0, 2)
     return float((a * np.cross(b, c)).sum() / 6)

@@ -179,7 +179,7 @@ def nearest(triangles, box, first, count, child, points):
 
 @njit(cache=True, error_model="numpy")
 def solid_angle(px, py, pz, t, i):
-    """Of triangle i, seen from a point: positive from behind (van Oosterom and Strackee 1983, eq. 8)."""
+    """Solid angle of triangle i, seen from a point: positive from behind (van Oosterom and Strackee 1983, eq. 8)."""
     ax, ay, az = t[i, 0] - px, t[i, 1] - py, t[i, 2] - pz
     bx, by, bz = t[i, 3] - px, t[i, 4] - py, t[i, 5] - pz
     cx, cy, cz = t[i, 6] - px, t[i, 7] - py, t[i, 8] - pz

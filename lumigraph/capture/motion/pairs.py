@@ -1,4 +1,4 @@
-"""Which photographs to compare with which: all, neighbours in time, or those that look alike."""
+"""Pairs of photographs to match: all, neighbours in time, or those that look alike."""
 
 from __future__ import annotations
 

@@ -77,7 +77,7 @@ class View:
         return places.numpy(), inside.numpy()
 
     def shadow(self, points: Float[torch.Tensor, "point 3"], size: float) -> Float[np.ndarray, "height width"]:
-        """How much of each pixel cubes cover that are `size` large and stand at points: about 1 inside, 0 outside."""
+        """Coverage of each pixel by cubes of side `size` at points: about 1 inside, 0 outside."""
         places, inside = self.at(points)
         hit = np.zeros(self.lab.shape[:2])
         hit[tuple(places[inside].T)] = 1.0
@@ -87,7 +87,7 @@ class View:
         return ndimage.gaussian_filter(closed, 0.5 * radius)
 
     def pixels(self, points: Float[torch.Tensor, "point 3"], size: float) -> float:
-        """How large a length appears in the middle of points, in pixels."""
+        """Size of a length at the mean of points, in pixels."""
         middle = points.mean(0)
         ends, _ = self.camera.project(torch.stack([middle, middle + size * self.camera.pose[0, :, 0]]))
         return max(1.0, float((ends[1] - ends[0]).norm()))

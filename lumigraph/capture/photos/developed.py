@@ -72,7 +72,7 @@ def reason(path: Path, fault: LumigraphError) -> str:
 
 
 def brightness_of_all(photos: list[RawPhoto]) -> float | None:
-    """What each photograph's light is to be multiplied by, times its exposure; None where some do not say theirs."""
+    """Factor on each photograph's light, times its exposure; None if some exposures are unknown."""
     found = []
     for photo in evenly(photos, PROBES):
         if photo.exposure is None:

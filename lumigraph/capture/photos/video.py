@@ -55,7 +55,7 @@ class Index:
 
 
 def is_video(path: Path) -> bool:
-    """Whether a file is a film, by its suffix."""
+    """True if a file is a video, by its suffix."""
     return path.suffix.lower() in VIDEOS and path.is_file()
 
 

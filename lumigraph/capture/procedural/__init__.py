@@ -140,7 +140,7 @@ def known_planes(stage: Stage, camera: Camera) -> dict[str, Plane]:
 
 
 def known_facts(stage: Stage, camera: Camera, jittered: bool) -> dict[str, Any]:
-    """What one photograph says of itself. jittered: whether its pose is not the true one, which is told then"""
+    """Facts of one photograph. jittered: whether its pose is perturbed; the true one is then included"""
     known = {TRUE_POSE: camera.pose[0].double().numpy()} if jittered else {}
     if stage.facts is not None and camera.image_index is not None:
         known |= stage.facts(int(camera.image_index))
@@ -166,7 +166,7 @@ def without_passers_by(stage: Stage, camera: Camera) -> np.ndarray:
 
 
 def known(stage: Stage, camera: Camera, name: str) -> np.ndarray:
-    """What is exactly known along the rays through pixels' centres, as `render` has it."""
+    """Ground-truth layers along the rays through pixel centres, from `render`."""
     width, height = camera.size[0].tolist()
     seen = trace(stage.world_of(camera), camera.rays(camera.pixels()), shaded=False)
     values = {"depth": seen.depth, "normals": seen.normal, "labels": seen.identity, "albedo": seen.reflectance}[name]

@@ -1,4 +1,4 @@
-"""Where procedural scenes are photographed from: a dome around an object, a walk within a place."""
+"""Camera positions of procedural scenes: a dome around an object, a walk within a place."""
 
 from __future__ import annotations
 

@@ -38,7 +38,7 @@ class Member:
 
 @dataclass(frozen=True)
 class Many:
-    """As `Member`; count: of members."""
+    """Request for many members, like `Member`; count: of members."""
 
     count: Annotated[int, between(1, 100_000)] = 200
     size: Annotated[int, between(1, 8192)] = 64
@@ -48,7 +48,7 @@ class Many:
 
 
 def is_category(request: str) -> bool:
-    """Whether a request is for objects of a category, or for meshes."""
+    """True if a request is for objects of a category, or for meshes."""
     return request.partition(",")[0] in categories.available() or path_of(request) is not None
 
 
@@ -63,14 +63,14 @@ def path_of(request: str) -> Path | None:
 
 
 def is_collection(request: str) -> bool:
-    """Whether a request is for all members of a category, or all meshes of a folder, rather than for one."""
+    """True if a request is for all members of a category, or all meshes of a folder, rather than for one."""
     if (path := path_of(request)) is not None:
         return path.is_dir()
     return is_category(request) and not any(text.strip().startswith("member=") for text in request.split(",")[1:])
 
 
 def members_of(request: str) -> dict[str, str]:
-    """What to ask for each member by, by its name. Raises LumigraphError for a folder without meshes."""
+    """Request for each member, by its name. Raises LumigraphError for a folder without meshes."""
     name, many = told(Many, request)
     said = {key: value for key, value in asdict(many).items() if key != "count" and (key != "turned" or value)}
     shared = ",".join(f"{key}={value}" for key, value in said.items())

@@ -22,7 +22,7 @@ BOUNDS: tuple[Vector, Vector] = ((-RADIUS,) * 3, (RADIUS,) * 3)
 
 
 def mesh_stage(path: Path, size: int, views: int, seed: int) -> Stage:
-    """What one file holds, its middle at the origin, seen as members of categories are. seed: where cameras stand
+    """Stage with one file's mesh, centred at the origin, photographed like members of categories. seed: of the cameras
 
     Raises LumigraphError for a file that holds no surface.
     """

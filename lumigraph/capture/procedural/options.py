@@ -1,4 +1,4 @@
-"""What follows the name of something procedural: "still-life,size=400,seed=1"."""
+"""Options behind a procedural name: "still-life,size=400,seed=1"."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ Options = TypeVar("Options")
 
 @dataclass(frozen=True)
 class Pictures:
-    """What every scene can be asked for.
+    """Options of every scene.
 
     size: of the square pictures, pixels; views: number of photographs to learn from; seed: where cameras stand;
     jitter_poses: degrees, and percent of the box of interest, by which poses to learn from are off

@@ -25,7 +25,7 @@ CONTRAST = 0.08  # samples of a pixel that differ by more than this are not enou
 
 
 class Seen(NamedTuple):
-    """What single rays met; arrays with leading axis ray."""
+    """Hits of single rays; arrays with leading axis ray."""
 
     radiance: np.ndarray
     depth: np.ndarray
@@ -35,7 +35,7 @@ class Seen(NamedTuple):
 
 
 def render(world: World, camera: Camera, samples: int = 4, more: int = 8) -> Rendering:
-    """What a camera (a batch of one, any lens) sees of a world: the exact ground truth.
+    """Render a world for a camera (a batch of one, any lens): the exact ground truth.
 
     samples: rays per pixel; more: further rays where the first ones differ
 
@@ -87,7 +87,7 @@ def eight_bits(rgb: np.ndarray, opacity: np.ndarray, alpha: bool) -> np.ndarray:
 
 
 def trace(world: World, rays: Rays, shaded: bool = True) -> Seen:
-    """What each ray meets. `radiance` is linear light after the film's response, in [0, 1]; black unless shaded."""
+    """Hits of rays. `radiance` is linear light after the film's response, in [0, 1]; black unless shaded."""
     n = len(rays)
     origins, directions, radius = _arrays(rays)
     seen = Seen(np.empty((n, 3)), np.empty(n), np.empty((n, 3)), np.empty(n, np.int64), np.empty((n, 3)))

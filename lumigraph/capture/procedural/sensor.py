@@ -29,7 +29,7 @@ PHOTON = 0.29  # DN of one that is counted
 
 @dataclass(frozen=True)
 class Sensor:
-    """How photographs are taken.
+    """Sensor of the camera: exposures and sensitivity.
 
     exposures:   shares of the longest exposure; photographs take turns
     sensitivity: share of what the sensor can hold that white gives it in the longest exposure
@@ -42,7 +42,7 @@ class Sensor:
         return self.exposures[image % len(self.exposures)]
 
     def brightness(self, image: int) -> float:
-        """What the light of one photograph is multiplied by so that white becomes white."""
+        """Factor on the light of one photograph that makes white white."""
         return 1 / (self.sensitivity * self.exposure(image))
 
     def photograph(self, radiance: Callable[[], np.ndarray], size: tuple[int, int], image: int) -> RawPhoto:
@@ -65,7 +65,7 @@ class Sensor:
         )
 
     def numbers(self, radiance: Float[np.ndarray, "height width 3"], image: int) -> np.ndarray:
-        """What is read out of the sensor: whole numbers of 14 bits, (height, width)."""
+        """Sensor readout: whole numbers of 14 bits, (height, width)."""
         random = np.random.default_rng(image)
         camera = radiance @ np.linalg.inv(srgb_from_camera(np.array(COLOUR_MATRIX))).T / GAINS
         filters = repeated(PATTERN, (radiance.shape[1], radiance.shape[0])).astype(np.int64)

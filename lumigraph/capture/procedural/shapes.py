@@ -23,7 +23,7 @@ MAX_STEPS = 400
 
 
 class Shape:
-    """What all shapes tell: `describe` for the tracer, `reach` for the tree of boxes around objects."""
+    """Interface of all shapes: `describe` for the tracer, `reach` for the tree of boxes around objects."""
 
     def describe(self) -> tuple[int, tuple[float, ...], float, tuple[float, float, float]]:
         """Kind, numbers of the core, rounding, and half-size of the box around it in its own frame."""
@@ -171,7 +171,7 @@ def beside_segment(x, y, ax, ay, bx, by):
 
 @njit(**INNER)
 def hollow(kind):
-    """Whether a ray that leaves the shape can meet it again: it is not convex."""
+    """True if a ray that leaves the shape can meet it again: it is not convex."""
     return kind == TORUS or kind == ARCH
 
 
@@ -258,7 +258,7 @@ def inverse(d):
 
 @njit(**INNER)
 def slab(o, over, low, high):
-    """Where a ray enters and leaves a box, enter > leave where it misses; over is one over its direction."""
+    """Distances at which a ray enters and leaves a box, enter > leave if it misses; over is one over its direction."""
     ax, bx = (low[0] - o[0]) * over[0], (high[0] - o[0]) * over[0]
     ay, by = (low[1] - o[1]) * over[1], (high[1] - o[1]) * over[1]
     az, bz = (low[2] - o[2]) * over[2], (high[2] - o[2]) * over[2]

@@ -1,4 +1,4 @@
-"""What a procedural scene is made of: objects with a shape, a material and a rigid pose; lights; a sky.
+"""Contents of a procedural scene: objects with a shape, a material and a rigid pose; lights; a sky.
 
 Everything is a frozen value, so a moved, relit or repainted scene is `dataclasses.replace` away and the first stays as
 it was. `World.arrays` flattens it for the tracer, which is compiled once and never again for a new scene.
@@ -177,7 +177,7 @@ class Sun:
 
 @dataclass(frozen=True)
 class Sky:
-    """What surrounds everything: light from all sides, reflections, and the backdrop if it is visible.
+    """Environment of a scene: light from all sides, reflections, and the background if it is visible.
 
     visible: False leaves the background transparent
     light:   factor on the three colours
@@ -215,7 +215,7 @@ class World:
 
     @cached_property
     def names(self) -> tuple[str, ...]:
-        """What the numbers in a mask mean."""
+        """Names of the numbers in a mask."""
         return tuple(dict.fromkeys(o.name for o in self.objects))
 
     def moved(self, name: str, motion: Pose) -> World:

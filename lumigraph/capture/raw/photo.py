@@ -41,7 +41,7 @@ class RawPhoto:
 
     @property
     def filters(self) -> np.ndarray:
-        """Which filter lies over every pixel, int8 (height, width)."""
+        """Filter over every pixel, int8 (height, width)."""
         return repeated(self.pattern, self.size)
 
     def linear(self) -> Float[np.ndarray, "height width 3"]:

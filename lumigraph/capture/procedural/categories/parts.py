@@ -1,4 +1,4 @@
-"""What several categories are made of: colours and materials drawn at random."""
+"""Parts of several categories: colours and materials drawn at random."""
 
 from __future__ import annotations
 

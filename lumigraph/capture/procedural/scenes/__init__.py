@@ -17,7 +17,7 @@ def available() -> list[str]:
 
 
 def options(name: str) -> type[Pictures]:
-    """What a scene can be asked for. Raises LumigraphError for a name that nothing here has."""
+    """Options of a scene. Raises LumigraphError for an unknown name."""
     return getattr(scene(name), "Options", Pictures)
 
 

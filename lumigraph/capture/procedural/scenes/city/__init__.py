@@ -37,7 +37,7 @@ ERROR = 10.0  # metres of which errors of poses are so many percent: a street's 
 
 @dataclass(frozen=True)
 class Options(Pictures):
-    """As everywhere, but for these.
+    """Options of every scene, but for these.
 
     size:      width of the pictures, which are three quarters as high
     crossings: of streets; around each is as much of the city as one block of a large scene may hold
@@ -61,7 +61,7 @@ class Drive:
     seed: int
 
     def share(self, number: int) -> float:
-        """How much of the drive is over when a photograph is taken."""
+        """Share of the drive that is over when a photograph is taken."""
         return (number // len(RIG) + 0.5) / self.stops
 
     @property

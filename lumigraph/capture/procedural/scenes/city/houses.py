@@ -31,7 +31,7 @@ TILES = Material(Stripes((0.66, 0.34, 0.24), (0.48, 0.23, 0.16), period=0.45, sh
 
 @dataclass(frozen=True)
 class Style:
-    """What a house is made of, and what its windows are like (half their width and height)."""
+    """Materials of a house, and half the width and height of its windows."""
 
     wall: Material
     socle: Material
@@ -109,7 +109,7 @@ def house(
 
 
 def front(place: Pose, half: float, style: Style, random: np.random.Generator) -> Iterator[Object]:
-    """What is on one wall, which faces -y and is twice `half` wide: a door, shops or windows, rows of windows above."""
+    """Objects on one wall, which faces -y and is twice `half` wide: a door, shops or windows, rows of windows above."""
     bays = max(int((2 * half - 0.6) / BAY), 1)
     middles = (np.arange(bays) + 0.5 - bays / 2) * (2 * half - 0.6) / bays
     door = random.integers(bays)

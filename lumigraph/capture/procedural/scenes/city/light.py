@@ -30,7 +30,7 @@ def lights(today: Day) -> tuple[Sun]:
 
 
 def sky(today: Day) -> Sky:
-    """Of a world in metres: hardly any haze, corners that darken within arm's reach."""
+    """Sky of a world in metres: hardly any haze, ambient occlusion within arm's reach."""
     return replace(today.sky, haze=0.0012, reach=1.5)
 
 

@@ -37,7 +37,7 @@ def extent(count: int) -> tuple[Vector, Vector]:
 
 
 def neighbours(places: list[Crossing]) -> dict[Crossing, list[Crossing]]:
-    """Where streets lead to from each crossing."""
+    """Crossings that streets lead to from each crossing."""
     return {
         (i, j): [there for there in ((i + 1, j), (i, j + 1), (i - 1, j), (i, j - 1)) if there in places]
         for i, j in places
@@ -88,7 +88,7 @@ def curve(start: np.ndarray, way: np.ndarray, stop: np.ndarray, onward: np.ndarr
 
 
 def stops(places: list[Crossing], count: int) -> tuple[Float[np.ndarray, "stop 2"], Float[np.ndarray, " stop"], float]:
-    """Where a drive stops so many times, evenly spread; which way it heads there, radians; the drive's length."""
+    """Evenly spaced stops of a drive; its heading there, radians; its length."""
     line = track(places)
     gone = np.concatenate([[0.0], np.linalg.norm(np.diff(line, axis=0), axis=-1).cumsum()])
 

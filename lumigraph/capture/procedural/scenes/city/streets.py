@@ -105,7 +105,7 @@ def quarter(i: int, j: int, columns: int, rows: int, random: np.random.Generator
 
 
 def lined(here: Crossing, there: Crossing, random: np.random.Generator) -> Iterator[Object]:
-    """What stands along a street, on both sides: trees and lamps on the pavement, cars by the kerb."""
+    """Objects along a street, on both sides: trees and lamps on the pavement, cars by the kerb."""
     middle, half = between(here, there)
     reach = half + ROAD - CORNER
     for side in (-1, 1):

@@ -82,5 +82,5 @@ def traffic(everybody: list[Driver], time: float, eye: np.ndarray) -> Iterator[O
 
 @cache
 def parts(seed: int) -> tuple[Object, ...]:
-    """What one car is made of."""
+    """Parts of one car."""
     return tuple(car(Pose(), np.random.default_rng(seed), TRAFFIC))
