@@ -26,12 +26,14 @@ from lumigraph.export.film import animated
 from lumigraph.images import ImageStore
 from lumigraph.methods.instant_ngp import Config, InstantNGP
 from lumigraph.paths.keyframes import CameraPath, Keyframe
+from lumigraph.ranges import changed
 from lumigraph.rays import Rays
 from lumigraph.run import Run, build
 from lumigraph.scene import Frame
 from lumigraph.train import fit
 
-SMALL = Config(
+SMALL = changed(
+    Config(),
     levels=4,
     log2_hashmap_size=10,
     base_resolution=4,

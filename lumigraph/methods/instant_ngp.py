@@ -132,7 +132,7 @@ class InstantNGP(FieldMethod):
         self.sampler.settle(self.density, chance)
 
     def importance(self, camera: Camera) -> dict[str, Float[Tensor, " row"]]:
-        """Sum of the weights with which each entry of the table adds to one picture; see `components.sampling.importance`."""
+        """Weight of each entry of the table in one picture; see `components.sampling.importance`."""
         (shares,) = importance(self, camera, self.network.encode, [self.network.table])
         return {"network.table": shares.mean(-1)}
 
