@@ -19,6 +19,7 @@ from typing import Any
 import pytest
 import tiny
 import torch
+from budgets import PER_METHOD, budget
 
 import lumigraph
 from lumigraph import methods
@@ -59,7 +60,10 @@ DOCS = Path(__file__).parent.parent / "docs" / "methods"
 # A few steps leave a scene half transparent: what counts as solid there, and how well cameras must agree on it.
 HALF_SOLID, HALF_AGREED = 0.5, 0.3
 
-pytestmark = pytest.mark.filterwarnings("ignore:The cloud stops growing")
+pytestmark = [
+    budget("methods", PER_METHOD * len(NAMES)),
+    pytest.mark.filterwarnings("ignore:The cloud stops growing"),
+]
 
 
 @dataclass(frozen=True)

@@ -10,6 +10,7 @@ from functools import partial
 import pytest
 import tiny
 import torch
+from budgets import budget
 
 from lumigraph import methods
 from lumigraph.camera import ring
@@ -32,6 +33,8 @@ from lumigraph.run.converted import Converted
 from lumigraph.scene import Frame
 from lumigraph.signals import Stopped
 from lumigraph.train import fit
+
+pytestmark = budget("runs", 15)
 
 STUDENTS = [name for name in methods.available() if can(methods.find(name), FromField)]
 RADIUS, DENSITY = 0.6, 40.0

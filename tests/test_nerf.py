@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 import tiny
 import torch
+from budgets import budget
 
 from lumigraph.camera import Camera
 from lumigraph.components.fields.coordinate_network import CoordinateNetwork
@@ -21,6 +22,8 @@ from lumigraph.run import build
 from lumigraph.scene import Forward, Frame, Scene
 from lumigraph.train import fit
 from lumigraph.volume import composite
+
+pytestmark = budget("methods", 16)
 
 SMALL = {
     "depth": 3,

@@ -13,9 +13,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from budgets import budget
 
 from lumigraph.cli import main
 from lumigraph.run import Run
+
+pytestmark = budget("runs", 10)
 
 RUNS = Path(__file__).parent / "data" / "runs-0.1"
 NAMES = sorted(path.parent.name for path in RUNS.glob("*/config.json"))

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import tiny
 import torch
+from budgets import budget
 
 from lumigraph import memory
 from lumigraph.cli import main
@@ -25,6 +26,8 @@ from lumigraph.metrics import psnr
 from lumigraph.rays import Rays, Rendering
 from lumigraph.run import Run, State, build
 from lumigraph.scene import Frame
+
+pytestmark = budget("methods")
 
 RED, GREY = torch.tensor([0.9, 0.2, 0.1]), 0.5
 

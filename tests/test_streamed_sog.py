@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 import torch
 from balls import RED, Splatted, eye
+from budgets import budget
 from test_exchange import make, same
 
 from lumigraph import cli
@@ -18,6 +19,8 @@ from lumigraph.exchange.streamed_sog import Detail
 from lumigraph.gaussians import Gaussians, joined, simplified, splatting
 from lumigraph.geometry import to_matrix
 from lumigraph.run import open_any
+
+pytestmark = budget("exports", 8)
 
 SMALL = Detail(levels=3, ratio=4, chunk=1024)
 
