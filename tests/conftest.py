@@ -1,6 +1,7 @@
 """Before any test: Triton interprets where there is no GPU, and the shapes written at every door are executed.
 
-Around each: no test may hang, and what it costs is noted. Tests that need a browser come last, for they share one.
+Around each: no test may hang, and its cost is noted. Costly files come first, so that workers end together; tests that
+need a browser come last, for they share one.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ import lumigraph  # isort: skip
 import pytest  # isort: skip
 import torch  # isort: skip
 from browser import chromium, faults, page  # noqa: F401  # isort: skip
-from budgets import MUCH, Ledger, busy  # isort: skip
+from budgets import MUCH, Ledger, busy, share_of  # isort: skip
 from jaxtyping import install_import_hook  # isort: skip
 from numba.core import event  # isort: skip
 
@@ -64,7 +65,11 @@ event.register("numba:compile", LEDGER.compiling)
 
 @pytest.hookimpl(trylast=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    items.sort(key=lambda item: "chromium" in getattr(item, "fixturenames", ()))
+    def browser_then_cost(item: pytest.Item) -> tuple[bool, float]:
+        share = share_of(item.get_closest_marker("budget"))[1]
+        return "chromium" in getattr(item, "fixturenames", ()), -share
+
+    items.sort(key=browser_then_cost)
     from lumigraph import methods
 
     LEDGER.methods = len(methods.available())
@@ -74,7 +79,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 def pytest_runtest_protocol(item: pytest.Item) -> Iterator[None]:
     before = LEDGER.readings()
     done = yield
-    LEDGER.note(item.path.stem, before)
+    LEDGER.note(item.path.stem, share_of(item.get_closest_marker("budget")), before)
     return done
 
 

@@ -8,6 +8,7 @@ import statistics
 from pathlib import Path
 
 import pytest
+from budgets import budget
 from test_benchmark import Here
 from test_priors import prior_run
 
@@ -19,6 +20,8 @@ from lumigraph.benchmark.published import FEW
 from lumigraph.budget import Budget
 from lumigraph.cli import main
 from lumigraph.commands.benches.views import BenchViews
+
+pytestmark = budget("runs")
 
 SETTINGS = Settings(device="cpu", eval_views=1)
 

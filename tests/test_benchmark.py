@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from budgets import budget
 from PIL import Image
 
 from lumigraph.benchmark.cell import Cell, Settings
@@ -24,6 +25,8 @@ from lumigraph.budget import Budget
 from lumigraph.cli import main
 from lumigraph.errors import LumigraphError
 from lumigraph.run import Run
+
+pytestmark = budget("runs", 20)
 
 SETTINGS = Settings(device="cpu", eval_views=2)
 

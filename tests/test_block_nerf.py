@@ -11,6 +11,7 @@ import pytest
 import tiny
 import torch
 from balls import BLUE, RED, WHITE, Marched, eye
+from budgets import budget
 
 from lumigraph.components.fields.appearance import Appearance
 from lumigraph.components.fields.visibility import Visibility, transmittance
@@ -29,6 +30,8 @@ from lumigraph.rays import Rays, Samples
 from lumigraph.run import build
 from lumigraph.scene import Frame, Scene
 from lumigraph.train import fit
+
+pytestmark = budget("methods", 15)
 
 HERE = Similarity.make(1.0)
 STILL = {"residual_masks": False, "refine_cameras": False}

@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 import tiny  # noqa: F401  # its methods
 import torch
+from budgets import budget
 from proofs import kept
 from safetensors.torch import load_file
 from streets import crossing_streets, write_street
@@ -32,6 +33,8 @@ from lumigraph.methods import find
 from lumigraph.run import Run, open_any
 from lumigraph.run.splat_file import SplatFile
 from lumigraph.train import fit
+
+pytestmark = budget("runs", 15)
 
 STEPS = 6  # of each block
 

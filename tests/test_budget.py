@@ -7,6 +7,7 @@ import dataclasses
 import pytest
 import tiny
 import torch
+from budgets import budget
 
 from lumigraph import methods
 from lumigraph.budget import REJOIN, Budget, lasting
@@ -16,6 +17,8 @@ from lumigraph.evaluate import evaluate
 from lumigraph.quality import QUALITIES, Effort
 from lumigraph.run import Run, build
 from lumigraph.train import fit
+
+pytestmark = budget("runs", 8)
 
 
 @pytest.mark.parametrize("said", [{}, {"steps": 3, "seconds": 1.0}, {"steps": 0}, {"seconds": -1.0}])

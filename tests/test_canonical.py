@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 import tiny
 import torch
+from budgets import budget
 from canonical_errors import about_vertical, rotation_errors
 
 from lumigraph import kernels
@@ -28,6 +29,8 @@ from lumigraph.composition import standing
 from lumigraph.errors import LumigraphError
 from lumigraph.geometry import Similarity
 from lumigraph.run import Run, State, open_any
+
+pytestmark = budget("runs", 15)
 
 QUICK = Config(steps=12, points=256, channels=8, templates=3)
 CUBE = (-1.0, -1.0, -1.0), (1.0, 1.0, 1.0)

@@ -13,6 +13,7 @@ import numpy as np
 import pycolmap
 import pytest
 import torch
+from budgets import budget
 from captures import (
     FOCAL,
     HEIGHT,
@@ -39,6 +40,8 @@ from lumigraph.errors import LumigraphError, LumigraphWarning
 from lumigraph.lens import Equirectangular, Fisheye, OpenCV, Pinhole
 from lumigraph.rays import Rays
 from lumigraph.scene import Scene
+
+pytestmark = budget("capture", 10)
 
 
 @pytest.fixture

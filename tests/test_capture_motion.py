@@ -14,6 +14,7 @@ import numpy as np
 import pycolmap
 import pytest
 import torch
+from budgets import budget
 from PIL import Image
 from scipy.spatial import KDTree
 from views import draw, look_at, pattern, spoil, write_views
@@ -34,6 +35,8 @@ from lumigraph.capture.photos import Intake, Photo
 from lumigraph.capture.transforms import read as read_transforms
 from lumigraph.commands import capture as command
 from lumigraph.errors import LumigraphError
+
+pytestmark = budget("capture", 20)
 
 
 class Told:

@@ -15,10 +15,13 @@ from pathlib import Path
 
 import pytest
 import tiny
+from budgets import budget
 
 from lumigraph.cli import COMMANDS, main
 from lumigraph.commands.common import next_free, scene_name
 from lumigraph.run import Run
+
+pytestmark = budget("runs", 18)
 
 HERE = Path(__file__).parent
 ENVIRONMENT = {**os.environ, "PYTHONPATH": f"{HERE.parent}{os.pathsep}{HERE}"}

@@ -9,6 +9,7 @@ from dataclasses import replace
 import pytest
 import torch
 from balls import BLUE, RED, WHITE, Dense, Marched, Pictured, Splatted, eye
+from budgets import budget
 
 from lumigraph import cli
 from lumigraph.capabilities import HasDensity, HasGaussians, HasLooks, can
@@ -24,6 +25,8 @@ from lumigraph.run import open_any
 from lumigraph.run.composition import Part, place_from_json, place_to_json, read_composition, write_composition
 from lumigraph.scene import Frame
 from lumigraph.volume import composite, packed
+
+pytestmark = budget("runs")
 
 HERE = Similarity.make(1.0)
 KINDS = {"ray": Dense, "cloud": Splatted, "picture": Pictured}

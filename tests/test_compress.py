@@ -8,6 +8,7 @@ import shutil
 import pytest
 import tiny
 import torch
+from budgets import budget
 from test_gaussian_splatting import new
 
 from lumigraph import methods
@@ -22,6 +23,8 @@ from lumigraph.errors import LumigraphError
 from lumigraph.run import Run, build
 from lumigraph.run.compressed import Compressed
 from lumigraph.train import fit
+
+pytestmark = budget("runs", 15)
 
 
 @pytest.fixture(scope="module")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 import torch
+from budgets import budget
 from torch.nn import functional as F
 
 from lumigraph.components.fields import dense
@@ -13,6 +14,8 @@ from lumigraph.methods.mip_nerf import Config as MipConfig
 from lumigraph.methods.mip_nerf import MipNeRF
 from lumigraph.methods.nerf import Config, NeRF
 from lumigraph.scene import Frame
+
+pytestmark = budget("methods")
 
 EXACT = {"exact": True}
 

@@ -9,6 +9,7 @@ from functools import cache
 import pytest
 import tiny
 import torch
+from budgets import budget
 from torch.nn.functional import normalize
 
 from lumigraph.camera import Camera
@@ -17,6 +18,8 @@ from lumigraph.components.clouds.flat_view import flat_view
 from lumigraph.images import ImageStore
 from lumigraph.lens import Fisheye, OpenCV, Pinhole
 from lumigraph.scene import Frame, Scene
+
+pytestmark = budget("methods", 8)
 
 RADIUS, SIZE, FOCAL, COUNT = 0.6, 48, 64.0, 6
 

@@ -9,6 +9,7 @@ from dataclasses import replace
 import pytest
 import tiny
 import torch
+from budgets import budget
 
 from lumigraph import methods
 from lumigraph.announce import how_long, learner, learnt_from, machine
@@ -19,6 +20,8 @@ from lumigraph.display import TrainingDisplay, sizes, time_left
 from lumigraph.run import build
 from lumigraph.scene import Batch
 from lumigraph.train import fit
+
+pytestmark = budget("runs", 8)
 
 
 def test_a_log_says_what_begins_and_where_it_ends(capsys):

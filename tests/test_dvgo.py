@@ -8,6 +8,7 @@ from dataclasses import replace
 import pytest
 import tiny
 import torch
+from budgets import budget
 
 from lumigraph.cli import main
 from lumigraph.components.fields.voxels import VoxelGrid, corners, shape_of, tight_box
@@ -20,6 +21,8 @@ from lumigraph.run import build
 from lumigraph.scene import Frame
 from lumigraph.train import fit
 from lumigraph.volume import weights_of
+
+pytestmark = budget("methods", 8)
 
 BOX = [[-1.0, -0.5, 0.0], [1.0, 0.5, 0.25]]
 OPEN = Frame(reach=4.0, near=0.1, image_count=4)

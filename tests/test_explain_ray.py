@@ -9,6 +9,7 @@ from xml.etree import ElementTree
 import pytest
 import tiny
 import torch
+from budgets import budget
 from solids import Seen, around, ball, painted
 from test_instant_ngp import method as small_instant_ngp
 
@@ -21,6 +22,8 @@ from lumigraph.figures.charts import standalone
 from lumigraph.rays import Look, Samples
 from lumigraph.run import Run
 from lumigraph.volume import composite
+
+pytestmark = budget("exports")
 
 NEAR, FAR, SIGMA = 2.0, 4.0, 3.0
 SVG = "{http://www.w3.org/2000/svg}"

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 import tiny
 import torch
+from budgets import budget
 from listing import names
 from PIL import Image, ImageSequence
 
@@ -39,6 +40,8 @@ from lumigraph.paths.keyframes import CameraPath, Keyframe
 from lumigraph.report import write_report
 from lumigraph.run.settings import Source
 from lumigraph.scene import Frame
+
+pytestmark = budget("exports")
 
 
 def cameras(positions, targets) -> Camera:

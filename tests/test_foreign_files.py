@@ -12,6 +12,7 @@ import pytest
 import tiny
 import tiny_collection
 import torch
+from budgets import budget
 from listing import names
 from PIL import Image
 
@@ -25,6 +26,8 @@ from lumigraph.errors import LumigraphError
 from lumigraph.method import Method
 from lumigraph.paths.keyframes import CameraPath, Keyframe
 from lumigraph.run import Run, State, build
+
+pytestmark = budget("runs", 15)
 
 # What each command is told, and all that it would write.
 FILM = ("film.mp4", "film-depth.mp4", "film.json", "film/")

@@ -11,6 +11,7 @@ import listing
 import numpy as np
 import pytest
 import torch
+from budgets import budget
 from PIL import Image
 
 from lumigraph.capture import open_scene
@@ -23,6 +24,8 @@ from lumigraph.methods.fourier_features import Config, FourierFeatures, frequenc
 from lumigraph.rays import Rays
 from lumigraph.run import build
 from lumigraph.scene import Frame
+
+pytestmark = budget("methods", 12)
 
 CPU = torch.device("cpu")
 SMALL = Config(hidden_width=64, frequencies=64, pixels_per_step=512, learning_rate=5e-3)

@@ -16,6 +16,7 @@ import captures
 import pytest
 import tiny
 import torch
+from budgets import budget
 from fuzzing import flags, templates
 from fuzzing.bend import bend
 
@@ -31,6 +32,8 @@ from lumigraph.paths.keyframes import CameraPath
 from lumigraph.report import write_report
 from lumigraph.run import Run, open_any
 from lumigraph.run.composition import Part, write_composition
+
+pytestmark = budget("capture", 10)
 
 SEED = 18
 Open = Callable[[Path], object]

@@ -7,6 +7,7 @@ import warnings
 import pytest
 import tiny
 import torch
+from budgets import budget
 from test_gaussians import NAMES, cloud, similarity
 
 from lumigraph import cli, memory, methods
@@ -22,7 +23,7 @@ from lumigraph.run.splat_file import SplatFile
 from lumigraph.scene import Frame
 from lumigraph.train import fit
 
-pytestmark = pytest.mark.filterwarnings("ignore:The cloud stops growing")
+pytestmark = [budget("methods", 10), pytest.mark.filterwarnings("ignore:The cloud stops growing")]
 GROWING = {
     "refine_from": 10,
     "refine_every": 10,

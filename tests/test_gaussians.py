@@ -6,6 +6,7 @@ import math
 
 import pytest
 import torch
+from budgets import budget
 
 from lumigraph import kernels
 from lumigraph.camera import Camera
@@ -16,6 +17,8 @@ from lumigraph.geometry import multiply, to_matrix, to_quaternion
 from lumigraph.kernels.spherical_harmonics import K00
 from lumigraph.lens import Equirectangular, OpenCV, Pinhole
 from lumigraph.metrics import psnr
+
+pytestmark = budget("methods")
 
 WIDTH, HEIGHT = 64, 48
 

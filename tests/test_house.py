@@ -8,9 +8,12 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from budgets import budget
 from conftest import JIT, PACKAGE, checked_modules, module_name
 
 import lumigraph
+
+pytestmark = budget("house")
 
 # Each floor may know the floors above it in this list, and a room on it knows no other room of its own floor.
 # A new room is a new name here, on the floor where it belongs.

@@ -8,6 +8,7 @@ import pytest
 import tiny
 import tiny_collection
 import torch
+from budgets import budget
 
 from lumigraph import kernels
 from lumigraph.cli import main
@@ -24,6 +25,8 @@ from lumigraph.methods.hyp_nerf import FOUND, HypNeRF, around, held, patch
 from lumigraph.metrics import psnr
 from lumigraph.run import Run, State
 from lumigraph.scene import Scene
+
+pytestmark = budget("methods", 10)
 
 SHAPE = HashShape(HashLevels(2, 2, 6, 3, 8), (4, 6, 5), (5 + 1, 6, 3), 1)
 

@@ -7,6 +7,7 @@ from dataclasses import replace
 import pytest
 import tiny
 import torch
+from budgets import budget
 
 from lumigraph.evaluate import evaluate
 from lumigraph.images import ImageStore
@@ -16,6 +17,8 @@ from lumigraph.rays import Rays
 from lumigraph.run import Run, build
 from lumigraph.scene import Scene
 from lumigraph.train import fit
+
+pytestmark = budget("methods", 10)
 
 SMALL = changed(
     Config(),

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import pytest
 import tiny
+from budgets import budget
 from conftest import PACKAGE
 
 from lumigraph import locks
@@ -21,6 +22,8 @@ from lumigraph.errors import LumigraphError
 from lumigraph.locks import held
 from lumigraph.run import Run
 from lumigraph.train import fit
+
+pytestmark = budget("runs")
 
 HOLDER = """
 import sys

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import tiny
 import torch
+from budgets import budget
 
 from lumigraph import memory, methods
 from lumigraph.errors import LumigraphError
@@ -17,6 +18,8 @@ from lumigraph.memory import peak_memory, want_of_memory
 from lumigraph.run import build
 from lumigraph.run.needs import bytes_of
 from lumigraph.train import fit
+
+pytestmark = budget("runs", 12)
 
 TAKE = """
 import torch

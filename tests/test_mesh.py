@@ -13,6 +13,7 @@ import pytest
 import tiny
 import torch
 import trimesh
+from budgets import budget
 from listing import names
 from scipy.spatial import cKDTree
 from solids import SOLID, Seen, Solid, around, ball, painted, shell, together, torus
@@ -35,6 +36,8 @@ from lumigraph.rays import Rendering
 from lumigraph.run import Run
 from lumigraph.scene import Frame
 from lumigraph.train import fit
+
+pytestmark = budget("exports", 25)
 
 CELL = 1 / 24
 # A scene that was shrunk to half, turned a quarter about z and moved.

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import tiny
 import torch
+from budgets import budget
 from captures import HEIGHT, WIDTH, Tiny, write_colmap, write_ngp
 
 from lumigraph.capture import multiscale, open_scene
@@ -17,6 +18,8 @@ from lumigraph.evaluate import evaluate
 from lumigraph.images import ImageStore
 from lumigraph.run import Run, State
 from lumigraph.scene import Scene
+
+pytestmark = budget("runs")
 
 
 @pytest.fixture

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import tiny
 import torch
+from budgets import budget
 
 from lumigraph.capabilities import HasDensity, HasField, HasLooks, can
 from lumigraph.components.fields.appearance import PhotographCodes
@@ -25,6 +26,8 @@ from lumigraph.run import build
 from lumigraph.scene import Scene
 from lumigraph.train import fit
 from lumigraph.volume import composite
+
+pytestmark = budget("methods")
 
 NETWORK = {
     "field": "network", "depth": 2, "skip_layer": 1, "coarse_samples": 8, "fine_samples": 8, "rays_per_step": 64,

@@ -11,6 +11,7 @@ import numba
 import numpy as np
 import pytest
 import torch
+from budgets import budget
 from PIL import Image
 
 from lumigraph.camera import Camera
@@ -28,6 +29,8 @@ from lumigraph.methods import find
 from lumigraph.metrics import psnr
 from lumigraph.rays import Rendering
 from lumigraph.scene import Frame
+
+pytestmark = budget("exports", 8)
 
 NORTH = torch.tensor([0.0, 1.0, 0.0])
 HERE = torch.tensor([0.1, -0.2, 0.05])

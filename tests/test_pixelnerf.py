@@ -9,6 +9,7 @@ import safetensors.torch
 import tiny
 import tiny_collection
 import torch
+from budgets import budget
 from torch.nn import functional as F
 
 from lumigraph import methods
@@ -22,6 +23,8 @@ from lumigraph.errors import LumigraphError
 from lumigraph.lens import Fisheye
 from lumigraph.run import build
 from lumigraph.scene import Photograph
+
+pytestmark = budget("methods", 10)
 
 CPU = torch.device("cpu")
 SMALL = {"widths": (8, 8, 8, 8), "blocks": (1, 1, 1)}

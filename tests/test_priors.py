@@ -10,6 +10,7 @@ import tiny
 import tiny_collection
 import tiny_shapes
 import torch
+from budgets import budget
 from PIL import Image
 
 from lumigraph import memory, methods
@@ -22,6 +23,8 @@ from lumigraph.prior import Prior
 from lumigraph.run import Run, State, build
 from lumigraph.run.inferred import Inferred
 from lumigraph.scene import Scene
+
+pytestmark = budget("capture", 20)
 
 CPU = torch.device("cpu")
 

@@ -11,6 +11,7 @@ from typing import Annotated, Any, Literal
 import pytest
 import tiny
 import torch
+from budgets import budget
 
 from lumigraph import methods
 from lumigraph.cli import COMMANDS, main
@@ -19,6 +20,8 @@ from lumigraph.files import write_json
 from lumigraph.ranges import Count, Share, between, check, domain, hints, numbers, outside, typed
 from lumigraph.run import Run, build
 from lumigraph.train import fit
+
+pytestmark = budget("methods", 20)
 
 OURS = list(methods.COLOURED)
 

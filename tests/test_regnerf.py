@@ -8,6 +8,7 @@ from dataclasses import replace
 import pytest
 import tiny
 import torch
+from budgets import budget
 
 from lumigraph.components.training.fog import thickness_before
 from lumigraph.components.training.patch_flow import SIDE, PatchFlow, photographed
@@ -19,6 +20,8 @@ from lumigraph.methods.mip_nerf import Config as MipConfig
 from lumigraph.methods.regnerf import RegNeRF
 from lumigraph.rays import Samples
 from lumigraph.run import build
+
+pytestmark = budget("methods")
 
 
 def chance(seed: int = 0) -> torch.Generator:

@@ -13,6 +13,7 @@ from pathlib import Path
 import pytest
 import tiny
 import torch
+from budgets import budget
 from listing import names
 
 from lumigraph import methods
@@ -22,6 +23,8 @@ from lumigraph.plain import alike, flatten, unflatten
 from lumigraph.ranges import typed
 from lumigraph.run import Run, State
 from lumigraph.train import fit
+
+pytestmark = budget("runs", 8)
 
 
 @pytest.fixture(scope="module")

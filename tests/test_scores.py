@@ -12,6 +12,7 @@ import tiny
 import tiny_collection
 import tiny_shapes
 import torch
+from budgets import budget
 
 from lumigraph import methods
 from lumigraph.benchmark.cell import Cell, Settings
@@ -28,6 +29,8 @@ from lumigraph.run import Run, build
 from lumigraph.shapes import Shapes
 from lumigraph.train import fit
 from lumigraph.viewer.training_panel import describe, measure_of
+
+pytestmark = budget("runs", 10)
 
 CPU = torch.device("cpu")
 

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import tiny
 import torch
+from budgets import budget
 from torch.nn.functional import grid_sample, normalize
 
 from lumigraph.alignment import moves
@@ -21,6 +22,8 @@ from lumigraph.geometry import look_at, rotated
 from lumigraph.images import ImageStore
 from lumigraph.lens import Pinhole
 from lumigraph.scene import Scene
+
+pytestmark = budget("methods", 8)
 
 SIZE = 160
 

@@ -11,10 +11,13 @@ import sys
 import time
 
 import pytest
+from budgets import budget
 from conftest import PACKAGE
 
 from lumigraph.cli import main
 from lumigraph.signals import AGAIN, Interrupt, Stopped, go_on_unless, listening, until_interrupted
+
+pytestmark = budget("runs", 15)
 
 BOTH = [signal.SIGINT, signal.SIGTERM]
 # What each command is doing when the signal comes: RUN and PICTURE are put in.

@@ -12,6 +12,7 @@ import pytest
 import tiny
 import tiny_atlas
 import torch
+from budgets import budget
 from PIL import Image
 from tiny_atlas import DENSITY, RADIUS
 
@@ -28,6 +29,8 @@ from lumigraph.metrics import psnr
 from lumigraph.rays import Rays
 from lumigraph.run import Run, State, open_any
 from lumigraph.train import fit
+
+pytestmark = budget("methods", 12)
 
 
 @pytest.fixture(scope="module")

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import tiny
 import torch
+from budgets import budget
 
 from lumigraph import methods
 from lumigraph.budget import Budget
@@ -14,6 +15,8 @@ from lumigraph.commands.outcome import advice, more_time, next_commands, photogr
 from lumigraph.run import Run, build
 from lumigraph.train import fit
 from lumigraph.verdict import Trend, last_psnr, loss_trend
+
+pytestmark = budget("runs")
 
 FLAT, FALLING = Trend(0.01, 0.01), Trend(0.3, 0.02)
 

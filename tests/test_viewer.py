@@ -18,6 +18,7 @@ import numpy as np
 import pytest
 import tiny
 import torch
+from budgets import budget
 from torch import nn
 from viewer_client import Client
 
@@ -45,7 +46,7 @@ from lumigraph.viewer.view_request import ViewRequest
 
 WHITE = (1.0, 1.0, 1.0)
 # A client may leave at any moment; viser warns of what was still on its way.
-pytestmark = pytest.mark.filterwarnings("ignore:Queued a .* on a closed connection")
+pytestmark = [budget("exports", 10), pytest.mark.filterwarnings("ignore:Queued a .* on a closed connection")]
 
 
 @pytest.fixture(scope="module")

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import tiny
 import torch
+from budgets import budget
 from viewer_client import Client
 
 from lumigraph import methods
@@ -19,7 +20,7 @@ from lumigraph.run import build
 from lumigraph.viewer import Subject, Viewer, choose_address
 
 # A client may leave at any moment; viser warns of what was still on its way.
-pytestmark = pytest.mark.filterwarnings("ignore:Queued a .* on a closed connection")
+pytestmark = [budget("exports"), pytest.mark.filterwarnings("ignore:Queued a .* on a closed connection")]
 
 
 def subject(scene, folder) -> Subject:

@@ -10,6 +10,7 @@ import pytest
 import tiny
 import torch
 import volumes
+from budgets import budget
 from test_viewer import subject
 from test_web import OPENING
 from windows import SIZE, psnr, some_camera
@@ -27,6 +28,8 @@ from lumigraph.export.page import volume_bytes, volume_page
 from lumigraph.rays import Rays
 from lumigraph.run import open_any
 from lumigraph.viewer import Viewer, choose_address
+
+pytestmark = budget("exports", 30)
 
 GROUND = torch.tensor(OPENING.background)
 LEVELS = 5

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from budgets import budget
 from tiny import method as tiny_method
 from tiny import new_run, scene
 from windows import SIZE, psnr, some_camera
@@ -23,6 +24,8 @@ from lumigraph.gaussians.splatting import render
 from lumigraph.mesh import Mesh
 from lumigraph.paths import Surroundings
 from lumigraph.run import State
+
+pytestmark = budget("exports", 15)
 
 PACKAGES = Path(__file__).parent.parent / "web" / "package.json"
 OPENING = Opening(

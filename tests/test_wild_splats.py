@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import tiny
 import torch
+from budgets import budget
 from test_gaussian_splatting import new
 from test_gaussians import cloud
 from test_nerf_w import two_lights
@@ -29,7 +30,7 @@ from lumigraph.run import Run, build
 from lumigraph.scene import Photograph
 from lumigraph.train import fit
 
-pytestmark = pytest.mark.filterwarnings("ignore:The cloud stops growing")
+pytestmark = [budget("methods", 10), pytest.mark.filterwarnings("ignore:The cloud stops growing")]
 
 
 def code(seed: int = 0) -> torch.Tensor:
