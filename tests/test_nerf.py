@@ -8,19 +8,19 @@ import torch
 from budgets import budget
 
 from lumigraph.camera import Camera
+from lumigraph.camera.lens import Pinhole
+from lumigraph.camera.rays import Rays
 from lumigraph.components.fields.coordinate_network import CoordinateNetwork
 from lumigraph.components.sampling.occupancy_mask import OccupancyMask
+from lumigraph.datasets.images import ImageStore
+from lumigraph.datasets.scene import Forward, Frame, Scene
 from lumigraph.errors import LumigraphError
-from lumigraph.evaluate import evaluate
-from lumigraph.images import ImageStore
-from lumigraph.lens import Pinhole
+from lumigraph.evaluation import evaluate
 from lumigraph.method import RayMethod
 from lumigraph.methods import mip_nerf, nerf
 from lumigraph.metrics import psnr
-from lumigraph.rays import Rays
 from lumigraph.run import build
-from lumigraph.scene import Forward, Frame, Scene
-from lumigraph.train import fit
+from lumigraph.training import fit
 from lumigraph.volume import composite
 
 pytestmark = budget("methods", 16)

@@ -11,21 +11,21 @@ import tiny
 import torch
 from budgets import budget
 
-from lumigraph import memory
-from lumigraph.cli import main
+from lumigraph.camera.rays import Rays, Rendering
+from lumigraph.commands.cli import main
 from lumigraph.components.fields import leaves as leaves_module
 from lumigraph.components.fields.harmonic_field import colour
 from lumigraph.components.fields.leaves import Leaves, in_space, places_of
 from lumigraph.components.fields.octree_baking import fill, overlapping, tight_cube
+from lumigraph.datasets.scene import Frame
 from lumigraph.errors import LumigraphError
 from lumigraph.export.octree import contents, parents
 from lumigraph.geometry import Similarity
 from lumigraph.kernels.octree_cells import Tree, code_of, levels_of
 from lumigraph.methods.plenoctrees import PlenOctrees
 from lumigraph.metrics import psnr
-from lumigraph.rays import Rays, Rendering
 from lumigraph.run import Run, State, build
-from lumigraph.scene import Frame
+from lumigraph.system import memory
 
 pytestmark = budget("methods")
 

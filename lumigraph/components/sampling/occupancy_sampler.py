@@ -10,12 +10,12 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from ...camera.rays import Rays, Samples
+from ...datasets.scene import Frame, Scene
+from ...exchange.packing import Stored
+from ...files.ranges import NonNegative, Share, Steps, between
 from ...method import Features, Field, Pass, Sampler
 from ...method.sampler import Density, codes_at
-from ...packing import Stored
-from ...ranges import NonNegative, Share, Steps, between
-from ...rays import Rays, Samples
-from ...scene import Frame, Scene
 from ...volume import visible, weights_of
 from .carving import visual_hull
 from .occupancy import OccupancyGrid
