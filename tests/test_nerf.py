@@ -23,7 +23,7 @@ from lumigraph.run import build
 from lumigraph.training import fit
 from lumigraph.volume import composite
 
-pytestmark = budget("methods", 16)
+pytestmark = budget("methods", 24)
 
 SMALL = {
     "depth": 3,
@@ -57,8 +57,8 @@ def test_it_learns_held_out_views(kind, options):
         options = options | {"networks": 1, "transmittance_threshold": 1e-3}
     scene, made = tiny.scene(), method(kind, **options)
     before = evaluate(made, scene).psnr
-    fit(made, scene, steps=120, show=False, rehearsal=False)
-    assert evaluate(made, scene).psnr > max(before, 9) + 6
+    fit(made, scene, steps=100, show=False, rehearsal=False)
+    assert evaluate(made, scene).psnr > max(before, 9) + 6  # 6.3 to 9.0 after 90 steps
 
 
 @KIND
@@ -159,7 +159,7 @@ def wall(reach: float, forward: bool) -> Scene:
 def test_it_learns_in_every_space(kind, forward):
     scene = wall(4.0, forward)
     made = method(kind, scene.frame, **({"density_noise": 0.0} if kind is nerf.NeRF else {}))
-    fit(made, scene, steps=150, show=False, rehearsal=False)
+    fit(made, scene, steps=120, show=False, rehearsal=False)
     evaluation = evaluate(made, scene)
     assert evaluation.psnr > 20
     seen = made.render(scene.cameras[4])
