@@ -129,11 +129,11 @@ class OccupancySampler(Sampler):
         self.step_share, self.sampled_share, self.stale = 1.0, 1.0, False
 
     @property
-    def batch_size(self) -> int:
+    def batch_size(self) -> int:  # type: ignore[override]
         return int(self.rays_per_step)
 
     @property
-    def expected_rays(self) -> float:
+    def expected_rays(self) -> float:  # type: ignore[override]
         return (
             min(self.max_rays, self.numbers.samples_per_step / self.samples_per_ray) if self.adapts else self.max_rays
         )

@@ -79,11 +79,11 @@ class ProposalSampler(Sampler):
             self.register_buffer(name, torch.zeros(0, 3))
 
     @property
-    def batch_size(self) -> int:
+    def batch_size(self) -> int:  # type: ignore[override]
         return self.rays
 
     @property
-    def expected_rays(self) -> float:
+    def expected_rays(self) -> float:  # type: ignore[override]
         return self.rays
 
     def sample(
