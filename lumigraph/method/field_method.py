@@ -38,7 +38,7 @@ class FieldMethod(RayMethod, ABC):
 
     def recoloured(self, rgb: Float[Tensor, "point 3"]) -> Float[Tensor, "point 3"]:
         """Colours of the field under the settings."""
-        for part in self.parts:
+        for part in self.held_parts:
             rgb = part.recoloured(self, rgb)
         return rgb
 
@@ -70,7 +70,7 @@ class FieldMethod(RayMethod, ABC):
 
     def learn(self, rays: Rays, generator: torch.Generator) -> tuple[list[Pass], dict[str, Tensor]]:
         """Passes along rays of photographs at random places, and the sampler's loss terms by name."""
-        for part in self.parts:
+        for part in self.held_parts:
             rays = part.moved(rays)
         passes = self.sampler.sample(rays, self.network, self.code(rays), generator)
         last = passes[-1]
