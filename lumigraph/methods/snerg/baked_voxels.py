@@ -10,12 +10,12 @@ from torch import Tensor, nn
 
 from ... import kernels
 from ...baked import Atlas
+from ...components.sampling.spaces import Contraction
 from ...kernels.block_march import ALPHA, CHANNELS
 from ...kernels.block_march.reference import contracted, steps
 from ...rays import Rays, Samples
 from ...volume import packed
-from ..sampling.spaces import Contraction
-from .deferred import ViewDependence
+from .deferred_field import ViewDependence
 
 STEPS = 255  # between the least and the largest of a value that is told by eight bits
 OPAQUE = 1 - 1e-6

@@ -11,29 +11,29 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from ..camera import Camera
-from ..collection import Collection
-from ..components.fields.code_space import fitted
-from ..components.fields.hash_field import HashNumbers, check_levels
-from ..components.fields.hash_instance import HashInstance, HashShape
-from ..components.fields.hypernetwork import HyperNetwork
-from ..components.fields.instance_codes import AVERAGE, InstanceCodes
-from ..components.fields.kept_photographs import Kept
-from ..components.fields.picture_denoiser import PictureDenoiser
-from ..components.sampling.carving import visual_hull
-from ..components.sampling.coarse_to_fine import lattice
-from ..components.sampling.marching import reached
-from ..components.sampling.occupancy import OccupancyGrid
-from ..components.training.lazy_adam import LazyAdam
-from ..components.training.members import chance, photographed, rays_through
-from ..components.training.photometric import backdrop, residuals
-from ..components.training.schedules import falling
-from ..controls import Control, Value, blend
-from ..errors import LumigraphError
-from ..geometry import look_at
-from ..method import Method, RayMethod
-from ..quality import Effort, Efforts
-from ..ranges import (
+from ...camera import Camera
+from ...collection import Collection
+from ...components.fields.code_space import fitted
+from ...components.fields.hash_field import HashNumbers, check_levels
+from ...components.fields.hash_instance import HashInstance, HashShape
+from ...components.fields.hypernetwork import HyperNetwork
+from ...components.fields.instance_codes import AVERAGE, InstanceCodes
+from ...components.fields.kept_photographs import Kept
+from ...components.fields.picture_denoiser import PictureDenoiser
+from ...components.sampling.carving import visual_hull
+from ...components.sampling.coarse_to_fine import lattice
+from ...components.sampling.marching import reached
+from ...components.sampling.occupancy import OccupancyGrid
+from ...components.training.lazy_adam import LazyAdam
+from ...components.training.members import chance, photographed, rays_through
+from ...components.training.photometric import backdrop, residuals
+from ...components.training.schedules import falling
+from ...controls import Control, Value, blend
+from ...errors import LumigraphError
+from ...geometry import look_at
+from ...method import Method, RayMethod
+from ...quality import Effort, Efforts
+from ...ranges import (
     BatchSize,
     Count,
     Layers,
@@ -45,9 +45,9 @@ from ..ranges import (
     Width,
     between,
 )
-from ..rays import Look, Rays, Rendering
-from ..scene import Batch, Frame, Photograph, Scene
-from ..volume import composite
+from ...rays import Look, Rays, Rendering
+from ...scene import Batch, Frame, Photograph, Scene
+from ...volume import composite
 
 Tally = Annotated[int, between(0, 100_000)]
 

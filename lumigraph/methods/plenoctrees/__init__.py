@@ -11,13 +11,13 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from ..baked import Octree
-from ..camera import Camera
-from ..capabilities import HasField, HasLooks, can
-from ..components.fields.harmonic_field import HarmonicHash, HarmonicNetwork, colour
-from ..components.fields.hash_field import TABLE_ON_A_CPU, TINY_TABLE, HashNumbers, check_levels
-from ..components.fields.leaves import Leaves, ask_for_octree
-from ..components.fields.octree_baking import (
+from ...baked import Octree
+from ...camera import Camera
+from ...capabilities import HasField, HasLooks, can
+from ...components.fields.harmonic_field import HarmonicHash, HarmonicNetwork, colour
+from ...components.fields.hash_field import TABLE_ON_A_CPU, TINY_TABLE, HashNumbers, check_levels
+from ...components.fields.leaves import Leaves, ask_for_octree
+from ...components.fields.octree_baking import (
     Baking,
     averaged_harmonics,
     bake,
@@ -25,19 +25,19 @@ from ..components.fields.octree_baking import (
     fill,
     met,
 )
-from ..components.fields.taken_over import logit, taken_over
-from ..components.sampling.carving import visual_hull
-from ..components.sampling.coarse_to_fine import SAMPLES_OF_A_RAY, first_grid, keep_looking, lattice, stage
-from ..components.sampling.marching import FIRST_RAYS, rays_for, reached
-from ..components.sampling.occupancy import OccupancyGrid
-from ..components.training.lazy_adam import LazyAdam
-from ..components.training.lazy_rmsprop import LazyRMSprop
-from ..components.training.photometric import backdrop, residuals
-from ..components.training.schedules import falling, held
-from ..errors import LumigraphError
-from ..method import RayMethod
-from ..packing import Stored, most_important
-from ..ranges import (
+from ...components.fields.taken_over import logit, taken_over
+from ...components.sampling.carving import visual_hull
+from ...components.sampling.coarse_to_fine import SAMPLES_OF_A_RAY, first_grid, keep_looking, lattice, stage
+from ...components.sampling.marching import FIRST_RAYS, rays_for, reached
+from ...components.sampling.occupancy import OccupancyGrid
+from ...components.training.lazy_adam import LazyAdam
+from ...components.training.lazy_rmsprop import LazyRMSprop
+from ...components.training.photometric import backdrop, residuals
+from ...components.training.schedules import falling, held
+from ...errors import LumigraphError
+from ...method import RayMethod
+from ...packing import Stored, most_important
+from ...ranges import (
     BatchSize,
     Depth,
     Layers,
@@ -52,9 +52,9 @@ from ..ranges import (
     Width,
     between,
 )
-from ..rays import Look, Rays, Rendering
-from ..scene import Batch, Frame, Scene
-from ..volume import composite, weights_of
+from ...rays import Look, Rays, Rendering
+from ...scene import Batch, Frame, Scene
+from ...volume import composite, weights_of
 
 DensityRate = Annotated[float, between(1e-6, 1e4)]
 

@@ -12,24 +12,24 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import softplus
 
-from ..camera import Camera
-from ..capture.fewer import spread_out
-from ..collection import Collection
-from ..components.fields.dense import in_chunks
-from ..components.fields.encodings import FrequencyEncoding
-from ..components.fields.kept_photographs import KeptPhotographs, padded
-from ..components.fields.picture_encoder import STRIDE, PictureEncoder
-from ..components.fields.picture_lookup import look_up
-from ..components.fields.residual_network import ResidualNetwork
-from ..components.sampling.sampling import inverse_transform, midpoints, stratified
-from ..components.sampling.spaces import space_of
-from ..components.training.members import chance, photographed, rays_through
-from ..components.training.schedules import falling
-from ..controls import Control, Value
-from ..errors import LumigraphError
-from ..method import Method, RayMethod
-from ..quality import Effort, Efforts
-from ..ranges import (
+from ...camera import Camera
+from ...capture.fewer import spread_out
+from ...collection import Collection
+from ...components.fields.dense import in_chunks
+from ...components.fields.encodings import FrequencyEncoding
+from ...components.fields.kept_photographs import KeptPhotographs, padded
+from ...components.fields.picture_encoder import STRIDE, PictureEncoder
+from ...components.fields.picture_lookup import look_up
+from ...components.fields.residual_network import ResidualNetwork
+from ...components.sampling.sampling import inverse_transform, midpoints, stratified
+from ...components.sampling.spaces import space_of
+from ...components.training.members import chance, photographed, rays_through
+from ...components.training.schedules import falling
+from ...controls import Control, Value
+from ...errors import LumigraphError
+from ...method import Method, RayMethod
+from ...quality import Effort, Efforts
+from ...ranges import (
     BatchSize,
     Layers,
     LearningRate,
@@ -42,9 +42,9 @@ from ..ranges import (
     Width,
     between,
 )
-from ..rays import Look, Rays, Samples
-from ..scene import Batch, Frame, Photograph, Scene
-from ..volume import composite, weights_of
+from ...rays import Look, Rays, Samples
+from ...scene import Batch, Frame, Photograph, Scene
+from ...volume import composite, weights_of
 
 Views = Annotated[int, between(1, 64)]
 
