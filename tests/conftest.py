@@ -46,7 +46,7 @@ def checked_modules() -> set[str]:
 if not torch.cuda.is_available():
     os.environ["TRITON_INTERPRET"] = "1"  # read when Triton is imported
 
-own = {"lumigraph.threads"}  # must come before PyTorch, and has no shapes
+own = {"lumigraph.system", "lumigraph.system.threads"}  # must come before PyTorch, and has no shapes
 loaded = sorted(name for name in sys.modules if name.startswith("lumigraph.") and name not in own)
 assert not loaded, f"loaded before their shapes could be checked: {loaded}"
 checker = "beartype.beartype(conf=beartype.BeartypeConf(is_pep484_tower=True))"  # an int will do for a float
@@ -155,7 +155,7 @@ def ball_run(tmp_path_factory: pytest.TempPathFactory) -> Any:
     """A Run of the tests' own method, which has learnt the tiny scene for 60 steps."""
     import tiny
 
-    from lumigraph.train import fit
+    from lumigraph.training import fit
 
     run = tiny.new_run(tmp_path_factory.mktemp("runs") / "ball")
     fit(run.new_method(), tiny.scene(), run, steps=60, show=False, rehearsal=False)

@@ -22,17 +22,17 @@ from proofs import kept
 from safetensors.torch import load_file
 from streets import crossing_streets, write_street
 
-from lumigraph.budget import Budget
 from lumigraph.capture import Places, open_scene, places_of, read_capture
-from lumigraph.cli import main
+from lumigraph.commands.cli import main
 from lumigraph.errors import LumigraphError, LumigraphWarning
 from lumigraph.large import BlockRun, crossings, layout, monitor, planning, training, worker
 from lumigraph.large.on_ray import Workers
 from lumigraph.large.plan import Plan, Task
 from lumigraph.methods import find
 from lumigraph.run import Run, open_any
+from lumigraph.run.budget import Budget
 from lumigraph.run.splat_file import SplatFile
-from lumigraph.train import fit
+from lumigraph.training import fit
 
 pytestmark = budget("runs", 15)
 

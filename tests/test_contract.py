@@ -24,13 +24,16 @@ from budgets import PER_METHOD, budget
 import lumigraph
 from lumigraph import methods
 from lumigraph.camera import Camera
-from lumigraph.capabilities import CanCompress, HasDensity, HasDistance, HasField, HasGaussians, HasLooks, HasMesh, can
-from lumigraph.cli import main
-from lumigraph.compression import LADDER
-from lumigraph.compression.model import Model
+from lumigraph.camera.lens import Equirectangular, Fisheye, Lens, OmnidirectionalStereo, OpenCV, Pinhole
+from lumigraph.camera.rays import Rays, Rendering
+from lumigraph.commands.cli import main
+from lumigraph.datasets.mesh import Mesh
+from lumigraph.datasets.scene import Scene
 from lumigraph.depth_maps import depth_map
+from lumigraph.derive.compression import LADDER
+from lumigraph.derive.compression.model import Model
 from lumigraph.errors import LumigraphError
-from lumigraph.evaluate import evaluate, held_out_poses
+from lumigraph.evaluation import evaluate, held_out_poses
 from lumigraph.exchange import read_gaussians
 from lumigraph.explain.ray import along_ray
 from lumigraph.export import points as export_points
@@ -38,16 +41,22 @@ from lumigraph.export.film import film
 from lumigraph.export.mesh import extract_mesh
 from lumigraph.export.page import opening_of_scene, splats_page, views_page
 from lumigraph.export.splats import export_splats
-from lumigraph.lens import Equirectangular, Fisheye, Lens, OmnidirectionalStereo, OpenCV, Pinhole
-from lumigraph.mesh import Mesh
 from lumigraph.method import Method, RayMethod
+from lumigraph.method.capabilities import (
+    CanCompress,
+    HasDensity,
+    HasDistance,
+    HasField,
+    HasGaussians,
+    HasLooks,
+    HasMesh,
+    can,
+)
 from lumigraph.metrics import psnr
 from lumigraph.paths import camera_path
-from lumigraph.rays import Rays, Rendering
 from lumigraph.run import Run, build
 from lumigraph.run.checkpoint import Checkpoints
-from lumigraph.scene import Scene
-from lumigraph.train import fit
+from lumigraph.training import fit
 
 STEPS, PAUSES, LATER = 24, (5, 18), 48
 SHOWN = 4  # the camera whose picture is looked at, a held-out one

@@ -14,25 +14,25 @@ from budgets import budget
 
 from lumigraph import methods
 from lumigraph.camera import ring
-from lumigraph.capabilities import FromField, HasField, can
-from lumigraph.cli import main
+from lumigraph.camera.rays import Look, Samples
+from lumigraph.commands.cli import main
 from lumigraph.components.clouds.at_surfaces import facing
 from lumigraph.components.fields.taken_over import OfDepthMaps, OfField, logit, taken_over
 from lumigraph.components.sampling.spaces import space_of
-from lumigraph.conversion import Aim, convert, ways
-from lumigraph.conversion.renderings import between, rendered_scene
+from lumigraph.datasets.scene import Frame
+from lumigraph.derive.conversion import Aim, convert, ways
+from lumigraph.derive.conversion.renderings import between, rendered_scene
 from lumigraph.errors import LumigraphError
 from lumigraph.export.splats import export_splats
 from lumigraph.geometry import to_matrix, unit
 from lumigraph.kernels import spherical_harmonics
 from lumigraph.method import RayMethod
+from lumigraph.method.capabilities import FromField, HasField, can
 from lumigraph.metrics import psnr
-from lumigraph.rays import Look, Samples
 from lumigraph.run import Run, build, open_any
 from lumigraph.run.converted import Converted
-from lumigraph.scene import Frame
-from lumigraph.signals import Stopped
-from lumigraph.train import fit
+from lumigraph.system.signals import Stopped
+from lumigraph.training import fit
 
 pytestmark = budget("runs", 15)
 
@@ -281,7 +281,9 @@ def test_the_same_command_goes_on_where_it_was_stopped(ball_run, tmp_path, monke
     aim = Aim(methods.find("plenoxels").smallest(), steps=12, views=1)
     straight = convert(ball_run, "plenoxels", tmp_path / "straight", aim)
     stopping = lambda *told, **more: replace(fit(*told, **more, pause_at=5), signal=2)  # noqa: E731
-    monkeypatch.setattr(sys.modules["lumigraph.conversion.convert"], "fit", stopping)  # the function has its name
+    monkeypatch.setattr(
+        sys.modules["lumigraph.derive.conversion.convert"], "fit", stopping
+    )  # the function has its name
     with pytest.raises(Stopped):
         convert(ball_run, "plenoxels", tmp_path / "broken", aim)
     assert Converted.read(tmp_path / "broken") is None and Run(tmp_path / "broken").state.step == 5

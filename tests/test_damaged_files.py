@@ -25,6 +25,7 @@ from budgets import budget
 from PIL import Image
 
 from lumigraph import files
+from lumigraph.camera.lens import Equirectangular, Fisheye, Lens, OpenCV, Pinhole, mix
 from lumigraph.capture import blender, open_scene
 from lumigraph.capture import transforms as transforms_reader
 from lumigraph.capture.assemble import checked_pose
@@ -33,16 +34,15 @@ from lumigraph.capture.meshes import read_shape
 from lumigraph.capture.motion.folder import claim
 from lumigraph.capture.motion.stages import Stages
 from lumigraph.capture.oddities import oddities
+from lumigraph.datasets.scene import Frame
 from lumigraph.errors import LumigraphError, LumigraphWarning
+from lumigraph.evaluation.report import header
 from lumigraph.exchange import read_gaussians
-from lumigraph.lens import Equirectangular, Fisheye, Lens, OpenCV, Pinhole, mix
+from lumigraph.files.ranges import hints
 from lumigraph.metrics import scores_of
 from lumigraph.paths.keyframes import CameraPath
-from lumigraph.ranges import hints
-from lumigraph.report import header
 from lumigraph.run import Run
 from lumigraph.run.composition import read_composition
-from lumigraph.scene import Frame
 
 pytestmark = budget("capture", 10)
 

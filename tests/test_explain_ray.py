@@ -14,12 +14,12 @@ from solids import Seen, around, ball, painted
 from test_instant_ngp import method as small_instant_ngp
 
 import lumigraph.methods
-from lumigraph.cli import main
+from lumigraph.camera.rays import Look, Samples
+from lumigraph.commands.cli import main
 from lumigraph.errors import LumigraphError
 from lumigraph.explain.ray import Sight, along_ray
 from lumigraph.explain.ray_figure import LEFT, RIGHT, ray_figure
 from lumigraph.figures.charts import standalone
-from lumigraph.rays import Look, Samples
 from lumigraph.run import Run
 from lumigraph.volume import composite
 

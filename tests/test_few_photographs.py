@@ -13,7 +13,7 @@ from test_gaussian_splatting import new
 
 from lumigraph.components.clouds.few_photographs import some_left_out, unseen_roughness
 from lumigraph.components.clouds.initial_cloud import round_gaussians
-from lumigraph.train import fit
+from lumigraph.training import fit
 
 pytestmark = budget("methods")
 

@@ -11,11 +11,13 @@ import torch
 from budgets import budget
 
 from lumigraph import kernels
-from lumigraph.cli import main
-from lumigraph.collection import Collection
-from lumigraph.conversion.ways import way
+from lumigraph.commands.cli import main
+from lumigraph.datasets.collection import Collection
+from lumigraph.datasets.images import ImageStore
+from lumigraph.datasets.scene import Scene
+from lumigraph.derive.conversion.ways import way
 from lumigraph.errors import LumigraphError
-from lumigraph.images import ImageStore
+from lumigraph.files.ranges import changed
 from lumigraph.kernels import HashLevels
 from lumigraph.methods import find
 from lumigraph.methods.hyp_nerf import FOUND, HypNeRF, around, held, patch
@@ -23,9 +25,7 @@ from lumigraph.methods.hyp_nerf.hash_instance import HashInstance, HashShape
 from lumigraph.methods.hyp_nerf.hypernetwork import HyperNetwork
 from lumigraph.methods.hyp_nerf.instance_codes import AVERAGE, InstanceCodes
 from lumigraph.metrics import psnr
-from lumigraph.ranges import changed
 from lumigraph.run import Run, State
-from lumigraph.scene import Scene
 
 pytestmark = budget("methods", 10)
 

@@ -19,8 +19,11 @@ from scipy.spatial import cKDTree
 from solids import SOLID, Seen, Solid, around, ball, painted, shell, together, torus
 
 from lumigraph.camera import Camera
-from lumigraph.cli import main
-from lumigraph.crop import Box, Sphere
+from lumigraph.camera.crop import Box, Sphere
+from lumigraph.camera.rays import Rendering
+from lumigraph.commands.cli import main
+from lumigraph.datasets.mesh import Mesh
+from lumigraph.datasets.scene import Frame
 from lumigraph.depth_maps import Tolerance, render_depth_maps
 from lumigraph.errors import LumigraphError
 from lumigraph.exchange import write_gaussians
@@ -31,11 +34,8 @@ from lumigraph.export.polygons import BLOCK, Grid, zero_level
 from lumigraph.export.surface import simplified, smoothed
 from lumigraph.gaussians import Gaussians
 from lumigraph.kernels.spherical_harmonics import K00
-from lumigraph.mesh import Mesh
-from lumigraph.rays import Rendering
 from lumigraph.run import Run
-from lumigraph.scene import Frame
-from lumigraph.train import fit
+from lumigraph.training import fit
 
 pytestmark = budget("exports", 25)
 

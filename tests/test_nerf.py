@@ -8,22 +8,22 @@ import torch
 from budgets import budget
 
 from lumigraph.camera import Camera
+from lumigraph.camera.lens import Pinhole
+from lumigraph.camera.rays import Rays
 from lumigraph.components.fields.coordinate_network import CoordinateNetwork
 from lumigraph.components.sampling.occupancy_mask import OccupancyMask
+from lumigraph.datasets.images import ImageStore
+from lumigraph.datasets.scene import Forward, Frame, Scene
 from lumigraph.errors import LumigraphError
-from lumigraph.evaluate import evaluate
-from lumigraph.images import ImageStore
-from lumigraph.lens import Pinhole
+from lumigraph.evaluation import evaluate
 from lumigraph.method import RayMethod
 from lumigraph.methods import mip_nerf, nerf
 from lumigraph.metrics import psnr
-from lumigraph.rays import Rays
 from lumigraph.run import build
-from lumigraph.scene import Forward, Frame, Scene
-from lumigraph.train import fit
+from lumigraph.training import fit
 from lumigraph.volume import composite
 
-pytestmark = budget("methods", 16)
+pytestmark = budget("methods", 24)
 
 SMALL = {
     "depth": 3,
@@ -57,8 +57,8 @@ def test_it_learns_held_out_views(kind, options):
         options = options | {"networks": 1, "transmittance_threshold": 1e-3}
     scene, made = tiny.scene(), method(kind, **options)
     before = evaluate(made, scene).psnr
-    fit(made, scene, steps=120, show=False, rehearsal=False)
-    assert evaluate(made, scene).psnr > max(before, 9) + 6
+    fit(made, scene, steps=100, show=False, rehearsal=False)
+    assert evaluate(made, scene).psnr > max(before, 9) + 6  # 6.3 to 9.0 after 90 steps
 
 
 @KIND
@@ -159,7 +159,7 @@ def wall(reach: float, forward: bool) -> Scene:
 def test_it_learns_in_every_space(kind, forward):
     scene = wall(4.0, forward)
     made = method(kind, scene.frame, **({"density_noise": 0.0} if kind is nerf.NeRF else {}))
-    fit(made, scene, steps=150, show=False, rehearsal=False)
+    fit(made, scene, steps=120, show=False, rehearsal=False)
     evaluation = evaluate(made, scene)
     assert evaluation.psnr > 20
     seen = made.render(scene.cameras[4])

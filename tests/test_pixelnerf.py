@@ -14,15 +14,15 @@ from torch.nn import functional as F
 
 from lumigraph import methods
 from lumigraph.camera import Camera
-from lumigraph.collection import Collection
+from lumigraph.camera.lens import Fisheye
 from lumigraph.components.fields.kept_photographs import KeptPhotographs, padded
+from lumigraph.datasets.collection import Collection
+from lumigraph.datasets.scene import Photograph
 from lumigraph.errors import LumigraphError
-from lumigraph.lens import Fisheye
 from lumigraph.methods.pixelnerf.picture_encoder import PictureEncoder, finer
 from lumigraph.methods.pixelnerf.picture_lookup import look_up
 from lumigraph.methods.pixelnerf.residual_network import ResidualNetwork
 from lumigraph.run import build
-from lumigraph.scene import Photograph
 
 pytestmark = budget("methods", 10)
 

@@ -10,10 +10,12 @@ import tiny
 import torch
 from budgets import budget
 
-from lumigraph import memory
-from lumigraph.cli import main
+from lumigraph.camera.rays import Rays, Rendering
+from lumigraph.commands.cli import main
+from lumigraph.datasets.scene import Frame
 from lumigraph.errors import LumigraphError
 from lumigraph.export.octree import contents, parents
+from lumigraph.files.ranges import changed
 from lumigraph.geometry import Similarity
 from lumigraph.kernels.octree_cells import Tree, code_of, levels_of
 from lumigraph.methods.plenoctrees import PlenOctrees
@@ -21,10 +23,8 @@ from lumigraph.methods.plenoctrees import leaves as leaves_module
 from lumigraph.methods.plenoctrees.baking import fill, overlapping, tight_cube
 from lumigraph.methods.plenoctrees.leaves import Leaves, in_space, places_of
 from lumigraph.metrics import psnr
-from lumigraph.ranges import changed
-from lumigraph.rays import Rays, Rendering
 from lumigraph.run import Run, State, build
-from lumigraph.scene import Frame
+from lumigraph.system import memory
 
 pytestmark = budget("methods")
 

@@ -11,10 +11,10 @@ import pytest
 from budgets import budget
 from rich.tree import Tree
 
-from lumigraph import progress
 from lumigraph.commands.common import show
-from lumigraph.console import bold, console
-from lumigraph.progress import Stage, counting, track
+from lumigraph.system import progress
+from lumigraph.system.console import bold, console
+from lumigraph.system.progress import Stage, counting, track
 
 pytestmark = budget("runs")
 

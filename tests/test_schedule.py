@@ -9,11 +9,12 @@ import tiny
 import torch
 from budgets import budget
 
-from lumigraph import methods, train
+from lumigraph import methods
 from lumigraph.components.clouds.density_control import AdaptiveDensity, MarkovChain
 from lumigraph.components.training.rhythm import Rhythm, haste
 from lumigraph.run import build
-from lumigraph.train import fit
+from lumigraph.training import fit
+from lumigraph.training import loop as train
 
 pytestmark = budget("methods", 25)
 

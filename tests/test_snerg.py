@@ -17,19 +17,19 @@ from PIL import Image
 from tiny_atlas import DENSITY, RADIUS
 
 from lumigraph import kernels
-from lumigraph.capabilities import HasAtlas, can
-from lumigraph.cli import main
+from lumigraph.camera.rays import Rays
+from lumigraph.commands.cli import main
 from lumigraph.errors import LumigraphError
 from lumigraph.exchange import snerg
+from lumigraph.files.ranges import changed
 from lumigraph.kernels.block_march import ALPHA
+from lumigraph.method.capabilities import HasAtlas, can
 from lumigraph.methods.snerg import ATLAS, FIELD, VOXELS, SNeRG
 from lumigraph.methods.snerg.deferred_field import encoded
 from lumigraph.methods.snerg.visibility_grid import VisibilityGrid
 from lumigraph.metrics import psnr
-from lumigraph.ranges import changed
-from lumigraph.rays import Rays
 from lumigraph.run import Run, State, open_any
-from lumigraph.train import fit
+from lumigraph.training import fit
 
 pytestmark = budget("methods", 12)
 

@@ -12,7 +12,7 @@ from balls import RED, Splatted, eye
 from budgets import budget
 from test_exchange import make, same
 
-from lumigraph import cli
+from lumigraph.commands import cli
 from lumigraph.errors import LumigraphError
 from lumigraph.exchange import is_splat_file, read_gaussians, size_of, sog, write_gaussians
 from lumigraph.exchange.streamed_sog import Detail

@@ -11,10 +11,10 @@ import torch
 from budgets import budget
 
 from lumigraph.errors import LumigraphError
-from lumigraph.evaluate import evaluate
+from lumigraph.evaluation import evaluate
 from lumigraph.run import Run
 from lumigraph.run.checkpoint import Checkpoints
-from lumigraph.train import Clock, finite, fit, rehearse, set_learning_rate
+from lumigraph.training import Clock, finite, fit, rehearse, set_learning_rate
 
 pytestmark = budget("runs", 16)
 

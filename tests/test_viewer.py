@@ -22,16 +22,16 @@ from budgets import budget
 from torch import nn
 from viewer_client import Client
 
-from lumigraph.cli import main
-from lumigraph.crop import Box
+from lumigraph.camera.crop import Box
+from lumigraph.camera.rays import Rendering
+from lumigraph.commands.cli import main
 from lumigraph.errors import LumigraphError, LumigraphWarning
 from lumigraph.figures import NOTHING, RAMP, hex_colour
 from lumigraph.gaussians import Gaussians, splatting
 from lumigraph.gaussians.cleaning import cleaned
 from lumigraph.method import Method, RayMethod
-from lumigraph.rays import Rendering
 from lumigraph.run import Run
-from lumigraph.train import fit
+from lumigraph.training import fit
 from lumigraph.viewer import Subject, Viewer, choose_address
 from lumigraph.viewer.cameras import angle_for, angles, pose_of, rows
 from lumigraph.viewer.crop import render_inside

@@ -13,9 +13,9 @@ from budgets import budget
 from viewer_client import Client
 
 from lumigraph import methods
-from lumigraph.controls import Control
 from lumigraph.gaussians import Gaussians, splatting
 from lumigraph.method import Method
+from lumigraph.method.controls import Control
 from lumigraph.run import build
 from lumigraph.viewer import Subject, Viewer, choose_address
 

@@ -14,7 +14,7 @@ from test_viewer import some_cloud, subject
 from viewer_client import Client
 
 import lumigraph.methods
-from lumigraph.crop import Box, Sphere
+from lumigraph.camera.crop import Box, Sphere
 from lumigraph.errors import LumigraphError
 from lumigraph.gaussians.cleaning import ISOLATION, MAX_SCALE, cleaned
 from lumigraph.viewer import Viewer, choose_address

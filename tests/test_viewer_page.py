@@ -17,10 +17,10 @@ from test_nerf_w import made, two_lights
 from test_viewer import some_cloud, subject
 
 import lumigraph.methods
+from lumigraph.datasets.scene import Frame
 from lumigraph.paths.keyframes import CameraPath
 from lumigraph.run import build
-from lumigraph.scene import Frame
-from lumigraph.train import fit
+from lumigraph.training import fit
 from lumigraph.viewer import Viewer, choose_address
 
 # A client may leave at any moment; viser warns of what was still on its way.

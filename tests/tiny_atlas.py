@@ -5,10 +5,10 @@ from __future__ import annotations
 import torch
 
 from lumigraph import methods
+from lumigraph.datasets.scene import Frame
+from lumigraph.files.ranges import changed
 from lumigraph.method import Method
 from lumigraph.methods.snerg.deferred_field import Deferred
-from lumigraph.ranges import changed
-from lumigraph.scene import Frame
 
 RADIUS, DENSITY = 0.6, 4.0
 WALL, WIDE = 1.0, 0.4

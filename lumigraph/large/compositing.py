@@ -16,12 +16,12 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from ..camera import Camera
+from ..camera.rays import Rendering
 from ..composition import Placed
-from ..controls import Control, Value
+from ..datasets.scene import Frame, Photograph
 from ..errors import LumigraphError
 from ..method import Method
-from ..rays import Rendering
-from ..scene import Frame, Photograph
+from ..method.controls import Control, Value
 from .block_cache import Nearby
 from .exposure_alignment import EXPOSURE, Asked, exposed
 from .visibility import GLANCE, saw

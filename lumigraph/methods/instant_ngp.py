@@ -29,10 +29,10 @@ from ..components.training.exposure import Exposure, Setting
 from ..components.training.photometric import backdrop, residuals
 from ..components.training.pose_refinement import PoseNumbers, poses_for
 from ..components.training.schedules import held
+from ..datasets.scene import Batch, Frame
+from ..exchange.packing import most_important
+from ..files.ranges import LearningRate, NonNegative, PositiveShare, Seed, Width, between
 from ..method import FieldMethod
-from ..packing import most_important
-from ..ranges import LearningRate, NonNegative, PositiveShare, Seed, Width, between
-from ..scene import Batch, Frame
 from ..volume import composite
 
 

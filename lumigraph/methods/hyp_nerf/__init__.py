@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from ...camera import Camera
-from ...collection import Collection
+from ...camera.rays import Look, Rays, Rendering
 from ...components.fields.code_space import fitted
 from ...components.fields.hash_field import HashNumbers
 from ...components.fields.kept_photographs import Kept
@@ -23,12 +23,10 @@ from ...components.training.lazy_adam import LazyAdam
 from ...components.training.members import chance, photographed, rays_through
 from ...components.training.photometric import backdrop, residuals
 from ...components.training.schedules import falling
-from ...controls import Control, Value, blend
+from ...datasets.collection import Collection
+from ...datasets.scene import Batch, Frame, Photograph, Scene
 from ...errors import LumigraphError
-from ...geometry import look_at
-from ...method import Method, RayMethod
-from ...quality import Effort, Efforts
-from ...ranges import (
+from ...files.ranges import (
     BatchSize,
     Count,
     Layers,
@@ -40,8 +38,10 @@ from ...ranges import (
     Width,
     between,
 )
-from ...rays import Look, Rays, Rendering
-from ...scene import Batch, Frame, Photograph, Scene
+from ...geometry import look_at
+from ...method import Method, RayMethod
+from ...method.controls import Control, Value, blend
+from ...method.quality import Effort, Efforts
 from ...volume import composite
 from .hash_instance import HashInstance, HashShape
 from .hypernetwork import HyperNetwork

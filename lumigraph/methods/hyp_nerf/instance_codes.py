@@ -7,7 +7,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
 from ...components.fields.code_space import axes_of
-from ...controls import blend
+from ...method.controls import blend
 
 AVERAGE = "average"
 

@@ -10,9 +10,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from ...baked import Octree
 from ...camera import Camera
-from ...capabilities import HasField, HasLooks, can
+from ...camera.rays import Rays, Rendering
 from ...components.fields.hash_field import CPU_LEVELS, TINY_LEVELS, TableNumbers
 from ...components.fields.taken_over import logit, taken_over
 from ...components.sampling.occupancy_sampler import NGP_SCHEDULE, OccupancyNumbers, OccupancySampler, StepNumbers
@@ -20,10 +19,11 @@ from ...components.sampling.spaces import Box
 from ...components.training.lazy_rmsprop import LazyRMSprop
 from ...components.training.photometric import backdrop, residuals
 from ...components.training.schedules import falling, held
+from ...datasets.scene import Batch, Frame, Scene
 from ...errors import LumigraphError
-from ...method import Field, FieldMethod, Sampler
-from ...packing import most_important
-from ...ranges import (
+from ...exchange.baked import Octree
+from ...exchange.packing import most_important
+from ...files.ranges import (
     BatchSize,
     Depth,
     Layers,
@@ -37,8 +37,8 @@ from ...ranges import (
     Width,
     between,
 )
-from ...rays import Rays, Rendering
-from ...scene import Batch, Frame, Scene
+from ...method import Field, FieldMethod, Sampler
+from ...method.capabilities import HasField, HasLooks, can
 from ...volume import composite, weights_of
 from .baking import Baking, averaged_harmonics, bake, density_of, fill, met
 from .harmonic_field import HarmonicHash, HarmonicNetwork, Teacher

@@ -6,8 +6,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from ...camera.rays import Rays
 from ...method import Pass, Sampler
-from ...rays import Rays
 from .leaves import Leaves
 
 

@@ -12,10 +12,9 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
-from ...baked import Atlas
-from ...blending import over
 from ...camera import Camera
-from ...capabilities import HasField, can
+from ...camera.rays import Look, Rays, Rendering
+from ...color.blending import over
 from ...components.fields.hash_field import CPU_LEVELS, TINY_LEVELS, TableNumbers
 from ...components.fields.taken_over import taken_over
 from ...components.sampling.occupancy_sampler import (
@@ -33,14 +32,26 @@ from ...components.training.lazy_adam import LazyAdam
 from ...components.training.photometric import backdrop, residuals
 from ...components.training.schedules import falling, held
 from ...components.training.sparsity import cauchy
+from ...datasets.scene import Batch, Frame, Scene
 from ...errors import LumigraphError, LumigraphWarning
+from ...exchange.baked import Atlas
+from ...files.ranges import (
+    BatchSize,
+    Layers,
+    LearningRate,
+    NonNegative,
+    Octaves,
+    PositiveShare,
+    Seed,
+    Share,
+    Width,
+    between,
+)
 from ...geometry import unit
 from ...kernels.block_march import ALPHA, CHANNELS
 from ...kernels.spherical_harmonics import K00
 from ...method import FieldMethod, Pass
-from ...ranges import BatchSize, Layers, LearningRate, NonNegative, Octaves, PositiveShare, Seed, Share, Width, between
-from ...rays import Look, Rays, Rendering
-from ...scene import Batch, Frame, Scene
+from ...method.capabilities import HasField, can
 from ...volume import composite, weights_of
 from .baked_voxels import BakedVoxels, rounded
 from .deferred_field import Deferred, DeferredField, Geometry, HashDeferred, NetworkDeferred, ViewDependence
