@@ -21,10 +21,10 @@ from lumigraph.capture.motion.folder import WRITTEN, claim_results, copy_photogr
 from lumigraph.capture.photos import Photo
 from lumigraph.capture.photos.track import untracked
 from lumigraph.commands.cli import COMMANDS, main
-from lumigraph.components.fields.octree_baking import fill
 from lumigraph.errors import LumigraphError
 from lumigraph.files import marks, partials
 from lumigraph.method import Method
+from lumigraph.methods.plenoctrees.baking import fill
 from lumigraph.paths.keyframes import CameraPath, Keyframe
 from lumigraph.run import Run, State, build
 
@@ -98,7 +98,7 @@ def octree_run(folder: Path) -> Run:
     """Eight leaves of nothing."""
     method: Any = tiny_method("plenoctrees")
     fill(method.leaves, torch.arange(8, 16))
-    method.teacher = method.occupancy = None
+    method.teacher = method.teacher_sampler = None
     return run_of(method, folder)
 
 

@@ -12,17 +12,18 @@ from budgets import budget
 
 from lumigraph import kernels
 from lumigraph.commands.cli import main
-from lumigraph.components.fields.hash_instance import HashInstance, HashShape
-from lumigraph.components.fields.hypernetwork import HyperNetwork
-from lumigraph.components.fields.instance_codes import AVERAGE, InstanceCodes
 from lumigraph.datasets.collection import Collection
 from lumigraph.datasets.images import ImageStore
 from lumigraph.datasets.scene import Scene
 from lumigraph.derive.conversion.ways import way
 from lumigraph.errors import LumigraphError
+from lumigraph.files.ranges import changed
 from lumigraph.kernels import HashLevels
 from lumigraph.methods import find
 from lumigraph.methods.hyp_nerf import FOUND, HypNeRF, around, held, patch
+from lumigraph.methods.hyp_nerf.hash_instance import HashInstance, HashShape
+from lumigraph.methods.hyp_nerf.hypernetwork import HyperNetwork
+from lumigraph.methods.hyp_nerf.instance_codes import AVERAGE, InstanceCodes
 from lumigraph.metrics import psnr
 from lumigraph.run import Run, State
 
@@ -32,7 +33,7 @@ SHAPE = HashShape(HashLevels(2, 2, 6, 3, 8), (4, 6, 5), (5 + 1, 6, 3), 1)
 
 
 def hyp_nerf(**numbers) -> HypNeRF:
-    return HypNeRF(tiny_collection.collection().frame, replace(HypNeRF.smallest(), **numbers))
+    return HypNeRF(tiny_collection.collection().frame, changed(HypNeRF.smallest(), **numbers))
 
 
 @pytest.fixture(scope="module")
@@ -76,7 +77,7 @@ def test_tables_and_layers_reach_the_kernels_with_right_gradients():
         made = hyper([colour if of_colour else shape for of_colour in SHAPE.of_colour])
         sums = []
         for tensors in made:
-            density, rgb = HashInstance(SHAPE, tensors).field(points.to(code), directions.to(code))
+            density, rgb = HashInstance(SHAPE, tensors)(points.to(code), directions.to(code))
             sums.append((torch.cat([density.log()[:, None], rgb], -1) * weights.to(code)).sum())
         return torch.stack(sums)
 
@@ -96,10 +97,10 @@ def test_colours_are_the_colour_codes_and_shapes_the_shape_codes():
     method = hyp_nerf()
     points, directions = torch.rand(30, 3) - 0.5, torch.nn.functional.normalize(torch.randn(30, 3), dim=-1)
     code = torch.randn(1, 8)
-    for changed, same in ((slice(0, 4), False), (slice(4, 8), True)):
+    for part, same in ((slice(0, 4), False), (slice(4, 8), True)):
         other = code.clone()
-        other[:, changed] += 3.0
-        (a, ra), (b, rb) = (method._made(x)[0].field(points, directions) for x in (code, other))
+        other[:, part] += 3.0
+        (a, ra), (b, rb) = (method._made(x)[0](points, directions) for x in (code, other))
         assert torch.equal(a, b) == same and not torch.allclose(ra, rb)
 
 

@@ -16,12 +16,12 @@ from lumigraph import methods
 from lumigraph.camera import Camera
 from lumigraph.camera.lens import Fisheye
 from lumigraph.components.fields.kept_photographs import KeptPhotographs, padded
-from lumigraph.components.fields.picture_encoder import PictureEncoder, finer
-from lumigraph.components.fields.picture_lookup import look_up
-from lumigraph.components.fields.residual_network import ResidualNetwork
 from lumigraph.datasets.collection import Collection
 from lumigraph.datasets.scene import Photograph
 from lumigraph.errors import LumigraphError
+from lumigraph.methods.pixelnerf.picture_encoder import PictureEncoder, finer
+from lumigraph.methods.pixelnerf.picture_lookup import look_up
+from lumigraph.methods.pixelnerf.residual_network import ResidualNetwork
 from lumigraph.run import build
 
 pytestmark = budget("methods", 10)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -13,16 +12,16 @@ from budgets import budget
 
 from lumigraph.camera.rays import Rays, Rendering
 from lumigraph.commands.cli import main
-from lumigraph.components.fields import leaves as leaves_module
-from lumigraph.components.fields.harmonic_field import colour
-from lumigraph.components.fields.leaves import Leaves, in_space, places_of
-from lumigraph.components.fields.octree_baking import fill, overlapping, tight_cube
 from lumigraph.datasets.scene import Frame
 from lumigraph.errors import LumigraphError
 from lumigraph.export.octree import contents, parents
+from lumigraph.files.ranges import changed
 from lumigraph.geometry import Similarity
 from lumigraph.kernels.octree_cells import Tree, code_of, levels_of
 from lumigraph.methods.plenoctrees import PlenOctrees
+from lumigraph.methods.plenoctrees import leaves as leaves_module
+from lumigraph.methods.plenoctrees.baking import fill, overlapping, tight_cube
+from lumigraph.methods.plenoctrees.leaves import Leaves, in_space, places_of
 from lumigraph.metrics import psnr
 from lumigraph.run import Run, State, build
 from lumigraph.system import memory
@@ -58,7 +57,7 @@ class Ball:
 
 
 def method(**config) -> PlenOctrees:
-    numbers = replace(PlenOctrees.smallest(), **config)
+    numbers = changed(PlenOctrees.smallest(), **config)
     return build(PlenOctrees, tiny.scene().frame, numbers, torch.device("cpu"), 0)
 
 
@@ -66,7 +65,7 @@ def some_leaves(codes: torch.Tensor, basis: int = 4) -> Leaves:
     leaves = Leaves(basis)
     fill(leaves, codes)
     leaves.codes = leaves.codes[in_space(leaves.codes.long())]
-    leaves.density.data[:] = 0.2 + random(len(codes), 1, seed=1)
+    leaves.densities.data[:] = 0.2 + random(len(codes), 1, seed=1)
     leaves.harmonics.data[:] = random(len(codes), 3 * basis, seed=2) - 0.5
     return leaves
 
@@ -110,7 +109,7 @@ def test_a_tree_that_cannot_be_is_refused(codes):
 def test_a_ray_through_a_fog_of_leaves_dims_exponentially():
     """Straight through, and as far past everything."""
     leaves = some_leaves(torch.arange(8, 16))
-    leaves.density.data[:] = 0.7
+    leaves.densities.data[:] = 0.7
     rays = Rays(torch.tensor([[-3.0, 0.2, 0.3], [-3.0, 2.0, 0.3]]), torch.tensor([[1.0, 0, 0]] * 2), torch.ones(2))
     seen = leaves.seen(rays, 0.05, 0.0, torch.ones(1, 3))
     assert seen.opacity.tolist() == pytest.approx([1 - math.exp(-1.4), 0.0], abs=1e-5)
@@ -121,7 +120,7 @@ def test_coarser_keeps_all_that_stops_light():
     leaves = some_leaves(torch.arange(64, 128)[::3])
     coarse = leaves.coarser(1)
     assert len(coarse) == 8 and coarse.tree.depth == 1
-    volumes = [0.25**3 * leaves.density.sum(), 0.5**3 * coarse.density.sum()]
+    volumes = [0.25**3 * leaves.densities.sum(), 0.5**3 * coarse.densities.sum()]
     torch.testing.assert_close(*(8 * v for v in volumes))
 
 
@@ -130,7 +129,7 @@ def test_the_noun_holds_what_the_leaves_hold():
     octree = leaves.octree()
     assert octree.child.shape == (1 + 5, 2, 2, 2)
     centres, _ = leaves.centres
-    expected = leaves.density.detach(), leaves.harmonics.detach()
+    expected = leaves.densities.detach(), leaves.harmonics.detach()
     for row in range(0, len(leaves), 7):
         node, place, size = 0, ((centres[row] - octree.low) / octree.size), 1.0
         while True:
@@ -150,7 +149,7 @@ def test_the_noun_holds_what_the_leaves_hold():
 def test_a_ball_looks_baked_as_it_does_itself(ball):
     """Seen from a camera that took part: its silhouette within a cell, its colours within what bands of two hold and
     what shows through leaves that it only half fills."""
-    assert ball.baked and ball.occupancy is None and len(ball.leaves) > 100
+    assert ball.baked and ball.teacher_sampler is None and len(ball.leaves) > 100
     camera = tiny.scene().cameras[1]
     seen, rays = ball.render(camera), camera.rays(camera.pixels())
     across = rays.origins - (rays.origins * rays.directions).sum(-1, keepdim=True) * rays.directions
@@ -190,7 +189,7 @@ def test_harmonics_of_a_field_are_its_colours(ball):
     centres, _ = leaves.centres
     directions = torch.nn.functional.normalize(centres - cameras.position[2], dim=-1)
     seen = (centres.norm(dim=-1) < 0.5) & ((centres * directions).sum(-1) < -0.1)
-    shown = colour(leaves.harmonics.detach().view(-1, 4, 3), directions)
+    shown = leaves.colour(leaves.harmonics.detach(), directions)
     expected = Ball().field(centres, directions)[1]
     assert (shown - expected)[seen].abs().mean() < 0.05
 
@@ -230,7 +229,7 @@ def test_a_part_teaches_the_leaves_that_rays_touch_and_no_other(ball):
     rays = camera.rays(camera.pixels())[200:260]
     ends = ball.frame.near, 1e-3, torch.ones(1, 3)
     rows = ball.leaves.touched(rays, *ends[:2])
-    tables = ball.leaves.density, ball.leaves.harmonics
+    tables = ball.leaves.densities, ball.leaves.harmonics
     whole = torch.autograd.grad(ball.leaves.seen(rays, *ends).rgb.square().sum(), tables)
     part = torch.autograd.grad(ball.leaves.seen(rays, *ends, ball.leaves.part(rows)).rgb.square().sum(), tables)
     for dense, sparse in zip(whole, part, strict=True):
@@ -255,10 +254,10 @@ def test_a_tree_too_deep_for_memory_names_the_depth_that_fits(ball, monkeypatch)
 
 
 def test_baking_too_deep_for_memory_names_the_depth_that_fits(monkeypatch):
-    from lumigraph.components.fields import octree_baking
+    from lumigraph.methods.plenoctrees import baking
 
     made = method()
-    monkeypatch.setattr(octree_baking, "free_on", lambda device: Leaves.bytes_of(1500, 4, learning=True))
+    monkeypatch.setattr(baking, "free_on", lambda device: Leaves.bytes_of(1500, 4, learning=True))
     with pytest.raises(LumigraphError, match=r"An octree of depth 4 .* give --octree-depth 3, which fits"):
         made.from_field(Ball(), tiny.scene().cameras)
 
@@ -346,7 +345,7 @@ def test_the_file_lies_in_its_frame():
     assert arrays["invradius3"].tolist() == [0.25] * 3
     corner = moved.points(leaves.low.double()).numpy() * arrays["invradius3"] + arrays["offset"]
     np.testing.assert_allclose(corner, 0, atol=1e-6)
-    np.testing.assert_allclose(arrays["data"][..., -1].max(), float(leaves.density.detach().max()) / 2, rtol=1e-3)
+    np.testing.assert_allclose(arrays["data"][..., -1].max(), float(leaves.densities.detach().max()) / 2, rtol=1e-3)
     assert parents(arrays["child"])[1:].tolist() == [[place, 1] for place in range(8)]
 
 

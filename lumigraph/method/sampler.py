@@ -105,3 +105,6 @@ class Sampler(Part):
 
     def settle(self, density: Density, chance: torch.Generator) -> None:
         """Follow a field that was taught by a teacher. density: per scene unit"""
+
+    def release(self) -> None:
+        """Drop what sampling alone needs, once the field is baked."""

@@ -29,18 +29,14 @@ Joining = Callable[[int], Tensor | None]  # weights of so many levels or octaves
 
 
 @dataclass(frozen=True)
-class HashNumbers:
-    """A Config's numbers of the hash table (Müller 2022, table 1) and of the networks behind it (section 5.4)."""
+class TableNumbers:
+    """A Config's numbers of the hash table (Müller 2022, table 1)."""
 
     levels: Annotated[int, between(1, 32)] = 16  # L, number of levels
     features_per_level: Annotated[int, between(1, 16)] = 2  # F, features of an entry
     log2_hashmap_size: Annotated[int, between(1, 28)] = 19  # log2 T, entries of a level: 14 to 24
     base_resolution: Annotated[int, between(1, 4096)] = 16  # N_min, resolution of the coarsest level
     max_resolution: Annotated[int, between(1, 1 << 20)] = 2048  # N_max of the finest, times the reach, section 5.4
-    density_layers: Layers = 1  # hidden layers of the density network, section 5.4
-    colour_layers: Layers = 2  # hidden layers of the colour network, section 5.4
-    geometry_features: Annotated[int, between(1, 256)] = 16  # features from density to colour network, section 5.4
-    sh_bands: Annotated[int, between(1, 4)] = 4  # bands of spherical harmonics of the direction, section 5.4
 
     def check(self) -> None:
         """Raises LumigraphError for numbers of levels that contradict each other."""
@@ -55,17 +51,41 @@ class HashNumbers:
                 f"32 bits count; give a smaller one"
             )
 
+    def levels_of(self, finer: float = 1.0) -> kernels.HashLevels:
+        """Levels of the table. finer: factor on the finest resolution"""
+        sizes = self.features_per_level, self.log2_hashmap_size, self.base_resolution
+        return kernels.HashLevels(self.levels, *sizes, int(self.max_resolution * finer))
+
+    @property
+    def width(self) -> int:
+        """Number of features of a point, over all levels."""
+        return self.levels * self.features_per_level
+
+
+@dataclass(frozen=True)
+class HashNumbers(TableNumbers):
+    """The same with numbers of the networks behind the table (section 5.4)."""
+
+    density_layers: Layers = 1  # hidden layers of the density network, section 5.4
+    colour_layers: Layers = 2  # hidden layers of the colour network, section 5.4
+    geometry_features: Annotated[int, between(1, 256)] = 16  # features from density to colour network, section 5.4
+    sh_bands: Annotated[int, between(1, 4)] = 4  # bands of spherical harmonics of the direction, section 5.4
+
     def activation_bytes(self, samples: int, hidden_width: int) -> int:
         """Lower bound of the bytes of activations that a step of so many samples keeps for its gradients."""
-        hidden = hidden_width * (self.density_layers + self.colour_layers)
-        return 4 * samples * (self.levels * self.features_per_level + hidden)
+        return 4 * samples * (self.width + hidden_width * (self.density_layers + self.colour_layers))
 
 
 # Tables for a plain CPU, which learn most in a minute (docs/methods/instant_ngp.md), and for tests.
-CPU_TABLE = HashNumbers(levels=8, features_per_level=4, log2_hashmap_size=17, max_resolution=512)
-TINY_TABLE = HashNumbers(
-    levels=4, log2_hashmap_size=11, base_resolution=4, max_resolution=32, geometry_features=8, sh_bands=2
-)
+CPU_LEVELS = TableNumbers(levels=8, features_per_level=4, log2_hashmap_size=17, max_resolution=512)
+CPU_TABLE = HashNumbers(**vars(CPU_LEVELS))
+TINY_LEVELS = TableNumbers(levels=4, log2_hashmap_size=11, base_resolution=4, max_resolution=32)
+TINY_TABLE = HashNumbers(**vars(TINY_LEVELS), geometry_features=8, sh_bands=2)
+
+
+def new_table(levels: kernels.HashLevels) -> nn.Parameter:
+    """Random entries of all levels, close to zero (section 4)."""
+    return nn.Parameter(torch.empty(levels.offsets[-1], levels.features).uniform_(-1e-4, 1e-4))
 
 
 class HashField(Field):
@@ -91,11 +111,9 @@ class HashField(Field):
         n = numbers
         self.space, self.bands, self.joining = space, n.sh_bands, joining
         self.extent, finer = (1.0, OPEN_RESOLUTION) if space.is_open else (reach, reach)
-        finest = int(n.max_resolution * finer)
-        self.levels = kernels.HashLevels(n.levels, n.features_per_level, n.log2_hashmap_size, n.base_resolution, finest)
-        self.table = nn.Parameter(torch.empty(self.levels.offsets[-1], n.features_per_level).uniform_(-1e-4, 1e-4))
-        encoded = n.levels * n.features_per_level
-        self.density_network = MLP(encoded, *[hidden_width] * n.density_layers, n.geometry_features)
+        self.levels = n.levels_of(finer)
+        self.table = new_table(self.levels)
+        self.density_network = MLP(n.width, *[hidden_width] * n.density_layers, n.geometry_features)
         self.colour_network = MLP(n.geometry_features + n.sh_bands**2 + code, *[hidden_width] * n.colour_layers, 3)
 
     def encode(self, points: Float[Tensor, "point 3"]) -> Float[Tensor, "point width"]:

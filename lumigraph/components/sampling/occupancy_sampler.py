@@ -193,6 +193,10 @@ class OccupancySampler(Sampler):
     def settle(self, density: Density, chance: torch.Generator) -> None:
         self.grid.update(density, self.numbers.occupancy_threshold, chance)
 
+    def release(self) -> None:
+        for name in self.grid.grows:
+            setattr(self.grid, name, getattr(self.grid, name)[:, :1, :1, :1].clone())
+
     def before_step(self, method: Any, step: int, progress: float) -> None:
         """Refine the grid when its stage begins, and update it when that is due (appendix E.2)."""
         n, schedule = self.numbers, self.schedule

@@ -195,8 +195,8 @@ class ProposalSampler(Sampler):
         }
 
 
-def _scaled(t: Float[Tensor, " sample"], rgb: Float[Tensor, "sample 3"]) -> Float[Tensor, "sample 3"]:
-    return scaled_by_distance(t, rgb)[0]
+def _scaled(t: Float[Tensor, " sample"], values: Float[Tensor, "sample _"]) -> Float[Tensor, "sample _"]:
+    return scaled_by_distance(t, values)[0]
 
 
 def some(points: Points, generator: torch.Generator) -> Points:

@@ -6,8 +6,8 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
+from ...components.fields.code_space import axes_of
 from ...method.controls import blend
-from .code_space import axes_of
 
 AVERAGE = "average"
 

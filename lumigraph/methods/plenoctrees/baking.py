@@ -24,16 +24,16 @@ from ...system.memory import free_on, gigabytes
 from ...volume import weights_of
 from .leaves import Leaves, codes_of
 
-CELLS = 128  # along each axis of the lattice that a teacher's samples mark, at most
-MARKS = 1 << 17  # rays that mark it, at most
-CHUNK = 1 << 13  # rays asked at once
-POINTS = 1 << 18  # points asked at once
-PER_CELL = 32  # rays that look, for each cell of one face of the cube
-MOST_RAYS = 1 << 22
-LEAST_PASSING = 1e-6  # share of light that a leaf lets through
+MAX_CELLS = 128  # along each axis of the lattice that a teacher's samples mark, at most
+MAX_MARKING_RAYS = 1 << 17  # rays that mark it, at most
+RAYS_PER_CHUNK = 1 << 13  # rays asked at once
+POINTS_PER_CHUNK = 1 << 18  # points asked at once
+RAYS_PER_CELL = 32  # rays that look, for each cell of one face of the cube
+MAX_RAYS = 1 << 22
+MIN_TRANSMITTANCE = 1e-6  # share of light that a leaf lets through
 
 Density = Callable[[Float[Tensor, "point 3"]], Float[Tensor, " point"]]
-Harmonics = Callable[[Float[Tensor, "point 3"]], tuple[Float[Tensor, " point"], Float[Tensor, "point basis 3"]]]
+Geometry = Callable[[Float[Tensor, "point 3"]], tuple[Float[Tensor, " point"], Float[Tensor, "point harmonic"]]]
 
 
 @dataclass(frozen=True)
@@ -92,10 +92,10 @@ def random_rays(cameras: Camera, count: int, generator: torch.Generator) -> Rays
 
 def met(teacher: Any, cameras: Camera, numbers: Baking, generator: torch.Generator) -> Bool[Tensor, "x y z"]:
     """Cells of a lattice over [-1, 1]^3 in which a teacher's samples weigh something, and those next to them."""
-    n = min(CELLS, 1 << numbers.depth)
+    n = min(MAX_CELLS, 1 << numbers.depth)
     marks = torch.zeros(n**3, dtype=torch.bool, device=teacher.device)
-    for _ in range(0, min(PER_CELL << 2 * numbers.depth, MARKS), CHUNK):
-        rays = random_rays(cameras, CHUNK, generator).to(teacher.device)
+    for _ in range(0, min(RAYS_PER_CELL << 2 * numbers.depth, MAX_MARKING_RAYS), RAYS_PER_CHUNK):
+        rays = random_rays(cameras, RAYS_PER_CHUNK, generator).to(teacher.device)
         look = teacher.looks(rays)[-1]
         points = look.samples.along(rays)[0][weights_of(look.samples, look.density) > numbers.threshold]
         x, y, z = ((points * 0.5 + 0.5) * n).long().clamp(0, n - 1).unbind(-1)
@@ -131,7 +131,7 @@ def dense_cells(
             place = place[overlapping(mask, leaves.low + place * (size / 2**level), size / 2**level)]
     side = size / 2**numbers.depth
     found = []
-    for some in place.split(POINTS):
+    for some in place.split(POINTS_PER_CHUNK):
         stopped = 1 - torch.exp(-density(leaves.low + (some + 0.5) * side) * side)
         found.append(some[stopped > numbers.threshold])
     return codes_of(torch.cat(found), numbers.depth)
@@ -163,7 +163,7 @@ def ask_for_cells(cells: int, basis: int, depth: int, level: int, device: torch.
 def fill(leaves: Leaves, codes: Int[Tensor, " row"]) -> None:
     """Leaves of these codes, which hold nothing yet."""
     leaves.codes = codes.sort()[0].int()
-    leaves.density = nn.Parameter(torch.zeros(len(codes), 1, device=codes.device))
+    leaves.densities = nn.Parameter(torch.zeros(len(codes), 1, device=codes.device))
     leaves.harmonics = nn.Parameter(torch.zeros(len(codes), 3 * leaves.basis, device=codes.device))
 
 
@@ -178,31 +178,31 @@ def points_in(
 def averaged_density(leaves: Leaves, density: Density, count: int, generator: torch.Generator) -> None:
     """Each leaf's, so that it stops as much light over its side as the field does on average over random points."""
     centres, side = leaves.centres
-    for rows in torch.arange(len(leaves), device=centres.device).split(max(POINTS // count, 1)):
+    for rows in torch.arange(len(leaves), device=centres.device).split(max(POINTS_PER_CHUNK // count, 1)):
         points = points_in(centres[rows], side[rows], count, generator)
         thickness = density(points.flatten(0, 1)).view(len(rows), count) * side[rows, None]
-        passing = torch.exp(-thickness).mean(1).clamp_min(LEAST_PASSING)
-        leaves.density.data[rows, 0] = -passing.log() / side[rows]
+        passing = torch.exp(-thickness).mean(1).clamp_min(MIN_TRANSMITTANCE)
+        leaves.densities.data[rows, 0] = -passing.log() / side[rows]
 
 
 def seen(leaves: Leaves, cameras: Camera, numbers: Baking, generator: torch.Generator) -> Bool[Tensor, " row"]:
     """Which leaves have enough weight somewhere in the pictures, from random rays of all of them."""
     most = torch.zeros(len(leaves), device=leaves.codes.device)
-    for _ in range(0, min(PER_CELL << 2 * numbers.depth, MOST_RAYS), CHUNK):
-        rays = random_rays(cameras, CHUNK, generator).to(most.device)
+    for _ in range(0, min(RAYS_PER_CELL << 2 * numbers.depth, MAX_RAYS), RAYS_PER_CHUNK):
+        rays = random_rays(cameras, RAYS_PER_CHUNK, generator).to(most.device)
         found = leaves.crossed(rays, numbers.near, numbers.threshold)
-        tau = leaves.density[found.rows, 0].relu() * (found.t_end - found.t_start)
+        tau = leaves.densities[found.rows, 0].relu() * (found.t_end - found.t_start)
         weights = composite(tau, tau[:, None], found.ray_starts)[2]
         most.scatter_reduce_(0, found.rows, weights, "amax")
     return most > numbers.threshold
 
 
-def averaged_harmonics(leaves: Leaves, harmonics: Harmonics, count: int, generator: torch.Generator) -> None:
+def averaged_harmonics(leaves: Leaves, geometry: Geometry, count: int, generator: torch.Generator) -> None:
     """Each leaf's mean over random points, where they are dense more than where they are not."""
     centres, side = leaves.centres
-    for rows in torch.arange(len(leaves), device=centres.device).split(max(POINTS // count, 1)):
+    for rows in torch.arange(len(leaves), device=centres.device).split(max(POINTS_PER_CHUNK // count, 1)):
         points = points_in(centres[rows], side[rows], count, generator)
-        density, found = harmonics(points.flatten(0, 1))
+        density, found = geometry(points.flatten(0, 1))
         weights = (density.view(len(rows), count, 1) + 1e-6).double()
         mean = (weights * found.view(len(rows), count, -1)).sum(1) / weights.sum(1)
         leaves.harmonics.data[rows] = mean.float()

@@ -13,27 +13,28 @@ from ... import kernels
 from ...camera.rays import Rays, Rendering
 from ...errors import LumigraphError
 from ...exchange.baked import Octree
+from ...exchange.packing import Stored
 from ...kernels.octree_cells import Crossed, Tree, code_of, levels_of
 from ...kernels.octree_cells.reference import leaves
 from ...system.memory import free_on, gigabytes
-from .harmonic_field import colour
+from .harmonic_field import HarmonicField
 
 
-class Leaves(nn.Module):
+class Leaves(HarmonicField):
     """The table of an octree's leaves. What a leaf holds is the same everywhere inside of it (Yu 2021, section 4).
 
     codes:     of the leaves, rising in memory as they lie in space (see `kernels.Tree`)
-    density:   (row, 1) per scene unit; what is below 0 counts as 0
+    densities: (row, 1) per scene unit; what is below 0 counts as 0
     harmonics: (row, 3 basis), before the sigmoid, colours next to each other
     low, size: corner and side of the cube that is divided, in the scene's frame
     There are none at first.
     """
 
-    grows: ClassVar[tuple[str, ...]] = ("codes", "density", "harmonics")
+    grows: ClassVar[tuple[str, ...]] = ("codes", "densities", "harmonics")
     codes: Tensor
     low: Tensor
     size: Tensor
-    density: nn.Parameter
+    densities: nn.Parameter
     harmonics: nn.Parameter
 
     def __init__(self, basis: int):
@@ -42,7 +43,7 @@ class Leaves(nn.Module):
         self.register_buffer("codes", torch.zeros(0, dtype=torch.int32))
         self.register_buffer("low", torch.full((3,), -1.0))
         self.register_buffer("size", torch.tensor(2.0))
-        self.density = nn.Parameter(torch.zeros(0, 1), requires_grad=False)
+        self.densities = nn.Parameter(torch.zeros(0, 1), requires_grad=False)
         self.harmonics = nn.Parameter(torch.zeros(0, 3 * basis), requires_grad=False)
         self._made: tuple[Tensor, int, Tree] | None = None
 
@@ -72,10 +73,10 @@ class Leaves(nn.Module):
         return Crossed(found.t_start * size, found.t_end * size, found.ray_starts, found.rows)
 
     def seen(
-        self, rays: Rays, near: float, stop: float, background: Float[Tensor, "#ray 3"], part: Part | None = None
+        self, rays: Rays, near: float, stop: float, background: Float[Tensor, "#ray 3"], part: Subtree | None = None
     ) -> Rendering:
         """What rays see before a background colour. part: the rows through which gradients go; all by default"""
-        tree, density, harmonics = part or (self.tree, self.density, self.harmonics)
+        tree, density, harmonics = part or (self.tree, self.densities, self.harmonics)
         thickness = density[:, 0].relu() * float(self.size)
         tables = thickness, harmonics.view(-1, self.basis, 3)
         rgb, distance, opacity = kernels.octree_march(*self._within(rays), tree, *tables, *self._ends(near, stop))
@@ -93,15 +94,15 @@ class Leaves(nn.Module):
         marks[self.crossed(rays, near, stop).rows] = True
         return marks.nonzero()[:, 0]
 
-    def part(self, rows: Int[Tensor, " some"]) -> Part:
+    def part(self, rows: Int[Tensor, " some"]) -> Subtree:
         """A small table of some rows, through which a sparse gradient reaches them: what a step touches."""
-        density, harmonics = (embedding(rows, table, sparse=True) for table in (self.density, self.harmonics))
+        density, harmonics = (embedding(rows, table, sparse=True) for table in (self.densities, self.harmonics))
         return self.tree.part(rows), density, harmonics
 
     @property
     def _thickness(self) -> Float[Tensor, " row"]:
         """Density per side of the cube."""
-        return self.density[:, 0].relu() * float(self.size)
+        return self.densities[:, 0].relu() * float(self.size)
 
     def _within(self, rays: Rays) -> tuple[Tensor, Tensor]:
         return (rays.origins - self.low) / float(self.size), rays.directions
@@ -119,17 +120,20 @@ class Leaves(nn.Module):
         value, _ = leaves(tree, torch.where(inside[:, None], place, 0).long())
         return torch.where(inside & (value < 0), -1 - value, -1)
 
-    def at(
-        self, points: Float[Tensor, "point 3"], directions: Float[Tensor, "point 3"]
-    ) -> tuple[Float[Tensor, " point"], Float[Tensor, "point 3"]]:
-        """Density per scene unit, and colour; grey where nothing is."""
+    def geometry(
+        self, points: Float[Tensor, "point 3"], code: Tensor | None = None
+    ) -> tuple[Float[Tensor, " point"], Float[Tensor, "point harmonic"]]:
+        """Density and harmonics of the leaf that each point is in; zeros where there is none."""
         rows = self.rows_at(points)
-        rgb = colour(self._rows(self.harmonics, rows).view(-1, self.basis, 3), directions)
-        return self._rows(self.density, rows)[:, 0].relu(), rgb
+        return self._rows(self.densities, rows)[:, 0].relu(), self._rows(self.harmonics, rows)
 
-    def density_at(self, points: Float[Tensor, "point 3"]) -> Float[Tensor, " point"]:
+    def density(self, points: Float[Tensor, "point 3"], code: Tensor | None = None) -> Float[Tensor, " point"]:
         """Density per scene unit."""
-        return self._rows(self.density, self.rows_at(points))[:, 0].relu()
+        return self._rows(self.densities, self.rows_at(points))[:, 0].relu()
+
+    def storage(self) -> dict[str, Stored]:
+        """Harmonics by a codebook, density in 16 bits."""
+        return {"densities": Stored("scaled", bits=16), "harmonics": Stored("coded")}
 
     def _rows(self, table: Float[Tensor, "row value"], rows: Int[Tensor, " point"]) -> Float[Tensor, "point value"]:
         found = table.new_zeros(len(rows), table.shape[1])
@@ -142,7 +146,7 @@ class Leaves(nn.Module):
     def keep(self, rows: Bool[Tensor, " row"]) -> None:
         """Leave some rows; where a leaf is gone, there is nothing."""
         self.codes = self.codes[rows]
-        self.density, self.harmonics = nn.Parameter(self.density[rows]), nn.Parameter(self.harmonics[rows])
+        self.densities, self.harmonics = nn.Parameter(self.densities[rows]), nn.Parameter(self.harmonics[rows])
 
     @property
     def centres(self) -> tuple[Float[Tensor, "row 3"], Float[Tensor, " row"]]:
@@ -160,7 +164,7 @@ class Leaves(nn.Module):
         own = torch.arange(len(cells), dtype=torch.int32, device=cells.device)[:, None, None, None]
         child = torch.where(cells > 0, cells - own, 0)
         rows = torch.where(cells < 0, -1 - cells, -1).flatten().long()
-        density = self._rows(self.density, rows).relu().view(cells.shape)
+        density = self._rows(self.densities, rows).relu().view(cells.shape)
         harmonics = self._rows(self.harmonics, rows).view(*cells.shape, self.basis, 3)
         return Octree(child, density, harmonics, self.low.clone(), float(self.size))
 
@@ -171,7 +175,7 @@ class Leaves(nn.Module):
         codes, levels = self.codes.long(), levels_of(self.codes.long())
         over = (levels - depth).clamp_min(0)
         merged, which = torch.unique(codes >> 3 * over, return_inverse=True)
-        share = self.density.relu() / 8.0 ** over[:, None]
+        share = self.densities.relu() / 8.0 ** over[:, None]
         density = torch.zeros(len(merged), 1, device=share.device).index_add_(0, which, share)
         harmonics = torch.zeros(len(merged), self.harmonics.shape[1], device=share.device)
         harmonics.index_add_(0, which, share * self.harmonics)
@@ -179,7 +183,7 @@ class Leaves(nn.Module):
         found.low, found.size = self.low.clone(), self.size.clone()
         order = in_space(merged)
         found.codes = merged[order].int()
-        found.density = nn.Parameter(density[order])
+        found.densities = nn.Parameter(density[order])
         found.harmonics = nn.Parameter((harmonics / density.clamp_min(1e-9))[order])
         return found
 
@@ -203,7 +207,7 @@ def ask_for_octree(leaves: Leaves, depth: int | None = None) -> None:
         )
 
 
-Part = tuple[Tree, Tensor, Tensor]  # a tree for some rows, and those rows of density and harmonics
+Subtree = tuple[Tree, Tensor, Tensor]  # a tree for some rows, and those rows of density and harmonics
 
 
 def places_of(codes: Int[Tensor, " row"], levels: Int[Tensor, " row"]) -> Int[Tensor, "row 3"]:

@@ -9,13 +9,12 @@ from jaxtyping import Float, Int, UInt8
 from torch import Tensor, nn
 
 from ... import kernels
-from ...camera.rays import Rays, Samples
+from ...components.sampling.spaces import Contraction
 from ...exchange.baked import Atlas
 from ...kernels.block_march import ALPHA, CHANNELS
 from ...kernels.block_march.reference import contracted, steps
 from ...volume import packed
-from ..sampling.spaces import Contraction
-from .deferred import ViewDependence
+from .deferred_field import ViewDependence
 
 STEPS = 255  # between the least and the largest of a value that is told by eight bits
 OPAQUE = 1 - 1e-6

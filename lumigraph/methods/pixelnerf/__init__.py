@@ -12,24 +12,21 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import softplus
 
-from ..budget import Effort, Efforts
-from ..camera import Camera
-from ..camera.rays import Look, Rays, Samples
-from ..capture.fewer import spread_out
-from ..components.fields.dense import in_chunks
-from ..components.fields.encodings import FrequencyEncoding
-from ..components.fields.kept_photographs import KeptPhotographs, padded
-from ..components.fields.picture_encoder import STRIDE, PictureEncoder
-from ..components.fields.picture_lookup import look_up
-from ..components.fields.residual_network import ResidualNetwork
-from ..components.sampling.sampling import inverse_transform, midpoints, stratified
-from ..components.sampling.spaces import space_of
-from ..components.training.members import chance, photographed, rays_through
-from ..components.training.schedules import falling
-from ..datasets.collection import Collection
-from ..datasets.scene import Batch, Frame, Photograph, Scene
-from ..errors import LumigraphError
-from ..files.ranges import (
+from ...budget import Effort, Efforts
+from ...camera import Camera
+from ...camera.rays import Look, Rays, Samples
+from ...capture.fewer import spread_out
+from ...components.fields.dense import in_chunks
+from ...components.fields.encodings import FrequencyEncoding
+from ...components.fields.kept_photographs import KeptPhotographs, padded
+from ...components.sampling.sampling import inverse_transform, midpoints, stratified
+from ...components.sampling.spaces import space_of
+from ...components.training.members import chance, photographed, rays_through
+from ...components.training.schedules import falling
+from ...datasets.collection import Collection
+from ...datasets.scene import Batch, Frame, Photograph, Scene
+from ...errors import LumigraphError
+from ...files.ranges import (
     BatchSize,
     Layers,
     LearningRate,
@@ -42,9 +39,12 @@ from ..files.ranges import (
     Width,
     between,
 )
-from ..method import Method, RayMethod
-from ..method.controls import Control, Value
-from ..volume import composite, weights_of
+from ...method import Method, RayMethod
+from ...method.controls import Control, Value
+from ...volume import composite, weights_of
+from .picture_encoder import STRIDE, PictureEncoder
+from .picture_lookup import look_up
+from .residual_network import ResidualNetwork
 
 Views = Annotated[int, between(1, 64)]
 
@@ -388,7 +388,7 @@ class PixelNeRF(RayMethod):
         """Density per scene unit and colour of points seen along directions (section 4.2, eq. 4 to 6)."""
         cameras, c = sources.cameras, self.config
         turned = cameras.pose[:, :, :3].mT  # the world's axes in each camera's
-        middle = c.centred and sources.frame.reach <= 1
+        middle = c.centred and not sources.frame.is_open
         origins = torch.zeros_like(cameras.position) if middle else cameras.position
 
         def answer(points: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:

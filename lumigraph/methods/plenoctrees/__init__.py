@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal
@@ -11,33 +10,20 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from ..camera import Camera
-from ..camera.rays import Look, Rays, Rendering
-from ..components.fields.harmonic_field import HarmonicHash, HarmonicNetwork, colour
-from ..components.fields.hash_field import TABLE_ON_A_CPU, TINY_TABLE, HashNumbers, check_levels
-from ..components.fields.leaves import Leaves, ask_for_octree
-from ..components.fields.octree_baking import (
-    Baking,
-    averaged_harmonics,
-    bake,
-    density_of,
-    fill,
-    met,
-)
-from ..components.fields.taken_over import logit, taken_over
-from ..components.sampling.carving import visual_hull
-from ..components.sampling.coarse_to_fine import SAMPLES_OF_A_RAY, first_grid, keep_looking, lattice, stage
-from ..components.sampling.marching import FIRST_RAYS, rays_for, reached
-from ..components.sampling.occupancy import OccupancyGrid
-from ..components.training.lazy_adam import LazyAdam
-from ..components.training.lazy_rmsprop import LazyRMSprop
-from ..components.training.photometric import backdrop, residuals
-from ..components.training.schedules import falling, held
-from ..datasets.scene import Batch, Frame, Scene
-from ..errors import LumigraphError
-from ..exchange.baked import Octree
-from ..exchange.packing import Stored, most_important
-from ..files.ranges import (
+from ...camera import Camera
+from ...camera.rays import Rays, Rendering
+from ...components.fields.hash_field import CPU_LEVELS, TINY_LEVELS, TableNumbers
+from ...components.fields.taken_over import logit, taken_over
+from ...components.sampling.occupancy_sampler import NGP_SCHEDULE, OccupancyNumbers, OccupancySampler, StepNumbers
+from ...components.sampling.spaces import Box
+from ...components.training.lazy_rmsprop import LazyRMSprop
+from ...components.training.photometric import backdrop, residuals
+from ...components.training.schedules import falling, held
+from ...datasets.scene import Batch, Frame, Scene
+from ...errors import LumigraphError
+from ...exchange.baked import Octree
+from ...exchange.packing import most_important
+from ...files.ranges import (
     BatchSize,
     Depth,
     Layers,
@@ -48,21 +34,26 @@ from ..files.ranges import (
     PositiveShare,
     Seed,
     Share,
-    Steps,
     Width,
     between,
 )
-from ..method import RayMethod
-from ..method.capabilities import HasField, HasLooks, can
-from ..volume import composite, weights_of
+from ...method import Field, FieldMethod, Sampler
+from ...method.capabilities import HasField, HasLooks, can
+from ...volume import composite, weights_of
+from .baking import Baking, averaged_harmonics, bake, density_of, fill, met
+from .harmonic_field import HarmonicHash, HarmonicNetwork, Teacher
+from .leaf_sampler import LeafSampler
+from .leaves import Leaves, ask_for_octree
 
 DensityRate = Annotated[float, between(1e-6, 1e4)]
 
 
 @dataclass(frozen=True)
-class Config(HashNumbers):
+class Config:
     """The paper's numbers, with where it or its release gives them; `PlenOctrees.preset` has those of a plain CPU."""
 
+    table: TableNumbers = TableNumbers()
+    occupancy: OccupancyNumbers = OccupancyNumbers(transmittance_threshold=0.01)  # of all stages; section 4.2
     field: Literal["hash", "network"] = "network"  # first field: the paper's network, or a faster hash table
     depth: Depth = 8  # hidden layers of the network, as in NeRF; more hold more detail, and cost time
     skip_layer: Layers = 5  # layer of the network whose activation the input is concatenated to again
@@ -73,12 +64,7 @@ class Config(HashNumbers):
     sparsity_weight: NonNegative = 1e-3  # weight of density at random points, eq. 4; higher empties more; the release's
     sparsity_length: Positive = 0.05  # lambda of eq. 4: scene units over which that density absorbs light
     sparsity_points: Annotated[int, between(1, 1 << 20)] = 10_000  # K, random points of eq. 4; more cost time
-    samples_per_step: Annotated[int, between(64, 1 << 24)] = 1 << 18  # samples in a step of the first stage
     steps_per_diagonal: Annotated[int, between(4, 16_384)] = 1024  # samples across the cube's diagonal, first stage
-    occupancy_resolution: Annotated[int, between(4, 512)] = 128  # cells per axis of the occupancy grid, first stage
-    occupancy_threshold: NonNegative = 0.05  # optical thickness of a cell below which it is empty; higher skips more
-    occupancy_interval: Steps = 16  # steps between updates of the occupancy grid; more are faster, less current
-    occupancy_decay: Share = 0.95  # share of a cell's density kept at each update; higher forgets more slowly
     learning_rate: LearningRate = 5e-4  # the field's learning rate at first, section 5.1; higher may diverge
     final_learning_rate: LearningRate = 5e-5  # learning rate of the field at the end of the first stage
     decay_start: Annotated[float, between(0, 0.99)] = 0.0  # share of the first stage before that rate falls
@@ -91,46 +77,45 @@ class Config(HashNumbers):
     final_density_learning_rate: DensityRate = 1.0  # rate of the leaves' density at the end
     harmonics_learning_rate: LearningRate = 0.02  # rate of the leaves' harmonics at first
     final_harmonics_learning_rate: LearningRate = 0.002  # rate of the leaves' harmonics at the end
-    transmittance_threshold: Share = 0.01  # transmittance at which a ray terminates, section 4.2; higher is faster
     seed: Seed = 0  # seed of all random numbers; another seed gives another run
 
-    def check(self) -> None:
-        """Raises LumigraphError for numbers that contradict each other."""
-        check_levels(self)
+
+ROWS_PER_CELL = 16  # leaves of most scenes, for each cell of one face of the cube
 
 
-RAYS = 1 << 18  # rendered at once, once there are leaves alone
-ROWS = 16  # leaves that are left of most scenes, for each cell of one face of the cube
-
-
-class PlenOctrees(RayMethod):
+class PlenOctrees(FieldMethod):
     """Three stages: NeRF-SH learns, its field is baked into an octree, the leaves learn on. From the second on there is
-    nothing but the octree: `teacher` and `occupancy` are None.
+    nothing but the octree: `teacher` and `teacher_sampler` are None.
 
     begun: share of the budget at which the leaves began to learn
     """
 
     Config = Config
-    teacher: HarmonicHash | HarmonicNetwork | None
-    occupancy: OccupancyGrid | None
-    teacher_rays: Tensor
+    teacher: Teacher | None
+    teacher_sampler: OccupancySampler | None
     begun: Tensor
 
     def __init__(self, frame: Frame, config: Any = None):
-        config = config or Config()
-        super().__init__(frame, config)
-        if frame.reach > 1:
+        c = config or Config()
+        super().__init__(frame, c)
+        if frame.is_open:
             raise LumigraphError(
                 "An octree here holds an object, and this capture has no bounds; "
                 "`lumigraph train plenoxels` or instant-ngp learn it"
             )
         with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(config.seed)
-            self.teacher = HarmonicHash(config) if config.field == "hash" else HarmonicNetwork(config)
-        self.occupancy = first_grid(config, 1.0)
-        self.lattice = lattice(config, 1.0)
-        self.leaves = Leaves(config.sh_bands**2)
-        self.register_buffer("teacher_rays", torch.tensor(FIRST_RAYS))
+            torch.manual_seed(c.seed)
+            if c.field == "hash":
+                self.teacher = HarmonicHash(c.table, c.hidden_layers, c.hidden_width, c.sh_bands)
+            else:
+                layers = c.depth, c.hidden_width, c.skip_layer
+                self.teacher = HarmonicNetwork(c.position_frequencies, *layers, c.sh_bands)
+        space, steps = Box(frame.bounds, frame.near), StepNumbers(c.steps_per_diagonal)
+        self.teacher_sampler = OccupancySampler(frame, space, c.occupancy, NGP_SCHEDULE, steps)
+        self.leaves = Leaves(c.sh_bands**2)
+        self.leaf_sampler = LeafSampler(frame.near, c.occupancy.transmittance_threshold, c.rays_per_step)
+        learnt, baked = self.teacher_sampler.expected_rays, self.leaf_sampler.expected_rays
+        self.expected_rays = c.teacher_share * learnt + (1 - c.teacher_share) * baked
         self.register_buffer("begun", torch.tensor(0.0, dtype=torch.float64))
         self._progress, self._optimizers = 0.0, list[torch.optim.Optimizer]()
 
@@ -140,14 +125,13 @@ class PlenOctrees(RayMethod):
         if device.type == "cuda":
             return Config()
         return Config(
+            table=CPU_LEVELS,
+            occupancy=OccupancyNumbers(1 << 15, transmittance_threshold=0.01, occupancy_threshold=0.15),
             field="hash",
             hidden_width=32,
-            **TABLE_ON_A_CPU,
             sh_bands=3,
             sparsity_points=1024,
-            samples_per_step=1 << 15,
             steps_per_diagonal=384,
-            occupancy_threshold=0.15,
             learning_rate=2e-2,
             final_learning_rate=1e-3,
             decay_start=0.3,
@@ -160,15 +144,14 @@ class PlenOctrees(RayMethod):
     def smallest(cls) -> Any:
         """Tiny tables that are baked half way through some twenty quick steps."""
         return Config(
+            table=TINY_LEVELS,
+            occupancy=OccupancyNumbers(2048, transmittance_threshold=0.01, occupancy_resolution=16),
             field="hash",
             hidden_width=16,
-            **TINY_TABLE,
             hidden_layers=1,
             sh_bands=2,
             sparsity_points=64,
-            samples_per_step=2048,
             steps_per_diagonal=128,
-            occupancy_resolution=16,
             learning_rate=2e-2,
             final_learning_rate=1e-2,
             teacher_share=0.5,
@@ -179,28 +162,22 @@ class PlenOctrees(RayMethod):
 
     @classmethod
     def further_bytes(cls, frame: Frame, config: Any, learning: bool) -> int:
-        rows = min(ROWS << 2 * config.octree_depth, 1 << 3 * config.octree_depth)
-        grid = OccupancyGrid.bytes_of(1.0, config.occupancy_resolution)
-        return grid + Leaves.bytes_of(rows, config.sh_bands**2, learning)
+        rows = min(ROWS_PER_CELL << 2 * config.octree_depth, 1 << 3 * config.octree_depth)
+        return super().further_bytes(frame, config, learning) + Leaves.bytes_of(rows, config.sh_bands**2, learning)
 
-    # What is there
+    # The field and its sampler
 
     @property
     def baked(self) -> bool:
         return self.teacher is None
 
-    def density(self, points: Float[Tensor, "point 3"]) -> Float[Tensor, " point"]:
-        """Density per scene unit."""
-        return self.teacher.density(points) if self.teacher else self.leaves.density_at(points)
+    @property
+    def network(self) -> Field:  # type: ignore[override]
+        return self.teacher or self.leaves
 
-    def field(
-        self, points: Float[Tensor, "point 3"], directions: Float[Tensor, "point 3"]
-    ) -> tuple[Float[Tensor, " point"], Float[Tensor, "point 3"]]:
-        """Density per scene unit, and sRGB-encoded colour seen along unit directions."""
-        if not self.teacher:
-            return self.leaves.at(points, directions)
-        density, harmonics = self.teacher(points)
-        return density, colour(harmonics, directions)
+    @property
+    def sampler(self) -> Sampler:  # type: ignore[override]
+        return self.teacher_sampler or self.leaf_sampler
 
     def octree(self, depth: int | None = None) -> Octree:
         """The scene as an octree, of so many levels at most; what lies deeper is averaged. Raises LumigraphError while
@@ -217,18 +194,14 @@ class PlenOctrees(RayMethod):
             )
         return self.leaves
 
-    def storage(self) -> dict[str, Stored]:
-        """Harmonics by a codebook, density in 16 bits."""
-        return {"leaves.density": Stored("scaled", bits=16), "leaves.harmonics": Stored("coded")}
-
     @torch.no_grad()
     def importance(self, camera: Camera) -> dict[str, Float[Tensor, " row"]]:
         """How much each leaf adds to one picture. Raises LumigraphError while there is no octree."""
         leaves, rays = self._leaves(), camera.rays(camera.pixels()).to(self.device)
         total = torch.zeros(len(leaves), device=self.device)
-        for i in range(0, len(rays), RAYS):
-            found = leaves.crossed(rays[i : i + RAYS], self.frame.near, self.config.transmittance_threshold)
-            total.index_add_(0, found.rows, weights_of(found.samples, leaves.density[found.rows, 0].relu()))
+        for i in range(0, len(rays), self.rays_per_chunk):
+            found = leaves.crossed(rays[i : i + self.rays_per_chunk], *self._ends)
+            total.index_add_(0, found.rows, weights_of(found.samples, leaves.densities[found.rows, 0].relu()))
         return {"leaves.harmonics": total}
 
     @torch.no_grad()
@@ -239,68 +212,39 @@ class PlenOctrees(RayMethod):
         self.leaves.keep(kept)
         return {"leaves.harmonics": weights[kept]}
 
-    # Being seen
+    # Rendering
 
-    def looks(self, rays: Rays) -> list[Look]:
-        return [self._crossed(rays) if self.baked else self._march(rays)]
-
-    def _march(self, rays: Rays, jitter: Float[Tensor, " ray"] | None = None) -> Look:
-        """The field at samples in occupied cells that light reaches."""
-        assert self.occupancy is not None
-        found = self.occupancy.sample(rays, self.frame.near, *self.lattice, jitter=jitter)
-        samples, asked = reached(rays, found, self.density, self.config.transmittance_threshold)
-        density, rgb = self.field(*samples.along(rays))
-        self.figures |= {"rays": len(rays), "samples": asked, "visible_samples": len(samples)}
-        return Look("samples", samples, density, rgb)
-
-    def _crossed(self, rays: Rays) -> Look:
-        """The leaves along rays, each a sample as long as the ray is in it."""
-        found = self.leaves.crossed(rays, self.frame.near, self.config.transmittance_threshold)
-        directions = rays.directions[found.samples.ray_index]
-        harmonics = self.leaves.harmonics[found.rows].view(-1, self.leaves.basis, 3)
-        return Look("leaves", found.samples, self.leaves.density[found.rows, 0].relu(), colour(harmonics, directions))
+    @property
+    def _ends(self) -> tuple[float, float]:
+        """Distance at which rays begin, and transmittance at which they terminate."""
+        return self.leaf_sampler.near, self.leaf_sampler.stop
 
     def render_rays(self, rays: Rays, background: Float[Tensor, "#ray 3"]) -> Rendering:
-        if self.baked:
-            return self.leaves.seen(rays, self.frame.near, self.config.transmittance_threshold, background)
-        look = self._march(rays)
-        return composite(look.samples, look.density, look.rgb, background)
+        return self.leaves.seen(rays, *self._ends, background) if self.baked else super().render_rays(rays, background)
 
     # Learning
 
-    def begin(self, scene: Scene, seconds: float = math.inf) -> None:
-        if self.occupancy is not None and scene.images.has_alpha:
-            self.occupancy.rule_out(visual_hull(scene, self.config.occupancy_resolution)[None])
-
-    def rehearse_begin(self) -> None:
-        """One step of eight leaves, on the copy that is there to compile what later stages need."""
-        learnt, teacher, occupancy = self.leaves, self.teacher, self.occupancy
-        self.leaves = Leaves(learnt.basis).to(self.device)
-        fill(self.leaves, torch.arange(8, 16, device=self.device))
-        self.leaves.density.data += 1
-        self.teacher = self.occupancy = None
-        (optimizer,) = self._of_leaves()
-        from_outside = torch.tensor([[-3.0, 0.1, 0.2]], device=self.device)
-        rays = Rays(
-            from_outside, torch.tensor([[1.0, 0.0, 0.0]], device=self.device), torch.ones(1, device=self.device)
-        )
-        rows = self.leaves.touched(rays, 0.0, 1e-3)
-        self.leaves.seen(rays, 0.0, 1e-3, self.background, self.leaves.part(rows)).rgb.sum().backward()
+    def compile_begin(self) -> None:
+        """One step of eight leaves, whose kernels later stages need."""
+        leaves, device = Leaves(self.leaves.basis).to(self.device), self.device
+        fill(leaves, torch.arange(8, 16, device=device))
+        leaves.densities.data += 1
+        (optimizer,) = self._of_leaves(leaves)
+        origin, direction = torch.tensor([[-3.0, 0.1, 0.2]]), torch.tensor([[1.0, 0.0, 0.0]])
+        rays = Rays(origin, direction, torch.ones(1)).to(device)
+        rows = leaves.touched(rays, 0.0, 1e-3)
+        leaves.seen(rays, 0.0, 1e-3, self.background, leaves.part(rows)).rgb.sum().backward()
         optimizer.step()
-        self.leaves, self.teacher, self.occupancy = learnt, teacher, occupancy
 
     def rays_in_a_step(self, data: Scene) -> float:
-        c = self.config
-        first = c.samples_per_step / SAMPLES_OF_A_RAY
-        return c.teacher_share * first + (1 - c.teacher_share) * c.rays_per_step
+        return self.expected_rays
 
     def batch(self, data: Scene, generator: torch.Generator) -> Batch:
         """Rays of a step. Here the field is baked when its share of the budget is over, for here cameras are known."""
         if not self.baked and self._progress >= self.config.teacher_share:
             self._bake(data.cameras[data.splits["train"]])
             self.begun.fill_(self._progress)
-        rays = self.config.rays_per_step if self.baked else int(self.teacher_rays)
-        return data.sample_rays(rays, generator).to(self.device)
+        return super().batch(data, generator)
 
     def from_field(self, teacher: Any, cameras: Camera) -> None:
         """Bake a teacher's density and colour as far as cameras see them; what is learnt from then on are leaves."""
@@ -325,7 +269,7 @@ class PlenOctrees(RayMethod):
         chance, numbers = self.random(-1), self._baking
         mask = met(self, cameras, numbers, chance)
         bake(self.leaves, self.density, mask, cameras, numbers, chance)
-        averaged_harmonics(self.leaves, self.teacher, numbers.points, chance)
+        averaged_harmonics(self.leaves, self.teacher.geometry, numbers.points, chance)
         self._leave_field()
 
     @property
@@ -334,21 +278,22 @@ class PlenOctrees(RayMethod):
         return Baking(c.octree_depth, c.leaf_points, c.weight_threshold, self.frame.near)
 
     def _leave_field(self) -> None:
-        """From here on there are leaves alone, which need little memory along rays."""
-        self.teacher = self.occupancy = None
-        self.figures, self.rays_per_chunk = {}, RAYS
-        self._optimizers[:] = self._of_leaves()  # in the list that the trainer holds
+        """Drop the teacher and its sampler."""
+        self.teacher = self.teacher_sampler = None
+        self.figures = {}
+        self._optimizers[:] = self._of_leaves(self.leaves)  # in the list that the trainer holds
 
     def loss(self, batch: Batch, step: int) -> dict[str, Tensor]:
-        generator, stop = self.random(step), self.config.transmittance_threshold
+        generator = self.random(step)
         background = backdrop(batch, self.background, generator)
         terms = {}
         if self.baked:
-            rows = self.leaves.touched(batch.rays, self.frame.near, stop)
-            rendering = self.leaves.seen(batch.rays, self.frame.near, stop, background, self.leaves.part(rows))
+            rows = self.leaves.touched(batch.rays, *self._ends)
+            rendering = self.leaves.seen(batch.rays, *self._ends, background, self.leaves.part(rows))
             self.figures |= {"rays": len(batch), "leaves": len(self.leaves), "touched": len(rows)}
         else:
-            look = self._march(batch.rays, torch.rand(len(batch), generator=generator).to(self.device))
+            (samples,), terms = self.learn(batch.rays, generator)
+            look = samples.look(self.network)
             rendering = composite(look.samples, look.density, look.rgb, background)
             if self.config.sparsity_weight:
                 terms["sparsity"] = self.config.sparsity_weight * self._sparsity(generator)
@@ -357,26 +302,18 @@ class PlenOctrees(RayMethod):
 
     def _sparsity(self, generator: torch.Generator) -> Tensor:
         """(1 / K) sum_k |1 - exp(-lambda sigma_k)| at K random points (eq. 4)."""
-        assert self.teacher is not None
         points = 2 * torch.rand(self.config.sparsity_points, 3, generator=generator) - 1
-        density = self.teacher.density(points.to(self.device))
+        density = self.density(points.to(self.device))
         return (1 - torch.exp(-self.config.sparsity_length * density)).abs().mean()
 
     def optimizers(self) -> list[torch.optim.Optimizer]:
-        self._optimizers = self._of_leaves() if self.baked else self._of_teacher()
+        teacher, c = self.teacher, self.config
+        self._optimizers = teacher.optimizers_at(c.learning_rate) if teacher else self._of_leaves(self.leaves)
         return self._optimizers
 
-    def _of_teacher(self) -> list[torch.optim.Optimizer]:
-        assert self.teacher is not None
-        common = {"lr": self.config.learning_rate, "betas": (0.9, 0.99), "eps": 1e-15}
-        if isinstance(self.teacher, HarmonicNetwork):
-            return [torch.optim.Adam(self.teacher.parameters(), lr=self.config.learning_rate, eps=1e-7)]
-        networks = [*self.teacher.network.parameters()]
-        return [LazyAdam([self.teacher.table], **common), torch.optim.Adam(networks, foreach=True, **common)]
-
-    def _of_leaves(self) -> list[torch.optim.Optimizer]:
-        density = {"params": [self.leaves.density], "name": "density"}
-        harmonics = {"params": [self.leaves.harmonics], "name": "harmonics"}
+    def _of_leaves(self, leaves: Leaves) -> list[torch.optim.Optimizer]:
+        density = {"params": [leaves.densities], "name": "density"}
+        harmonics = {"params": [leaves.harmonics], "name": "harmonics"}
         table = LazyRMSprop([density, harmonics])
         for group in table.param_groups:
             group["lr"] = self._rates(0.0)[group["name"]]
@@ -398,14 +335,6 @@ class PlenOctrees(RayMethod):
         }
 
     def before_step(self, step: int, progress: float) -> None:
-        self._progress, c = progress, self.config
-        if self.occupancy is not None and progress < c.teacher_share:
-            over = progress / c.teacher_share
-            self.lattice = lattice(c, 1.0, stage(over).steps)
-            keep_looking(self.occupancy, self.density, c, step, over, self.random(~step))
-
-    def after_step(self, step: int) -> None:
-        """Set the next step's number of rays so that they give about `samples_per_step` samples."""
-        if not self.baked:
-            rays = rays_for(self.config.samples_per_step, int(self.teacher_rays), self.figures["samples"])
-            self.teacher_rays.fill_(rays)
+        self._progress, share = progress, self.config.teacher_share
+        if not self.baked and progress < share:
+            super().before_step(step, progress / share)

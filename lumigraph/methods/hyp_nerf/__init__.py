@@ -11,52 +11,58 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from ..budget import Effort, Efforts
-from ..camera import Camera
-from ..camera.rays import Look, Rays, Rendering
-from ..components.fields.code_space import fitted
-from ..components.fields.hash_field import HashNumbers, check_levels
-from ..components.fields.hash_instance import HashInstance, HashShape
-from ..components.fields.hypernetwork import HyperNetwork
-from ..components.fields.instance_codes import AVERAGE, InstanceCodes
-from ..components.fields.kept_photographs import Kept
-from ..components.fields.picture_denoiser import PictureDenoiser
-from ..components.sampling.carving import visual_hull
-from ..components.sampling.coarse_to_fine import lattice
-from ..components.sampling.marching import reached
-from ..components.sampling.occupancy import OccupancyGrid
-from ..components.training.lazy_adam import LazyAdam
-from ..components.training.members import chance, photographed, rays_through
-from ..components.training.photometric import backdrop, residuals
-from ..components.training.schedules import falling
-from ..datasets.collection import Collection
-from ..datasets.scene import Batch, Frame, Photograph, Scene
-from ..errors import LumigraphError
-from ..files.ranges import BatchSize, Count, Layers, LearningRate, NonNegative, Positive, Seed, Share, Width, between
-from ..geometry import look_at
-from ..method import Method, RayMethod
-from ..method.controls import Control, Value, blend
-from ..volume import composite
+from ...budget import Effort, Efforts
+from ...camera import Camera
+from ...camera.rays import Look, Rays, Rendering
+from ...components.fields.code_space import fitted
+from ...components.fields.hash_field import HashNumbers
+from ...components.fields.kept_photographs import Kept
+from ...components.sampling.carving import visual_hull
+from ...components.sampling.occupancy import OccupancyGrid
+from ...components.sampling.occupancy_sampler import reached
+from ...components.training.lazy_adam import LazyAdam
+from ...components.training.members import chance, photographed, rays_through
+from ...components.training.photometric import backdrop, residuals
+from ...components.training.schedules import falling
+from ...datasets.collection import Collection
+from ...datasets.scene import Batch, Frame, Photograph, Scene
+from ...errors import LumigraphError
+from ...files.ranges import (
+    BatchSize,
+    Count,
+    Layers,
+    LearningRate,
+    NonNegative,
+    Positive,
+    Seed,
+    Share,
+    Width,
+    between,
+)
+from ...geometry import look_at
+from ...method import Method, RayMethod
+from ...method.controls import Control, Value, blend
+from ...volume import composite
+from .hash_instance import HashInstance, HashShape
+from .hypernetwork import HyperNetwork
+from .instance_codes import AVERAGE, InstanceCodes
+from .picture_denoiser import PictureDenoiser
 
 Tally = Annotated[int, between(0, 100_000)]
 
 
 @dataclass(frozen=True)
-class Config(HashNumbers):
+class Config:
     """The paper's numbers where it or its published code gives them; `HypNeRF.preset` has those of a plain CPU."""
 
+    table: HashNumbers = HashNumbers(log2_hashmap_size=11)  # of an object
     shape_code: Width = 512  # numbers of the code of table and density, section 3.2; more hold more shapes
     colour_code: Width = 512  # numbers of the code of the colour network, section 3.2; more hold more colours
     code_deviation: Positive = 0.01  # standard deviation of codes at first; larger ones start farther apart
     hyper_width: Width = 512  # channels of the hypernetwork's hidden layers; wider costs memory and time
     hyper_layers: Layers = 2  # hidden layers of the hypernetwork for each tensor; more cost time
     members: Count = 4096  # members of a collection at most; each has a code, so more cost memory
-    log2_hashmap_size: Annotated[int, between(1, 24)] = 11  # log2 of entries of a level; one more doubles the table
     hidden_width: Width = 64  # channels of an object's density and colour networks; wider costs time
-    density_layers: Layers = 1  # hidden layers of an object's density network; more cost time
-    colour_layers: Layers = 2  # hidden layers of an object's colour network; more cost time
-    geometry_features: Annotated[int, between(1, 256)] = 16  # features from density to colour network
-    sh_bands: Annotated[int, between(1, 4)] = 4  # spherical-harmonics bands of the direction; 1: no view dependence
     steps_per_diagonal: Annotated[int, between(4, 16_384)] = 512  # samples across the diagonal; fewer are faster
     transmittance_threshold: Share = 1e-4  # transmittance at which a ray terminates; higher is faster, less exact
     occupancy_resolution: Annotated[int, between(4, 256)] = 64  # cells per axis of the occupancy grid; more skip more
@@ -82,9 +88,11 @@ class Config(HashNumbers):
     denoise_weight: NonNegative = 0.5  # weight of denoised renderings beside the photographs, in tuning
     seed: Seed = 0  # seed of all random numbers; another seed gives another run
 
-    def check(self) -> None:
-        """Raises LumigraphError for numbers that contradict each other."""
-        check_levels(self)
+
+CPU_TABLE = HashNumbers(5, 4, log2_hashmap_size=12, base_resolution=8, max_resolution=64, sh_bands=2)
+TINY_TABLE = HashNumbers(
+    levels=3, log2_hashmap_size=9, base_resolution=4, max_resolution=16, geometry_features=8, sh_bands=1
+)
 
 
 @dataclass(frozen=True)
@@ -111,7 +119,7 @@ class Lesson:
         return sum(len(x.rays) for x in self.evidence)
 
 
-class Tuned(torch.nn.Module):
+class TensorChanges(torch.nn.Module):
     """What was added to the tensors of an instance by tuning: a row of each, or none."""
 
     def __init__(self, rows: Iterable[Float[Tensor, "_ _ _"]]):
@@ -126,13 +134,13 @@ class Tuned(torch.nn.Module):
         return [kept.rows[0] for kept in self.kept]  # type: ignore[index]
 
 
-PATCH = 64  # pixels of a picture's side at most, by which the denoiser learns
-LOOKS = 6  # at each cell of a field that is to be seen
-EMPTY = 1 / 16  # scene units over which density counts that should not be there
-RAYS = 1024  # of a step while one scene is found
-CANDIDATES = 64  # learnt codes at most that are tried as a beginning
+PATCH_PIXELS = 64  # side of the pictures from which the denoiser learns, at most
+GRID_UPDATES = 6  # of the occupancy grid of a field that is rendered
+EMPTY_LENGTH = 1 / 16  # scene units over which density in empty space absorbs light
+RAYS_PER_STEP = 1024  # rays of a step that fits a code or tunes a field
+MAX_CANDIDATES = 64  # learnt codes at most that a fit may begin with
 FOUND = "found"
-HEIGHTS = 0.35, 0.8  # radians above the horizon, of views that are denoised
+ELEVATIONS = 0.35, 0.8  # radians above the horizon, of views that are denoised
 
 Seen = Callable[[int, torch.Generator], Evidence]  # so many random rays of what is known of a scene
 
@@ -148,7 +156,7 @@ class HypNeRF(RayMethod):
         config = config or Config()
         super().__init__(frame, config)
         c = config
-        self.shape = HashShape.of(c)
+        self.shape = HashShape.of(c.table, c.hidden_width)
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(c.seed)
             sizes = [c.colour_code if colour else c.shape_code for colour in self.shape.of_colour]
@@ -157,7 +165,7 @@ class HypNeRF(RayMethod):
         self.codes = InstanceCodes(c.members, c.shape_code + c.colour_code)
         self.found = Kept(torch.empty(0, c.shape_code + c.colour_code))  # the code of a scene that was given, or drawn
         self.tuned = untuned(self.shape)
-        self.lattice = lattice(c, 1.0)
+        self.step_length = 2 * math.sqrt(3) / c.steps_per_diagonal
         self._cells: dict[int, OccupancyGrid] = {}  # of members, by number
         self._shown: tuple[HashInstance, OccupancyGrid] | None = None  # until a step changes it
         self._denoising = False
@@ -174,14 +182,8 @@ class HypNeRF(RayMethod):
             hyper_width=96,
             hyper_layers=2,
             members=1024,
-            levels=5,
-            features_per_level=4,
-            log2_hashmap_size=12,
-            base_resolution=8,
-            max_resolution=64,
+            table=CPU_TABLE,
             hidden_width=32,
-            geometry_features=16,
-            sh_bands=2,
             steps_per_diagonal=112,
             transmittance_threshold=1e-3,
             occupancy_resolution=32,
@@ -203,13 +205,8 @@ class HypNeRF(RayMethod):
             hyper_width=16,
             hyper_layers=1,
             members=16,
-            levels=3,
-            log2_hashmap_size=9,
-            base_resolution=4,
-            max_resolution=16,
+            table=TINY_TABLE,
             hidden_width=16,
-            geometry_features=8,
-            sh_bands=1,
             steps_per_diagonal=64,
             occupancy_resolution=16,
             members_per_step=2,
@@ -228,10 +225,8 @@ class HypNeRF(RayMethod):
     @classmethod
     def further_bytes(cls, frame: Frame, config: Any, learning: bool) -> int:
         """Activations that a step keeps for its gradients."""
-        c = config
-        samples = c.members_per_step * c.rays_per_member * c.steps_per_diagonal // 8
-        hidden = c.hidden_width * (c.density_layers + c.colour_layers) + c.levels * c.features_per_level
-        return 4 * samples * hidden * learning
+        samples = config.members_per_step * config.rays_per_member * config.steps_per_diagonal // 8
+        return config.table.activation_bytes(samples, config.hidden_width) * learning
 
     # Learning
 
@@ -269,7 +264,7 @@ class HypNeRF(RayMethod):
 
     def _cells_of(self, scene: Scene) -> OccupancyGrid:
         """The cells of a scene that no photograph proves empty. Raises LumigraphError for scenes without bounds."""
-        if scene.frame.reach > 1:
+        if scene.frame.is_open:
             raise LumigraphError(
                 f"hyp-nerf knows objects, and {scene.source} is a place without bounds; name photographs of an object"
             )
@@ -308,7 +303,7 @@ class HypNeRF(RayMethod):
         if self.config.empty_points and self.config.empty_weight:
             points = 2 * torch.rand(self.config.empty_points, 3, generator=generator).to(self.device) - 1
             density = instance.density(points[~held(cells, points)])
-            terms["empty"] = self.config.empty_weight * torch.log1p(EMPTY * density).sum() / len(points)
+            terms["empty"] = self.config.empty_weight * torch.log1p(EMPTY_LENGTH * density).sum() / len(points)
         return terms
 
     def _denoiser_error(self, batch: Lesson, instance: HashInstance) -> Tensor:
@@ -327,8 +322,8 @@ class HypNeRF(RayMethod):
         jitter: Float[Tensor, " ray"] | None = None,
     ) -> Rendering:
         """What rays see of an instance, of all samples in cells: few lie far behind what is seen."""
-        samples = cells.sample(rays, self.frame.near, *self.lattice, jitter=jitter)
-        density, rgb = instance.field(*samples.along(rays))
+        samples = cells.sample(rays, self.frame.near, self.step_length, jitter=jitter)
+        density, rgb = instance(*samples.along(rays))
         self.figures |= {"rays": len(rays), "samples": len(samples)}
         return composite(samples, density, rgb, background, self.config.transmittance_threshold)
 
@@ -366,7 +361,7 @@ class HypNeRF(RayMethod):
     def _filled(self, instance: HashInstance) -> OccupancyGrid:
         """The cells where a field holds something."""
         cells, generator = OccupancyGrid(1.0, self.config.occupancy_resolution).to(self.device), self.random(0)
-        for _ in range(LOOKS):
+        for _ in range(GRID_UPDATES):
             cells.update(
                 lambda points: instance.density(points) * self._inside(points),
                 self.config.occupancy_threshold,
@@ -448,7 +443,7 @@ class HypNeRF(RayMethod):
             tuned = self._tuned_to([seen, denoised], tuned, c.denoise_steps, 3)
         self.found = Kept(code[None])
         pairs = zip(tuned, made.tensors, strict=True)
-        self.tuned = Tuned((tensor - first)[None] for tensor, first in pairs)
+        self.tuned = TensorChanges((tensor - first)[None] for tensor, first in pairs)
 
     def _code_of(self, seen: Seen) -> Float[Tensor, " code"]:
         """The code that explains photographs best, not far from those that were learnt (section 3.3)."""
@@ -456,7 +451,7 @@ class HypNeRF(RayMethod):
 
         def error(where: Float[Tensor, " axis"]) -> Tensor:
             (instance,) = self._made((average + where @ axes)[None])
-            terms = self._errors(instance, seen(RAYS, generator), generator)
+            terms = self._errors(instance, seen(RAYS_PER_STEP, generator), generator)
             return torch.stack([*terms.values()]).sum() + self.config.code_prior * where.square().mean()
 
         if not len(axes):
@@ -468,9 +463,9 @@ class HypNeRF(RayMethod):
     def _nearest(self, seen: Seen) -> Float[Tensor, " code"]:
         """The learnt code that explains photographs best, or the average."""
         known = self.codes.rows[self.codes.learnt]
-        some = torch.randperm(len(known), generator=self.random(3))[:CANDIDATES]
+        some = torch.randperm(len(known), generator=self.random(3))[:MAX_CANDIDATES]
         codes = torch.cat([self.codes.average[None], known[some.to(known.device)]])
-        evidence, errors = seen(RAYS // 2, self.random(4)), list[Tensor]()
+        evidence, errors = seen(RAYS_PER_STEP // 2, self.random(4)), list[Tensor]()
         for instance in (self._made(code[None])[0] for code in codes):
             errors.append(self._errors(instance, evidence, self.random(5))["colour"])
         return codes[int(torch.stack(errors).argmin())]
@@ -485,7 +480,7 @@ class HypNeRF(RayMethod):
             adam.param_groups[0]["lr"] = rate * (1 - step / steps)
             adam.zero_grad()
             for weight, seen in zip((1.0, self.config.denoise_weight), sources, strict=False):
-                terms = self._errors(instance, seen(RAYS // len(sources), generator), generator)
+                terms = self._errors(instance, seen(RAYS_PER_STEP // len(sources), generator), generator)
                 (weight * torch.stack([*terms.values()]).sum()).backward()
             adam.step()
         return [tensor.detach() for tensor in tuned]
@@ -509,15 +504,15 @@ class HypNeRF(RayMethod):
 
     def looks(self, rays: Rays) -> list[Look]:
         instance, cells = self.shown
-        samples = cells.sample(rays, self.frame.near, *self.lattice)
-        samples, _ = reached(rays, samples, instance.density, self.config.transmittance_threshold)
-        return [Look("samples", samples, *instance.field(*samples.along(rays)))]
+        samples = cells.sample(rays, self.frame.near, self.step_length)
+        samples, _ = reached(rays, samples, instance, None, self.config.transmittance_threshold)
+        return [Look("samples", samples, *instance(*samples.along(rays)))]
 
     def field(
         self, points: Float[Tensor, "point 3"], directions: Float[Tensor, "point 3"]
     ) -> tuple[Float[Tensor, " point"], Float[Tensor, "point 3"]]:
         """Density per scene unit, nothing beyond the bounds, and sRGB-encoded colour seen along unit directions."""
-        density, rgb = self.shown[0].field(points, directions)
+        density, rgb = self.shown[0](points, directions)
         return density * self._inside(points), rgb
 
     def density(self, points: Float[Tensor, "point 3"]) -> Float[Tensor, " point"]:
@@ -529,8 +524,8 @@ class HypNeRF(RayMethod):
         return ((points > low) & (points < high)).all(-1)
 
 
-def untuned(shape: HashShape) -> Tuned:
-    return Tuned(torch.empty(0, *sizes) for sizes in shape.tensors)
+def untuned(shape: HashShape) -> TensorChanges:
+    return TensorChanges(torch.empty(0, *sizes) for sizes in shape.tensors)
 
 
 def held(cells: OccupancyGrid, points: Float[Tensor, "point 3"]) -> Bool[Tensor, " point"]:
@@ -544,7 +539,7 @@ def patch(
 ) -> tuple[Rays, Float[Tensor, "height width 3"]]:
     """A random part of a photograph, as rays and as a picture."""
     height, width = photograph.rgb.shape[:2]
-    rows, columns = min(height, PATCH), min(width, PATCH)
+    rows, columns = min(height, PATCH_PIXELS), min(width, PATCH_PIXELS)
     top, left = chance(height - rows + 1, generator), chance(width - columns + 1, generator)
     part = slice(top, top + rows), slice(left, left + columns)
     pixels = photograph.camera.pixels().view(height, width, 2)[part].reshape(-1, 2)
@@ -556,7 +551,7 @@ def around(camera: Camera, frame: Frame, count: int) -> Iterator[Camera]:
     middle = torch.tensor(frame.bounds).mean(0)
     distance = (camera.position - middle).norm()
     for number in range(count):
-        azimuth, height = torch.tensor(2 * math.pi * number / count), torch.tensor(HEIGHTS[number % len(HEIGHTS)])
+        azimuth, height = torch.tensor(2 * math.pi * number / count), torch.tensor(ELEVATIONS[number % len(ELEVATIONS)])
         outward = torch.stack([height.cos() * azimuth.cos(), height.cos() * azimuth.sin(), height.sin()])[None]
         pose = look_at(middle + distance * outward, -outward, torch.tensor([0.0, 0.0, 1.0]))
         yield replace(camera, pose=pose)

@@ -6,7 +6,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from .dense import Dense
+from ...components.fields.dense import Dense
 
 
 class ResidualNetwork(nn.Module):
