@@ -214,9 +214,9 @@ class Method(nn.Module, ABC):
         Raises LumigraphError for what this method cannot be told.
         """
         parts = {name: part for name, part in self.named_children() if isinstance(part, Part)}
-        chosen = [next((n for n, part in parts.items() if isinstance(piece, part.accepts)), None) for piece in evidence]
-        for piece, name in zip(evidence, chosen, strict=True):
-            if name is None:
+        chosen = [[n for n, part in parts.items() if isinstance(piece, part.accepts)] for piece in evidence]
+        for piece, names in zip(evidence, chosen, strict=True):
+            if not names:
                 kinds = " or ".join(kind.__name__ for kind in self.takes) or "nothing but its controls"
                 kind = type(piece).__name__
                 raise LumigraphError(f"{type(self).__name__} cannot be given a {kind}; it takes {kinds}")
@@ -230,8 +230,9 @@ class Method(nn.Module, ABC):
             told.__dict__[held] = dict(self.__dict__[held])
         told.figures = {}
         told.told = self.told | {name: known[name].checked(value) for name, value in controls.items()}
-        for piece, name in zip(evidence, chosen, strict=True):
-            told._modules[name] = parts[name].adapted(told, piece)
+        for piece, names in zip(evidence, chosen, strict=True):
+            for name in names:
+                told._modules[name] = told._modules[name].adapted(told, piece)  # type: ignore[union-attr, operator]
         return told
 
     def control(self, name: str) -> Value:

@@ -1,4 +1,7 @@
-"""One paper, one file. A method is found by its file's name, which is also what the user types."""
+"""One paper, one file, or a folder whose `__init__.py` is the paper and which holds what serves it alone.
+
+A method is found by that file's or folder's name, which is also what the user types.
+"""
 
 from __future__ import annotations
 
@@ -29,9 +32,10 @@ def colour(name: str) -> int:
 
 
 def summary(name: str) -> str:
-    """The first line of a method's file: what it is and who published it. Reads the file without running it."""
+    """The first line of a method's file, or of its folder's `__init__.py`: what it is and who published it. Reads the file without running it."""
     for folder in __path__:
-        file = Path(folder) / f"{name.replace('-', '_')}.py"
+        stem = Path(folder) / name.replace("-", "_")
+        file = stem / "__init__.py" if stem.is_dir() else stem.with_suffix(".py")
         if file.exists():
             return (ast.get_docstring(ast.parse(file.read_text("utf-8"))) or "").partition("\n")[0]
     return ""
