@@ -13,9 +13,7 @@ import torch
 from balls import BLUE, RED, WHITE, Marched, eye
 
 from lumigraph.components.fields.appearance import Appearance
-from lumigraph.components.fields.visibility import Visibility, transmittance
 from lumigraph.components.sampling.spaces import space_of
-from lumigraph.components.training.moving import CELLS, Moving
 from lumigraph.composition import Placed
 from lumigraph.errors import LumigraphError
 from lumigraph.evaluate import evaluate
@@ -25,6 +23,9 @@ from lumigraph.images import ImageStore
 from lumigraph.large import InBlocks, Mixing, Nearby, align_appearance
 from lumigraph.large.weights import inverse_distance, seeing, shares
 from lumigraph.methods.block_nerf import BlockNeRF
+from lumigraph.methods.block_nerf.moving import CELLS, Moving
+from lumigraph.methods.block_nerf.visibility import Visibility, transmittance
+from lumigraph.ranges import changed
 from lumigraph.rays import Rays, Samples
 from lumigraph.run import build
 from lumigraph.scene import Frame, Scene
@@ -39,7 +40,7 @@ NETWORK = {
 
 
 def made(scene: Scene, **options) -> BlockNeRF:
-    return build(BlockNeRF, scene.frame, replace(BlockNeRF.smallest(), **options), torch.device("cpu"), 0)
+    return build(BlockNeRF, scene.frame, changed(BlockNeRF.smallest(), **options), torch.device("cpu"), 0)
 
 
 def stops(image: int) -> int:
@@ -125,7 +126,7 @@ def test_visibility_is_learnt_beside_the_field_and_changes_nothing_of_it(lit):
     fit(other, scene, steps=5, show=False, rehearsal=False)
     again = made(scene, samples_per_step=1 << 13, **STILL)
     fit(again, scene, steps=5, show=False, rehearsal=False)
-    assert torch.equal(other.network.scene.table, again.network.scene.table)
+    assert torch.equal(other.network.table, again.network.table)
     assert torch.equal(other.visibility(rays.origins, rays.directions), torch.ones(len(rays)))
 
 
@@ -214,9 +215,9 @@ def test_what_errs_in_one_photograph_alone_teaches_nothing():
     error = 0.02 + 0.02 * torch.rand(200_000, generator=random) + 0.5 * patch + 0.05 * (image == 2)
     moving.note(image, place, error)
     assert moving.weights(image, place).all()  # not judged yet
-    moving.before_step(100, 0.1)
+    moving.before_step(None, 100, 0.1)
     assert moving.weights(image, place).all()
-    moving.before_step(100, 0.5)
+    moving.before_step(None, 100, 0.5)
     counted = moving.weights(image, place) > 0
     assert not counted[patch].any() and counted[image != 1].all()
     assert counted[(image == 1) & (place > 0.2 + 2 / CELLS).any(-1)].all()

@@ -32,7 +32,7 @@ def colour(name: str) -> int:
 
 
 def summary(name: str) -> str:
-    """The first line of a method's file, or of its folder's `__init__.py`: what it is and who published it. Reads the file without running it."""
+    """The first line of a method's file: what it is and who published it. Reads the file without running it."""
     for folder in __path__:
         stem = Path(folder) / name.replace("-", "_")
         file = stem / "__init__.py" if stem.is_dir() else stem.with_suffix(".py")

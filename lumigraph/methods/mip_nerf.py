@@ -56,9 +56,7 @@ class MipNeRF(FieldMethod):
         self.poses = poses_for(frame, c.poses)
         self.bands = BandSchedule(c.coarse_to_fine) if c.coarse_to_fine else None
         self.network = FrustumField(c.network, c.hidden_width, space, joining=joining_of(self.poses, self.bands))
-        self.sampler = ConeSampler(
-            space, c.rays, c.mask, c.coarse_loss_weight > 0, resample_padding=c.resample_padding
-        )
+        self.sampler = ConeSampler(space, c.rays, c.mask, c.coarse_loss_weight > 0, resample_padding=c.resample_padding)
 
     @classmethod
     def preset(cls, device: torch.device) -> Any:

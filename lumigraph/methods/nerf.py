@@ -36,7 +36,7 @@ class Config:
     final_learning_rate: LearningRate = 5e-5  # at the end of the budget, section 5.3
     density_noise: NonNegative = 1.0  # deviation of noise on captures' raw density in training, appendix A
     networks: Annotated[int, between(1, 2)] = 2  # one for each pass; 1: the same for both
-    coarse_loss_weight: NonNegative = 1.0  # weight of the coarse pass's error, eq. 6; 0 with one network: it only guides
+    coarse_loss_weight: NonNegative = 1.0  # weight of the coarse pass's error, eq. 6; 0: it only guides
     transmittance_threshold: Share = 0.0  # transmittance at which a ray terminates
     warmup: Share = 0.0  # share of the budget in which the learning rate grows
     seed: Seed = 0
@@ -114,9 +114,7 @@ class NeRF(FieldMethod):
         self.sampler.begin_from(known, chance)
         optimizer = torch.optim.Adam(network.network.parameters(), c.learning_rate, eps=1e-7)
         usual, network.activation = network.activation, softplus  # negative outputs must learn as well
-        distil(
-            network, known, network.space, [optimizer], POINTS_PER_RAY * c.rays.rays_per_step, chance, self.device
-        )
+        distil(network, known, network.space, [optimizer], POINTS_PER_RAY * c.rays.rays_per_step, chance, self.device)
         network.activation = usual
         if network.coarse:
             network.coarse.network.load_state_dict(network.network.state_dict())

@@ -31,7 +31,7 @@ from ..components.training.pose_refinement import PoseNumbers, poses_for
 from ..components.training.schedules import falling, held
 from ..components.training.unseen_views import patches, roughness, unseen_cameras
 from ..method import FieldMethod
-from ..ranges import LearningRate, NonNegative, PositiveShare, Share, Steps, Width, between, Seed
+from ..ranges import LearningRate, NonNegative, PositiveShare, Seed, Share, Steps, Width, between
 from ..rays import Look, Rays, Rendering
 from ..scene import Batch, Frame, Scene
 from ..volume import composite

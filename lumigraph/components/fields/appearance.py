@@ -23,6 +23,7 @@ from ...volume import composite, weights_of
 from .code_space import axes_of, fitted
 
 CodeWidth = Annotated[int, between(1, 1024)]  # numbers of a photograph's code
+APPEARANCE = "The photograph, by number or name, in whose light and colours the scene is shown; or the average of all."
 AVERAGE = "average"  # the choice of the mean of all learnt codes
 FIT_STEPS, FIT_RATE = 100, 0.1  # the rate in deviations of the learnt codes
 FIT_PRIOR = 2e-5  # of squared error, for a deviation from the average
@@ -129,8 +130,7 @@ class AppearanceCodes(PhotographCodes):
 
     @property
     def controls(self) -> tuple[Control, ...]:
-        about = "The photograph, by number or name, in whose light and colours the scene is shown; or the average of all."
-        return (self.control("appearance", about),)
+        return (self.control("appearance", APPEARANCE),)
 
     @property
     def accepts(self) -> tuple[type, ...]:

@@ -63,4 +63,3 @@ class CoordinateNetwork(nn.Module):
     def _trunk(self, position: Encoded) -> Float[Tensor, "sample width"]:
         position = position.to(self.feature.type_of_products(position))
         return self.after(torch.cat([position, self.before(position)], -1))
-

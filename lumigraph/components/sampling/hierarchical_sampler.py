@@ -47,7 +47,7 @@ class HierarchicalSampler(Sampler):
         self,
         space: Space,
         numbers: RayNumbers,
-        mask: MaskNumbers = MaskNumbers(),  # noqa: B008
+        mask: MaskNumbers = MaskNumbers(),
         learns_coarse: bool = True,
         transmittance_threshold: float = 0.0,
     ):

@@ -240,6 +240,6 @@ class BlockNeRF(FieldMethod):
     def visibility(
         self, points: Float[Tensor, "point 3"], directions: Float[Tensor, "point 3"]
     ) -> Float[Tensor, " point"]:
-        """Share of each place, seen along a unit direction, that the block's photographs saw, in [0, 1] (section 4.2.5);
-        1 everywhere where that was not learnt."""
+        """Share of each place, seen along a unit direction, that the block's photographs saw (section 4.2.5); 1 where
+        that was not learnt."""
         return self.sight(points, directions) if self.sight else torch.ones_like(points[:, 0])

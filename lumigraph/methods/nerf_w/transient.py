@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -54,8 +55,8 @@ class TransientHead(nn.Module):
 
 
 class HashTransientHead(nn.Module):
-    """The same from the encoding of an `EncodedHashField`. One photograph alone sees a passer-by and cannot tell how far
-    away they stood, so transient density is learnt where its rays are sampled anyway: at the surfaces behind."""
+    """The same from the encoding of an `EncodedHashField`. One photograph alone sees a passer-by and cannot tell how
+    far away they stood, so transient density is learnt where its rays are sampled anyway: at the surfaces behind."""
 
     def __init__(self, *widths: int):
         super().__init__()
@@ -72,12 +73,14 @@ class EncodedHashField(HashField):
     """A hash table whose features include the encoding, without gradients: the table holds the static scene, and a
     transient head does not change what it learns."""
 
-    def geometry(self, points: Float[Tensor, "point 3"], code: Tensor | None = None) -> tuple[Tensor, tuple[Tensor, Tensor]]:  # type: ignore[override]
+    def geometry(
+        self, points: Float[Tensor, "point 3"], code: Tensor | None = None
+    ) -> tuple[Float[Tensor, " point"], Any]:
         encoded = self.encode(points)
         density, geometry = self.decode(points, encoded)
         return density, (geometry, encoded.detach())
 
-    def colour(self, features: tuple[Tensor, Tensor], directions: Tensor, code: Tensor | None = None) -> Tensor:  # type: ignore[override]
+    def colour(self, features: Any, directions: Float[Tensor, "point 3"], code: Tensor | None = None) -> Tensor:
         return super().colour(features[0], directions, code)
 
 
