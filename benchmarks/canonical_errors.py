@@ -8,8 +8,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from lumigraph.alignment import angles
-from lumigraph.canonical.rotations import nearest_rotation
+from lumigraph.datasets.alignment import angles
+from lumigraph.derive.canonical.rotations import nearest_rotation
 
 ROUNDS = 10
 

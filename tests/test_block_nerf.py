@@ -11,25 +11,28 @@ import pytest
 import tiny
 import torch
 from balls import BLUE, RED, WHITE, Marched, eye
+from budgets import budget
 
+from lumigraph.camera.rays import Rays, Samples
 from lumigraph.components.fields.appearance import Appearance
 from lumigraph.components.sampling.spaces import space_of
 from lumigraph.composition import Placed
+from lumigraph.datasets.images import ImageStore
+from lumigraph.datasets.scene import Frame, Scene
 from lumigraph.errors import LumigraphError
-from lumigraph.evaluate import evaluate
-from lumigraph.evaluate.halves import judged_by_halves, left_half
+from lumigraph.evaluation import evaluate
+from lumigraph.evaluation.halves import judged_by_halves, left_half
+from lumigraph.files.ranges import changed
 from lumigraph.geometry import Similarity
-from lumigraph.images import ImageStore
 from lumigraph.large import InBlocks, Mixing, Nearby, align_appearance
 from lumigraph.large.weights import inverse_distance, seeing, shares
 from lumigraph.methods.block_nerf import BlockNeRF
 from lumigraph.methods.block_nerf.moving import CELLS, Moving
 from lumigraph.methods.block_nerf.visibility import Visibility, transmittance
-from lumigraph.ranges import changed
-from lumigraph.rays import Rays, Samples
 from lumigraph.run import build
-from lumigraph.scene import Frame, Scene
-from lumigraph.train import fit
+from lumigraph.training import fit
+
+pytestmark = budget("methods", 15)
 
 HERE = Similarity.make(1.0)
 STILL = {"residual_masks": False, "refine_cameras": False}
@@ -341,14 +344,14 @@ def test_controls_are_passed_on_and_exposures_are_made_one(exposed):
     for block, told in ((method, 0.5), (brighter, -0.5)):
         expected = Placed(block.given(exposure=told), HERE).rendering(camera)
         index = int(block is brighter)
-        torch.testing.assert_close(both.parts[index].rendering(camera).rgb, expected.rgb)
+        torch.testing.assert_close(both.blocks[index].rendering(camera).rgb, expected.rgb)
     assert all(x.render(camera).rgb.isfinite().all() for x in near)
     more, most = (both.given(exposure=x) for x in (0.5, 1.5))
-    assert more.parts[0].method.told["exposure"] == pytest.approx(1)
-    assert most.parts[0].method.told["exposure"] == pytest.approx(1)  # no more than it learnt from
+    assert more.blocks[0].method.told["exposure"] == pytest.approx(1)
+    assert most.blocks[0].method.told["exposure"] == pytest.approx(1)  # no more than it learnt from
     shot = scene.photograph(0)
     taken = both.given(shot)
-    assert taken.parts[0].method.told["exposure"] == pytest.approx(1 - stops(0), abs=1e-4)
+    assert taken.blocks[0].method.told["exposure"] == pytest.approx(1 - stops(0), abs=1e-4)
     with pytest.raises(LumigraphError, match="does not learn"):
         both.batch(scene, torch.Generator())
     with pytest.raises(LumigraphError, match="as many centres"):

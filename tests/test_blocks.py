@@ -17,21 +17,24 @@ import numpy as np
 import pytest
 import tiny  # noqa: F401  # its methods
 import torch
+from budgets import budget
 from proofs import kept
 from safetensors.torch import load_file
 from streets import crossing_streets, write_street
 
-from lumigraph.budget import Budget
 from lumigraph.capture import Places, open_scene, places_of, read_capture
-from lumigraph.cli import main
+from lumigraph.commands.cli import main
 from lumigraph.errors import LumigraphError, LumigraphWarning
 from lumigraph.large import BlockRun, crossings, layout, monitor, planning, training, worker
 from lumigraph.large.on_ray import Workers
 from lumigraph.large.plan import Plan, Task
 from lumigraph.methods import find
 from lumigraph.run import Run, open_any
+from lumigraph.run.budget import Budget
 from lumigraph.run.splat_file import SplatFile
-from lumigraph.train import fit
+from lumigraph.training import fit
+
+pytestmark = budget("runs", 15)
 
 STEPS = 6  # of each block
 
@@ -251,7 +254,7 @@ def test_blocks_are_shown_in_one_light_and_known_ones_keep_theirs(street, tmp_pa
     assert training.finish(folder).appearance == first and (folder / "blocks.json").read_bytes() == before
     assert training.finish(folder, again=["1"]).appearance["0"] == first["0"]
     opened = BlockRun(folder)
-    shown = [part.method.shown_in.code.tolist() for part in opened.method().parts]
+    shown = [part.method.shown_in.code.tolist() for part in opened.method().blocks]
     assert shown == [pytest.approx(Plan.read(folder / "blocks.json").appearance[name]) for name in "01"]
 
 

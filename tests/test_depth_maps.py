@@ -6,9 +6,9 @@ import pytest
 import torch
 
 from lumigraph.camera import Camera
+from lumigraph.camera.lens import Pinhole
+from lumigraph.camera.rays import Rendering
 from lumigraph.depth_maps import TSDF, DepthMap, Tolerance, back_project, free
-from lumigraph.lens import Pinhole
-from lumigraph.rays import Rendering
 
 WALL, SIZE = 2.0, 16  # the wall's z, seen from the origin along +z; pixels a side
 

@@ -6,9 +6,12 @@ from dataclasses import replace
 
 import pytest
 import torch
+from budgets import budget
 
 from lumigraph import kernels
 from lumigraph.kernels import HashLevels, _facts, composite, hash_encode, march, perceptron, rasterize, tile
+
+pytestmark = budget("kernels")
 
 LEVELS = HashLevels(levels=2, features=2, log2_entries=6, coarsest=2, finest=9)
 POINTS, TABLE = torch.rand(5, 3), torch.rand(LEVELS.entries, 2)

@@ -12,26 +12,29 @@ import tiny
 import torch
 
 from lumigraph import methods
+from lumigraph import synthetic as procedural
 from lumigraph.camera import Camera
-from lumigraph.capture import open_scene, procedural
-from lumigraph.capture.procedural.scenes import swing
-from lumigraph.cli import main
+from lumigraph.camera.rays import Rays
+from lumigraph.capture import open_scene
+from lumigraph.commands.cli import main
 from lumigraph.components.training.exposure import gain_between
 from lumigraph.components.training.lights import spread_of_exposure
-from lumigraph.controls import Control, moment
+from lumigraph.datasets.images import ImageStore
+from lumigraph.datasets.scene import Frame
 from lumigraph.errors import LumigraphError, LumigraphWarning
-from lumigraph.evaluate import evaluate
-from lumigraph.evaluate.halves import judged_by_halves, left_half
+from lumigraph.evaluation import evaluate
+from lumigraph.evaluation.halves import judged_by_halves, left_half
 from lumigraph.export.film import animated
-from lumigraph.images import ImageStore
+from lumigraph.files.ranges import changed
+from lumigraph.method.controls import Control, moment
 from lumigraph.methods.instant_ngp import Config, InstantNGP
 from lumigraph.paths.keyframes import CameraPath, Keyframe
-from lumigraph.rays import Rays
 from lumigraph.run import Run, build
-from lumigraph.scene import Frame
-from lumigraph.train import fit
+from lumigraph.synthetic.scenes import swing
+from lumigraph.training import fit
 
-SMALL = Config(
+SMALL = changed(
+    Config(),
     levels=4,
     log2_hashmap_size=10,
     base_resolution=4,

@@ -7,15 +7,18 @@ from dataclasses import replace
 import pytest
 import tiny
 import torch
+from budgets import budget
 
-from lumigraph.evaluate import evaluate
-from lumigraph.images import ImageStore
+from lumigraph.camera.rays import Rays
+from lumigraph.datasets.images import ImageStore
+from lumigraph.datasets.scene import Scene
+from lumigraph.evaluation import evaluate
+from lumigraph.files.ranges import changed
 from lumigraph.methods.instant_ngp import Config, InstantNGP
-from lumigraph.ranges import changed
-from lumigraph.rays import Rays
 from lumigraph.run import Run, build
-from lumigraph.scene import Scene
-from lumigraph.train import fit
+from lumigraph.training import fit
+
+pytestmark = budget("methods", 10)
 
 SMALL = changed(
     Config(),

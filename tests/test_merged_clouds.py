@@ -8,8 +8,8 @@ import pytest
 import torch
 from balls import WHITE, Pictured, Splatted, eye
 
+from lumigraph.camera.crop import Box
 from lumigraph.composition import PickedCloud, Placed
-from lumigraph.crop import Box
 from lumigraph.errors import LumigraphError
 from lumigraph.gaussians import Gaussians, joined
 from lumigraph.geometry import Similarity, to_matrix

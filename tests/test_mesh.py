@@ -13,13 +13,17 @@ import pytest
 import tiny
 import torch
 import trimesh
+from budgets import budget
 from listing import names
 from scipy.spatial import cKDTree
 from solids import SOLID, Seen, Solid, around, ball, painted, shell, together, torus
 
 from lumigraph.camera import Camera
-from lumigraph.cli import main
-from lumigraph.crop import Box, Sphere
+from lumigraph.camera.crop import Box, Sphere
+from lumigraph.camera.rays import Rendering
+from lumigraph.commands.cli import main
+from lumigraph.datasets.mesh import Mesh
+from lumigraph.datasets.scene import Frame
 from lumigraph.depth_maps import Tolerance, render_depth_maps
 from lumigraph.errors import LumigraphError
 from lumigraph.exchange import write_gaussians
@@ -30,11 +34,10 @@ from lumigraph.export.polygons import BLOCK, Grid, zero_level
 from lumigraph.export.surface import simplified, smoothed
 from lumigraph.gaussians import Gaussians
 from lumigraph.kernels.spherical_harmonics import K00
-from lumigraph.mesh import Mesh
-from lumigraph.rays import Rendering
 from lumigraph.run import Run
-from lumigraph.scene import Frame
-from lumigraph.train import fit
+from lumigraph.training import fit
+
+pytestmark = budget("exports", 25)
 
 CELL = 1 / 24
 # A scene that was shrunk to half, turned a quarter about z and moved.

@@ -12,9 +12,8 @@ import torch
 from PIL import Image
 
 from lumigraph import methods
-from lumigraph.alignment import aligning, moves
 from lumigraph.camera import Camera
-from lumigraph.capabilities import RefinesPoses, can
+from lumigraph.camera.lens import Pinhole
 from lumigraph.capture import open_scene
 from lumigraph.capture.capture import Shot
 from lumigraph.capture.folds import about_fold
@@ -23,13 +22,14 @@ from lumigraph.components.clouds.seen_from import seen_from
 from lumigraph.components.fields.encodings import FrequencyEncoding
 from lumigraph.components.training.coarse_to_fine import BEGINS, ENDS, FIRST, band_weights
 from lumigraph.components.training.pose_refinement import PoseRefinement, seen_places
-from lumigraph.evaluate.held_out_poses import HeldOutPoses, held_out_poses, pose_scores
+from lumigraph.datasets.alignment import aligning, moves
+from lumigraph.datasets.images import ImageStore
+from lumigraph.evaluation.held_out_poses import HeldOutPoses, held_out_poses, pose_scores
 from lumigraph.gaussians.splatting import splat, view_of
 from lumigraph.geometry import Similarity
-from lumigraph.images import ImageStore
-from lumigraph.lens import Pinhole
+from lumigraph.method.capabilities import RefinesPoses, can
 from lumigraph.run import build
-from lumigraph.verdict import cameras_moved
+from lumigraph.training.verdict import cameras_moved
 
 CPU = torch.device("cpu")
 SMALL = {"nerf": {"position_frequencies": 3, "bfloat16": False}, "mip-nerf": {"bfloat16": False}, "instant-ngp": {}}

@@ -9,17 +9,19 @@ from types import SimpleNamespace
 import pytest
 import tiny
 import torch
+from budgets import budget
 
 from lumigraph.components.training.fog import thickness_before
 from lumigraph.components.training.patch_flow import SIDE, PatchFlow, photographed
 from lumigraph.components.training.unseen_views import patches, roughness, unseen_cameras
+from lumigraph.files.ranges import changed
 from lumigraph.geometry import nearest_to_lines, unit
 from lumigraph.methods.instant_ngp import Config as NgpConfig
 from lumigraph.methods.instant_ngp import InstantNGP
 from lumigraph.methods.regnerf import RegNeRF
-from lumigraph.ranges import changed
-from lumigraph.rays import Samples
 from lumigraph.run import build
+
+pytestmark = budget("methods")
 
 
 def chance(seed: int = 0) -> torch.Generator:

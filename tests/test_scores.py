@@ -12,22 +12,25 @@ import tiny
 import tiny_collection
 import tiny_shapes
 import torch
+from budgets import budget
 
 from lumigraph import methods
 from lumigraph.benchmark.cell import Cell, Settings
 from lumigraph.benchmark.conduct import conduct
 from lumigraph.benchmark.table import markdown
-from lumigraph.budget import Budget
-from lumigraph.cli import main
+from lumigraph.commands.cli import main
+from lumigraph.datasets.shapes import Shapes
 from lumigraph.errors import LumigraphError
-from lumigraph.evaluate import evaluate, evaluate_collection, evaluate_on, evaluate_run, evaluate_shapes
+from lumigraph.evaluation import evaluate, evaluate_collection, evaluate_on, evaluate_run, evaluate_shapes
+from lumigraph.evaluation.report import write_report
 from lumigraph.metrics import Score, named, scores_of
 from lumigraph.metrics.surfaces import chamfer_distance, intersection_over_union, normal_consistency
-from lumigraph.report import write_report
 from lumigraph.run import Run, build
-from lumigraph.shapes import Shapes
-from lumigraph.train import fit
+from lumigraph.run.budget import Budget
+from lumigraph.training import fit
 from lumigraph.viewer.training_panel import describe, measure_of
+
+pytestmark = budget("runs", 10)
 
 CPU = torch.device("cpu")
 
@@ -155,9 +158,9 @@ def shaped(tmp_path_factory) -> Run:
 
 def smaller(patch: pytest.MonkeyPatch) -> None:
     """Pictures and numbers of points that take no time."""
-    patch.setattr("lumigraph.train.PREVIEW_SIZE", 16)
+    patch.setattr("lumigraph.training.loop.PREVIEW_SIZE", 16)
     small = {"points": 4000, "cells": 24, "size": 16}
-    patch.setattr("lumigraph.evaluate.run.evaluate_shapes", functools.partial(evaluate_shapes, **small))
+    patch.setattr("lumigraph.evaluation.run.evaluate_shapes", functools.partial(evaluate_shapes, **small))
 
 
 def test_eval_picks_the_protocol(shaped, capsys):

@@ -8,12 +8,15 @@ import numba
 import pytest
 import tiny
 import torch
+from budgets import budget
 
 from lumigraph import kernels
 from lumigraph.components.fields.factorised import FactorGrid, nodes_in
+from lumigraph.datasets.scene import Forward, Frame
 from lumigraph.kernels.factor_grid import Factors
 from lumigraph.methods.tensorf import UPSAMPLINGS, TensoRF
-from lumigraph.scene import Forward, Frame
+
+pytestmark = budget("methods")
 
 WHOLE = (torch.zeros(3), torch.ones(3))
 

@@ -7,14 +7,14 @@ import pytest
 import torch
 from numba import njit
 
+from lumigraph.camera.rays import Rays, Samples
 from lumigraph.components.sampling.proposal import Proposal, edges_of, overlooked
 from lumigraph.components.sampling.proposal_sampler import MIN_WEIGHT, ProposalNumbers, ProposalSampler
 from lumigraph.components.sampling.spaces import NDC, Contraction
 from lumigraph.components.training.fog import elsewhere, scaled_by_distance, spread
-from lumigraph.method import Field
+from lumigraph.datasets.scene import Forward
 from lumigraph.kernels.sample_proposals.cpu import cube_root, exponential
-from lumigraph.rays import Rays, Samples
-from lumigraph.scene import Forward
+from lumigraph.method import Field
 from lumigraph.volume import composite
 
 AHEAD = Forward(((1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0)), (1.0, 1.0), 1.0)

@@ -21,7 +21,7 @@ LATE = ("torch._dynamo", "av", "pycolmap", "trimesh", "PIL.ImageFile", "msgspec"
 def warm() -> None:
     """Load every module of the package, what they load late, and the kernels that were compiled before."""
     torch.set_num_threads(1)
-    from lumigraph.signals import untouched
+    from lumigraph.system.signals import untouched
 
     with untouched():
         for name in LATE:

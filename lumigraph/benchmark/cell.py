@@ -8,12 +8,12 @@ from pathlib import Path
 from typing import Any
 
 from .. import files
-from ..budget import Budget
 from ..capture import requested
-from ..capture.procedural import is_category
 from ..errors import LumigraphError
 from ..run import Run
+from ..run.budget import Budget
 from ..run.inferred import Inferred
+from ..synthetic import is_category
 
 SHEET = "views.png"
 MEMBERS = "-members"  # behind a collection's name: its members, averaged

@@ -8,8 +8,8 @@ from pathlib import Path
 
 from .. import files
 from ..errors import LumigraphError
-from ..locks import check_place, held
-from ..progress import clock, counting
+from ..files.locks import check_place, held
+from ..system.progress import clock, counting
 from .cell import Cell, Settings, claim, evaluation, training
 from .launch import STOPPED, Launch, claim_log, launch, reason
 from .pictures import draw_charts, draw_views

@@ -9,15 +9,14 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from ..collection import Collection
-from ..dataset import Dataset
+from ..datasets.collection import Collection
+from ..datasets.dataset import Dataset
+from ..datasets.scene import Scene
+from ..datasets.shapes import Shapes
 from ..errors import LumigraphError
 from ..files import exists, expanded
-from ..names import natural
-from ..ranges import typed
-from ..readers import LISTED, NAMES
-from ..scene import Scene
-from ..shapes import Shapes
+from ..files.names import natural
+from ..files.ranges import typed
 from . import meshes, single_image
 from .assemble import Before as Before
 from .assemble import assemble as assemble
@@ -32,6 +31,7 @@ from .pictures import list_images
 from .places import Places as Places
 from .places import places_of as places_of
 from .raw import with_raw
+from .readers import LISTED, NAMES
 
 READERS: dict[str, ModuleType] = {n: import_module(f".{n.replace('-', '_')}", __package__) for n in NAMES}
 PROCEDURAL = "procedural:"

@@ -13,13 +13,13 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from ..camera import Camera
+from ..camera.lens import Equirectangular, Lens, Pinhole
+from ..datasets.images import ImageSource, ImageStore, in_parallel, load
+from ..datasets.scene import Forward, Frame, Scene
 from ..errors import LumigraphError, LumigraphWarning
+from ..files.names import counted, natural
 from ..geometry import RIGID
-from ..images import ImageSource, ImageStore, in_parallel, load
-from ..lens import Equirectangular, Lens, Pinhole
-from ..names import counted, natural
-from ..progress import counting
-from ..scene import Forward, Frame, Scene
+from ..system.progress import counting
 from .beside import make_about, make_layers
 from .capture import Capture, Shot
 from .forward import find_forward

@@ -15,11 +15,11 @@ from PIL import Image
 from torch import Tensor
 
 from ..camera import Camera
-from ..choice import evenly
+from ..datasets.images import ImageStore, Layer, LayerSource, in_parallel, resized
+from ..datasets.images.layer import known
 from ..depth_maps import back_project
 from ..errors import LumigraphError
-from ..images import ImageStore, Layer, LayerSource, in_parallel, resized
-from ..images.layer import known
+from ..geometry.choice import evenly
 from .capture import Capture, Plane, Shot
 from .numbers import kind_of, read_numbers
 from .photos.exif import exposure

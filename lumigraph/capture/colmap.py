@@ -10,10 +10,10 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from ..camera.lens import Equirectangular, Fisheye, Lens, OpenCV, Pinhole
 from ..errors import LumigraphError
-from ..lens import Equirectangular, Fisheye, Lens, OpenCV, Pinhole
-from ..library import pycolmap
-from ..names import natural
+from ..files.names import natural
+from ..system.library import pycolmap
 from .capture import Capture, Shot
 from .pictures import reductions, versions
 from .points import SparsePoints, read_points3d

@@ -10,7 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ..camera import Camera
-from ..scene import Forward
+from ..datasets.scene import Forward
 from .capture import Capture, Shot
 from .normalise import reliable_points
 

@@ -11,9 +11,9 @@ from torch import Tensor
 from torch.nn import functional
 
 from ..camera import Camera
-from ..images import ImageStore
-from ..lens import OpenCV, Pinhole
-from ..scene import Vector
+from ..camera.lens import OpenCV, Pinhole
+from ..datasets.images import ImageStore
+from ..datasets.scene import Vector
 
 VIEWS = 24
 GRIDS = (32, 32, 64)  # cells along each side of the box that is searched; each round searches what the last one found

@@ -10,13 +10,13 @@ import numpy as np
 from jaxtyping import Float, UInt8
 from plyfile import PlyData
 
-from ..dataset import splits_of
+from ..datasets.dataset import splits_of
+from ..datasets.mesh import Mesh
+from ..datasets.shapes import Shape, Shapes, normalised
 from ..errors import LumigraphError, LumigraphWarning
-from ..memory import free_memory
-from ..mesh import Mesh
-from ..names import natural
-from ..progress import track
-from ..shapes import Shape, Shapes, normalised
+from ..files.names import natural
+from ..system.memory import free_memory
+from ..system.progress import track
 
 SUFFIXES = (".obj", ".ply", ".off", ".stl", ".glb", ".gltf")
 STANDING = (".stl", ".off")  # by custom with +z up; the others have +y up

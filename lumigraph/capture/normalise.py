@@ -14,9 +14,9 @@ import torch
 from jaxtyping import Float
 
 from ..camera import Camera
-from ..choice import evenly
-from ..images import ImageStore
-from ..scene import Vector
+from ..datasets.images import ImageStore
+from ..datasets.scene import Vector
+from ..geometry.choice import evenly
 from .capture import Capture
 from .hull import hull_box, silhouettes
 from .up import find_upright, upright_by

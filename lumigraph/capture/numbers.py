@@ -16,8 +16,8 @@ import av
 import numpy as np
 from PIL import ExifTags, Image, TiffImagePlugin
 
-from ..memory import free_memory
-from ..srgb import srgb_from_linear
+from ..color.srgb import srgb_from_linear
+from ..system.memory import free_memory
 
 Tag = ExifTags.Base
 PNG, EXR = b"\x89PNG\r\n\x1a\n", b"\x76\x2f\x31\x01"  # how these files begin

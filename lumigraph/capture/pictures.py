@@ -13,9 +13,9 @@ from pathlib import Path
 import numpy as np
 from PIL import Image, ImageOps
 
+from ..datasets.images import ImageSource, resized
 from ..errors import LumigraphError
 from ..files import is_file
-from ..images import ImageSource, resized
 from .capture import Plane, Shot
 from .numbers import TIFF_SUFFIXES, Kind, as_bytes, check_pixels, colours, kind_of, read_numbers, tiff_tags, turned
 

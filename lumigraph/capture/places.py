@@ -9,8 +9,8 @@ import torch
 from jaxtyping import Float
 
 from ..camera import Camera
+from ..camera.lens import Pinhole
 from ..errors import LumigraphError
-from ..lens import Pinhole
 from .assemble import checked_pose, in_order
 from .capture import Capture
 from .normalise import upright_of

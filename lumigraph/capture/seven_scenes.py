@@ -13,8 +13,8 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from ..camera.lens import Pinhole
 from ..errors import LumigraphError
-from ..lens import Pinhole
 from .beside import with_depth_points
 from .capture import Capture, Plane, Shot
 from .pictures import find_file, measure

@@ -14,10 +14,10 @@ from typing import Annotated, Any
 import numpy as np
 import torch
 
+from ..camera.lens import Equirectangular, Fisheye, Lens, OpenCV, Pinhole
 from ..errors import LumigraphError
 from ..files import is_file, read_json
-from ..lens import Equirectangular, Fisheye, Lens, OpenCV, Pinhole
-from ..ranges import Coordinate, Name, Point, Positive, Row, between, typed
+from ..files.ranges import Coordinate, Name, Point, Positive, Row, between, typed
 from . import colmap
 from .capture import Capture, Plane, Shot
 from .pictures import EXIF_SIDEWAYS, find_file, measure, reductions, versions

@@ -13,10 +13,10 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from ..camera.lens import Lens, OpenCV, Pinhole
 from ..errors import LumigraphError
 from ..files import is_file
 from ..geometry import to_matrix
-from ..lens import Lens, OpenCV, Pinhole
 from .beside import with_depth_points
 from .capture import Capture, Plane, Shot
 

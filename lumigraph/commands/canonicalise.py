@@ -10,7 +10,7 @@ from tyro.conf import Positional
 
 from ..errors import LumigraphError
 from ..files import claim_folder
-from ..ranges import Seed, Steps, between
+from ..files.ranges import Seed, Steps, between
 from .common import choose_device, needed, option, show, typed
 
 
@@ -41,7 +41,7 @@ class Canonicalise:
     """Device for density and pictures: auto (a GPU if there is one), cpu, cuda, cuda:1."""
 
     def run(self) -> int:
-        from ..canonical import PRESETS, canonicalise, found_in
+        from ..derive.canonical import PRESETS, canonicalise, found_in
 
         output = self.output or self.runs.resolve().with_name(f"{self.runs.resolve().name}-canonical")
         if output.resolve() == self.runs.resolve():

@@ -10,7 +10,7 @@ from typing import Annotated, Any, Literal
 from tyro.conf import Positional
 
 from ..errors import LumigraphError
-from ..ranges import Count, between
+from ..files.ranges import Count, between
 from .common import needed, option, say, scene_name, show, typed
 
 NAMELESS = ("images", "photos", "photographs", "pictures", "input", "frames")  # folders named after what is in them
@@ -64,7 +64,7 @@ def tell_masks(folder: Path, onward: str) -> None:
     from ..capture import choose_reader
     from ..capture.masks import OBJECT_MASKS
     from ..capture.objects import mask_object
-    from ..progress import track
+    from ..system.progress import track
 
     if (folder / OBJECT_MASKS).exists():
         show({"masks": f"{folder / OBJECT_MASKS}, as they are; delete them to have them made anew", "next": onward})
@@ -108,7 +108,7 @@ def scene_folder(what: tuple[Path, ...]) -> Path:
 def find_cameras(what: tuple[Path, ...], folder: Path, options: Any = None) -> dict[str, Any]:
     """reconstruct(), with bars; Ctrl-C says how to go on."""
     from ..capture.motion import reconstruct
-    from ..progress import track
+    from ..system.progress import track
 
     try:
         return reconstruct([path.expanduser() for path in what], folder, options, track)

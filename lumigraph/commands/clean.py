@@ -34,10 +34,10 @@ class Clean:
     """Device for the pictures: auto (a GPU if there is one), cpu, cuda, cuda:1."""
 
     def run(self) -> int:
-        from ..capabilities import HasGaussians, needs
         from ..exchange import names_splats, place_of
         from ..figures import save_picture
         from ..gaussians.cleaning import gone
+        from ..method.capabilities import HasGaussians, needs
         from ..run import open_any
         from ..run.picking import check_output, save_picked
 
@@ -64,10 +64,10 @@ class Clean:
 def before_and_after(opened: Any, gaussians: Any, gone: Any) -> Any:
     """A sheet of some views: all Gaussians, those that stay, those that went. Some from afar, where floaters show."""
     from ..camera import ring
-    from ..choice import evenly
     from ..composition import PickedCloud
     from ..figures import Row, contact_sheet
-    from ..progress import track
+    from ..geometry.choice import evenly
+    from ..system.progress import track
 
     clouds = [PickedCloud(opened.frame, some) for some in (gaussians, gaussians[~gone], gaussians[gone])]
     around = ring(opened.frame.bounds, size=SIZE)

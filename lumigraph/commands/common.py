@@ -12,13 +12,13 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import tyro
 
 from .. import methods
-from ..budget import Budget
-from ..console import console, dim
+from ..capture.readers import LISTED, NAMES
 from ..errors import LumigraphError
 from ..files import scene_name as scene_name
-from ..quality import MEANS, Quality
-from ..readers import LISTED, NAMES
-from ..signals import exit_code as exit_code
+from ..method.quality import MEANS, Quality
+from ..run.budget import Budget
+from ..system.console import console, dim
+from ..system.signals import exit_code as exit_code
 
 if TYPE_CHECKING:
     Reader = str

@@ -10,7 +10,7 @@ from tyro.conf import Positional, arg
 
 from ..errors import LumigraphError
 from ..files import claim
-from ..ranges import Coordinate, Positive, between
+from ..files.ranges import Coordinate, Positive, between
 from .common import Overwrite, needed, option, show, typed
 
 Triple = tuple[Coordinate, Coordinate, Coordinate]
@@ -46,8 +46,8 @@ class Compose:
     def run(self) -> int:
         import torch
 
+        from ..camera.crop import Box
         from ..composition import standing
-        from ..crop import Box
         from ..geometry import Similarity
         from ..run import open_any
         from ..run.composition import Part, relative, write_composition

@@ -10,10 +10,10 @@ from typing import Annotated, Any
 
 from tyro.conf import Positional, arg
 
-from ..console import console
 from ..errors import LumigraphError
-from ..quality import Quality
-from ..ranges import Codes, Count, Decibels, Seconds, Steps
+from ..files.ranges import Codes, Count, Decibels, Seconds, Steps
+from ..method.quality import Quality
+from ..system.console import console
 from .common import choose_device, needed, option, show, typed
 
 LOSSES: Mapping[Quality, float] = {"draft": 1.0, "good": 0.3, "best": 0.1}  # dB that each quality may lose
@@ -56,7 +56,7 @@ class Compress:
     """Device to compute on: auto (a GPU if there is one), cpu, cuda, cuda:1."""
 
     def run(self) -> int:
-        from ..compression import Aim, compress
+        from ..derive.compression import Aim, compress
         from ..run import Run
 
         if sum(told is not None for told in (self.to, self.quality, self.max_loss)) > 1:

@@ -8,10 +8,10 @@ from typing import Annotated, Any, Literal
 
 from tyro.conf import Positional, arg
 
-from ..console import console
 from ..errors import LumigraphError
-from ..quality import Quality
-from ..ranges import Count, Seconds, Seed, Steps
+from ..files.ranges import Count, Seconds, Seed, Steps
+from ..method.quality import Quality
+from ..system.console import console
 from .common import about_quality, choose_device, method_config, option, show, told_budget, typed
 from .compress import size
 
@@ -60,7 +60,7 @@ class Convert:
 
     def run(self) -> int:
         from .. import methods
-        from ..conversion import Aim, convert
+        from ..derive.conversion import Aim, convert
         from ..run import open_any
 
         if self.list:
@@ -107,7 +107,7 @@ def listed() -> Any:
     """Table of conversions: a row for each source method, a column for each target."""
     from rich.table import Table
 
-    from ..conversion import ways
+    from ..derive.conversion import ways
 
     found = ways()
     rows = Table("from / into", *found)

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
-from ..budget import Budget
-from ..console import bold
-from ..ranges import Count, Seconds
+from ..files.ranges import Count, Seconds
+from ..run.budget import Budget
+from ..system.console import bold
 from .common import choose_device, exit_code, next_free, option, say, show, typed
 
 FRAMES = 90
@@ -37,13 +37,13 @@ class Demo:
     def run(self) -> int:
         from .. import methods
         from ..capture import open_dataset
-        from ..evaluate import evaluate_run
+        from ..evaluation import evaluate_run
+        from ..evaluation.report import write_report
         from ..export.film import film
         from ..metrics import scores_of
         from ..paths import film_cameras
-        from ..report import write_report
         from ..run import Run, build, check_new
-        from ..train import fit
+        from ..training import fit
 
         budget = Budget(seconds=self.seconds)
         kind, device = methods.find(self.method), choose_device(self.device)

@@ -9,8 +9,8 @@ from typing import Annotated, Any, Literal
 
 from tyro.conf import Positional
 
-from ..console import bold
-from ..ranges import Count
+from ..files.ranges import Count
+from ..system.console import bold
 from .common import Overwrite, choose_device, needed, option, show
 from .controls import Set, tell
 
@@ -47,11 +47,11 @@ class Eval:
     """Device to compute on: auto (a GPU if there is one), cpu, cuda, cuda:1."""
 
     def run(self) -> int:
-        from ..evaluate import claim_evaluation, evaluate_run, stem
+        from ..evaluation import claim_evaluation, evaluate_run, stem
         from ..large import BlockRun
         from ..metrics import scores_of
         from ..run import open_run
-        from ..verdict import last_psnr
+        from ..training.verdict import last_psnr
         from .outcome import next_commands
 
         run = open_run(self.run_folder)

@@ -9,7 +9,7 @@ from typing import Annotated, Any
 from tyro.conf import Positional
 
 from ..errors import LumigraphError
-from ..ranges import Count, Downscale, Seed
+from ..files.ranges import Count, Downscale, Seed
 from .common import ReaderOption, choose_device, needed, next_free, option, scene_name, show
 
 
@@ -41,7 +41,7 @@ class Infer:
     """Device to compute on: auto (a GPU if there is one), cpu, cuda, cuda:1."""
 
     def run(self) -> int:
-        from ..prior import Prior
+        from ..method.prior import Prior
         from ..run import Run, check_new
         from ..run.inferred import draw
         from .outcome import next_commands
@@ -67,10 +67,10 @@ class Infer:
         from ..capture import PROCEDURAL, kind_of, open_dataset, single_image, sources_of
         from ..capture.assemble import HOLD_OUT
         from ..capture.photos import is_bare
-        from ..collection import Collection
-        from ..dataset import check_kind
+        from ..datasets.collection import Collection
+        from ..datasets.dataset import check_kind
+        from ..datasets.scene import Scene
         from ..run.inferred import infer
-        from ..scene import Scene
 
         assert self.scene is not None
         name, path = made_by.method_name, Path(self.scene).expanduser()

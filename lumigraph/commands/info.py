@@ -8,8 +8,8 @@ from typing import Annotated, Any
 
 from tyro.conf import Positional
 
-from ..console import console
-from ..ranges import Downscale
+from ..files.ranges import Downscale
+from ..system.console import console
 from .common import ReaderOption, needed, option
 
 LONG = 4096  # letters; a tree cuts its lines where the console ends, and folders have long names

@@ -6,24 +6,24 @@ from typing import Any
 
 from rich.tree import Tree
 
-from ..alignment import Moves
-from ..budget import Budget
-from ..choice import evenly
-from ..console import bold, dim
-from ..dataset import Dataset
+from ..datasets.alignment import Moves
+from ..datasets.dataset import Dataset
+from ..datasets.scene import Frame, Scene
+from ..datasets.shapes import Shapes
 from ..errors import LumigraphError
 from ..exchange import size_of
+from ..files.names import natural
 from ..gaussians import Gaussians
+from ..geometry.choice import evenly
 from ..large import BlockRun
 from ..metrics import scores_of
-from ..names import natural
 from ..run import Run
+from ..run.budget import Budget
 from ..run.compressed import Compressed
 from ..run.converted import Converted
 from ..run.inferred import Inferred
-from ..scene import Frame, Scene
-from ..shapes import Shapes
-from ..verdict import cameras_moved
+from ..system.console import bold, dim
+from ..training.verdict import cameras_moved
 
 MEMBERS = 12  # of many shapes, that are told of one by one
 

@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal
 from tyro.conf import arg
 
 from ..errors import LumigraphError
-from ..ranges import Coordinate, Positive, Share
+from ..files.ranges import Coordinate, Positive, Share
 from .common import option
 
 Six = tuple[Coordinate, Coordinate, Coordinate, Coordinate, Coordinate, Coordinate]
@@ -58,7 +58,7 @@ class Keeping:
 
     def crop(self, frame: Any) -> Any:
         """The Crop, in the scene's frame; None where there is none."""
-        from ..crop import Box, Crop, Sphere
+        from ..camera.crop import Box, Crop, Sphere
 
         crop: Crop
         if self.box is not None:
@@ -89,8 +89,8 @@ class Keeping:
 
     def of_method(self, method: Any) -> Any:
         """The part of a method that is wanted, ready to render. Raises LumigraphError where it can have no floaters."""
-        from ..capabilities import HasGaussians, can, needs
         from ..composition import PickedCloud, cropped
+        from ..method.capabilities import HasGaussians, can, needs
 
         crop = self.crop(method.frame)
         if self.floaters or (crop is not None and can(method, HasGaussians)):

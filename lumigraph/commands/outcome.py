@@ -5,10 +5,10 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from ..budget import Budget
+from ..datasets.scene import Scene
 from ..method import Method, RayMethod
-from ..quality import QUALITIES
-from ..scene import Scene
+from ..method.quality import QUALITIES
+from ..run.budget import Budget
 from .common import say, show, typed
 
 TOTALS = (10.0, 30.0, 60.0, 180.0, 600.0, 1800.0, 3600.0, 7200.0)  # seconds that are suggested
@@ -22,7 +22,7 @@ NEXT = {
 
 def tell_outcome(run: Any, outcome: Any, method: Method, data: Any) -> None:
     """Print the state of a Run after an Outcome, and the next commands."""
-    from ..verdict import cameras_moved, last_psnr, loss_trend
+    from ..training.verdict import cameras_moved, last_psnr, loss_trend
 
     state, budget = outcome.state, Budget.from_json(run.settings.budget)
     besides = f"{state.compile_seconds:.1f} s compiling, {outcome.saving_seconds:.1f} s saving"

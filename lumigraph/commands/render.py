@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal
 from tyro.conf import Positional
 
 from ..errors import LumigraphError
-from ..ranges import Count, FramesPerSecond, Pixels
+from ..files.ranges import Count, FramesPerSecond, Pixels
 from .common import Overwrite, needed, option, show
 from .controls import Animate, Set, animate, open_method
 

@@ -23,9 +23,9 @@ class Report:
     overwrite: Overwrite = False
 
     def run(self) -> int:
-        from ..progress import counting
-        from ..report import claim_report, write_report
+        from ..evaluation.report import claim_report, write_report
         from ..run import Run
+        from ..system.progress import counting
 
         run = Run(self.run_folder)
         claim_report(run, self.overwrite)

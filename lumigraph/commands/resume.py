@@ -8,10 +8,10 @@ from typing import Annotated, Any
 
 from tyro.conf import Positional
 
-from ..budget import Budget
 from ..errors import LumigraphError
-from ..quality import Quality
-from ..ranges import Port, Seconds, Steps
+from ..files.ranges import Port, Seconds, Steps
+from ..method.quality import Quality
+from ..run.budget import Budget
 from .common import choose_device, exit_code, needed, option, quality_budget, told_budget, typed
 
 
@@ -58,7 +58,7 @@ class Resume:
 
     def _go_on(self, run: Any) -> int:
         from ..run.inferred import Inferred
-        from ..train import fit
+        from ..training import fit
         from .outcome import tell_outcome
         from .view import keep_showing, watching
 

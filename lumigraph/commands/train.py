@@ -10,9 +10,9 @@ from typing import Annotated, Any, Literal
 from tyro.conf import Fixed, OmitArgPrefixes, Positional, Suppress
 
 from .. import methods
-from ..budget import Budget
-from ..quality import Quality
-from ..ranges import Count, Downscale, Port, Scales, Seconds, Seed, Steps
+from ..files.ranges import Count, Downscale, Port, Scales, Seconds, Seed, Steps
+from ..method.quality import Quality
+from ..run.budget import Budget
 from .capture import posed
 from .common import (
     ReaderOption,
@@ -80,9 +80,9 @@ class Train:
 
     def run(self) -> int:
         from ..capture import confirm, kind_of, open_dataset
-        from ..dataset import check_kind
+        from ..datasets.dataset import check_kind
         from ..run import Run, build, check_new
-        from ..train import fit
+        from ..training import fit
         from .outcome import tell_outcome
         from .view import keep_showing, watching
 

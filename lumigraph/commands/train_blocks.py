@@ -12,8 +12,8 @@ from tyro.conf import arg
 
 from .. import methods
 from ..errors import LumigraphError
-from ..names import counted
-from ..ranges import Count
+from ..files.names import counted
+from ..files.ranges import Count
 from .capture import posed
 from .common import (
     choose_device,
@@ -59,9 +59,9 @@ class Blocks:
         train: the command's other options, a `Train`
         """
         from ..capture import kind_of
+        from ..datasets.scene import Scene
         from ..large.layout import LARGE
         from ..large.planning import survey
-        from ..scene import Scene
 
         if self.into is not None:
             return self._again(train, self.into)
@@ -83,7 +83,7 @@ class Blocks:
         from ..large.on_ray import Workers
         from ..large.planning import Recipe, begin, make_plan
         from ..large.training import conduct, finish
-        from ..memory import free_memory
+        from ..system.memory import free_memory
 
         here = self.address is None
         budget = told_budget(train.steps, train.seconds, train.quality)

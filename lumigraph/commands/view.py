@@ -12,8 +12,8 @@ from typing import Annotated, Any
 from tyro.conf import Positional
 
 from ..errors import LumigraphError
-from ..ranges import Port
-from ..signals import until_interrupted
+from ..files.ranges import Port
+from ..system.signals import until_interrupted
 from .common import needed, option, show
 from .controls import Set, open_method
 
@@ -93,8 +93,8 @@ def saver(opened: Any) -> Any:
     """A function that saves a part of a cloud of Gaussians, as `lumigraph clean` does: a splat file or a new run."""
 
     def save(name: str, crop: Any, floaters: Mapping[str, float]) -> str:
-        from ..capabilities import HasGaussians, needs
         from ..gaussians.cleaning import gone, unwanted
+        from ..method.capabilities import HasGaussians, needs
         from ..run.picking import save_picked
 
         output = opened.path.parent / name

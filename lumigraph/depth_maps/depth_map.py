@@ -13,9 +13,9 @@ from torch import Tensor
 from torch.nn.functional import max_pool2d
 
 from ..camera import Camera
+from ..camera.rays import Rendering
+from ..datasets.images import cosines
 from ..geometry import Vector, normals_from_depth
-from ..images import cosines
-from ..rays import Rendering
 from . import loops
 
 SURFACE_OPACITY = 0.5  # a pixel above it shows a surface

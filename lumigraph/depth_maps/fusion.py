@@ -13,8 +13,8 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from ..geometry import unit
-from ..progress import track
-from ..threads import processors
+from ..system.progress import track
+from ..system.threads import processors
 from . import loops
 from .depth_map import DepthMap, Tolerance
 

@@ -9,11 +9,11 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from ..camera import Camera
-from ..choice import evenly
+from ..camera.rays import Rendering
 from ..errors import LumigraphError
 from ..geometry import Vector
-from ..progress import track
-from ..rays import Rendering
+from ..geometry.choice import evenly
+from ..system.progress import track
 from .depth_map import DepthMap, SurfacePoints, Tolerance
 
 MIN_FREE_VIEWS = 2  # cameras that must see past a point for it to lie in free space

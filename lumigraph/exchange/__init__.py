@@ -8,8 +8,8 @@ from pathlib import Path
 from ..errors import LumigraphError
 from ..files import claim, claim_folder, exists, expanded, explained
 from ..gaussians import Gaussians
-from ..memory import free_memory
-from ..progress import counting
+from ..system.memory import free_memory
+from ..system.progress import counting
 from . import compressed_ply, glb, ply, sog, splat, spz, streamed_sog
 from .checks import checked
 from .ply_header import read_header

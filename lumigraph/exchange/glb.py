@@ -20,13 +20,13 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
+from ..color.srgb import linear_from_srgb
 from ..errors import LumigraphError
 from ..files import write_bytes
+from ..files.ranges import shown
 from ..gaussians import Gaussians
 from ..geometry import is_similarity, to_matrix
 from ..kernels.spherical_harmonics import K00
-from ..ranges import shown
-from ..srgb import linear_from_srgb
 from . import gltf
 from .axes import TURN_HARMONICS, TURN_MEAN, TURN_ROTATION
 from .checks import check_room

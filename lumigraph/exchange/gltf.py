@@ -17,7 +17,7 @@ import numpy as np
 
 from ..errors import LumigraphError
 from ..files import from_json
-from ..ranges import Coordinate, Tally, between, shown, typed
+from ..files.ranges import Coordinate, Tally, between, shown, typed
 
 HEADER, CHUNK = struct.Struct("<4sII"), struct.Struct("<I4s")
 MAGIC, JSON, BINARY = b"glTF", b"JSON", b"BIN\0"

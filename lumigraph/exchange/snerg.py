@@ -31,12 +31,12 @@ from jaxtyping import UInt8
 from PIL import Image, UnidentifiedImageError
 from torch import Tensor
 
-from ..baked import Atlas, ViewNetwork
 from ..errors import LumigraphError
 from ..files import claim_folder, from_json, replacing_folder
-from ..memory import free_memory, gigabytes
-from ..progress import track
-from ..ranges import Coordinate, Positive, Row, between, typed
+from ..files.ranges import Coordinate, Positive, Row, between, typed
+from ..system.memory import free_memory, gigabytes
+from ..system.progress import track
+from .baked import Atlas, ViewNetwork
 from .bundle import Bundle
 
 META, INDICES = "scene_params.json", "atlas_indices.png"

@@ -31,14 +31,14 @@ from PIL import Image, UnidentifiedImageError
 
 from ..errors import LumigraphError
 from ..files import from_json, replacing_folder, write_bytes
+from ..files.ranges import Coordinate, Name, Tally, between, shown, typed
 from ..gaussians import Gaussians
-from ..packing.clusters import clustered
-from ..ranges import Coordinate, Name, Tally, between, shown, typed
 from .bundle import Bundle, zipped
 from .checks import check_room
 from .codes import LOGITS, alpha_to_byte, array, cloud, to_byte, with_largest, without_largest
 from .levels import levels, nearest_level
 from .morton import morton_order
+from .packing.clusters import clustered
 
 VERSION = 2
 META = "meta.json"

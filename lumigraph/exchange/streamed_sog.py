@@ -25,10 +25,10 @@ from jaxtyping import Float, Int
 
 from ..errors import LumigraphError
 from ..files import read_json, replacing_folder
+from ..files.ranges import Name, Point, Tally, between, shown, typed
 from ..gaussians import Gaussians, joined, simplified
 from ..geometry import to_matrix
-from ..progress import track
-from ..ranges import Name, Point, Tally, between, shown, typed
+from ..system.progress import track
 from . import sog
 from .checks import check_room
 from .codes import array

@@ -10,13 +10,13 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from ..datasets.scene import Scene
 from ..methods.fourier_features import Config, Encoding, FourierFeatures
 from ..metrics import psnr
-from ..progress import track
 from ..run import build
-from ..scene import Scene
-from ..signals import go_on_unless
-from ..train import fit
+from ..system.progress import track
+from ..system.signals import go_on_unless
+from ..training import fit
 from .tangent_kernel import spectrum, tangent_kernel
 
 FLAT: tuple[Encoding, ...] = ("none", "basic")

@@ -10,10 +10,10 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ..camera import Camera
-from ..capabilities import HasLooks, needs
+from ..camera.rays import Look
 from ..errors import LumigraphError
 from ..method import Method
-from ..rays import Look
+from ..method.capabilities import HasLooks, needs
 from ..volume import composite, weights_of
 
 SEEN = 1e-3  # weight from which on a sample shows in a picture of 256 levels

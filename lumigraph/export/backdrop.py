@@ -10,9 +10,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ..camera import Camera
-from ..choice import evenly
+from ..datasets.scene import Vector
+from ..geometry.choice import evenly
 from ..method import Method
-from ..scene import Vector
 
 VIEWS, SIZE = 12, 96  # pictures that are looked at, and the longer side of each in pixels
 CLOSED = 0.97  # share of them that must be opaque, or the scene's background is part of what it shows

@@ -12,13 +12,13 @@ import torch
 from PIL import Image
 
 from ..camera import Camera
-from ..choice import evenly
-from ..controls import Value
 from ..figures import Range, colour_depth, depth_range, to_bytes
 from ..files import claim, claim_folder, replacing_folder, write_json
-from ..memory import ask_for_picture
+from ..geometry.choice import evenly
 from ..method import Method
-from ..progress import track
+from ..method.controls import Value
+from ..system.memory import ask_for_picture
+from ..system.progress import track
 from .exr import exr, light_of
 from .video import open_video
 

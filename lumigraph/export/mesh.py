@@ -14,14 +14,14 @@ from torch import Tensor
 from torch.nn.functional import grid_sample
 
 from ..camera import Camera
-from ..capabilities import HasDensity, can, needs
-from ..crop import Box, Crop
+from ..camera.crop import Box, Crop
+from ..datasets.mesh import Mesh
+from ..datasets.scene import Frame
 from ..depth_maps import TSDF, DepthMap, Tolerance, fused_colours, hidden, render_depth_maps
 from ..errors import LumigraphError
-from ..mesh import Mesh
 from ..method import Method
-from ..progress import counting, track
-from ..scene import Frame
+from ..method.capabilities import HasDensity, can, needs
+from ..system.progress import counting, track
 from .polygons import BLOCK, Grid, zero_level
 from .surface import larger_pieces, simplified, smoothed, vertex_normals
 

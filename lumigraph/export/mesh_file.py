@@ -9,13 +9,13 @@ import torch
 import trimesh
 from jaxtyping import Float
 
+from ..color.srgb import linear_from_srgb
+from ..datasets.mesh import Mesh
 from ..errors import LumigraphError
 from ..exchange import gltf
 from ..files import write_bytes
 from ..geometry import to_quaternion, turning
-from ..mesh import Mesh
-from ..progress import counting
-from ..srgb import linear_from_srgb
+from ..system.progress import counting
 from .surface import vertex_normals
 from .usdz import usdz
 

@@ -24,18 +24,18 @@ from PIL import Image
 from torch import Tensor
 
 from .. import __version__
-from ..baked.browser import Browsable
 from ..camera import Camera
+from ..datasets.mesh import Mesh
+from ..datasets.scene import Frame, Vector
 from ..errors import LumigraphError
 from ..exchange import spz
+from ..exchange.baked.browser import Browsable
 from ..figures import to_bytes
 from ..files import write_bytes
 from ..gaussians import Gaussians
-from ..mesh import Mesh
 from ..method import Method
 from ..paths import Surroundings, angle_of_view, camera_path, film_size, pivot
-from ..progress import counting, track
-from ..scene import Frame, Vector
+from ..system.progress import counting, track
 from .backdrop import Backdrop
 
 WEB = Path(__file__).parent / "web"

@@ -18,17 +18,17 @@ from PIL.PngImagePlugin import PngInfo
 from torch import Tensor
 
 from ..camera import Camera
+from ..camera.lens import Equirectangular, Pinhole
+from ..camera.rays import Rendering
+from ..datasets.scene import Frame
 from ..errors import LumigraphError
 from ..figures import to_image
 from ..files import replacing
 from ..geometry import look_at
-from ..lens import Equirectangular, Pinhole
-from ..memory import ask_for_picture
 from ..method import Method
 from ..paths import Surroundings
-from ..progress import track
-from ..rays import Rendering
-from ..scene import Frame
+from ..system.memory import ask_for_picture
+from ..system.progress import track
 
 AT_ONCE = 1 << 18  # pixels rendered between two looks at the progress
 BANDS = 3  # of rows, each seen by flat pictures that are pitched towards it

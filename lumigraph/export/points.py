@@ -12,13 +12,13 @@ from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
 from ..camera import Camera
-from ..crop import Crop
+from ..camera.crop import Crop
+from ..datasets.scene import Frame
 from ..depth_maps import DepthMap, SurfacePoints, Tolerance, render_depth_maps
 from ..errors import LumigraphError
 from ..files import replacing
 from ..method import Method
-from ..progress import counting, track
-from ..scene import Frame
+from ..system.progress import counting, track
 
 CANDIDATES = 4  # as many pixels are looked at as points are wanted, times this
 SQUARELY = 0.2  # cosine between a surface's normal and the ray from which on its depth is trusted

@@ -10,10 +10,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from ..camera.lens import Equirectangular, OmnidirectionalStereo
+from ..camera.rays import Rendering
 from ..errors import LumigraphError
-from ..lens import Equirectangular, OmnidirectionalStereo
 from ..method import Method
-from ..rays import Rendering
 from .panorama import level_camera, sphere, sphere_size
 
 SHARE = 1 / 50  # of the distance to what is around: 64 mm in a room of some three metres

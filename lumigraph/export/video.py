@@ -21,7 +21,7 @@ from torch import Tensor
 
 from ..errors import LumigraphError
 from ..files import Kind, replacing
-from ..progress import counting, track
+from ..system.progress import counting, track
 
 CRF = 17  # x264's constant rate factor: 0 is lossless, 18 looks it, 28 is small
 WEBP_QUALITY = 85  # of 100

@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from ..crop import Crop
+from ..camera.crop import Crop
 from .cloud import Gaussians
 
 NEIGHBOURS = 16  # whose distances say how isolated a Gaussian is

@@ -9,11 +9,11 @@ from jaxtyping import Float
 from torch import Tensor
 
 from .. import kernels
-from ..blending import over
 from ..camera import Camera
+from ..camera.lens import Mixed, OpenCV, Pinhole
+from ..camera.rays import Rendering
+from ..color.blending import over
 from ..errors import LumigraphError
-from ..lens import Mixed, OpenCV, Pinhole
-from ..rays import Rendering
 from .cloud import Gaussians
 
 BLUR = 0.3  # square pixels by which every footprint is widened (Kerbl 2023; the original release)

@@ -10,12 +10,12 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ..camera import Camera
-from ..capabilities import HasAppearance, can, needs
-from ..choice import evenly
 from ..components.fields.appearance import Appearance, Patches
 from ..composition import Placed
-from ..progress import track
-from ..scene import Batch
+from ..datasets.scene import Batch
+from ..geometry.choice import evenly
+from ..method.capabilities import HasAppearance, can, needs
+from ..system.progress import track
 from .block_cache import Nearby
 from .exposure_alignment import Asked, exposed
 from .visibility import saw

@@ -21,18 +21,18 @@ from torch import Tensor
 
 from .. import files, methods
 from ..camera import Camera
-from ..capabilities import HasGaussians, can
 from ..capture import Before, Part, open_dataset
 from ..composition import PickedCloud, Placed
+from ..datasets.scene import Frame, Scene
 from ..errors import LumigraphError, LumigraphWarning
+from ..files.names import natural
 from ..geometry import Similarity
 from ..method import Method
-from ..names import natural
+from ..method.capabilities import HasGaussians, can
 from ..run.checkpoint import State
 from ..run.folder import Run
 from ..run.opened import Trained
 from ..run.settings import Settings, Source
-from ..scene import Frame, Scene
 from .block_cache import Nearby
 from .compositing import InBlocks
 from .merging import merged

@@ -6,10 +6,10 @@ from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from statistics import median
 
-from ..capabilities import HasExposure, can, needs
 from ..composition import Placed
-from ..controls import Control
-from ..scene import Photograph
+from ..datasets.scene import Photograph
+from ..method.capabilities import HasExposure, can, needs
+from ..method.controls import Control
 
 EXPOSURE = "exposure"  # the control's name
 

@@ -19,7 +19,7 @@ from scipy.spatial import cKDTree
 from ..capture import Places
 from ..errors import LumigraphError, LumigraphWarning
 from ..files import read_json
-from ..ranges import Point, Positive, typed
+from ..files.ranges import Point, Positive, typed
 from .crossings import find_crossings
 from .plan import Block
 

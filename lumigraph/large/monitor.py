@@ -18,10 +18,10 @@ from typing import Any
 from rich.progress import BarColumn, Progress, TextColumn
 
 from .. import files
-from ..budget import Budget
-from ..console import console, is_live
 from ..errors import LumigraphError
-from ..progress import clock, tell
+from ..run.budget import Budget
+from ..system.console import console, is_live
+from ..system.progress import clock, tell
 from .plan import DONE
 
 EVERY = 1.0  # seconds between looks

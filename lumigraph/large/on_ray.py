@@ -16,9 +16,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from ..allocation import settle_memory
 from ..errors import LumigraphError
-from ..signals import Interrupt
+from ..system.allocation import settle_memory
+from ..system.signals import Interrupt
 from .monitor import in_order
 from .plan import Done
 from .worker import Conducted, train_block, writable

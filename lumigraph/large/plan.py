@@ -22,7 +22,7 @@ import msgspec
 from .. import files
 from ..capture import Part
 from ..errors import LumigraphError
-from ..ranges import Point, Positive, between, typed
+from ..files.ranges import Point, Positive, between, typed
 from ..run.settings import Source
 
 FORMAT = "lumigraph blocks 1"

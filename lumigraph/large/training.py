@@ -7,11 +7,11 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from ..capabilities import HasGaussians, can
 from ..components.fields.appearance import Appearance
 from ..errors import LumigraphError
 from ..exchange import write_gaussians
-from ..locks import held
+from ..files.locks import held
+from ..method.capabilities import HasGaussians, can
 from .appearance_alignment import align_appearance
 from .block_cache import Nearby
 from .block_run import BlockRun

@@ -7,9 +7,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ..camera import Camera
-from ..capabilities import HasVisibility, can, needs
+from ..camera.rays import Rendering
 from ..composition import Placed
-from ..rays import Rendering
+from ..method.capabilities import HasVisibility, can, needs
 
 GLANCE = 16  # pixels along the longer side of a picture that tells whether a block sees what a camera looks at
 STATIONS = (0.125, 0.375, 0.625, 0.875)  # of the way to what a pixel shows, where visibility is asked

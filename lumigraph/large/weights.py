@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from ..ranges import Share, between
+from ..files.ranges import Share, between
 
 NEAREST = 1e-6  # of a radius: distance that is divided by at least
 UNSEEN = 1e-12  # of its weight, that a block keeps which does not see: where none sees, they are mixed by distance

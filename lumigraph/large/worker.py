@@ -23,15 +23,15 @@ import numpy as np
 import torch
 
 from .. import files, methods
-from ..budget import Budget
 from ..capture import Before, open_dataset
+from ..datasets.scene import Scene
 from ..errors import LumigraphError
-from ..locks import held
+from ..files.locks import held
+from ..files.ranges import typed
 from ..method import Method
-from ..ranges import typed
 from ..run import Run, build
-from ..scene import Scene
-from ..train import fit
+from ..run.budget import Budget
+from ..training import fit
 from .plan import DONE, Done, Task
 
 PATIENCE = 60.0  # seconds to wait for a process that was told to end, and still holds the folder

@@ -9,8 +9,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from ..rays import Look, Rays, Rendering
-from ..scene import Batch, Scene
+from ..camera.rays import Look, Rays, Rendering
+from ..datasets.scene import Batch, Scene
 from ..volume import composite
 from .field import Field
 from .ray_method import RayMethod

@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn.functional import embedding
 
-from ..rays import Look, Rays, Samples
+from ..camera.rays import Look, Rays, Samples
 from .field import Features, Field
 from .part import Part
 
@@ -78,23 +78,17 @@ class Sampler(Part):
     """Chooses where along rays a field is evaluated, with its start-up, schedule, loss terms, optimizer and storage.
 
     is_open:        whether it samples rays without an end
+    batch_size:     number of rays of the next step
+    expected_rays:  number of rays of a typical step
     rays_per_chunk: rays that are rendered at once
     evaluated:      number of points of the last training step at which density was evaluated
     """
 
     is_open: ClassVar[bool] = False
+    batch_size: int
+    expected_rays: float
     rays_per_chunk: int = 16_384
     evaluated: int = 0
-
-    @property
-    @abstractmethod
-    def batch_size(self) -> int:
-        """Number of rays of the next step."""
-
-    @property
-    @abstractmethod
-    def expected_rays(self) -> float:
-        """Number of rays of a typical step."""
 
     @abstractmethod
     def sample(

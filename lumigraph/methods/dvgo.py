@@ -12,7 +12,7 @@ from torch import Tensor, nn
 
 from .. import kernels
 from ..camera import Camera
-from ..choice import evenly
+from ..camera.rays import Look
 from ..components.fields.mlp import MLP
 from ..components.fields.taken_over import cells_of, logit, taken_over
 from ..components.fields.voxels import VoxelGrid, corners, tight_box
@@ -25,12 +25,12 @@ from ..components.training.lazy_adam import LazyAdam
 from ..components.training.photometric import backdrop, residuals
 from ..components.training.schedules import falling
 from ..components.training.smoothness import variation
+from ..datasets.scene import Batch, Frame, Scene
+from ..exchange.packing import Stored, most_important
+from ..files.ranges import Layers, LearningRate, NonNegative, PositiveShare, Seed, Share, Steps, Width, between
+from ..geometry.choice import evenly
 from ..kernels.spherical_harmonics import K00
 from ..method import Field, FieldMethod
-from ..packing import Stored, most_important
-from ..ranges import Layers, LearningRate, NonNegative, PositiveShare, Seed, Share, Steps, Width, between
-from ..rays import Look
-from ..scene import Batch, Frame, Scene
 from ..volume import composite
 
 Voxels = Annotated[int, between(64, 1 << 30)]

@@ -11,12 +11,12 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
+from ..camera.rays import Rays, Rendering
 from ..components.fields.dense import Dense
 from ..components.fields.encodings import FourierFeatures as Waves
+from ..datasets.scene import Batch, Frame, Scene
+from ..files.ranges import BatchSize, Depth, LearningRate, NonNegative, Seed, Width, between
 from ..method import RayMethod
-from ..ranges import BatchSize, Depth, LearningRate, NonNegative, Seed, Width, between
-from ..rays import Rays, Rendering
-from ..scene import Batch, Frame, Scene
 
 Encoding = Literal["none", "basic", "positional", "gaussian"]
 FEW = 16  # inputs to a layer below which it multiplies in float32: in bfloat16 alone they tell no pixel from the next

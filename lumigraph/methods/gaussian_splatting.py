@@ -12,8 +12,9 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from .. import kernels
-from ..blending import over
 from ..camera import Camera
+from ..camera.rays import Rendering
+from ..color.blending import over
 from ..components.clouds.at_surfaces import at_surfaces, of_cloud
 from ..components.clouds.cloud import Cloud, CloudAdam
 from ..components.clouds.dense_points import compile_sweep
@@ -33,17 +34,16 @@ from ..components.training.pose_refinement import PoseRefinement
 from ..components.training.rhythm import Rhythm, haste, intervals
 from ..components.training.schedules import falling
 from ..components.training.trimming import Trimming
-from ..controls import Control, Value
+from ..datasets.scene import Frame, Photograph, Scene
 from ..errors import LumigraphWarning
 from ..exchange.morton import morton_order
+from ..exchange.packing import Stored, most_important
+from ..files.ranges import CloudSize, LearningRate, NonNegative, PositiveShare, Seed, Share, Steps, between
 from ..gaussians import Gaussians
 from ..gaussians.splatting import Splatted, render, splat, view_of
-from ..memory import room_for
 from ..method import Method
-from ..packing import Stored, most_important
-from ..ranges import CloudSize, LearningRate, NonNegative, PositiveShare, Seed, Share, Steps, between
-from ..rays import Rendering
-from ..scene import Frame, Photograph, Scene
+from ..method.controls import Control, Value
+from ..system.memory import room_for
 
 
 @dataclass(frozen=True)

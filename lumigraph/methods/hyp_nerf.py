@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from ..camera import Camera
-from ..collection import Collection
+from ..camera.rays import Look, Rays, Rendering
 from ..components.fields.code_space import fitted
 from ..components.fields.hash_field import HashNumbers, check_levels
 from ..components.fields.hash_instance import HashInstance, HashShape
@@ -28,25 +28,14 @@ from ..components.training.lazy_adam import LazyAdam
 from ..components.training.members import chance, photographed, rays_through
 from ..components.training.photometric import backdrop, residuals
 from ..components.training.schedules import falling
-from ..controls import Control, Value, blend
+from ..datasets.collection import Collection
+from ..datasets.scene import Batch, Frame, Photograph, Scene
 from ..errors import LumigraphError
+from ..files.ranges import BatchSize, Count, Layers, LearningRate, NonNegative, Positive, Seed, Share, Width, between
 from ..geometry import look_at
 from ..method import Method, RayMethod
-from ..quality import Effort, Efforts
-from ..ranges import (
-    BatchSize,
-    Count,
-    Layers,
-    LearningRate,
-    NonNegative,
-    Positive,
-    Seed,
-    Share,
-    Width,
-    between,
-)
-from ..rays import Look, Rays, Rendering
-from ..scene import Batch, Frame, Photograph, Scene
+from ..method.controls import Control, Value, blend
+from ..method.quality import Effort, Efforts
 from ..volume import composite
 
 Tally = Annotated[int, between(0, 100_000)]

@@ -29,10 +29,10 @@ from ..components.training.exposure import Exposure, Setting
 from ..components.training.photometric import backdrop, huber, residuals
 from ..components.training.pose_refinement import PoseNumbers, poses_for
 from ..components.training.schedules import held
+from ..datasets.scene import Batch, Frame
+from ..exchange.packing import most_important
+from ..files.ranges import LearningRate, NonNegative, PositiveShare, Seed, Width, between
 from ..method import FieldMethod
-from ..packing import most_important
-from ..ranges import LearningRate, NonNegative, PositiveShare, Seed, Width, between
-from ..scene import Batch, Frame
 from ..volume import composite
 
 
@@ -132,7 +132,7 @@ class InstantNGP(FieldMethod):
         self.sampler.settle(self.density, chance)
 
     def importance(self, camera: Camera) -> dict[str, Float[Tensor, " row"]]:
-        """Sum of the weights with which each entry of the table adds to one picture; see `components.sampling.importance`."""
+        """Weight of each entry of the table in one picture; see `components.sampling.importance`."""
         (shares,) = importance(self, camera, self.network.encode, [self.network.table])
         return {"network.table": shares.mean(-1)}
 

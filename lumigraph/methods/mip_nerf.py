@@ -19,9 +19,9 @@ from ..components.training.coarse_to_fine import BandSchedule, joining_of
 from ..components.training.distillation import POINTS_PER_RAY, distil
 from ..components.training.pose_refinement import PoseNumbers, poses_for
 from ..components.training.schedules import falling
+from ..datasets.scene import Frame
+from ..files.ranges import LearningRate, NonNegative, Seed, Share, Width
 from ..method import FieldMethod
-from ..ranges import LearningRate, NonNegative, Seed, Share, Width
-from ..scene import Frame
 
 
 @dataclass(frozen=True)

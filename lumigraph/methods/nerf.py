@@ -17,10 +17,10 @@ from ..components.sampling.spaces import space_of
 from ..components.training.distillation import POINTS_PER_RAY, distil
 from ..components.training.pose_refinement import PoseNumbers, poses_for
 from ..components.training.schedules import falling
+from ..datasets.scene import Frame
 from ..errors import LumigraphError
+from ..files.ranges import LearningRate, NonNegative, Seed, Share, Width, between
 from ..method import FieldMethod
-from ..ranges import LearningRate, NonNegative, Seed, Share, Width, between
-from ..scene import Frame
 
 
 @dataclass(frozen=True)

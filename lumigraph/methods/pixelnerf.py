@@ -13,8 +13,8 @@ from torch import Tensor
 from torch.nn.functional import softplus
 
 from ..camera import Camera
+from ..camera.rays import Look, Rays, Samples
 from ..capture.fewer import spread_out
-from ..collection import Collection
 from ..components.fields.dense import in_chunks
 from ..components.fields.encodings import FrequencyEncoding
 from ..components.fields.kept_photographs import KeptPhotographs, padded
@@ -25,11 +25,10 @@ from ..components.sampling.sampling import inverse_transform, midpoints, stratif
 from ..components.sampling.spaces import space_of
 from ..components.training.members import chance, photographed, rays_through
 from ..components.training.schedules import falling
-from ..controls import Control, Value
+from ..datasets.collection import Collection
+from ..datasets.scene import Batch, Frame, Photograph, Scene
 from ..errors import LumigraphError
-from ..method import Method, RayMethod
-from ..quality import Effort, Efforts
-from ..ranges import (
+from ..files.ranges import (
     BatchSize,
     Layers,
     LearningRate,
@@ -42,8 +41,9 @@ from ..ranges import (
     Width,
     between,
 )
-from ..rays import Look, Rays, Samples
-from ..scene import Batch, Frame, Photograph, Scene
+from ..method import Method, RayMethod
+from ..method.controls import Control, Value
+from ..method.quality import Effort, Efforts
 from ..volume import composite, weights_of
 
 Views = Annotated[int, between(1, 64)]

@@ -11,9 +11,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from ..baked import Octree
 from ..camera import Camera
-from ..capabilities import HasField, HasLooks, can
+from ..camera.rays import Look, Rays, Rendering
 from ..components.fields.harmonic_field import HarmonicHash, HarmonicNetwork, colour
 from ..components.fields.hash_field import TABLE_ON_A_CPU, TINY_TABLE, HashNumbers, check_levels
 from ..components.fields.leaves import Leaves, ask_for_octree
@@ -34,10 +33,11 @@ from ..components.training.lazy_adam import LazyAdam
 from ..components.training.lazy_rmsprop import LazyRMSprop
 from ..components.training.photometric import backdrop, residuals
 from ..components.training.schedules import falling, held
+from ..datasets.scene import Batch, Frame, Scene
 from ..errors import LumigraphError
-from ..method import RayMethod
-from ..packing import Stored, most_important
-from ..ranges import (
+from ..exchange.baked import Octree
+from ..exchange.packing import Stored, most_important
+from ..files.ranges import (
     BatchSize,
     Depth,
     Layers,
@@ -52,8 +52,8 @@ from ..ranges import (
     Width,
     between,
 )
-from ..rays import Look, Rays, Rendering
-from ..scene import Batch, Frame, Scene
+from ..method import RayMethod
+from ..method.capabilities import HasField, HasLooks, can
 from ..volume import composite, weights_of
 
 DensityRate = Annotated[float, between(1e-6, 1e4)]

@@ -23,13 +23,13 @@ from ..components.training.lazy_rmsprop import LazyRMSprop
 from ..components.training.photometric import backdrop, residuals
 from ..components.training.schedules import falling
 from ..components.training.sparsity import cauchy
+from ..datasets.scene import Batch, Frame, Scene
 from ..errors import LumigraphError
+from ..exchange.packing import Stored, most_important
+from ..files.ranges import BatchSize, LearningRate, NonNegative, Positive, PositiveShare, Seed, Share, Steps, between
 from ..kernels import total_variation
 from ..kernels.harmonic_grid import BANDS
 from ..method import Field, FieldMethod
-from ..packing import Stored, most_important
-from ..ranges import BatchSize, LearningRate, NonNegative, Positive, PositiveShare, Seed, Share, Steps, between
-from ..scene import Batch, Frame, Scene
 from ..volume import composite, weights_of
 
 Resolution = Annotated[int, between(4, 1024)]

@@ -15,6 +15,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from ..camera import Camera
+from ..camera.rays import Rays, Rendering
 from ..components.fields.activations import truncated_exp
 from ..components.fields.development import CONTROLS, decoded, exposed, toned
 from ..components.fields.hash_field import CPU_TABLE, TINY_TABLE, HashField, HashNumbers
@@ -33,12 +34,11 @@ from ..components.sampling.thin_lens import through_lens
 from ..components.training.fog import evened
 from ..components.training.pose_refinement import PoseNumbers, poses_for
 from ..components.training.schedules import held
-from ..controls import Control
+from ..datasets.scene import Batch, Frame, Scene
 from ..errors import LumigraphWarning
+from ..files.ranges import LearningRate, NonNegative, Positive, Seed, Width
 from ..method import FieldMethod
-from ..ranges import LearningRate, NonNegative, Positive, Seed, Width
-from ..rays import Rays, Rendering
-from ..scene import Batch, Frame, Scene
+from ..method.controls import Control
 from ..volume import composite
 
 

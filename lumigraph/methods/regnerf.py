@@ -13,6 +13,7 @@ from typing import Annotated, Any, Literal
 import torch
 from torch import Tensor
 
+from ..camera.rays import Look, Rays, Rendering
 from ..components.fields.coordinate_field import NetworkNumbers
 from ..components.fields.frustum_field import FrustumField
 from ..components.fields.hash_field import CPU_TABLE, HashField, HashNumbers
@@ -30,10 +31,9 @@ from ..components.training.photometric import backdrop, huber, residuals
 from ..components.training.pose_refinement import PoseNumbers, poses_for
 from ..components.training.schedules import falling, held
 from ..components.training.unseen_views import patches, roughness, unseen_cameras
+from ..datasets.scene import Batch, Frame, Scene
+from ..files.ranges import LearningRate, NonNegative, PositiveShare, Seed, Share, Steps, Width, between
 from ..method import FieldMethod
-from ..ranges import LearningRate, NonNegative, PositiveShare, Seed, Share, Steps, Width, between
-from ..rays import Look, Rays, Rendering
-from ..scene import Batch, Frame, Scene
 from ..volume import composite
 
 

@@ -12,10 +12,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from ..baked import Atlas
-from ..blending import over
 from ..camera import Camera
-from ..capabilities import HasField, can
+from ..camera.rays import Look, Rays, Rendering, Samples
+from ..color.blending import over
 from ..components.clouds.dense_points import compile_sweep
 from ..components.fields.baked_voxels import BakedVoxels, rounded
 from ..components.fields.deferred import Deferred, HashDeferred, NetworkDeferred, ViewDependence
@@ -35,12 +34,10 @@ from ..components.training.lazy_adam import LazyAdam
 from ..components.training.photometric import backdrop, residuals
 from ..components.training.schedules import falling, held
 from ..components.training.sparsity import cauchy
+from ..datasets.scene import Batch, Frame, Scene
 from ..errors import LumigraphError, LumigraphWarning
-from ..geometry import unit
-from ..kernels.block_march import ALPHA, CHANNELS
-from ..kernels.spherical_harmonics import K00
-from ..method import RayMethod
-from ..ranges import (
+from ..exchange.baked import Atlas
+from ..files.ranges import (
     BatchSize,
     Layers,
     LearningRate,
@@ -53,8 +50,11 @@ from ..ranges import (
     Width,
     between,
 )
-from ..rays import Look, Rays, Rendering, Samples
-from ..scene import Batch, Frame, Scene
+from ..geometry import unit
+from ..kernels.block_march import ALPHA, CHANNELS
+from ..kernels.spherical_harmonics import K00
+from ..method import RayMethod
+from ..method.capabilities import HasField, can
 from ..volume import composite, weights_of
 
 

@@ -26,13 +26,13 @@ from ..components.training.exchange import exchange
 from ..components.training.lazy_adam import LazyAdam
 from ..components.training.photometric import backdrop, residuals
 from ..components.training.schedules import falling
+from ..datasets.scene import Batch, Frame, Scene
 from ..errors import LumigraphError
+from ..exchange.packing import Stored, most_important
+from ..files.ranges import BatchSize, LearningRate, NonNegative, Positive, Seed, Share, Steps, Width, between
 from ..kernels import factor_grid, spherical_harmonics
 from ..kernels.factor_grid import Factors
 from ..method import Field, FieldMethod
-from ..packing import Stored, most_important
-from ..ranges import BatchSize, LearningRate, NonNegative, Positive, Seed, Share, Steps, Width, between
-from ..scene import Batch, Frame, Scene
 from ..volume import composite
 
 Resolution = Annotated[int, between(4, 2048)]  # nodes per axis of a cube with as many nodes

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Annotated, Any, Literal
 
-from ..ranges import between
+from ..files.ranges import between
 
 # Of one view, and of views' means: key, name, unit, better, digits.
 KEYS = (

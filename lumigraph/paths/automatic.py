@@ -18,10 +18,10 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from ..camera import Camera
+from ..camera.lens import Pinhole
+from ..datasets.scene import Frame
 from ..errors import LumigraphError
 from ..geometry import look_at, nearest_to_lines, unit
-from ..lens import Pinhole
-from ..scene import Frame
 
 Poses = Float[Tensor, "frame 3 4"]
 

@@ -20,12 +20,12 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ..camera import Camera
+from ..camera.lens import Lens, Pinhole
+from ..datasets.scene import Frame
 from ..errors import LumigraphError
 from ..files import read_json, write_json
+from ..files.ranges import Coordinate, Row, Side, between, typed
 from ..geometry import RIGID, is_similarity, to_matrix, to_quaternion
-from ..lens import Lens, Pinhole
-from ..ranges import Coordinate, Row, Side, between, typed
-from ..scene import Frame
 
 FORMAT = "lumigraph camera path 1"
 NARROWEST, WIDEST = 1.0, 170.0  # degrees that a flat picture can show

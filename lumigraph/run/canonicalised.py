@@ -26,10 +26,10 @@ import torch
 from .. import files
 from ..camera import Camera
 from ..composition import Placed, compose
+from ..datasets.scene import Frame, Vector
+from ..files.ranges import Name, Point, Share, typed
 from ..geometry import Similarity
 from ..method import Method
-from ..ranges import Name, Point, Share, typed
-from ..scene import Frame, Vector
 from .composition import box_of, place_from_json, place_to_json
 from .folder import Run
 from .opened import Opened

@@ -31,12 +31,12 @@ import torch
 
 from .. import files
 from ..camera import Camera
+from ..camera.crop import Box
 from ..composition import Placed, compose, frame_around
-from ..crop import Box
 from ..errors import LumigraphError
+from ..files.ranges import Name, Point, Row, between, typed
 from ..geometry import Similarity, Vector, is_similarity, to_matrix, to_quaternion
 from ..method import Method
-from ..ranges import Name, Point, Row, between, typed
 from .opened import Opened
 
 FORMAT = "lumigraph composition 1"

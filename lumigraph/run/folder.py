@@ -25,18 +25,19 @@ from typing import Any
 
 import torch
 
-from .. import files, marks, methods
+from .. import files, methods
 from ..camera import Camera, ring
-from ..dataset import Dataset
+from ..datasets.dataset import Dataset
+from ..datasets.scene import Frame, Scene
 from ..errors import LumigraphError
-from ..locks import NAME as LOCK
-from ..locks import check_place, held
-from ..marks import NAME as RECORD
+from ..files import marks
+from ..files.locks import NAME as LOCK
+from ..files.locks import check_place, held
+from ..files.marks import NAME as RECORD
+from ..files.partials import FORM
+from ..files.plain import understood
+from ..files.ranges import check
 from ..method import Method
-from ..partials import FORM
-from ..plain import understood
-from ..ranges import check
-from ..scene import Frame, Scene
 from . import cameras
 from .checkpoint import PACKED, Checkpoints, State
 from .measured import read_rows

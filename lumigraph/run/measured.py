@@ -8,8 +8,8 @@ from typing import Any
 
 from .. import files
 from ..errors import LumigraphError
+from ..files.ranges import Lasted, Tally, typed
 from ..metrics import Score
-from ..ranges import Lasted, Tally, typed
 
 
 @dataclass(frozen=True)

@@ -10,12 +10,12 @@ from typing import Any
 import torch
 
 from ..camera import Camera, dome
-from ..capabilities import HasGaussians, needs
-from ..dataset import Dataset
+from ..datasets.dataset import Dataset
+from ..datasets.scene import Frame, Scene
 from ..exchange import size_of
 from ..gaussians import Gaussians
 from ..method import Method
-from ..scene import Frame, Scene
+from ..method.capabilities import HasGaussians, needs
 from .checkpoint import State
 from .measured import read_evaluation
 from .settings import Settings, Source

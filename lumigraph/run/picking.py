@@ -13,9 +13,9 @@ from jaxtyping import Bool
 from torch import Tensor
 
 from .. import files
-from ..capabilities import CanPrune, needs
 from ..errors import LumigraphError
 from ..exchange import SUFFIXES, claim_splats, names_splats, write_gaussians
+from ..method.capabilities import CanPrune, needs
 from .checkpoint import Checkpoints
 from .folder import Run, check_new
 from .opened import Opened

@@ -8,12 +8,12 @@ import torch
 
 from .. import methods
 from ..camera import Camera, ring
+from ..datasets.scene import Frame
 from ..errors import LumigraphError
 from ..exchange import read_gaussians
 from ..gaussians import Gaussians
 from ..geometry import Similarity
 from ..method import Method
-from ..scene import Frame
 from .opened import Opened
 
 SHARE = 0.96  # of what is visible that the box of interest holds, along each axis

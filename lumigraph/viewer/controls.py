@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable
 from typing import Any
 
-from ..scene import Frame, Vector
+from ..datasets.scene import Frame, Vector
 from .modes import MODES
 from .scenery import CAMERAS, POINTS
 from .serving import PAGE

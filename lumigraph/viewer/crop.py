@@ -15,9 +15,9 @@ from jaxtyping import Bool, Shaped
 from torch import Tensor
 
 from ..camera import Camera
-from ..crop import Crop
+from ..camera.crop import Crop
+from ..camera.rays import Rays, Rendering
 from ..method import Method, RayMethod
-from ..rays import Rays, Rendering
 
 TOLERANCE = 0.01  # of the crop's size: an expected depth may lie so far outside
 

@@ -10,10 +10,10 @@ from typing import Any, cast
 import numpy as np
 from jaxtyping import Float
 
-from ..crop import Box, Crop, Sphere
+from ..camera.crop import Box, Crop, Sphere
+from ..datasets.scene import Frame, Vector
 from ..errors import LumigraphError
 from ..gaussians.cleaning import ISOLATION, MAX_SCALE, MIN_OPACITY
-from ..scene import Frame, Vector
 from .path_panel import code
 from .subject import NAME, NAMING, Keep
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from ..controls import Control, Value
 from ..method import Method
+from ..method.controls import Control, Value
 
 STEPS = 200  # of a slider
 

@@ -6,11 +6,11 @@ from dataclasses import dataclass
 from typing import Any
 
 from ..camera import Camera
-from ..capabilities import HasGaussians, needs
+from ..camera.rays import Rendering
 from ..gaussians import Gaussians, splatting
 from ..gaussians.cleaning import cleaned
 from ..method import Method
-from ..rays import Rendering
+from ..method.capabilities import HasGaussians, needs
 from .crop import render_inside
 from .scenery import Scenery
 from .subject import Subject

@@ -8,7 +8,7 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Float
 
-from ..progress import clock, short
+from ..system.progress import clock, short
 from .turns import Turns
 
 EVERY = 1.0  # seconds between updates

@@ -8,10 +8,10 @@ from dataclasses import dataclass
 import torch
 
 from ..camera import Camera
-from ..controls import Value
-from ..crop import Crop
-from ..lens import Pinhole
-from ..scene import Vector
+from ..camera.crop import Crop
+from ..camera.lens import Pinhole
+from ..datasets.scene import Vector
+from ..method.controls import Value
 
 
 @dataclass(frozen=True)

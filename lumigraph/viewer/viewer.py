@@ -8,8 +8,8 @@ from collections.abc import Callable
 from typing import Any
 
 from ..camera import Camera
-from ..capabilities import HasGaussians, can
 from ..method import Method
+from ..method.capabilities import HasGaussians, can
 from . import window
 from .address import Address
 from .cameras import angles

@@ -11,8 +11,8 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial import ConvexHull, QhullError
 
-from ...library import pycolmap
-from ...names import counted, natural
+from ...files.names import counted, natural
+from ...system.library import pycolmap
 from ..folds import in_steps, jumps
 from ..normalise import where_axes_meet
 from ..photos import Intake, Photo

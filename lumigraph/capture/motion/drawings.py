@@ -11,8 +11,8 @@ from jaxtyping import Float, UInt8
 from PIL import Image, ImageDraw, ImageFont
 
 from ...figures import RAMP, fit_into, save_picture
-from ...library import pycolmap
-from ...names import natural
+from ...files.names import natural
+from ...system.library import pycolmap
 from ..photos import Intake
 from .diagnosis import Diagnosis
 

@@ -15,8 +15,8 @@ from PIL import Image
 from ...errors import LumigraphError
 from ...files import claim as claim_file
 from ...files import claim_folder, read_json, remove, replacing, replacing_folder, write_json
-from ...library import pycolmap
-from ...marks import is_ours
+from ...files.marks import is_ours
+from ...system.library import pycolmap
 from ..masks import MASKS as MASKS
 from ..photos import Photo
 from ..photos.track import Track

@@ -10,8 +10,8 @@ import torch
 from jaxtyping import Float
 
 from ...camera import Camera
-from ...lens import Pinhole
-from ...library import pycolmap
+from ...camera.lens import Pinhole
+from ...system.library import pycolmap
 from ..photos import Photo
 from ..up import common_up, turn_onto_z
 

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Literal
 
 from ...errors import LumigraphError
-from ...library import pycolmap
+from ...system.library import pycolmap
 from ..photos import Photo
 
 Sharing = Literal["auto", "single", "per-device", "per-image"]

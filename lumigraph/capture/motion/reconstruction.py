@@ -16,11 +16,11 @@ import numpy as np
 from ...errors import LumigraphError
 from ...files import claim as claim_file
 from ...files import read_json, remove, replacing, replacing_folder, write_bytes, write_json
-from ...library import pycolmap
-from ...locks import held
-from ...names import counted, natural
-from ...progress import counting
-from ...ranges import typed
+from ...files.locks import held
+from ...files.names import counted, natural
+from ...files.ranges import typed
+from ...system.library import pycolmap
+from ...system.progress import counting
 from ..photos import Intake, Photo, gather
 from ..photos.track import Track, untracked
 from ..raw import REMEMBERED, Remembered

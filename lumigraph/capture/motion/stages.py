@@ -16,8 +16,8 @@ from typing import Any
 
 from ...errors import LumigraphError
 from ...files import read_json, write_json
-from ...processes import start
-from ...ranges import Lasted
+from ...files.ranges import Lasted
+from ...system.processes import start
 
 WORKER = Path(__file__).with_name("worker.py")
 

@@ -12,11 +12,11 @@ import torch
 from jaxtyping import Float
 from PIL import Image
 
-from ...choice import evenly
+from ...datasets.scene import Scene
 from ...errors import LumigraphError
 from ...figures import Row, contact_sheet, fit_into, save_picture
 from ...files import claim, replacing_folder
-from ...scene import Scene
+from ...geometry.choice import evenly
 from ..assemble import assemble
 from ..capture import Capture
 from ..masks import OBJECT_MASKS, inner_names

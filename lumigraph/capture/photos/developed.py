@@ -10,9 +10,9 @@ from pathlib import Path
 
 from PIL import Image
 
-from ...choice import evenly
 from ...errors import LumigraphError
 from ...files import read_json, replacing, write_json
+from ...geometry.choice import evenly
 from ..raw import REMEMBERED, Developed, RawPhoto, Remembered, exif_of, open_raw
 from .track import Track
 from .upright import QUALITY, is_current

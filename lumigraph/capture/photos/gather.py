@@ -14,7 +14,7 @@ from PIL import Image, UnidentifiedImageError
 
 from ...errors import LumigraphError
 from ...files import explained
-from ...names import counted, natural
+from ...files.names import counted, natural
 from ..masks import MASKS, OBJECT_MASKS, find_mask
 from ..pictures import describe, reductions
 from ..raw import Developed, is_raw

@@ -24,7 +24,7 @@ from jaxtyping import Float
 from PIL import Image
 from scipy.ndimage import gaussian_filter
 
-from ...srgb import linear_from_srgb
+from ...color.srgb import linear_from_srgb
 from ..pictures import eight_bits, same_shape
 
 WORKING = 640  # pixels, the longer side of what is judged

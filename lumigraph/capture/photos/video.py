@@ -25,7 +25,7 @@ from PIL import Image
 
 from ...errors import LumigraphError, LumigraphWarning
 from ...files import is_file, read_json, replacing_folder, write_json
-from ...ranges import Lasted
+from ...files.ranges import Lasted
 from .judge import SAME, WORKING, sharpness, signature
 from .movement import Odometer
 from .track import Track, untracked

@@ -15,7 +15,7 @@ import numpy as np
 
 from ...errors import LumigraphError
 from ...files import read_json
-from ...ranges import Coordinate, Name, Side, between
+from ...files.ranges import Coordinate, Name, Side, between
 from ..numbers import check_pixels, kind_of, read_numbers
 from ..pictures import readable
 from .photo import RawPhoto, srgb_from_camera

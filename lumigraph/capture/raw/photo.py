@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from ...srgb import srgb_from_linear
+from ...color.srgb import srgb_from_linear
 from .demosaic import GREEN, Pattern, demosaiced, repeated
 
 XYZ_FROM_SRGB = np.array(

@@ -16,7 +16,7 @@ import numpy as np
 
 from ...errors import LumigraphError
 from ...files import exists, read_json
-from ...ranges import Name, between
+from ...files.ranges import Name, between
 from ..capture import Capture, Plane, Shot
 from ..masks import inner_names
 from ..pictures import same_shape, stat

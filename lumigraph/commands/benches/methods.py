@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Annotated
 
 from ... import methods
-from ...ranges import Seconds, Steps
+from ...files.ranges import Seconds, Steps
 from ..common import option, scene_name
 from .cells import Cells, budgets, place_of
 

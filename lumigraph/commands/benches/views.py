@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 from ... import methods
-from ...budget import Budget
 from ...errors import LumigraphError
-from ...ranges import Count, Seconds, Steps
+from ...files.ranges import Count, Seconds, Steps
+from ...run.budget import Budget
 from ..common import needed, option, say, scene_name
 from .cells import Cells, budgets, place_of
 
@@ -83,7 +83,7 @@ class BenchViews(Cells):
         are not there."""
         from ...benchmark.cell import Cell
         from ...capture import kind_of
-        from ...collection import Collection
+        from ...datasets.collection import Collection
         from ...run import Run
 
         there = {Run(path).method_name: path.resolve() for path in self.priors}
@@ -107,8 +107,8 @@ class BenchViews(Cells):
         """The source itself, or held-out members of the collection that it is."""
         from ...benchmark.cell import MEMBERS
         from ...capture import kind_of, open_dataset, sources_of
-        from ...choice import evenly
-        from ...collection import Collection
+        from ...datasets.collection import Collection
+        from ...geometry.choice import evenly
 
         if kind_of(source) is not Collection:
             yield Place(source, scene_name(source))
@@ -152,7 +152,7 @@ class BenchViews(Cells):
 
 def learns_across(name: str) -> bool:
     """True if a method learns from collections and takes a scene as input."""
-    from ...collection import Collection
+    from ...datasets.collection import Collection
 
     return methods.find(name).learns_from is Collection
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
-from ...ranges import Steps, between
+from ...files.ranges import Steps, between
 from ..common import Overwrite, option, show
 
 
@@ -28,7 +28,7 @@ class ExplainActivation:
     def run(self) -> int:
         from ...explain.activation import draw, fits
         from ...files import claim
-        from ...progress import counting
+        from ...system.progress import counting
 
         claim(self.output, "figure", self.overwrite)
         with counting("Learning an edge in three orders"):

@@ -9,7 +9,7 @@ from typing import Annotated
 from tyro.conf import Positional
 
 from ...errors import LumigraphError
-from ...ranges import Downscale, Seed, Steps, between
+from ...files.ranges import Downscale, Seed, Steps, between
 from ..common import Overwrite, choose_device, needed, option, scene_name, show
 
 
@@ -55,7 +55,7 @@ class ExplainEncodings:
         from ...explain.encodings import compare
         from ...explain.encodings_page import claim_page, write_page
         from ...methods.fourier_features import FourierFeatures
-        from ...progress import counting
+        from ...system.progress import counting
 
         if not single_image.recognises(self.picture.expanduser()):
             raise LumigraphError(f"{self.picture} is no image file; name one picture, as in photograph.png")

@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal
 from tyro.conf import Positional
 
 from ...errors import LumigraphError
-from ...ranges import between
+from ...files.ranges import between
 from ..common import Overwrite, choose_device, needed, option, say, show
 from ..controls import Set, tell
 
@@ -44,13 +44,13 @@ class ExplainRay:
     def run(self) -> int:
         if self.output and self.output.suffix != ".svg":
             raise LumigraphError(f"{self.output} does not say that it is a figure; give --output a name ending in .svg")
-        from ...evaluate import file_name
+        from ...evaluation import file_name
         from ...explain.ray import along_ray
         from ...explain.ray_figure import ray_figure
         from ...figures.charts import standalone
         from ...files import claim, write_bytes, write_json
-        from ...progress import counting
         from ...run import Run
+        from ...system.progress import counting
 
         run = Run(self.run_folder)
         name, camera = find_view(run, self.split, self.view)

@@ -10,7 +10,7 @@ from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from ...errors import LumigraphError
 from ...files import claim
-from ...ranges import Count, Pixels, Positive, Share, between
+from ...files.ranges import Count, Pixels, Positive, Share, between
 from ..common import Overwrite, needed, option, show
 from ..controls import Set, open_method
 from ..keeping import Keeping

@@ -10,7 +10,7 @@ from tyro.conf import Positional
 
 from ...errors import LumigraphError
 from ...files import claim
-from ...ranges import between
+from ...files.ranges import between
 from ..common import Overwrite, needed, option, show
 from ..controls import Set, tell
 
@@ -36,8 +36,8 @@ class ExportOctree:
         if self.output.suffix.lower() != ".npz":
             raise LumigraphError(f"{self.output} should end in .npz, as viewers of octrees expect; rename it")
         claim(self.output, "octree", self.overwrite, [self.source])
-        from ...capabilities import HasOctree, needs
         from ...export.octree import write_octree
+        from ...method.capabilities import HasOctree, needs
         from ...run import open_any
 
         opened = open_any(self.source)

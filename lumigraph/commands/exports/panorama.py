@@ -9,7 +9,7 @@ from typing import Annotated, Any
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from ...files import claim
-from ...ranges import Coordinate, SphereSize
+from ...files.ranges import Coordinate, SphereSize
 from ..common import Overwrite, needed, option, show
 from ..controls import Set, open_method
 from ..keeping import Keeping

@@ -10,7 +10,7 @@ from tyro.conf import OmitArgPrefixes, Positional
 
 from ...errors import LumigraphError
 from ...files import claim
-from ...ranges import CloudSize, Count, Pixels
+from ...files.ranges import CloudSize, Count, Pixels
 from ..common import Overwrite, needed, option, show
 from ..controls import Set, open_method
 from ..keeping import Keeping

@@ -32,9 +32,9 @@ class ExportSnerg:
     """The new folder."""
 
     def run(self) -> int:
-        from ...capabilities import HasAtlas, needs
         from ...exchange import size_of, snerg
         from ...files import claim_folder
+        from ...method.capabilities import HasAtlas, needs
         from ...run import open_any
 
         claim_folder(self.output, "atlas")

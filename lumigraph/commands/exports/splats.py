@@ -9,7 +9,7 @@ from typing import Annotated, Any
 from tyro.conf import OmitArgPrefixes, Positional
 
 from ...errors import LumigraphError
-from ...ranges import between
+from ...files.ranges import between
 from ..common import Overwrite, needed, option, show
 from ..controls import Set, tell
 from ..keeping import Keeping
@@ -63,10 +63,10 @@ class ExportSplats:
     told: Set = ()
 
     def run(self) -> int:
-        from ...capabilities import HasGaussians, needs
         from ...exchange import check_ending, claim_splats, is_splat_file, read_gaussians, size_of, write_gaussians
         from ...exchange.streamed_sog import Detail
         from ...export.splats import export_splats
+        from ...method.capabilities import HasGaussians, needs
         from ...run import open_any
         from ...run.splat_file import frame_of
 

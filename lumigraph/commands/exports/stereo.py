@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Annotated
 
 from ...errors import LumigraphError
-from ...ranges import Positive
+from ...files.ranges import Positive
 from ..common import option, show
 from .panorama import SphereExport
 

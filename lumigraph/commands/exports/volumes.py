@@ -13,15 +13,15 @@ INTO = "plenoctrees"
 
 
 def is_baked(method: Any) -> bool:
-    from ...capabilities import HasAtlas, HasOctree, can
+    from ...method.capabilities import HasAtlas, HasOctree, can
 
     return can(method, HasOctree) or can(method, HasAtlas)
 
 
 def browsable(method: Any, degree: int = 3) -> tuple[Any, str]:
     """A baked method's volume for browsers, and its description. degree: largest degree of an octree's harmonics"""
-    from ...baked.browser import atlas_for_browser, octree_for_browser
-    from ...capabilities import HasAtlas, HasOctree, can, needs
+    from ...exchange.baked.browser import atlas_for_browser, octree_for_browser
+    from ...method.capabilities import HasAtlas, HasOctree, can, needs
 
     if can(method, HasOctree):
         volume = octree_for_browser(method.octree(), degree)
@@ -32,7 +32,7 @@ def browsable(method: Any, degree: int = 3) -> tuple[Any, str]:
 
 def can_be_baked(opened: Any, method: Any) -> bool:
     """True if a method's field can be converted to an octree, which supports objects only."""
-    from ...conversion.ways import check, way
+    from ...derive.conversion.ways import check, way
     from ...methods import find
 
     try:
@@ -44,7 +44,7 @@ def can_be_baked(opened: Any, method: Any) -> bool:
 
 def converted(opened: Any, seconds: float, device: Any) -> tuple[Any, str]:
     """The opened method converted to an octree, and the cost as text. seconds: training time after initialisation"""
-    from ...conversion import Aim, convert
+    from ...derive.conversion import Aim, convert
     from ...run import open_any
 
     begin = time.monotonic()

@@ -11,7 +11,7 @@ from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from ...errors import LumigraphError
 from ...files import claim
-from ...ranges import Seconds, between
+from ...files.ranges import Seconds, between
 from ..common import Overwrite, choose_device, needed, option, show
 from ..controls import Set, open_method
 from ..keeping import Keeping
@@ -85,9 +85,9 @@ class ExportWeb:
 
     def _write(self, kind: str, method: Any, cameras: Any, opening: Any) -> str:
         """Write the page, and say what it holds."""
-        from ...capabilities import HasGaussians, needs
         from ...export.mesh import extract_mesh
         from ...export.page import mesh_page, splats_page, views_page, volume_page
+        from ...method.capabilities import HasGaussians, needs
 
         if kind == "splats":
             gaussians = self.part.of_gaussians(needs(method, HasGaussians).gaussians(), self.part.crop(method.frame))
@@ -105,7 +105,7 @@ class ExportWeb:
         return f"{len(mesh.faces):,} triangles"
 
     def _kind(self, opened: Any, method: Any) -> str:
-        from ...capabilities import HasGaussians, can
+        from ...method.capabilities import HasGaussians, can
 
         if self.kind != "auto":
             return self.kind

@@ -6,9 +6,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from ...capabilities import HasGaussians, can
 from ...errors import LumigraphError
 from ...gaussians import Gaussians
+from ...method.capabilities import HasGaussians, can
 from ..fields.taken_over import TakenOver
 from .initial_cloud import nearest_distance
 

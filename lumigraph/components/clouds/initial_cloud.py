@@ -9,9 +9,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from ...datasets.scene import Frame, Scene
 from ...gaussians import Gaussians
 from ...kernels.spherical_harmonics import K00
-from ...scene import Frame, Scene
 from ..sampling.carving import visual_hull
 from .dense_points import dense_points
 

@@ -14,11 +14,11 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
-from ...controls import Control, blend
+from ...datasets.scene import Batch, Photograph
 from ...errors import LumigraphError
+from ...files.ranges import between
 from ...method import Part
-from ...ranges import between
-from ...scene import Batch, Photograph
+from ...method.controls import Control, blend
 from ...volume import composite, weights_of
 from .code_space import axes_of, fitted
 

@@ -9,8 +9,8 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
+from ...files.ranges import Depth, Layers, Octaves
 from ...method import Field
-from ...ranges import Depth, Layers, Octaves
 from ..sampling.spaces import Space
 from .coordinate_network import CoordinateNetwork
 from .dense import in_chunks

@@ -12,9 +12,9 @@ from torch import Tensor, nn
 
 from ... import kernels
 from ...errors import LumigraphError
+from ...exchange.packing import Stored
+from ...files.ranges import Layers, between
 from ...method import Field
-from ...packing import Stored
-from ...ranges import Layers, between
 from ..sampling.spaces import Space
 from ..training.lazy_adam import LazyAdam
 from .activations import truncated_exp

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from ... import kernels
 from ...camera import Camera
-from ...scene import Photograph, Scene
+from ...datasets.scene import Photograph, Scene
 
 BANDS = 3  # of spherical harmonics
 NUMBERS = 3 * BANDS**2  # of a photograph's code: the harmonics by rows, three colours each

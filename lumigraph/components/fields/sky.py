@@ -6,9 +6,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ... import kernels
+from ...camera.rays import Rays
+from ...datasets.scene import Frame
 from ...method import Part
-from ...rays import Rays
-from ...scene import Frame
 from .hash_field import side_by_side
 from .mlp import MLP
 

@@ -17,12 +17,12 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from ...camera import Camera
-from ...capabilities import HasDensity, HasField, can
-from ...choice import evenly
 from ...depth_maps import DEPTH_EDGE, TSDF, DepthMap, SurfacePoints, Tolerance, free, render_depth_maps, surface_points
 from ...geometry import unit
+from ...geometry.choice import evenly
 from ...kernels import spherical_harmonics
-from ...progress import track
+from ...method.capabilities import HasDensity, HasField, can
+from ...system.progress import track
 from ..sampling.spaces import Space
 
 AT_ONCE = 1 << 17  # points

@@ -10,8 +10,8 @@ from torch import Tensor
 from torch.nn.functional import max_pool2d
 
 from ...camera import PIXEL_RADIUS, Camera
-from ...choice import evenly
-from ...scene import Scene
+from ...datasets.scene import Scene
+from ...geometry.choice import evenly
 
 VIEWS = 24  # photographs asked at most: more cut little further
 

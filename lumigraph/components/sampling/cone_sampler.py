@@ -9,7 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import pad
 
-from ...rays import Rays, Samples
+from ...camera.rays import Rays, Samples
 from ..fields.coordinate_field import Places
 from .frustums import blurred, frustums_between
 from .hierarchical_sampler import HierarchicalSampler

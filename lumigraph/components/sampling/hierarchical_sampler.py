@@ -9,9 +9,9 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from ...camera.rays import Rays, Samples
+from ...files.ranges import BatchSize, RaySamples
 from ...method import Pass, Sampler
-from ...ranges import BatchSize, RaySamples
-from ...rays import Rays, Samples
 from ...volume import weights_of
 from ..fields.coordinate_field import CoordinateField, Places
 from .occupancy_mask import MaskNumbers, OccupancyMask

@@ -10,9 +10,9 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn.functional import max_pool3d
 
+from ...datasets.scene import Scene
+from ...files.ranges import Cells, NonNegative
 from ...method import Part
-from ...ranges import Cells, NonNegative
-from ...scene import Scene
 from .carving import visual_hull
 from .occupancy import OccupancyGrid
 from .spaces import Space

@@ -10,12 +10,12 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from ...camera.rays import Rays, Samples
+from ...datasets.scene import Frame, Scene
+from ...exchange.packing import Stored
+from ...files.ranges import NonNegative, Share, Steps, between
 from ...method import Features, Field, Pass, Sampler
 from ...method.sampler import Density, codes_at
-from ...packing import Stored
-from ...ranges import NonNegative, Share, Steps, between
-from ...rays import Rays, Samples
-from ...scene import Frame, Scene
 from ...volume import visible, weights_of
 from .carving import visual_hull
 from .occupancy import OccupancyGrid
@@ -129,11 +129,11 @@ class OccupancySampler(Sampler):
         self.step_share, self.sampled_share, self.stale = 1.0, 1.0, False
 
     @property
-    def batch_size(self) -> int:
+    def batch_size(self) -> int:  # type: ignore[override]
         return int(self.rays_per_step)
 
     @property
-    def expected_rays(self) -> float:
+    def expected_rays(self) -> float:  # type: ignore[override]
         return (
             min(self.max_rays, self.numbers.samples_per_step / self.samples_per_ray) if self.adapts else self.max_rays
         )

@@ -9,7 +9,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from ... import kernels
-from ...rays import Rays, Samples
+from ...camera.rays import Rays, Samples
 from ...volume import weights_of
 from ..fields.activations import LIMIT, truncated_exp
 from ..fields.voxels import VoxelGrid

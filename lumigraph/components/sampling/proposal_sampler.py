@@ -16,12 +16,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from ...camera.rays import Rays
+from ...datasets.scene import Frame, Scene
+from ...exchange.packing import Stored
+from ...files.ranges import NonNegative, between
 from ...method import Field, Pass, Sampler
 from ...method.sampler import Density, codes_at
-from ...packing import Stored
-from ...ranges import NonNegative, between
-from ...rays import Rays
-from ...scene import Frame, Scene
 from ...volume import weights_of
 from ..clouds.dense_points import Points, compile_sweep, seen_points
 from ..training.fog import elsewhere, scaled_by_distance, spread
@@ -79,11 +79,11 @@ class ProposalSampler(Sampler):
             self.register_buffer(name, torch.zeros(0, 3))
 
     @property
-    def batch_size(self) -> int:
+    def batch_size(self) -> int:  # type: ignore[override]
         return self.rays
 
     @property
-    def expected_rays(self) -> float:
+    def expected_rays(self) -> float:  # type: ignore[override]
         return self.rays
 
     def sample(

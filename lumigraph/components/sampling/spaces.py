@@ -17,8 +17,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ... import kernels
-from ...rays import Rays, Samples
-from ...scene import Forward, Frame, Vector
+from ...camera.rays import Rays, Samples
+from ...datasets.scene import Forward, Frame, Vector
 
 INFINITY = 1000.0  # times the near plane's distance: rays in normalised device coordinates end at 0.998 instead of 1
 SIDEWAYS = 1e-3  # sine of the angle to the near plane, below which a ray is said not to reach it

@@ -10,7 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ...geometry import unit
-from ...progress import track
+from ...system.progress import track
 from ..fields.taken_over import TakenOver
 from ..sampling.spaces import Space
 from .schedules import held

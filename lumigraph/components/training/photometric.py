@@ -7,8 +7,8 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import huber_loss
 
-from ...rays import Rendering
-from ...scene import Batch
+from ...camera.rays import Rendering
+from ...datasets.scene import Batch
 from .exposure import Exposure
 
 

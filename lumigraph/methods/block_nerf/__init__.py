@@ -34,9 +34,9 @@ from ...components.sampling.spaces import space_of
 from ...components.training.photometric import backdrop
 from ...components.training.pose_refinement import PoseNumbers, poses_for
 from ...components.training.schedules import held
+from ...datasets.scene import Batch, Frame, Photograph, Scene
+from ...files.ranges import Layers, LearningRate, NonNegative, Octaves, PositiveShare, Seed, Width, between
 from ...method import FieldMethod
-from ...ranges import Layers, LearningRate, NonNegative, Octaves, PositiveShare, Seed, Width, between
-from ...scene import Batch, Frame, Photograph, Scene
 from ...volume import composite
 from .exposures import Exposures
 from .moving import Moving

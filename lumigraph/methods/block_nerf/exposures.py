@@ -10,9 +10,9 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from ...components.fields.encodings import FrequencyEncoding
-from ...controls import Control
+from ...datasets.scene import Photograph, Scene
 from ...method import Part
-from ...scene import Photograph, Scene
+from ...method.controls import Control
 
 FULL = 8.0  # stops that count as 1, so that the longest wave rises all the way from four below the usual to four above
 SAME = 0.01  # stops within which all photographs count as exposed alike

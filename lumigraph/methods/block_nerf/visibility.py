@@ -7,6 +7,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ... import kernels
+from ...camera.rays import Rays, Samples
 from ...components.fields.encodings import FrequencyEncoding
 from ...components.fields.hash_field import side_by_side
 from ...components.fields.mlp import MLP
@@ -14,7 +15,6 @@ from ...components.sampling.spaces import Space
 from ...components.training.fog import evened
 from ...components.training.schedules import falling
 from ...method import Part
-from ...rays import Rays, Samples
 
 BANDS = 3  # of spherical harmonics: from which side, and no more than that
 LEARNING_RATES = 5e-3, 5e-4  # at first and in the end

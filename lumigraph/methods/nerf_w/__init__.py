@@ -10,6 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import softplus
 
+from ...camera.rays import Rays, Rendering, Samples
 from ...components.fields.appearance import AVERAGE, AppearanceCodes, CodeWidth, PhotographCodes
 from ...components.fields.coordinate_field import CoordinateField, NetworkNumbers
 from ...components.fields.hash_field import CODES_RATE, CPU_TABLE, OPEN_RATE, TINY_TABLE, HashNumbers
@@ -28,11 +29,10 @@ from ...components.sampling.samplers import sampler_for
 from ...components.sampling.spaces import space_of
 from ...components.training.photometric import backdrop
 from ...components.training.schedules import held
-from ...controls import Control
+from ...datasets.scene import Batch, Frame
+from ...files.ranges import Layers, LearningRate, NonNegative, PositiveShare, Seed, Share, Width, between
 from ...method import FieldMethod, Pass
-from ...ranges import Layers, LearningRate, NonNegative, PositiveShare, Seed, Share, Width, between
-from ...rays import Rays, Rendering, Samples
-from ...scene import Batch, Frame
+from ...method.controls import Control
 from ...volume import composite
 from .transient import EncodedHashField, HashTransientHead, Transient, TransientHead, with_transient
 

@@ -11,11 +11,11 @@ from torch import Tensor, nn
 from torch.nn.functional import softplus
 
 from ... import kernels
+from ...camera.rays import Look, Rendering
 from ...components.fields.activations import truncated_exp
 from ...components.fields.dense import Dense, in_chunks
 from ...components.fields.hash_field import HashField, side_by_side
 from ...components.fields.mlp import MLP
-from ...rays import Look, Rendering
 from ...volume import composite
 
 MIN_OPACITY = 1e-10  # opacity of a sample that is divided by at least

@@ -1,0 +1,66 @@
+"""Distance surface: a grid of signed distances, sampled around the first surface of each ray. For tests of samplers."""
+
+from dataclasses import dataclass
+
+import torch
+from torch import nn
+
+from lumigraph.camera.rays import Samples
+from lumigraph.files.ranges import Cells, LearningRate, Seed
+from lumigraph.method import Field, FieldMethod, Pass, Sampler
+
+
+@dataclass(frozen=True)
+class Config:
+    cells: Cells = 16
+    learning_rate: LearningRate = 0.02
+    seed: Seed = 0
+
+
+class DistanceGrid(Field):
+    """Signed distance and colour at corners of a cube, a sphere at first; density after Yariv 2021 (VolSDF)."""
+
+    def __init__(self, cells):
+        super().__init__()
+        corners = torch.stack(torch.meshgrid(*[torch.linspace(-1, 1, cells)] * 3, indexing="ij"))
+        self.values = nn.Parameter(
+            torch.cat([corners.norm(dim=0, keepdim=True) - 0.6, 0.1 * torch.randn(3, *[cells] * 3)])[None]
+        )
+
+    def geometry(self, points, code=None):
+        places = points.flip(-1)[None, None, None]
+        found = nn.functional.grid_sample(self.values, places, align_corners=True, padding_mode="border")[0, :, 0, 0].T
+        return 40 * torch.sigmoid(-20 * found[:, 0]) * (points.abs() < 1).all(-1), found
+
+    def colour(self, features, directions, code=None):
+        return torch.sigmoid(10 * features[:, 1:])
+
+
+class SurfaceSampler(Sampler):
+    """Samples of a search along each ray, as far as a little behind the first surface."""
+
+    batch_size = expected_rays = 128
+
+    def sample(self, rays, field, code=None, generator=None):
+        edges = torch.linspace(1.0, 5.0, 49).expand(len(rays), -1)
+        samples = Samples.rows(edges[:, :-1], edges[:, -1])
+        with torch.no_grad():
+            inside = field.geometry(samples.along(rays)[0])[1][:, 0].view(len(rays), -1) < 0
+            samples = samples.keep((inside.cumsum(-1) < 4).flatten())
+        points, directions = samples.along(rays)
+        return [Pass("surface", samples, *field.geometry(points), directions, evaluated=len(samples))]
+
+
+class DistanceSurface(FieldMethod):
+    Config = Config
+
+    def __init__(self, frame, config):
+        super().__init__(frame, config)
+        self.network, self.sampler = DistanceGrid(config.cells), SurfaceSampler()
+
+    @classmethod
+    def smallest(cls):
+        return Config(cells=8)
+
+    def optimizers(self):
+        return [torch.optim.Adam([self.network.values], self.config.learning_rate)]
