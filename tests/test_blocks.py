@@ -254,7 +254,7 @@ def test_blocks_are_shown_in_one_light_and_known_ones_keep_theirs(street, tmp_pa
     assert training.finish(folder).appearance == first and (folder / "blocks.json").read_bytes() == before
     assert training.finish(folder, again=["1"]).appearance["0"] == first["0"]
     opened = BlockRun(folder)
-    shown = [part.method.shown_in.code.tolist() for part in opened.method().parts]
+    shown = [part.method.shown_in.code.tolist() for part in opened.method().blocks]
     assert shown == [pytest.approx(Plan.read(folder / "blocks.json").appearance[name]) for name in "01"]
 
 

@@ -109,7 +109,7 @@ class Method(nn.Module, ABC):
 
     def optimizers(self) -> list[torch.optim.Optimizer]:
         """Fresh optimizers over the parameters; the trainer calls this once. By default those of the parts."""
-        return [optimizer for part in self.held_parts for optimizer in part.optimizers()]
+        return [optimizer for part in self.parts for optimizer in part.optimizers()]
 
     def learning_rate(self, step: int, progress: float) -> float | dict[str, float] | None:
         """The learning rate of this step, which the trainer gives to the optimizers: one for all groups of
@@ -121,7 +121,7 @@ class Method(nn.Module, ABC):
 
     def learning_rates(self, step: int, progress: float) -> dict[str, float]:
         """Learning rates by the names of groups, "" for groups without one: the parts' and `learning_rate`."""
-        rates = {name: rate for part in self.held_parts for name, rate in part.learning_rates(step, progress).items()}
+        rates = {name: rate for part in self.parts for name, rate in part.learning_rates(step, progress).items()}
         own = self.learning_rate(step, progress)
         return rates if own is None else rates | (own if isinstance(own, dict) else {"": own})
 
@@ -135,22 +135,22 @@ class Method(nn.Module, ABC):
 
         seconds: the whole budget, of which a small share may be used; infinite where steps are counted
         """
-        for part in self.held_parts:
+        for part in self.parts:
             part.begin(self, data, seconds)
 
     def compile_begin(self) -> None:
         """Called on a copy before the clock starts: compile what `begin` needs and no step does."""
-        for part in self.held_parts:
+        for part in self.parts:
             part.compile_begin()
 
     def before_step(self, step: int, progress: float) -> None:
         """Called ahead of each step. progress is the share of the budget (steps or seconds) spent, in [0, 1]."""
-        for part in self.held_parts:
+        for part in self.parts:
             part.before_step(self, step, progress)
 
     def after_step(self, step: int) -> None:
         """Called once the step is done."""
-        for part in self.held_parts:
+        for part in self.parts:
             part.after_step(self, step)
 
     def statistics(self) -> dict[str, float]:
@@ -171,14 +171,14 @@ class Method(nn.Module, ABC):
     # Parts
 
     @property
-    def held_parts(self) -> list[Part]:
+    def parts(self) -> list[Part]:
         """All submodules with hooks, in the order in which they were assigned."""
         return [module for module in self.modules() if isinstance(module, Part)]
 
     @property
     def moves_cameras(self) -> bool:
         """Whether a part learns poses; what would follow from given poses is then left out of `begin`."""
-        return any(part.moves_cameras for part in self.held_parts)
+        return any(part.moves_cameras for part in self.parts)
 
     def storage(self) -> dict[str, Stored]:
         """Storage of tensors in a compressed run by their names; see `CanCompress`."""
@@ -190,12 +190,13 @@ class Method(nn.Module, ABC):
     @property
     def controls(self) -> tuple[Control, ...]:
         """What a user may turn, beside the camera."""
-        return tuple(control for part in self.held_parts for control in part.controls)
+        return tuple(control for part in self.parts for control in part.controls)
 
     @property
     def takes(self) -> tuple[type, ...]:
         """The kinds of evidence that `given` takes now: those of the class, and of the parts as they were trained."""
-        return (*self.accepts, *(kind for part in self.held_parts for kind in part.accepts))
+        parts = (part for part in self.children() if isinstance(part, Part))
+        return (*self.accepts, *(kind for part in parts for kind in part.accepts))
 
     @property
     def evidence_views(self) -> int | None:
@@ -214,9 +215,9 @@ class Method(nn.Module, ABC):
         Raises LumigraphError for what this method cannot be told.
         """
         parts = {name: part for name, part in self.named_children() if isinstance(part, Part)}
-        chosen = [next((n for n, part in parts.items() if isinstance(piece, part.accepts)), None) for piece in evidence]
-        for piece, name in zip(evidence, chosen, strict=True):
-            if name is None:
+        chosen = [[n for n, part in parts.items() if isinstance(piece, part.accepts)] for piece in evidence]
+        for piece, names in zip(evidence, chosen, strict=True):
+            if not names:
                 kinds = " or ".join(kind.__name__ for kind in self.takes) or "nothing but its controls"
                 kind = type(piece).__name__
                 raise LumigraphError(f"{type(self).__name__} cannot be given a {kind}; it takes {kinds}")
@@ -230,8 +231,9 @@ class Method(nn.Module, ABC):
             told.__dict__[held] = dict(self.__dict__[held])
         told.figures = {}
         told.told = self.told | {name: known[name].checked(value) for name, value in controls.items()}
-        for piece, name in zip(evidence, chosen, strict=True):
-            told._modules[name] = parts[name].adapted(told, piece)
+        for piece, names in zip(evidence, chosen, strict=True):
+            for name in names:
+                told._modules[name] = told._modules[name].adapted(told, piece)  # type: ignore[union-attr, operator]
         return told
 
     def control(self, name: str) -> Value:
@@ -251,7 +253,7 @@ class Method(nn.Module, ABC):
     def refined(self, cameras: Camera) -> Camera:
         """The cameras of photographs as this method has come to see them, by their `image_index`; as they are where it
         learns no poses. Evaluation, films and exports go by these."""
-        for part in self.held_parts:
+        for part in self.parts:
             cameras = part.refined(cameras)
         return cameras
 
