@@ -20,7 +20,7 @@ RIGHT_ALONE = "right halves are compared; nothing is told of left ones"
 def judged_by_halves(method: Method) -> bool:
     """Whether a method that learns from a Scene takes single photographs as evidence, and was told of none by a
     control."""
-    takes = issubclass(method.learns_from, Scene) and Photograph in method.accepts
+    takes = issubclass(method.learns_from, Scene) and Photograph in method.takes
     return takes and not any(control.of_photographs and control.name in method.told for control in method.controls)
 
 

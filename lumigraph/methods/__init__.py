@@ -1,4 +1,4 @@
-"""One paper, one file. A method is found by its file's name, which is also what the user types."""
+"""One paper, one file or folder. A method is found by its name, which is also what the user types."""
 
 from __future__ import annotations
 
@@ -17,7 +17,8 @@ COLOURED = ("gaussian-splatting", "instant-ngp", "mip-nerf", "nerf", "fourier-fe
 
 
 def available() -> list[str]:
-    """The methods that are installed, as the user types them: instant_ngp.py is `instant-ngp`."""
+    """The methods that are installed, as the user types them: instant_ngp.py is `instant-ngp`. A method may be a folder
+    whose `__init__.py` is the paper, beside parts that no other method uses."""
     modules = (module.name for module in pkgutil.iter_modules(__path__))
     return sorted(name.replace("_", "-") for name in modules if not name.startswith("_"))
 
@@ -31,8 +32,9 @@ def colour(name: str) -> int:
 def summary(name: str) -> str:
     """The first line of a method's file: what it is and who published it. Reads the file without running it."""
     for folder in __path__:
-        file = Path(folder) / f"{name.replace('-', '_')}.py"
-        if file.exists():
+        module = Path(folder) / name.replace("-", "_")
+        file = next((x for x in (module.with_suffix(".py"), module / "__init__.py") if x.exists()), None)
+        if file:
             return (ast.get_docstring(ast.parse(file.read_text("utf-8"))) or "").partition("\n")[0]
     return ""
 
@@ -48,7 +50,7 @@ def check(name: str) -> str:
 
 
 def find(name: str) -> type[Any]:
-    """The subclass of Method in the file of that name. Raises LumigraphError if there is no such file."""
+    """The subclass of Method in the module of that name. Raises LumigraphError if there is no such module."""
     from ..method import Method
 
     module = importlib.import_module(f"{__name__}.{check(name).replace('-', '_')}")

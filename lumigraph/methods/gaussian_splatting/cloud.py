@@ -1,10 +1,11 @@
-"""A cloud of Gaussians that learns, and whose number changes while it does."""
+"""Cloud: the Gaussians as parameters whose number changes in training; CloudAdam, their optimizer."""
 
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from functools import lru_cache
-from typing import ClassVar
+from typing import Annotated, ClassVar
 
 import numpy as np
 import torch
@@ -12,31 +13,61 @@ from jaxtyping import Bool, Float, Int
 from numba import njit, prange
 from torch import Tensor, nn
 
+from ...camera import Camera
+from ...components.training.exchange import exchange
+from ...components.training.schedules import falling
 from ...gaussians import Gaussians
-from ..training.exchange import exchange
-from .witnesses import marked, witnesses
+from ...method import Part
+from ...packing import Stored
+from ...ranges import LearningRate, between
+from .interval_schedule import short_schedule_lr_scale
+from .view_count import view_count, with_view
 
 NAMES = ("means", "quaternions", "log_scales", "opacities", "harmonics")
+FULL_SCHEDULE = 2400  # steps from which on the rates of scales and harmonics are not scaled
+REST_BANDS_SCALE = 1 / 20  # of the harmonics' learning rate, beyond the first band
 
 
-class Cloud(nn.Module):
-    """The tensors of `Gaussians` as parameters, and the photographs that saw each: a bit for each, see `witnesses`."""
+@dataclass(frozen=True)
+class RateNumbers:
+    """A Config's learning rates, those of the authors' release."""
 
-    grows: ClassVar[tuple[str, ...]] = (*NAMES, "marks")  # with training, so that a saved one may be of another size
+    means_lr: LearningRate = 1.6e-4  # learning rate of centres, times the extent of the cameras
+    final_means_lr: LearningRate = 1.6e-6  # at the end of the budget
+    sh_lr: LearningRate = 2.5e-3  # learning rate of harmonics; a twentieth of it beyond the first band
+    opacities_lr: LearningRate = 0.05  # learning rate of opacities
+    scales_lr: LearningRate = 5e-3  # learning rate of scales
+    quaternions_lr: LearningRate = 1e-3  # learning rate of rotations
+    most_haste: Annotated[float, between(1, 1000)] = 1.0  # times the rates of scales and harmonics, in short runs
+
+
+class Cloud(Part):
+    """The tensors of `Gaussians` as parameters.
+
+    view_bits: a bit for each photograph in which a Gaussian was visible, see `view_count`
+    extent:    of the cameras, in scene units
+    optimizer: updates the parameters, and follows where these change in size; None before training
+    """
+
+    grows: ClassVar[tuple[str, ...]] = (*NAMES, "view_bits")  # a saved one may be of another size
 
     means: nn.Parameter
     quaternions: nn.Parameter
     log_scales: nn.Parameter
     opacities: nn.Parameter
     harmonics: nn.Parameter
-    marks: Tensor
+    view_bits: Tensor
+    extent: Tensor
+    optimizer: CloudAdam | None = None
 
-    def __init__(self, gaussians: Gaussians):
+    def __init__(self, gaussians: Gaussians, rates: RateNumbers = RateNumbers()):
         super().__init__()
+        self.rates = rates
         self.antialiased = gaussians.antialiased
         for name in NAMES:
             setattr(self, name, nn.Parameter(getattr(gaussians, name).clone()))
-        self.register_buffer("marks", torch.zeros(len(gaussians), dtype=torch.int64))
+        self.register_buffer("view_bits", torch.zeros(len(gaussians), dtype=torch.int64))
+        self.register_buffer("extent", torch.tensor(1.0))
 
     def __len__(self) -> int:
         return len(self.means)
@@ -45,37 +76,75 @@ class Cloud(nn.Module):
         """The cloud; gradients flow back into the parameters."""
         return Gaussians(**{name: getattr(self, name) for name in NAMES}, antialiased=self.antialiased)
 
-    @torch.no_grad()
-    def replace(self, gaussians: Gaussians, optimizer: CloudAdam | None = None) -> None:
-        """Put another cloud in this one's place; the optimizer updates it from now on, with fresh moments."""
-        for name in NAMES:
-            exchange(self, name, getattr(gaussians, name).detach().clone(), optimizer)
-        self.marks = self.marks.new_zeros(len(gaussians))
+    def set_extent(self, cameras: Camera) -> None:
+        """Set the extent: 1.1 times the radius of the cameras around their mean."""
+        positions = cameras.position
+        self.extent.fill_(1.1 * float((positions - positions.mean(0)).norm(dim=-1).max()))
+
+    def optimizers(self) -> list[torch.optim.Optimizer]:
+        c = self.rates
+        columns = [1.0] * 3 + [REST_BANDS_SCALE] * (3 * self.harmonics.shape[1] - 3)
+        groups = [
+            {"name": "means", "params": [self.means], "lr": c.means_lr},
+            {"params": [self.quaternions], "lr": c.quaternions_lr},
+            {"name": "scales", "params": [self.log_scales], "lr": c.scales_lr},
+            {"params": [self.opacities], "lr": c.opacities_lr},
+            {"name": "harmonics", "params": [self.harmonics], "lr": c.sh_lr, "columns": columns},
+        ]
+        self.optimizer = CloudAdam(groups)
+        return [self.optimizer]
+
+    def learning_rates(self, step: int, progress: float) -> dict[str, float]:
+        """Exponential decay of the means' rate (section 7.1), in extents of the cameras; the others are constant, but
+        higher for scales and harmonics in short runs."""
+        c = self.rates
+        scale = short_schedule_lr_scale(step, progress, FULL_SCHEDULE, c.most_haste)
+        means = float(self.extent) * falling(c.means_lr, c.final_means_lr, progress)
+        return {"means": means, "scales": scale * c.scales_lr, "harmonics": scale * c.sh_lr}
 
     @torch.no_grad()
-    def rebuild(self, optimizer: CloudAdam, source: Int[Tensor, " new"], fresh: Bool[Tensor, " new"]) -> None:
+    def replace(self, gaussians: Gaussians) -> None:
+        """Put another cloud in this one's place, with fresh moments."""
+        for name in NAMES:
+            exchange(self, name, getattr(gaussians, name).detach().clone(), self.optimizer)
+        self.view_bits = self.view_bits.new_zeros(len(gaussians))
+
+    @torch.no_grad()
+    def rebuild(self, source: Int[Tensor, " new"], fresh: Bool[Tensor, " new"]) -> None:
         """Make Gaussian i a copy of source[i]; the optimizer's moments of the fresh ones are zero.
 
         One operation for all that density control does: a clone is a number twice, a pruned one a number left out.
         """
+        assert self.optimizer is not None
         for name in NAMES:
             old = getattr(self, name)
-            state = optimizer.state.get(old, {})
+            state = self.optimizer.state.get(old, {})
             if state:
                 for moment in ("mean", "square", "last"):
                     state[moment] = state[moment][source]
                     state[moment][fresh] = state["step"] if moment == "last" else 0
-            exchange(self, name, old.data[source], optimizer, state)
-        self.marks = self.marks[source]
+            exchange(self, name, old.data[source], self.optimizer, state)
+        self.view_bits = self.view_bits[source]
 
-    def see(self, image_index: int, seen: Bool[Tensor, " gaussian"]) -> None:
-        """Remember which Gaussians a photograph saw something of."""
-        self.marks = marked(self.marks, image_index, seen)
+    def prune(self, keep: Bool[Tensor, " gaussian"]) -> None:
+        """Leave the Gaussians of a mask, with their moments."""
+        source = keep.nonzero()[:, 0]
+        self.rebuild(source, torch.zeros_like(source, dtype=torch.bool))
+
+    def record_view(self, image_index: Int[Tensor, " 1"], visible: Bool[Tensor, " gaussian"]) -> None:
+        """Record the Gaussians that were visible in a photograph."""
+        self.view_bits = with_view(self.view_bits, image_index, visible)
 
     @property
-    def seen_by(self) -> Int[Tensor, " gaussian"]:
-        """How many photographs saw each Gaussian."""
-        return witnesses(self.marks)
+    def view_count(self) -> Int[Tensor, " gaussian"]:
+        """Number of photographs in which each Gaussian was visible."""
+        return view_count(self.view_bits)
+
+    def storage(self) -> dict[str, Stored]:
+        """Positions need the most bits; harmonics beyond the plain colour go by a codebook."""
+        scaled = dict.fromkeys(("quaternions", "log_scales", "opacities"), Stored("scaled"))
+        harmonics = Stored("coded", plain=3)
+        return {"means": Stored("scaled", 16), **scaled, "harmonics": harmonics, "view_bits": Stored("nothing")}
 
 
 class CloudAdam(torch.optim.Optimizer):
