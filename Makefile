@@ -26,7 +26,7 @@ demo: .venv/.installed
 	$(BIN)/lumigraph demo
 
 test: .venv/.tools
-	PYTEST_ADDOPTS="--durations=10 $$PYTEST_ADDOPTS" $(BIN)/python -m pytest -q -n $(WORKERS) --dist loadfile $(TESTS)
+	PYTEST_ADDOPTS="--durations=10 $$PYTEST_ADDOPTS" $(BIN)/python -m pytest -q -n $(WORKERS) --dist loadfile --no-loadscope-reorder $(TESTS)
 
 check: .venv/.tools
 	$(BIN)/ruff format --check .

@@ -19,16 +19,16 @@ import tyro
 
 from lumigraph import methods
 from lumigraph.benchmark.table import size, table
-from lumigraph.budget import Budget
+from lumigraph.camera.rays import Rendering
 from lumigraph.capture import open_scene
-from lumigraph.evaluate.views import evaluate
+from lumigraph.datasets.scene import Scene
+from lumigraph.evaluation.views import evaluate
 from lumigraph.figures import Row, contact_sheet, save_picture
 from lumigraph.files import is_file, write_json
-from lumigraph.rays import Rendering
 from lumigraph.run import Run
+from lumigraph.run.budget import Budget
 from lumigraph.run.folder import build
-from lumigraph.scene import Scene
-from lumigraph.train import fit
+from lumigraph.training import fit
 
 FIELD = {"plenoctrees": "teacher_share", "snerg": "deferred_share"}  # share of the budget in which a field learns
 

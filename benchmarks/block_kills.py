@@ -23,7 +23,7 @@ from pathlib import Path
 
 import tyro
 
-from lumigraph.run.block_plan import DONE, FOLDER
+from lumigraph.large.plan import DONE, FOLDER
 
 WEIGHTS = "checkpoints/*/weights.safetensors"
 

@@ -13,10 +13,10 @@ import tyro
 from rich.table import Table
 
 from lumigraph import files
-from lumigraph.blocks.planning import place_of
-from lumigraph.console import console
 from lumigraph.figures.charts import Series, line_chart, standalone
-from lumigraph.run.block_plan import DONE, NAME, Done, Plan
+from lumigraph.large.plan import DONE, NAME, Done, Plan
+from lumigraph.large.planning import place_of
+from lumigraph.system.console import console
 
 
 @dataclass(frozen=True)

@@ -157,7 +157,7 @@ def learner(method: str, scene: str) -> None:
 
     from lumigraph.capture import open_scene
     from lumigraph.run import build
-    from lumigraph.train import Descent, set_learning_rate
+    from lumigraph.training import Descent, set_learning_rate
 
     data, kind, device = open_scene(scene), methods.find(method), torch.device("cpu")
     config = kind.preset(device)
@@ -189,7 +189,7 @@ def learner(method: str, scene: str) -> None:
 def courtesy() -> contextlib.AbstractContextManager[None]:
     """What the command line runs every command in; nothing in a checkout that has none."""
     try:
-        from lumigraph.threads import considerate
+        from lumigraph.system.threads import considerate
     except ImportError:
         return contextlib.nullcontext()
     return considerate()
@@ -216,7 +216,7 @@ def show(result: dict[str, dict[str, Figures]], busy: int) -> None:
     """Medians; and speed beside the busy programs as a share of that alone when threads wait as OpenMP has it."""
     from rich.table import Table
 
-    from lumigraph.console import console
+    from lumigraph.system.console import console
 
     table = Table("work", "threads wait", "alone", f"beside {busy}", "of OpenMP's own, alone", f"beside {busy}")
     for work, rows in result.items():

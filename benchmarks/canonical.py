@@ -22,18 +22,18 @@ from typing import Any, Literal
 
 import torch
 import tyro
+from canonical_errors import rotation_errors
 from torch import Tensor
 
-from lumigraph.canonical import PRESETS, Instance, Solution, canonicalise, found_in, sampled, solve
-from lumigraph.canonical.errors import rotation_errors
-from lumigraph.canonical.learning import found_rotations
-from lumigraph.canonical.mean_shape import best_alignment, best_rotations, described
-from lumigraph.capture.procedural import signed_distance
-from lumigraph.capture.procedural.members import member_stage
-from lumigraph.choice import evenly
-from lumigraph.cli import main as command
+from lumigraph.commands.cli import main as command
+from lumigraph.derive.canonical import PRESETS, Instance, Solution, canonicalise, found_in, sampled, solve
+from lumigraph.derive.canonical.learning import found_rotations
+from lumigraph.derive.canonical.mean_shape import best_alignment, best_rotations, described
 from lumigraph.files import write_json
+from lumigraph.geometry.choice import evenly
 from lumigraph.run.canonicalised import Canonicalised
+from lumigraph.synthetic import signed_distance
+from lumigraph.synthetic.members import member_stage
 
 # How often a category looks alike on the way around the vertical. Backs tell where a chair's front is. A car's bonnet
 # and boot, and the two sides of a toy's face, differ by less than a cell or two of the grids.

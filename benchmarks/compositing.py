@@ -20,9 +20,9 @@ import tyro
 from media import LENGTH, MEDIA, RULES, Medium, errors, exponential_ramp, order
 
 from lumigraph import kernels
+from lumigraph.camera.rays import Samples
 from lumigraph.figures.charts import Series, line_chart, standalone
 from lumigraph.files import write_bytes, write_json
-from lumigraph.rays import Samples
 from lumigraph.volume import weights_of
 
 ENGINES = {"reference": torch.float64, "cpu": torch.float32}

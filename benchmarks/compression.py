@@ -15,15 +15,15 @@ from pathlib import Path
 import tyro
 from rich.table import Table
 
-from lumigraph.compression import LADDER, Aim
-from lumigraph.compression.compress import Ladder, important
-from lumigraph.compression.measure import truth_of
-from lumigraph.console import console
-from lumigraph.evaluate import evaluate
+from lumigraph.derive.compression import LADDER, Aim
+from lumigraph.derive.compression.compress import Ladder, important
+from lumigraph.derive.compression.measure import truth_of
+from lumigraph.evaluation import evaluate
 from lumigraph.figures.charts import Series, line_chart, standalone
 from lumigraph.files import write_bytes, write_json
 from lumigraph.methods import colour
 from lumigraph.run import Run
+from lumigraph.system.console import console
 
 
 @dataclass(frozen=True)

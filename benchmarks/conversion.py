@@ -24,13 +24,13 @@ import torch
 import tyro
 
 from lumigraph import methods
-from lumigraph.capabilities import FromField, needs
 from lumigraph.commands.compress import size
-from lumigraph.conversion import Aim, convert
-from lumigraph.conversion.convert import new_student
+from lumigraph.derive.conversion import Aim, convert
+from lumigraph.derive.conversion.convert import new_student
 from lumigraph.figures import Row, contact_sheet, save_picture
 from lumigraph.figures.charts import standalone
 from lumigraph.files import claim, is_file, write_bytes, write_json
+from lumigraph.method.capabilities import FromField, needs
 from lumigraph.run import Run
 from lumigraph.run.converted import Converted
 

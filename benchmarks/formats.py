@@ -15,13 +15,13 @@ from pathlib import Path
 import tyro
 from rich.table import Table
 
-from lumigraph.capabilities import HasGaussians, needs
-from lumigraph.choice import evenly
-from lumigraph.console import console
 from lumigraph.exchange import SUFFIXES, read_gaussians, write_gaussians
 from lumigraph.gaussians.splatting import render
+from lumigraph.geometry.choice import evenly
+from lumigraph.method.capabilities import HasGaussians, needs
 from lumigraph.metrics import psnr
 from lumigraph.run import open_any
+from lumigraph.system.console import console
 
 BLACK = (0.0, 0.0, 0.0)
 

@@ -102,7 +102,7 @@ def show(found: list[Verdict], seconds: float) -> None:
     """A row for each class, a column for each outcome; then what was bad, the same faults together."""
     from rich.table import Table
 
-    from lumigraph.console import console
+    from lumigraph.system.console import console
 
     outcomes = [name for name in (*FINE, *BAD) if name in BAD or any(v.outcome == name for v in found)]
     table = Table("class", "inputs", *outcomes)

@@ -262,7 +262,7 @@ def show(found: list[Kill], longest: dict[str, float], seconds: float) -> None:
     """A row for each command."""
     from rich.table import Table
 
-    from lumigraph.console import console
+    from lumigraph.system.console import console
 
     table = Table("command", "alone, s", "kills", "while it worked", "SIGKILL", "SIGTERM", "left partial", "faults")
     for name in [*longest, None]:

@@ -18,9 +18,9 @@ import numpy as np
 import tyro
 
 from lumigraph import files
-from lumigraph.blocks.planning import place_of
-from lumigraph.blocks.task import SAVE_EVERY
-from lumigraph.run.block_plan import DONE, NAME, Done, Plan
+from lumigraph.large.plan import DONE, NAME, Done, Plan
+from lumigraph.large.planning import place_of
+from lumigraph.large.worker import SAVE_EVERY
 
 
 @dataclass(frozen=True)

@@ -122,7 +122,7 @@ def drawn(folder: Path, options: Options) -> dict[str, float]:
 
 
 def peak() -> int:
-    from lumigraph.memory import peak_memory
+    from lumigraph.system.memory import peak_memory
 
     return peak_memory(torch.device("cpu"))
 

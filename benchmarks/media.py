@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from lumigraph.rays import Samples
+from lumigraph.camera.rays import Samples
 from lumigraph.volume import composite
 
 LENGTH = 2.0  # of the ray

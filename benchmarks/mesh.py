@@ -28,14 +28,14 @@ from rich.table import Table
 from scipy.spatial import cKDTree
 
 from lumigraph.capture import open_scene
-from lumigraph.capture.procedural import scenes, signed_distance, trace
-from lumigraph.console import console
+from lumigraph.datasets.mesh import Mesh
 from lumigraph.export.mesh import extract_mesh
 from lumigraph.export.points import extract_points
 from lumigraph.files import write_json
-from lumigraph.mesh import Mesh
 from lumigraph.method import Method
 from lumigraph.run import Run
+from lumigraph.synthetic import scenes, signed_distance, trace
+from lumigraph.system.console import console
 
 SAMPLES = 200_000  # points spread over a mesh
 RAYS = 100_000  # of the training cameras, towards the exact surface

@@ -18,14 +18,14 @@ from rich.table import Table
 
 from lumigraph import methods
 from lumigraph.capture import open_scene
-from lumigraph.console import console
-from lumigraph.evaluate import evaluate
+from lumigraph.datasets.scene import Scene
+from lumigraph.evaluation import evaluate
 from lumigraph.figures import save_picture
 from lumigraph.files import write_json
 from lumigraph.run import build
-from lumigraph.scene import Scene
-from lumigraph.signals import go_on_unless
-from lumigraph.train import fit
+from lumigraph.system.console import console
+from lumigraph.system.signals import go_on_unless
+from lumigraph.training import fit
 
 
 @dataclass(frozen=True)

@@ -24,12 +24,12 @@ from lumigraph.capture import open_scene
 from lumigraph.components.fields import dense
 from lumigraph.components.fields.coordinate_network import CoordinateNetwork
 from lumigraph.components.sampling.occupancy_mask import OccupancyMask
+from lumigraph.datasets.scene import Scene
 from lumigraph.errors import LumigraphError
 from lumigraph.files import write_json
 from lumigraph.methods.nerf import Config, NeRF
 from lumigraph.metrics import psnr
 from lumigraph.run import Run, build, processor
-from lumigraph.scene import Scene
 
 RAYS, SIDE = 1024, 100  # of a step, and of a frame
 CELLS, LOOKS = 128, 4  # of the grid, and at each of its cells

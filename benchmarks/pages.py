@@ -25,9 +25,9 @@ from PIL import Image
 from tyro.conf import Positional
 
 from lumigraph.camera import Camera
-from lumigraph.choice import evenly
+from lumigraph.camera.lens import Pinhole
 from lumigraph.files import write_json
-from lumigraph.lens import Pinhole
+from lumigraph.geometry.choice import evenly
 from lumigraph.run import open_any
 
 SIZE, ANGLE = 400, 40.0  # pixels, degrees

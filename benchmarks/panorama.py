@@ -22,17 +22,17 @@ from torch import Tensor
 
 from lumigraph import methods
 from lumigraph.camera import Camera
+from lumigraph.camera.lens import Equirectangular, OmnidirectionalStereo
 from lumigraph.capture import open_scene
-from lumigraph.capture.procedural import render, scenes, trace
-from lumigraph.console import console
 from lumigraph.export.panorama import level_camera, panorama, save_sphere, sphere_size
 from lumigraph.export.stereo import stereo_pair, surrounding_distances, top_bottom
 from lumigraph.files import write_json
-from lumigraph.lens import Equirectangular, OmnidirectionalStereo
 from lumigraph.metrics import psnr
 from lumigraph.run import Run, build
-from lumigraph.signals import go_on_unless
-from lumigraph.train import fit
+from lumigraph.synthetic import render, scenes, trace
+from lumigraph.system.console import console
+from lumigraph.system.signals import go_on_unless
+from lumigraph.training import fit
 
 PLACE, HEADING = torch.zeros(3), torch.tensor([1.0, 0.0, 0.0])
 EYES = 0.05  # room units between them

@@ -21,17 +21,17 @@ import tyro
 from rich.table import Table
 
 from lumigraph import methods
-from lumigraph.alignment import moves
 from lumigraph.capture import open_scene
 from lumigraph.components.training.pose_refinement import PoseRefinement
-from lumigraph.console import console
-from lumigraph.evaluate import evaluate
+from lumigraph.datasets.alignment import moves
+from lumigraph.datasets.scene import Scene
+from lumigraph.evaluation import evaluate
 from lumigraph.figures import save_picture
 from lumigraph.files import write_json
 from lumigraph.run import build
-from lumigraph.scene import Scene
-from lumigraph.signals import go_on_unless
-from lumigraph.train import fit
+from lumigraph.system.console import console
+from lumigraph.system.signals import go_on_unless
+from lumigraph.training import fit
 
 STEPS = {"nerf": 4000, "mip-nerf": 4000, "instant-ngp": 2500, "gaussian-splatting": 3000}
 POSES = ("exact", "jittered", "refined", "matched")

@@ -22,20 +22,20 @@ from scipy.ndimage import convolve
 from skimage.restoration import denoise_nl_means, denoise_tv_chambolle
 from torch import Tensor
 
+from lumigraph.camera.rays import Rendering
 from lumigraph.capture import open_scene
-from lumigraph.capture.procedural.sensor import BLACK, PHOTON, READ_NOISE, WHITE
 from lumigraph.capture.raw.demosaic import demosaiced
 from lumigraph.components.fields.development import decoded, encoded
-from lumigraph.evaluate.light import LIGHT, in_light
+from lumigraph.datasets.scene import Scene
+from lumigraph.evaluation.light import LIGHT, in_light
 from lumigraph.figures import Row, contact_sheet, save_picture
 from lumigraph.files import write_json
 from lumigraph.methods import find
 from lumigraph.metrics import psnr, ssim_map
-from lumigraph.rays import Rendering
 from lumigraph.run import build
-from lumigraph.scene import Scene
-from lumigraph.signals import go_on_unless
-from lumigraph.train import fit
+from lumigraph.synthetic.sensor import BLACK, PHOTON, READ_NOISE, WHITE
+from lumigraph.system.signals import go_on_unless
+from lumigraph.training import fit
 
 STRENGTHS = 0.6, 1.0, 1.5, 2.2  # of a filter, about its noise
 COLUMNS = ["rawnerf", "same field, 8-bit pictures", "denoised photograph", "noisy photograph"]

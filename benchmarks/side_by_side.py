@@ -16,12 +16,12 @@ import torch
 import tyro
 from tyro.conf import Positional
 
-from lumigraph.choice import evenly
-from lumigraph.evaluate.halves import judged_by_halves, left_half
-from lumigraph.evaluate.light import LIGHT, in_light
+from lumigraph.datasets.scene import Scene
+from lumigraph.evaluation.halves import judged_by_halves, left_half
+from lumigraph.evaluation.light import LIGHT, in_light
 from lumigraph.figures import Row, colour_depth, contact_sheet, depth_range
+from lumigraph.geometry.choice import evenly
 from lumigraph.run import Run
-from lumigraph.scene import Scene
 
 MOST = 60_000  # bytes of a picture
 

@@ -96,7 +96,7 @@ def one_round(method: str, scene: Path, run: Path, options: Options) -> None:
 
 def must(*words: object) -> None:
     """Run a command in this process; it has to go well."""
-    from lumigraph.cli import main as command
+    from lumigraph.commands.cli import main as command
 
     if code := command([str(word) for word in words]):
         raise RuntimeError(f"lumigraph {' '.join(map(str, words))} ended with {code}")

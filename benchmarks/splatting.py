@@ -21,11 +21,11 @@ from rich.table import Table
 
 from lumigraph import kernels, methods
 from lumigraph.capture import open_scene
-from lumigraph.console import console
 from lumigraph.files import write_json
 from lumigraph.gaussians import Gaussians, splatting
 from lumigraph.run import build
 from lumigraph.run.splat_file import SplatFile
+from lumigraph.system.console import console
 
 PARTS = ("batch", "forward and loss", "backward", "optimiser", "after")
 

@@ -21,12 +21,12 @@ import torch
 import tyro
 
 from lumigraph.capture import open_scene
+from lumigraph.datasets.scene import Batch, Scene
 from lumigraph.files import write_json
 from lumigraph.methods.tensorf import Config, TensoRF
 from lumigraph.run import build, processor
-from lumigraph.scene import Batch, Scene
-from lumigraph.signals import go_on_unless
-from lumigraph.train import fit
+from lumigraph.system.signals import go_on_unless
+from lumigraph.training import fit
 from lumigraph.volume import composite, weights_of
 
 

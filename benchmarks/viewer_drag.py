@@ -25,10 +25,10 @@ from torch import Tensor
 from tyro.conf import Positional
 
 from lumigraph.camera import Camera
-from lumigraph.capabilities import HasGaussians, can, needs
 from lumigraph.commands.view import subject_of
 from lumigraph.files import write_json
 from lumigraph.method import Method
+from lumigraph.method.capabilities import HasGaussians, can, needs
 from lumigraph.run import open_any
 from lumigraph.viewer import Subject, Viewer, choose_address
 

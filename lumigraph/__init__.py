@@ -5,28 +5,28 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING, Any
 
-from . import threads
+from .system import threads
 
 if TYPE_CHECKING:
     from .camera import Camera as Camera
+    from .camera.lens import Lens as Lens
+    from .camera.rays import Rays as Rays
+    from .camera.rays import Rendering as Rendering
+    from .camera.rays import Samples as Samples
     from .capture import open_dataset as open_dataset
     from .capture import open_scene as open_scene
-    from .collection import Collection as Collection
-    from .dataset import Dataset as Dataset
+    from .datasets.collection import Collection as Collection
+    from .datasets.dataset import Dataset as Dataset
+    from .datasets.scene import Scene as Scene
+    from .datasets.shapes import Shapes as Shapes
     from .errors import LumigraphError as LumigraphError
     from .gaussians import Gaussians as Gaussians
-    from .lens import Lens as Lens
     from .method import Method as Method
     from .method import RayMethod as RayMethod
-    from .rays import Rays as Rays
-    from .rays import Rendering as Rendering
-    from .rays import Samples as Samples
     from .run import Opened as Opened
     from .run import Run as Run
     from .run import open_any as open_any
-    from .scene import Scene as Scene
-    from .shapes import Shapes as Shapes
-    from .train import fit as fit
+    from .training import fit as fit
     from .volume import composite as composite
 
 __version__ = "0.1.0"
@@ -36,22 +36,22 @@ threads.share_one_pool()
 
 _homes = {
     "Camera": "camera",
-    "Collection": "collection",
-    "Dataset": "dataset",
+    "Collection": "datasets.collection",
+    "Dataset": "datasets.dataset",
     "Gaussians": "gaussians",
-    "Lens": "lens",
+    "Lens": "camera.lens",
     "LumigraphError": "errors",
     "Method": "method",
     "RayMethod": "method",
     "Opened": "run",
-    "Rays": "rays",
-    "Rendering": "rays",
+    "Rays": "camera.rays",
+    "Rendering": "camera.rays",
     "Run": "run",
-    "Samples": "rays",
-    "Scene": "scene",
-    "Shapes": "shapes",
+    "Samples": "camera.rays",
+    "Scene": "datasets.scene",
+    "Shapes": "datasets.shapes",
     "composite": "volume",
-    "fit": "train",
+    "fit": "training",
     "open_any": "run",
     "open_dataset": "capture",
     "open_scene": "capture",

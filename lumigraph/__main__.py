@@ -1,13 +1,13 @@
 """`python -m lumigraph` is `lumigraph`."""
 
-from .signals import exit_code, listening, number_of
+from .system.signals import exit_code, listening, number_of
 
 
 def main() -> int:
     """Run a command. Returns the exit code; signals are heard from the first moment on."""
     try:
         with listening():
-            from .cli import main as run
+            from .commands.cli import main as run
 
             return run()
     except KeyboardInterrupt as stopped:

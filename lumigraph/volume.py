@@ -9,8 +9,8 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from . import kernels
-from .blending import over
-from .rays import Rendering, Samples
+from .camera.rays import Rendering, Samples
+from .color.blending import over
 
 
 def composite(

@@ -151,7 +151,6 @@ def engine_of(name: str, engine: str) -> ModuleType:
 
 def _copy(name: str, engine: str, edit: Callable[[str], str], copies: Path, monkeypatch) -> ModuleType:
     source = edit((folder(name) / f"{engine}.py").read_text(encoding="utf-8"))
-    source = source.replace("from .lanes import", "from .plain_lanes import")
     for other in re.findall(rf"^from \.\.(\w+)\.{engine} import", source, re.MULTILINE):
         original = engine_of(other, engine)
         plain = _copy(other, engine, lambda same: same, copies, monkeypatch)

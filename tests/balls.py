@@ -6,13 +6,13 @@ import torch
 from solids import Seen, ball
 
 from lumigraph.camera import Camera
+from lumigraph.camera.lens import Pinhole
+from lumigraph.camera.rays import Look, Rendering, Samples
+from lumigraph.datasets.scene import Frame
 from lumigraph.gaussians import Gaussians, splatting
 from lumigraph.geometry import look_at, unit
 from lumigraph.kernels.spherical_harmonics import K00
-from lumigraph.lens import Pinhole
 from lumigraph.method import Method, RayMethod
-from lumigraph.rays import Look, Rendering, Samples
-from lumigraph.scene import Frame
 from lumigraph.volume import packed
 
 RED, BLUE = (0.9, 0.1, 0.1), (0.1, 0.2, 0.8)

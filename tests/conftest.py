@@ -1,6 +1,7 @@
 """Before any test: Triton interprets where there is no GPU, and the shapes written at every door are executed.
 
-Around each: no test may hang, and what it costs is noted. Tests that need a browser come last, for they share one.
+Around each: no test may hang, and its cost is noted. Costly files come first, so that workers end together; tests that
+need a browser come last, for they share one.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ import lumigraph  # isort: skip
 import pytest  # isort: skip
 import torch  # isort: skip
 from browser import chromium, faults, page  # noqa: F401  # isort: skip
-from budgets import MUCH, Ledger, busy  # isort: skip
+from budgets import MUCH, Ledger, busy, share_of  # isort: skip
 from jaxtyping import install_import_hook  # isort: skip
 from numba.core import event  # isort: skip
 
@@ -45,7 +46,7 @@ def checked_modules() -> set[str]:
 if not torch.cuda.is_available():
     os.environ["TRITON_INTERPRET"] = "1"  # read when Triton is imported
 
-own = {"lumigraph.threads"}  # must come before PyTorch, and has no shapes
+own = {"lumigraph.system", "lumigraph.system.threads"}  # must come before PyTorch, and has no shapes
 loaded = sorted(name for name in sys.modules if name.startswith("lumigraph.") and name not in own)
 assert not loaded, f"loaded before their shapes could be checked: {loaded}"
 checker = "beartype.beartype(conf=beartype.BeartypeConf(is_pep484_tower=True))"  # an int will do for a float
@@ -64,7 +65,11 @@ event.register("numba:compile", LEDGER.compiling)
 
 @pytest.hookimpl(trylast=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    items.sort(key=lambda item: "chromium" in getattr(item, "fixturenames", ()))
+    def browser_then_cost(item: pytest.Item) -> tuple[bool, float]:
+        share = share_of(item.get_closest_marker("budget"))[1]
+        return "chromium" in getattr(item, "fixturenames", ()), -share
+
+    items.sort(key=browser_then_cost)
     from lumigraph import methods
 
     LEDGER.methods = len(methods.available())
@@ -74,7 +79,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 def pytest_runtest_protocol(item: pytest.Item) -> Iterator[None]:
     before = LEDGER.readings()
     done = yield
-    LEDGER.note(item.path.stem, before)
+    LEDGER.note(item.path.stem, share_of(item.get_closest_marker("budget")), before)
     return done
 
 
@@ -150,7 +155,7 @@ def ball_run(tmp_path_factory: pytest.TempPathFactory) -> Any:
     """A Run of the tests' own method, which has learnt the tiny scene for 60 steps."""
     import tiny
 
-    from lumigraph.train import fit
+    from lumigraph.training import fit
 
     run = tiny.new_run(tmp_path_factory.mktemp("runs") / "ball")
     fit(run.new_method(), tiny.scene(), run, steps=60, show=False, rehearsal=False)

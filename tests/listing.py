@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from lumigraph.marks import NAME
+from lumigraph.files.marks import NAME
 
 
 def names(folder: Path) -> list[str]:

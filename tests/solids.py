@@ -8,11 +8,11 @@ from collections.abc import Callable
 import torch
 
 from lumigraph.camera import Camera
+from lumigraph.camera.lens import Pinhole
+from lumigraph.camera.rays import Rendering
+from lumigraph.datasets.scene import Frame
 from lumigraph.geometry import look_at
-from lumigraph.lens import Pinhole
 from lumigraph.method import RayMethod
-from lumigraph.rays import Rendering
-from lumigraph.scene import Frame
 
 SHARPNESS, SOLID = 200.0, 400.0  # of the density's rise, per scene unit; density inside
 Distance = Callable[[torch.Tensor], torch.Tensor]

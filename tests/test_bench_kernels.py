@@ -7,9 +7,12 @@ import json
 
 import pytest
 from agreement import OPERATIONS, facts
+from budgets import budget
 from rich.console import Console
 
 from lumigraph.kernels.bench import bench_kernels
+
+pytestmark = budget("kernels")
 
 
 def test_rates_and_ratios(tmp_path):

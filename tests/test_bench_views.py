@@ -8,6 +8,7 @@ import statistics
 from pathlib import Path
 
 import pytest
+from budgets import budget
 from test_benchmark import Here
 from test_priors import prior_run
 
@@ -16,9 +17,11 @@ from lumigraph.benchmark.conduct import Patience, conduct
 from lumigraph.benchmark.curves import over_views
 from lumigraph.benchmark.pictures import draw_charts
 from lumigraph.benchmark.published import FEW
-from lumigraph.budget import Budget
-from lumigraph.cli import main
 from lumigraph.commands.benches.views import BenchViews
+from lumigraph.commands.cli import main
+from lumigraph.run.budget import Budget
+
+pytestmark = budget("runs")
 
 SETTINGS = Settings(device="cpu", eval_views=1)
 

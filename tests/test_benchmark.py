@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from budgets import budget
 from PIL import Image
 
 from lumigraph.benchmark.cell import Cell, Settings
@@ -20,10 +21,12 @@ from lumigraph.benchmark.conduct import Patience, conduct
 from lumigraph.benchmark.launch import launch, reason
 from lumigraph.benchmark.pictures import draw_charts
 from lumigraph.benchmark.published import FIGURES, published
-from lumigraph.budget import Budget
-from lumigraph.cli import main
+from lumigraph.commands.cli import main
 from lumigraph.errors import LumigraphError
 from lumigraph.run import Run
+from lumigraph.run.budget import Budget
+
+pytestmark = budget("runs", 20)
 
 SETTINGS = Settings(device="cpu", eval_views=2)
 

@@ -11,23 +11,27 @@ import pytest
 import tiny
 import torch
 from balls import BLUE, RED, WHITE, Marched, eye
+from budgets import budget
 
+from lumigraph.camera.rays import Rays, Samples
 from lumigraph.components.fields.appearance import Appearance
 from lumigraph.components.fields.visibility import Visibility, transmittance
 from lumigraph.components.sampling.spaces import space_of
 from lumigraph.components.training.moving import CELLS, Moving
-from lumigraph.composition import InBlocks, Mixing, Nearby, Placed, align_appearance
-from lumigraph.composition.mixing import inverse_distance, seeing, shares
+from lumigraph.composition import Placed
+from lumigraph.datasets.images import ImageStore
+from lumigraph.datasets.scene import Frame, Scene
 from lumigraph.errors import LumigraphError
-from lumigraph.evaluate import evaluate
-from lumigraph.evaluate.halves import judged_by_halves, left_half
+from lumigraph.evaluation import evaluate
+from lumigraph.evaluation.halves import judged_by_halves, left_half
 from lumigraph.geometry import Similarity
-from lumigraph.images import ImageStore
+from lumigraph.large import InBlocks, Mixing, Nearby, align_appearance
+from lumigraph.large.weights import inverse_distance, seeing, shares
 from lumigraph.methods.block_nerf import BlockNeRF
-from lumigraph.rays import Rays, Samples
 from lumigraph.run import build
-from lumigraph.scene import Frame, Scene
-from lumigraph.train import fit
+from lumigraph.training import fit
+
+pytestmark = budget("methods", 15)
 
 HERE = Similarity.make(1.0)
 STILL = {"residual_masks": False, "refine_cameras": False}

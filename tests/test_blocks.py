@@ -17,21 +17,24 @@ import numpy as np
 import pytest
 import tiny  # noqa: F401  # its methods
 import torch
+from budgets import budget
 from proofs import kept
 from safetensors.torch import load_file
 from streets import crossing_streets, write_street
 
-from lumigraph.blocks import conduct, crossings, finishing, layout, planning, task, watch
-from lumigraph.blocks.workers import Workers
-from lumigraph.budget import Budget
 from lumigraph.capture import Places, open_scene, places_of, read_capture
-from lumigraph.cli import main
+from lumigraph.commands.cli import main
 from lumigraph.errors import LumigraphError, LumigraphWarning
+from lumigraph.large import BlockRun, crossings, layout, monitor, planning, training, worker
+from lumigraph.large.on_ray import Workers
+from lumigraph.large.plan import Plan, Task
 from lumigraph.methods import find
-from lumigraph.run import BlockRun, Run, open_any
-from lumigraph.run.block_plan import Plan, Task
+from lumigraph.run import Run, open_any
+from lumigraph.run.budget import Budget
 from lumigraph.run.splat_file import SplatFile
-from lumigraph.train import fit
+from lumigraph.training import fit
+
+pytestmark = budget("runs", 15)
 
 STEPS = 6  # of each block
 
@@ -46,15 +49,15 @@ def run(street, tmp_path_factory) -> Path:
     """Three blocks of the street, learnt in this process. Nobody may change it."""
     folder = tmp_path_factory.mktemp("runs") / "street"
     planned(street, folder)
-    found = conduct.conduct(folder, Plan.read(folder / "blocks.json"), Workers(), show=False)
+    found = training.conduct(folder, Plan.read(folder / "blocks.json"), Workers(), show=False)
     assert sorted(found.done) == ["0", "1", "2"] and not found.failed and found.signal is None
     return folder
 
 
 def planned(street: Path, folder: Path, wish: str = "3", method: str = "voxel-grid") -> Plan:
-    kind, steps = find(method), 3 * STEPS
+    recipe = planning.Recipe(method, find(method).smallest(), {}, Budget(steps=3 * STEPS))
     places = places_of(read_capture(street))
-    plan = planning.make_plan(str(street), places, wish, kind, kind.smallest(), {}, Budget(steps=steps), device="cpu")
+    plan = planning.make_plan(str(street), places, wish, recipe)
     return planning.begin(folder, plan, places, threads=1)
 
 
@@ -150,13 +153,13 @@ def test_what_is_done_is_skipped_and_what_has_a_state_goes_on_to_the_bit(street,
     planned(street, tmp_path / "again")
     block = tmp_path / "again" / "blocks" / "1"
     with monkeypatch.context() as patch:
-        patch.setattr(task, "fit", partial(fit, pause_at=2))
-        assert task.train_block(block).done is None and Run(block).state.step == 2
-    done = task.train_block(block).done
+        patch.setattr(worker, "fit", partial(fit, pause_at=2))
+        assert worker.train_block(block).done is None and Run(block).state.step == 2
+    done = worker.train_block(block).done
     assert done and done.steps == STEPS and done.key == Task.read(block).key
     assert weights(block) == weights(run / "blocks" / "1")
     before = listing(block)
-    assert task.train_block(block).done == done and listing(block) == before
+    assert worker.train_block(block).done == done and listing(block) == before
 
 
 def test_a_block_of_another_task_is_refused(run, tmp_path):
@@ -164,25 +167,25 @@ def test_a_block_of_another_task_is_refused(run, tmp_path):
     said = json.loads((block / "task.json").read_text())
     (block / "task.json").write_text(json.dumps(said | {"seed": 5}))
     with pytest.raises(LumigraphError, match="trained for other settings"):
-        task.train_block(block)
+        worker.train_block(block)
     (block / "done.json").unlink()
     with pytest.raises(LumigraphError, match="holds a run of other settings"):
-        task.train_block(block)
+        worker.train_block(block)
 
 
 def test_workers_say_where_they_do_not_see_the_folder(tmp_path):
     with pytest.raises(LumigraphError, match="does not see .*storage that all machines share"):
-        task.writable(tmp_path / "elsewhere")
+        worker.writable(tmp_path / "elsewhere")
 
 
 def test_how_far_blocks_are_is_read_from_their_folders(run, tmp_path):
-    assert watch.stand_of(run / "blocks" / "0").state == "done"
-    assert watch.stand_of(tmp_path).state == "waiting"
+    assert monitor.stand_of(run / "blocks" / "0").state == "done"
+    assert monitor.stand_of(tmp_path).state == "waiting"
     block = shutil.copytree(run / "blocks" / "0", tmp_path / "0")
     (block / "done.json").unlink()
     (block / "metrics.jsonl").write_text('{"step": 3, "seconds": 1.5, "psnr": 20.0}\n{"step": 4, "sec')
-    assert watch.stand_of(block) == watch.Stand("learning", 0.5, 1.5, 20.0)
-    watching = watch.Watching(tmp_path, {"0": block, "1": tmp_path / "1"}, show=False)
+    assert monitor.stand_of(block) == monitor.Stand("learning", 0.5, 1.5, 20.0)
+    watching = monitor.Watching(tmp_path, {"0": block, "1": tmp_path / "1"}, show=False)
     watching.look()
     assert watching.share == 0.25 and "0 of 2 blocks done" in watching.line() and "0 50 %" in watching.line()
 
@@ -211,6 +214,11 @@ def test_a_run_in_blocks_opens_as_one_scene(street, run):
     assert seen.rgb.shape == (16, 16, 3) and bool(seen.rgb.isfinite().all())
 
 
+def test_a_run_in_blocks_is_not_converted_as_a_whole(run, tmp_path, capsys):
+    assert main(["convert", str(run), "voxel-grid", "--output", str(tmp_path / "new")]) == 2
+    assert f"is a run in blocks; convert each by itself: {run / 'blocks' / '0'}" in capsys.readouterr().err
+
+
 def test_eval_and_render_take_a_run_in_blocks(run, tmp_path, capsys):
     copy = shutil.copytree(run, tmp_path / "copy")
     assert main(["eval", str(copy), "--views", "2"]) == 0
@@ -233,18 +241,18 @@ def test_blocks_that_have_learnt_nothing_are_left_out_and_named(run, tmp_path):
 def learnt(street: Path, folder: Path, method: str) -> Path:
     """Two blocks of the street by another method."""
     plan = planned(street, folder, "2", method)
-    found = conduct.conduct(folder, plan, Workers(), show=False)
+    found = training.conduct(folder, plan, Workers(), show=False)
     assert sorted(found.done) == ["0", "1"]
     return folder
 
 
 def test_blocks_are_shown_in_one_light_and_known_ones_keep_theirs(street, tmp_path):
     folder = learnt(street, tmp_path / "run", "block-nerf")
-    first = finishing.finish(folder).appearance
+    first = training.finish(folder).appearance
     assert sorted(first) == ["0", "1"] and all(len(code) == len(first["0"]) > 0 for code in first.values())
     before = (folder / "blocks.json").read_bytes()
-    assert finishing.finish(folder).appearance == first and (folder / "blocks.json").read_bytes() == before
-    assert finishing.finish(folder, again=["1"]).appearance["0"] == first["0"]
+    assert training.finish(folder).appearance == first and (folder / "blocks.json").read_bytes() == before
+    assert training.finish(folder, again=["1"]).appearance["0"] == first["0"]
     opened = BlockRun(folder)
     shown = [part.method.shown_in.code.tolist() for part in opened.method().parts]
     assert shown == [pytest.approx(Plan.read(folder / "blocks.json").appearance[name]) for name in "01"]
@@ -252,7 +260,7 @@ def test_blocks_are_shown_in_one_light_and_known_ones_keep_theirs(street, tmp_pa
 
 def test_clouds_of_blocks_become_one_file(street, tmp_path):
     folder = learnt(street, tmp_path / "run", "gaussian-splatting")
-    finishing.finish(folder)
+    training.finish(folder)
     opened = BlockRun(folder)
     cloud = opened.method().gaussians()
     every = [opened.placed(block).gaussians() for block in opened.blocks]
@@ -271,10 +279,10 @@ def test_the_command_goes_on_and_refuses_other_settings(street, run, tmp_path, c
     monkeypatch.chdir(tmp_path)
     told = [street, "--field", "voxel-grid", "--blocks", 2, "--steps", 4, "--output", "big"]
     stop = partial(fit, pause_at=1)
-    monkeypatch.setattr(task, "fit", lambda *given, **more: replace(stop(*given, **more), signal=signal.SIGINT))
+    monkeypatch.setattr(worker, "fit", lambda *given, **more: replace(stop(*given, **more), signal=signal.SIGINT))
     assert train(*told) == 130
     assert "Stopped and saved, 0 of 2 blocks done; the same command goes on" in capsys.readouterr().err
-    monkeypatch.setattr(task, "fit", fit)
+    monkeypatch.setattr(worker, "fit", fit)
     assert train(*told) == 0
     assert all((tmp_path / f"big/blocks/{name}/done.json").exists() for name in "01")
     assert (tmp_path / "big/blocks.png").exists() and "2 blocks of" in capsys.readouterr().err
@@ -332,11 +340,11 @@ def test_an_address_that_does_not_answer(run, address, told, tmp_path):
     pytest.importorskip("ray")
     plan = planned(Path(Plan.read(run / "blocks.json").scene.source), tmp_path / "big")
     with pytest.raises(LumigraphError, match=told):
-        conduct.conduct(tmp_path / "big", plan, Workers(address=address), show=False)
+        training.conduct(tmp_path / "big", plan, Workers(address=address), show=False)
 
 
 def of_blocks() -> list[Path]:
-    package = Path(task.__file__).parent
+    package = Path(worker.__file__).parent
     return [*package.glob("*.py"), package.parent / "train.py", package.parent / "locks.py"]
 
 
@@ -350,7 +358,7 @@ def test_a_worker_that_is_killed_loses_nothing(street, tmp_path):
     plan = planned(street, tmp_path / "big", method="instant-ngp")
     planned(street, tmp_path / "undisturbed", method="instant-ngp")
     for name in "012":
-        task.train_block(tmp_path / "undisturbed/blocks" / name)
+        worker.train_block(tmp_path / "undisturbed/blocks" / name)
     killed = []
 
     def kill() -> None:
@@ -368,7 +376,7 @@ def test_a_worker_that_is_killed_loses_nothing(street, tmp_path):
 
     killer = threading.Thread(target=kill)
     killer.start()
-    found = conduct.conduct(tmp_path / "big", plan, Workers(count=2), show=False)
+    found = training.conduct(tmp_path / "big", plan, Workers(count=2), show=False)
     killer.join()
     assert killed and sorted(found.done) == ["0", "1", "2"] and not found.failed
     for name in "012":

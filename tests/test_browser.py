@@ -5,7 +5,10 @@ from __future__ import annotations
 import io
 
 import numpy as np
+from budgets import budget
 from PIL import Image
+
+pytestmark = budget("exports")
 
 PAGE = """<body style="margin:0"><canvas width=40 height=30></canvas><script>
 const gl = document.querySelector("canvas").getContext("webgl2");

@@ -7,15 +7,18 @@ import dataclasses
 import pytest
 import tiny
 import torch
+from budgets import budget
 
 from lumigraph import methods
-from lumigraph.budget import REJOIN, Budget, lasting
-from lumigraph.cli import main
+from lumigraph.commands.cli import main
 from lumigraph.errors import LumigraphError
-from lumigraph.evaluate import evaluate
-from lumigraph.quality import QUALITIES, Effort
+from lumigraph.evaluation import evaluate
+from lumigraph.method.quality import QUALITIES, Effort
 from lumigraph.run import Run, build
-from lumigraph.train import fit
+from lumigraph.run.budget import REJOIN, Budget, lasting
+from lumigraph.training import fit
+
+pytestmark = budget("runs", 8)
 
 
 @pytest.mark.parametrize("said", [{}, {"steps": 3, "seconds": 1.0}, {"steps": 0}, {"seconds": -1.0}])

@@ -12,7 +12,7 @@ from test_lens import CAMERAS, KINDS, SPHERES, random_lens, random_pixels, unifo
 from torch import Tensor
 
 from lumigraph.camera import PIXEL_RADIUS, Camera
-from lumigraph.lens import Equirectangular, Lens, Mixed, Pinhole
+from lumigraph.camera.lens import Equirectangular, Lens, Mixed, Pinhole
 
 
 def random_rotations(generator, count):

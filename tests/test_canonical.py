@@ -9,25 +9,28 @@ from pathlib import Path
 import pytest
 import tiny
 import torch
+from budgets import budget
+from canonical_errors import about_vertical, rotation_errors
 
 from lumigraph import kernels
-from lumigraph.alignment import angles
-from lumigraph.canonical import Config, Instance, sampled, solve
-from lumigraph.canonical.errors import about_vertical, rotation_errors
-from lumigraph.canonical.harmonics import band, harmonics, turning
-from lumigraph.canonical.learning import drawn, learn, losses
-from lumigraph.canonical.mean_shape import best_rotations, described
-from lumigraph.canonical.moments import moments
-from lumigraph.canonical.network import Canonicaliser, rotations_of
-from lumigraph.canonical.rotations import near, nearest_rotation, random, spread
 from lumigraph.capture import open_scene
-from lumigraph.capture.procedural import categories, signed_distance
-from lumigraph.capture.procedural.members import member_stage, members_of
-from lumigraph.cli import main
+from lumigraph.commands.cli import main
 from lumigraph.composition import standing
+from lumigraph.datasets.alignment import angles
+from lumigraph.derive.canonical import Config, Instance, sampled, solve
+from lumigraph.derive.canonical.harmonics import band, harmonics, turning
+from lumigraph.derive.canonical.learning import drawn, learn, losses
+from lumigraph.derive.canonical.mean_shape import best_rotations, described
+from lumigraph.derive.canonical.moments import moments
+from lumigraph.derive.canonical.network import Canonicaliser, rotations_of
+from lumigraph.derive.canonical.rotations import near, nearest_rotation, random, spread
 from lumigraph.errors import LumigraphError
 from lumigraph.geometry import Similarity
 from lumigraph.run import Run, State, open_any
+from lumigraph.synthetic import categories, signed_distance
+from lumigraph.synthetic.members import member_stage, members_of
+
+pytestmark = budget("runs", 15)
 
 QUICK = Config(steps=12, points=256, channels=8, templates=3)
 CUBE = (-1.0, -1.0, -1.0), (1.0, 1.0, 1.0)
@@ -386,7 +389,7 @@ def test_a_damaged_file_is_refused(runs, tmp_path, said, words):
 
 
 def test_a_folder_that_is_called_like_a_category_does_not_hide_it(tmp_path, monkeypatch):
-    from lumigraph.capture.procedural import is_collection
+    from lumigraph.synthetic import is_collection
 
     monkeypatch.chdir(tmp_path)
     Path("chairs").mkdir()

@@ -13,6 +13,7 @@ import numpy as np
 import pycolmap
 import pytest
 import torch
+from budgets import budget
 from captures import (
     FOCAL,
     HEIGHT,
@@ -30,15 +31,17 @@ from captures import (
 )
 from PIL import Image
 
+from lumigraph.camera.lens import Equirectangular, Fisheye, OpenCV, Pinhole
+from lumigraph.camera.rays import Rays
 from lumigraph.capture import Capture, Shot, assemble, choose_reader, open_scene
 from lumigraph.capture.hull import farthest
 from lumigraph.capture.normalise import power_of_two
 from lumigraph.capture.points import similarity
 from lumigraph.capture.up import turn_onto_z
+from lumigraph.datasets.scene import Scene
 from lumigraph.errors import LumigraphError, LumigraphWarning
-from lumigraph.lens import Equirectangular, Fisheye, OpenCV, Pinhole
-from lumigraph.rays import Rays
-from lumigraph.scene import Scene
+
+pytestmark = budget("capture", 10)
 
 
 @pytest.fixture

@@ -14,11 +14,11 @@ import numpy as np
 import pycolmap
 import pytest
 import torch
+from budgets import budget
 from PIL import Image
 from scipy.spatial import KDTree
 from views import draw, look_at, pattern, spoil, write_views
 
-from lumigraph import cli
 from lumigraph.capture import open_scene
 from lumigraph.capture.colmap import read as read_colmap
 from lumigraph.capture.folds import jumps
@@ -33,7 +33,10 @@ from lumigraph.capture.motion.stages import WORKER, Stages, key_of
 from lumigraph.capture.photos import Intake, Photo
 from lumigraph.capture.transforms import read as read_transforms
 from lumigraph.commands import capture as command
+from lumigraph.commands import cli
 from lumigraph.errors import LumigraphError
+
+pytestmark = budget("capture", 20)
 
 
 class Told:

@@ -7,6 +7,7 @@ import re
 from xml.etree import ElementTree
 
 import pytest
+from budgets import budget
 
 from lumigraph.benchmark.curves import curves
 from lumigraph.figures.charts import (
@@ -23,6 +24,8 @@ from lumigraph.figures.charts import (
     ticks,
 )
 from lumigraph.methods import COLOURED, available, colour
+
+pytestmark = budget("runs")
 
 
 def elements(chart: str, kind: str) -> list[dict[str, str]]:

@@ -6,15 +6,16 @@ import numpy as np
 import pytest
 import torch
 
-from lumigraph.capture import open_scene, procedural
-from lumigraph.capture.procedural import Lamp, Material, Object, Pose, World, scenes
-from lumigraph.capture.procedural.rendering import render, signed_distance
-from lumigraph.capture.procedural.scenes.city import Drive, plan
-from lumigraph.capture.procedural.shapes import Box, Sphere
-from lumigraph.capture.procedural.textures import Checker, Plain
-from lumigraph.capture.procedural.world import joined
+from lumigraph import synthetic as procedural
+from lumigraph.capture import open_scene
+from lumigraph.datasets.images import ImageSource, load
 from lumigraph.errors import LumigraphError
-from lumigraph.images import ImageSource, load
+from lumigraph.synthetic import Lamp, Material, Object, Pose, World, scenes
+from lumigraph.synthetic.rendering import render, signed_distance
+from lumigraph.synthetic.scenes.city import Drive, plan
+from lumigraph.synthetic.shapes import Box, Sphere
+from lumigraph.synthetic.textures import Checker, Plain
+from lumigraph.synthetic.world import joined
 
 SMALL = "procedural:city,crossings=2,size=24,views=14"
 

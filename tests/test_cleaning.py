@@ -13,16 +13,16 @@ import torch
 from balls import RED, WHITE, Dense, Splatted, eye
 from test_gaussian_splatting import new
 
-from lumigraph import cli
+from lumigraph.camera.crop import Box, Crop, Sphere
+from lumigraph.camera.rays import Rays
+from lumigraph.commands import cli
 from lumigraph.composition import PickedCloud, cropped
-from lumigraph.crop import Box, Crop, Sphere
 from lumigraph.exchange import read_gaussians, write_gaussians
 from lumigraph.gaussians import Gaussians
 from lumigraph.gaussians.cleaning import cleaned, extent, unwanted
 from lumigraph.geometry import Similarity, to_matrix
-from lumigraph.rays import Rays
 from lumigraph.run import Run, open_any
-from lumigraph.train import fit
+from lumigraph.training import fit
 
 CROPS: dict[str, Crop] = {
     "box": Box((-0.3, -0.5, -0.2), (0.4, 0.1, 0.6)),

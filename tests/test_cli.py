@@ -15,15 +15,18 @@ from pathlib import Path
 
 import pytest
 import tiny
+from budgets import budget
 
-from lumigraph.cli import COMMANDS, main
+from lumigraph.commands.cli import COMMANDS, main
 from lumigraph.commands.common import next_free, scene_name
 from lumigraph.run import Run
+
+pytestmark = budget("runs", 18)
 
 HERE = Path(__file__).parent
 ENVIRONMENT = {**os.environ, "PYTHONPATH": f"{HERE.parent}{os.pathsep}{HERE}"}
 # A process that knows the method of the tests.
-LUMIGRAPH = [sys.executable, "-c", "import sys, tiny; from lumigraph.cli import main; sys.exit(main())"]
+LUMIGRAPH = [sys.executable, "-c", "import sys, tiny; from lumigraph.commands.cli import main; sys.exit(main())"]
 
 
 @pytest.fixture(scope="module")
@@ -198,7 +201,7 @@ def test_help_on_a_method_names_its_numbers(capsys):
 
 
 def test_help_does_not_wait_for_pytorch():
-    script = "import sys; from lumigraph.cli import main; main(['methods']); sys.exit('torch' in sys.modules)"
+    script = "import sys; from lumigraph.commands.cli import main; main(['methods']); sys.exit('torch' in sys.modules)"
     begin = time.perf_counter()
     done = subprocess.run([sys.executable, "-c", script], env=ENVIRONMENT, capture_output=True, text=True, timeout=120)
     assert done.returncode == 0 and "instant-ngp" in done.stdout, done.stderr

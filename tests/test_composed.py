@@ -9,21 +9,24 @@ from dataclasses import replace
 import pytest
 import torch
 from balls import BLUE, RED, WHITE, Dense, Marched, Pictured, Splatted, eye
+from budgets import budget
 
-from lumigraph import cli
-from lumigraph.capabilities import HasDensity, HasGaussians, HasLooks, can
+from lumigraph.camera.crop import Box
+from lumigraph.camera.rays import Look, Samples
+from lumigraph.commands import cli
 from lumigraph.composition import Placed, compose, frame_around, standing
 from lumigraph.composition.union import union
-from lumigraph.controls import Control
-from lumigraph.crop import Box
+from lumigraph.datasets.scene import Frame
 from lumigraph.errors import LumigraphError, LumigraphWarning
 from lumigraph.exchange import write_gaussians
 from lumigraph.geometry import Similarity, to_matrix
-from lumigraph.rays import Look, Samples
+from lumigraph.method.capabilities import HasDensity, HasGaussians, HasLooks, can
+from lumigraph.method.controls import Control
 from lumigraph.run import open_any
 from lumigraph.run.composition import Part, place_from_json, place_to_json, read_composition, write_composition
-from lumigraph.scene import Frame
 from lumigraph.volume import composite, packed
+
+pytestmark = budget("runs")
 
 HERE = Similarity.make(1.0)
 KINDS = {"ray": Dense, "cloud": Splatted, "picture": Pictured}

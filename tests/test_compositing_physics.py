@@ -10,7 +10,7 @@ from agreement import DEVICES, ENGINES
 from media import BLUE, LENGTH, MEDIA, RED, RULES, errors, order, value_and_derivative
 
 from lumigraph import kernels
-from lumigraph.rays import Samples
+from lumigraph.camera.rays import Samples
 from lumigraph.volume import composite
 
 # Numbers of samples that differ by fours, so that an edge keeps its place within a sample; for float32 so few that

@@ -8,20 +8,23 @@ import shutil
 import pytest
 import tiny
 import torch
+from budgets import budget
 from test_gaussian_splatting import new
 
 from lumigraph import methods
 from lumigraph.capture import open_scene
-from lumigraph.cli import main
+from lumigraph.commands.cli import main
 from lumigraph.commands.compress import bytes_in
-from lumigraph.compression import LADDER
-from lumigraph.compression.ladder import PLACES, rung_at
-from lumigraph.compression.measure import bytes_of, decibels, rendered, squared_error
-from lumigraph.compression.model import Model
+from lumigraph.derive.compression import LADDER
+from lumigraph.derive.compression.ladder import PLACES, rung_at
+from lumigraph.derive.compression.measure import bytes_of, decibels, rendered, squared_error
+from lumigraph.derive.compression.model import Model
 from lumigraph.errors import LumigraphError
 from lumigraph.run import Run, build
 from lumigraph.run.compressed import Compressed
-from lumigraph.train import fit
+from lumigraph.training import fit
+
+pytestmark = budget("runs", 15)
 
 
 @pytest.fixture(scope="module")

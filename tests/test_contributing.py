@@ -11,7 +11,7 @@ import tiny
 import torch
 
 from lumigraph.run import build
-from lumigraph.train import fit
+from lumigraph.training import fit
 
 GUIDE = Path(__file__).parent.parent / "CONTRIBUTING.md"
 

@@ -10,28 +10,31 @@ from functools import partial
 import pytest
 import tiny
 import torch
+from budgets import budget
 
 from lumigraph import methods
 from lumigraph.camera import ring
-from lumigraph.capabilities import FromField, HasField, can
-from lumigraph.cli import main
+from lumigraph.camera.rays import Look, Samples
+from lumigraph.commands.cli import main
 from lumigraph.components.clouds.at_surfaces import facing
-from lumigraph.components.fields.taken_over import OfField, OfSights, logit, taken_over
+from lumigraph.components.fields.taken_over import OfDepthMaps, OfField, logit, taken_over
 from lumigraph.components.sampling.spaces import space_of
-from lumigraph.conversion import Aim, convert, ways
-from lumigraph.conversion.renderings import between, rendered_scene
+from lumigraph.datasets.scene import Frame
+from lumigraph.derive.conversion import Aim, convert, ways
+from lumigraph.derive.conversion.renderings import between, rendered_scene
 from lumigraph.errors import LumigraphError
 from lumigraph.export.splats import export_splats
 from lumigraph.geometry import to_matrix, unit
 from lumigraph.kernels import spherical_harmonics
 from lumigraph.method import RayMethod
+from lumigraph.method.capabilities import FromField, HasField, can
 from lumigraph.metrics import psnr
-from lumigraph.rays import Look, Samples
 from lumigraph.run import Run, build, open_any
 from lumigraph.run.converted import Converted
-from lumigraph.scene import Frame
-from lumigraph.signals import Stopped
-from lumigraph.train import fit
+from lumigraph.system.signals import Stopped
+from lumigraph.training import fit
+
+pytestmark = budget("runs", 15)
 
 STUDENTS = [name for name in methods.available() if can(methods.find(name), FromField)]
 RADIUS, DENSITY = 0.6, 40.0
@@ -127,14 +130,14 @@ def test_surfaces_are_where_cameras_see_them(known):
 
 
 def test_pictures_with_depth_become_a_shell(ball, known, generator):
-    shell = OfSights(known.sights)
+    shell = OfDepthMaps(known.depth_maps)
     ways = unit(torch.randn(500, 3, generator=generator))
     ways = ways[(ways[:, 2].abs() < 0.6)]  # where the ring of cameras looks squarely
     thickness = sum(shell.density(r * ways) * 0.01 for r in torch.linspace(1.2, 0.4, 81).tolist())
     before = sum(shell.density(r * ways) * 0.01 for r in torch.linspace(1.2, 0.75, 46).tolist())
     assert thickness.median() > 2 and before.max() < 0.5
-    colour = torch.stack([shell.glance(RADIUS * ways, sight) for sight in shell.sights])
-    sees = torch.stack([sight.sees(RADIUS * ways) for sight in shell.sights])
+    colour = torch.stack([shell.glance(RADIUS * ways, seen) for seen in shell.depth_maps])
+    sees = torch.stack([seen.sees(RADIUS * ways) for seen in shell.depth_maps])
     error = (colour - (0.5 + RADIUS * ways / 1.2)).abs().mean(-1)
     assert error[sees].median() < 0.06
     density, rgb = shell.field(RADIUS * ways, -ways)
@@ -145,9 +148,9 @@ def test_pictures_with_depth_become_a_shell(ball, known, generator):
 def test_harmonics_are_found_again(known, generator):
     wanted = 0.3 * torch.randn(9, 3, generator=generator)
     points = 0.1 * torch.randn(50, 3, generator=generator)
-    sights = [replace(sight, depth=torch.full_like(sight.depth, torch.inf)) for sight in known.sights]
-    found = OfField(sights, Painted(wanted)).harmonics(points, 3, logit)
-    directions = unit(points - known.sights[3].camera.position)
+    depth_maps = [replace(seen, depth=torch.full_like(seen.depth, torch.inf)) for seen in known.depth_maps]
+    found = OfField(depth_maps, Painted(wanted)).harmonics(points, 3, logit)
+    directions = unit(points - known.depth_maps[3].camera.position)
     seen = (spherical_harmonics(directions, 3)[:, None] @ found)[:, 0]
     torch.testing.assert_close(seen, spherical_harmonics(directions, 3) @ wanted, atol=0.05, rtol=0)
 
@@ -207,20 +210,20 @@ def made(ball_run, tmp_path_factory) -> Run:
     """A run without photographs as splats."""
     folder = tmp_path_factory.mktemp("made") / "splats"
     kind = methods.find("gaussian-splatting")
-    convert(ball_run, "gaussian-splatting", folder, Aim(kind.smallest(), steps=24, views=3))
+    convert(ball_run, "gaussian-splatting", folder, Aim(kind.smallest(), steps=72, views=3))
     return Run(folder)
 
 
 def test_a_run_becomes_one_of_another_method(made, ball_run, capsys):
     said = Converted.read(made.folder)
-    assert (said.how, said.learnt_from, said.views, said.steps) == ("depth", "renderings of the source", 3, 24)
+    assert (said.how, said.learnt_from, said.views, said.steps) == ("depth", "renderings of the source", 3, 72)
     assert said.student.bytes == made.model_bytes and said.teacher.bytes == ball_run.model_bytes
     assert said.teacher.psnr is None and said.student.method == "gaussian-splatting"
     views = [
         torch.stack([x.render(c).rgb.clamp(0, 1) for c in held_out(ball_run)])
         for x in (made.method(), ball_run.method())
     ]
-    assert said.psnr == pytest.approx(psnr(*views), abs=1.0) and said.psnr > 17
+    assert said.psnr == pytest.approx(psnr(*views), abs=1.0) and said.psnr > 20  # 23.4, whatever the seed
     assert main(["info", str(made.folder)]) == 0
     assert "converted" in capsys.readouterr().out
     assert made.cameras()["test"].pose.equal(ball_run.cameras()["test"].pose)
@@ -232,11 +235,11 @@ def held_out(run: Run):
 
 
 def test_schedules_go_on_from_the_middle(made):
-    assert made.settings.budget == {"steps": 24, "joined": [0.0, 0.5]}
+    assert made.settings.budget == {"steps": 72, "joined": [0.0, 0.5]}
     first = made.metrics()[0]
     before = first["step"] - 1
     assert first["learning_rate"][0] == pytest.approx(
-        made.method().learning_rate(before, 0.5 + 0.5 * before / 24)["means"]
+        made.method().learning_rate(before, 0.5 + 0.5 * before / 72)["means"]
     )
 
 
@@ -278,7 +281,9 @@ def test_the_same_command_goes_on_where_it_was_stopped(ball_run, tmp_path, monke
     aim = Aim(methods.find("plenoxels").smallest(), steps=12, views=1)
     straight = convert(ball_run, "plenoxels", tmp_path / "straight", aim)
     stopping = lambda *told, **more: replace(fit(*told, **more, pause_at=5), signal=2)  # noqa: E731
-    monkeypatch.setattr(sys.modules["lumigraph.conversion.convert"], "fit", stopping)  # the function has its name
+    monkeypatch.setattr(
+        sys.modules["lumigraph.derive.conversion.convert"], "fit", stopping
+    )  # the function has its name
     with pytest.raises(Stopped):
         convert(ball_run, "plenoxels", tmp_path / "broken", aim)
     assert Converted.read(tmp_path / "broken") is None and Run(tmp_path / "broken").state.step == 5

@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import pytest
 import torch
+from budgets import budget
 from torch.nn import functional as F
 
 from lumigraph.components.fields import dense
 from lumigraph.components.fields.coordinate_network import CoordinateNetwork
 from lumigraph.components.fields.dense import Dense, in_chunks
+from lumigraph.datasets.scene import Frame
 from lumigraph.methods.mip_nerf import Config as MipConfig
 from lumigraph.methods.mip_nerf import MipNeRF
 from lumigraph.methods.nerf import Config, NeRF
-from lumigraph.scene import Frame
+
+pytestmark = budget("methods")
 
 EXACT = {"exact": True}
 

@@ -15,15 +15,15 @@ import torch
 
 from lumigraph import methods
 from lumigraph.capture import kind_of, meshes, open_dataset
-from lumigraph.cli import main
-from lumigraph.collection import Collection
-from lumigraph.dataset import Dataset
+from lumigraph.commands.cli import main
+from lumigraph.datasets.collection import Collection
+from lumigraph.datasets.dataset import Dataset
+from lumigraph.datasets.scene import Scene
+from lumigraph.datasets.shapes import PointBatch, Shapes
+from lumigraph.datasets.shapes.triangles import Triangles
 from lumigraph.errors import LumigraphError, LumigraphWarning
 from lumigraph.run import Run, build
-from lumigraph.scene import Scene
-from lumigraph.shapes import PointBatch, Shapes
-from lumigraph.shapes.triangles import Triangles
-from lumigraph.train import fit
+from lumigraph.training import fit
 
 CPU = torch.device("cpu")
 
@@ -231,7 +231,7 @@ def test_a_run_without_cameras_has_a_ring(tmp_path):
 
 
 def test_from_a_mesh_to_a_film_on_the_command_line(folder, tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr("lumigraph.train.PREVIEW_SIZE", 32)
+    monkeypatch.setattr("lumigraph.training.loop.PREVIEW_SIZE", 32)
     run = tmp_path / "run"
     command = ["train", "distance-grid", str(folder / "ball.obj"), "--steps", "20", "--output", str(run)]
     assert main([*command, "--pause-at", "10"]) == 0 and main(["resume", str(run)]) == 0

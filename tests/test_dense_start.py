@@ -9,14 +9,17 @@ from functools import cache
 import pytest
 import tiny
 import torch
+from budgets import budget
 from torch.nn.functional import normalize
 
 from lumigraph.camera import Camera
+from lumigraph.camera.lens import Fisheye, OpenCV, Pinhole
 from lumigraph.components.clouds import dense_points, initial_cloud
 from lumigraph.components.clouds.flat_view import flat_view
-from lumigraph.images import ImageStore
-from lumigraph.lens import Fisheye, OpenCV, Pinhole
-from lumigraph.scene import Frame, Scene
+from lumigraph.datasets.images import ImageStore
+from lumigraph.datasets.scene import Frame, Scene
+
+pytestmark = budget("methods", 8)
 
 RADIUS, SIZE, FOCAL, COUNT = 0.6, 48, 64.0, 6
 

@@ -5,12 +5,15 @@ from __future__ import annotations
 import pytest
 import tiny
 import torch
+from budgets import budget
 from test_gaussians import NAMES, cloud
 
 from lumigraph.components.clouds.cloud import Cloud, CloudAdam
 from lumigraph.components.clouds.density_control import FAINT, AdaptiveDensity, MarkovChain, sample_by, shared_out
 from lumigraph.components.clouds.initial_cloud import initial_cloud, nearest_distance
 from lumigraph.components.clouds.smoothing import VARIANCE, sampling_interval, smoothed
+
+pytestmark = budget("methods")
 
 
 def optimizer_of(some: Cloud, rate: float = 0.01) -> CloudAdam:

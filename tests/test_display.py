@@ -9,16 +9,19 @@ from dataclasses import replace
 import pytest
 import tiny
 import torch
+from budgets import budget
 
 from lumigraph import methods
-from lumigraph.announce import how_long, learner, learnt_from, machine
-from lumigraph.budget import Budget
 from lumigraph.capture import open_scene
-from lumigraph.console import console
-from lumigraph.display import TrainingDisplay, sizes, time_left
+from lumigraph.datasets.scene import Batch
 from lumigraph.run import build
-from lumigraph.scene import Batch
-from lumigraph.train import fit
+from lumigraph.run.budget import Budget
+from lumigraph.system.console import console
+from lumigraph.training import fit
+from lumigraph.training.announce import how_long, learner, learnt_from, machine
+from lumigraph.training.display import TrainingDisplay, sizes, time_left
+
+pytestmark = budget("runs", 8)
 
 
 def test_a_log_says_what_begins_and_where_it_ends(capsys):

@@ -6,9 +6,12 @@ from dataclasses import replace
 
 import pytest
 import torch
+from budgets import budget
 
 from lumigraph import kernels
 from lumigraph.kernels import HashLevels, _facts, composite, hash_encode, march, perceptron, rasterize, tile
+
+pytestmark = budget("kernels")
 
 LEVELS = HashLevels(levels=2, features=2, log2_entries=6, coarsest=2, finest=9)
 POINTS, TABLE = torch.rand(5, 3), torch.rand(LEVELS.entries, 2)
@@ -18,6 +21,7 @@ DEPTHS = torch.rand(4)
 TILES = tile(*FOOTPRINTS, DEPTHS, (16, 16), 16)
 RAYS = torch.zeros(3, 3), torch.eye(3), torch.zeros(3), torch.ones(3)
 CELLS = torch.ones(1, 4, 4, 4, dtype=torch.bool)
+GRID, RESAMPLING = torch.rand(2, 2, 2), kernels.Resampling(4, 2, 1.0, 0.01, 1e-5, 30.0)
 
 
 def drawn(tiles):
@@ -56,6 +60,10 @@ REFUSED = {
     "cells that are no cubes": lambda: march(*RAYS, CELLS[..., :3], CELLS[..., :3].float(), 0.1),
     "densities of other cells": lambda: march(*RAYS, CELLS, torch.rand(1, 3, 3, 3), 0.1),
     "occupancy as numbers": lambda: march(*RAYS, CELLS.float(), CELLS.float(), 0.1),
+    "proposals without bins": lambda: kernels.sample_proposals(*RAYS, GRID, replace(RESAMPLING, bins=0)),
+    "proposals of a flat grid": lambda: kernels.sample_proposals(*RAYS, GRID[:1], RESAMPLING),
+    "proposals without weight": lambda: kernels.sample_proposals(*RAYS, GRID, replace(RESAMPLING, min_weight=0.0)),
+    "a frustum without depth": lambda: kernels.sample_proposals(*RAYS, GRID, RESAMPLING, (1.0, 1.0, 0.0)),
     "a picture of no size": lambda: tile(*FOOTPRINTS, DEPTHS, (0, 16)),
     "a tile of any side": lambda: tile(*FOOTPRINTS, DEPTHS, (16, 16), 7),
     "fewer depths": lambda: tile(*FOOTPRINTS, DEPTHS[:3], (16, 16)),

@@ -8,18 +8,21 @@ from dataclasses import replace
 import pytest
 import tiny
 import torch
+from budgets import budget
 
-from lumigraph.cli import main
+from lumigraph.camera.rays import Look, Samples
+from lumigraph.commands.cli import main
 from lumigraph.components.fields.voxels import VoxelGrid, corners, shape_of, tight_box
 from lumigraph.components.training.lazy_adam import LazyAdam
-from lumigraph.evaluate import evaluate
+from lumigraph.datasets.scene import Frame
+from lumigraph.evaluation import evaluate
 from lumigraph.explain.activation import fits
 from lumigraph.methods.dvgo import DVGO, shift_of
-from lumigraph.rays import Look, Samples
 from lumigraph.run import build
-from lumigraph.scene import Frame
-from lumigraph.train import fit
+from lumigraph.training import fit
 from lumigraph.volume import weights_of
+
+pytestmark = budget("methods", 8)
 
 BOX = [[-1.0, -0.5, 0.0], [1.0, 0.5, 0.25]]
 OPEN = Frame(reach=4.0, near=0.1, image_count=4)

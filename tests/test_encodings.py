@@ -6,8 +6,11 @@ import math
 
 import pytest
 import torch
+from budgets import budget
 
 from lumigraph.components.fields.encodings import FourierFeatures, FrequencyEncoding, IntegratedEncoding
+
+pytestmark = budget("methods")
 
 
 def points(generator, count: int = 500, inputs: int = 3) -> torch.Tensor:

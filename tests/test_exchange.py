@@ -15,6 +15,7 @@ import plyfile
 import pytest
 import torch
 import zstandard
+from budgets import budget
 from listing import names
 
 from lumigraph.errors import LumigraphError
@@ -22,6 +23,8 @@ from lumigraph.exchange import REORDERED, SUFFIXES, is_splat_file, read_gaussian
 from lumigraph.exchange.morton import morton_order
 from lumigraph.exchange.spz import gzipped
 from lumigraph.gaussians import Gaussians, turned
+
+pytestmark = budget("exports")
 
 C0 = math.sqrt(1 / (4 * math.pi))
 HALF_TURN = torch.diag(torch.tensor([1.0, -1.0, -1.0]))  # between the axes of .spz and those of .ply

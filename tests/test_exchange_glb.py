@@ -14,7 +14,7 @@ from test_exchange import apart, components_apart, make, opacity_apart, refusal,
 from test_gaussians import camera, similarity
 from test_gaussians import cloud as soft_cloud
 
-from lumigraph import cli
+from lumigraph.commands import cli
 from lumigraph.errors import LumigraphError
 from lumigraph.exchange import is_splat_file, read_gaussians, write_gaussians
 from lumigraph.exchange.glb import EXTENSION

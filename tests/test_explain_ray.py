@@ -9,18 +9,21 @@ from xml.etree import ElementTree
 import pytest
 import tiny
 import torch
+from budgets import budget
 from solids import Seen, around, ball, painted
 from test_instant_ngp import method as small_instant_ngp
 
 import lumigraph.methods
-from lumigraph.cli import main
+from lumigraph.camera.rays import Look, Samples
+from lumigraph.commands.cli import main
 from lumigraph.errors import LumigraphError
 from lumigraph.explain.ray import Sight, along_ray
 from lumigraph.explain.ray_figure import LEFT, RIGHT, ray_figure
 from lumigraph.figures.charts import standalone
-from lumigraph.rays import Look, Samples
 from lumigraph.run import Run
 from lumigraph.volume import composite
+
+pytestmark = budget("exports")
 
 NEAR, FAR, SIGMA = 2.0, 4.0, 3.0
 SVG = "{http://www.w3.org/2000/svg}"

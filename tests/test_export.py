@@ -13,18 +13,21 @@ import numpy as np
 import pytest
 import tiny
 import torch
+from budgets import budget
 from listing import names
 from PIL import Image, ImageSequence
 
 from lumigraph.camera import Camera
-from lumigraph.cli import main
+from lumigraph.camera.lens import Equirectangular, Pinhole
+from lumigraph.commands.cli import main
+from lumigraph.datasets.scene import Frame
 from lumigraph.errors import LumigraphError
-from lumigraph.evaluate import evaluate
+from lumigraph.evaluation import evaluate
+from lumigraph.evaluation.report import write_report
 from lumigraph.export.film import film
 from lumigraph.export.video import open_video
 from lumigraph.figures import NOTHING, RAMP, colour_depth, colour_error, depth_range, hex_colour, save_picture
 from lumigraph.geometry import look_at, unit
-from lumigraph.lens import Equirectangular, Pinhole
 from lumigraph.paths import (
     PATHS,
     Surroundings,
@@ -36,9 +39,9 @@ from lumigraph.paths import (
     pivot,
 )
 from lumigraph.paths.keyframes import CameraPath, Keyframe
-from lumigraph.report import write_report
 from lumigraph.run.settings import Source
-from lumigraph.scene import Frame
+
+pytestmark = budget("exports")
 
 
 def cameras(positions, targets) -> Camera:

@@ -8,11 +8,14 @@ from dataclasses import replace
 import pytest
 import tiny
 import torch
+from budgets import budget
 from test_gaussian_splatting import new
 
 from lumigraph.components.clouds.few_photographs import some_left_out, unseen_roughness
 from lumigraph.components.clouds.initial_cloud import round_gaussians
-from lumigraph.train import fit
+from lumigraph.training import fit
+
+pytestmark = budget("methods")
 
 
 def chance(seed: int = 0) -> torch.Generator:

@@ -5,12 +5,15 @@ from __future__ import annotations
 import pytest
 import tiny
 import torch
+from budgets import budget
 
 from lumigraph.capture import open_scene
 from lumigraph.capture.fewer import spread_out, with_fewer_views
-from lumigraph.cli import main
+from lumigraph.commands.cli import main
 from lumigraph.errors import LumigraphError
 from lumigraph.run import Run
+
+pytestmark = budget("runs", 8)
 
 
 def kept(scene, views: int) -> set[int]:

@@ -12,19 +12,23 @@ import pytest
 import tiny
 import tiny_collection
 import torch
+from budgets import budget
 from listing import names
 from PIL import Image
 
-from lumigraph import files, marks, methods, partials
+from lumigraph import files, methods
 from lumigraph.capture.motion.folder import WRITTEN, claim_results, copy_photographs
 from lumigraph.capture.photos import Photo
 from lumigraph.capture.photos.track import untracked
-from lumigraph.cli import COMMANDS, main
+from lumigraph.commands.cli import COMMANDS, main
 from lumigraph.components.fields.octree_baking import fill
 from lumigraph.errors import LumigraphError
+from lumigraph.files import marks, partials
 from lumigraph.method import Method
 from lumigraph.paths.keyframes import CameraPath, Keyframe
 from lumigraph.run import Run, State, build
+
+pytestmark = budget("runs", 15)
 
 # What each command is told, and all that it would write.
 FILM = ("film.mp4", "film-depth.mp4", "film.json", "film/")

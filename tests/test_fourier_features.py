@@ -11,18 +11,21 @@ import listing
 import numpy as np
 import pytest
 import torch
+from budgets import budget
 from PIL import Image
 
+from lumigraph.camera.rays import Rays
 from lumigraph.capture import open_scene
-from lumigraph.cli import main
+from lumigraph.commands.cli import main
 from lumigraph.components.fields.dense import Dense
+from lumigraph.datasets.scene import Frame
 from lumigraph.explain.encodings import GRID, compare, kernel_at_start, learn
 from lumigraph.explain.encodings_page import write_page
 from lumigraph.explain.tangent_kernel import spectrum, tangent_kernel
 from lumigraph.methods.fourier_features import Config, FourierFeatures, frequencies
-from lumigraph.rays import Rays
 from lumigraph.run import build
-from lumigraph.scene import Frame
+
+pytestmark = budget("methods", 12)
 
 CPU = torch.device("cpu")
 SMALL = Config(hidden_width=64, frequencies=64, pixels_per_step=512, learning_rate=5e-3)

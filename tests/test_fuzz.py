@@ -16,21 +16,23 @@ import captures
 import pytest
 import tiny
 import torch
+from budgets import budget
 from fuzzing import flags, templates
 from fuzzing.bend import bend
 
-from lumigraph import packing
 from lumigraph.capture import open_dataset
-from lumigraph.cli import main
+from lumigraph.commands.cli import main
 from lumigraph.commands.info_tree import run_tree
 from lumigraph.errors import LumigraphError
-from lumigraph.exchange import SUFFIXES, write_gaussians
+from lumigraph.evaluation.report import write_report
+from lumigraph.exchange import SUFFIXES, packing, write_gaussians
 from lumigraph.gaussians import Gaussians
 from lumigraph.geometry import Similarity
 from lumigraph.paths.keyframes import CameraPath
-from lumigraph.report import write_report
 from lumigraph.run import Run, open_any
 from lumigraph.run.composition import Part, write_composition
+
+pytestmark = budget("capture", 10)
 
 SEED = 18
 Open = Callable[[Path], object]

@@ -7,22 +7,25 @@ import warnings
 import pytest
 import tiny
 import torch
+from budgets import budget
 from test_gaussians import NAMES, cloud, similarity
 
-from lumigraph import cli, memory, methods
-from lumigraph.capabilities import HasGaussians, needs
+from lumigraph import methods
+from lumigraph.commands import cli
+from lumigraph.datasets.scene import Frame
 from lumigraph.errors import LumigraphError, LumigraphWarning
-from lumigraph.evaluate import evaluate
+from lumigraph.evaluation import evaluate
 from lumigraph.exchange import read_gaussians, write_gaussians
 from lumigraph.export.splats import export_splats
 from lumigraph.gaussians.splatting import render
+from lumigraph.method.capabilities import HasGaussians, needs
 from lumigraph.metrics import psnr
 from lumigraph.run import Run, build
 from lumigraph.run.splat_file import SplatFile
-from lumigraph.scene import Frame
-from lumigraph.train import fit
+from lumigraph.system import memory
+from lumigraph.training import fit
 
-pytestmark = pytest.mark.filterwarnings("ignore:The cloud stops growing")
+pytestmark = [budget("methods", 10), pytest.mark.filterwarnings("ignore:The cloud stops growing")]
 GROWING = {
     "refine_from": 10,
     "refine_every": 10,

@@ -6,16 +6,19 @@ import math
 
 import pytest
 import torch
+from budgets import budget
 
 from lumigraph import kernels
 from lumigraph.camera import Camera
+from lumigraph.camera.lens import Equirectangular, OpenCV, Pinhole
 from lumigraph.errors import LumigraphError
 from lumigraph.gaussians import Gaussians
 from lumigraph.gaussians.splatting import render, splat, view_of
 from lumigraph.geometry import multiply, to_matrix, to_quaternion
 from lumigraph.kernels.spherical_harmonics import K00
-from lumigraph.lens import Equirectangular, OpenCV, Pinhole
 from lumigraph.metrics import psnr
+
+pytestmark = budget("methods")
 
 WIDTH, HEIGHT = 64, 48
 

@@ -12,26 +12,29 @@ import tiny
 import torch
 
 from lumigraph import methods
+from lumigraph import synthetic as procedural
 from lumigraph.camera import Camera
-from lumigraph.capture import open_scene, procedural
-from lumigraph.capture.procedural.scenes import swing
-from lumigraph.cli import main
-from lumigraph.components.training.corrections import gain_between
+from lumigraph.camera.rays import Rays
+from lumigraph.capture import open_scene
+from lumigraph.commands.cli import main
+from lumigraph.components.training.exposure import gain_between
 from lumigraph.components.training.lights import spread_of_exposure
-from lumigraph.controls import Control, moment
+from lumigraph.datasets.images import ImageStore
+from lumigraph.datasets.scene import Frame
 from lumigraph.errors import LumigraphError, LumigraphWarning
-from lumigraph.evaluate import evaluate
-from lumigraph.evaluate.halves import judged_by_halves, left_half
+from lumigraph.evaluation import evaluate
+from lumigraph.evaluation.halves import judged_by_halves, left_half
 from lumigraph.export.film import animated
-from lumigraph.images import ImageStore
+from lumigraph.files.ranges import changed
+from lumigraph.method.controls import Control, moment
 from lumigraph.methods.instant_ngp import Config, InstantNGP
 from lumigraph.paths.keyframes import CameraPath, Keyframe
-from lumigraph.rays import Rays
 from lumigraph.run import Run, build
-from lumigraph.scene import Frame
-from lumigraph.train import fit
+from lumigraph.synthetic.scenes import swing
+from lumigraph.training import fit
 
-SMALL = Config(
+SMALL = changed(
+    Config(),
     levels=4,
     log2_hashmap_size=10,
     base_resolution=4,
@@ -164,6 +167,13 @@ def test_the_pendulum_stays_within_its_bounds_and_away_from_cameras():
         assert procedural.signed_distance(stage.moving(time), positions).min() > stage.near
 
 
+def ball_centre(time: float) -> tuple[float, float, float]:
+    """Centre of the swing's ball, by the pendulum's angle."""
+    x, y, z = swing.PIVOT
+    swung = math.radians(swing.angle(time))
+    return x + swing.LENGTH * math.sin(swung), y, z - swing.LENGTH * math.cos(swung)
+
+
 def test_a_moving_scene_is_photographed_at_its_times(tmp_path):
     scene = open_scene("procedural:swing,size=32,views=6")
     assert scene.frame.times == (0.0, 1.0)
@@ -174,13 +184,13 @@ def test_a_moving_scene_is_photographed_at_its_times(tmp_path):
         seen = procedural.render(stage.world_of(replace(camera[0], time=torch.tensor([time]))), camera[0])
         ball = seen.extra["ids"] == stage.world.names.index("ball")
         found = camera[0].rays(camera[0].pixels()).at(seen.depth.flatten())[ball.flatten()]
-        away = (found - torch.tensor(swing.ball_centre(time))).norm(dim=-1)
+        away = (found - torch.tensor(ball_centre(time))).norm(dim=-1)
         assert len(away) > 8 and (away - 0.2).abs().max() < 1e-3
     for index in scene.splits["test"].tolist():  # and so is the layer of labels, of each photograph at its own moment
         shot = scene.photograph(index, layers=["labels", "depth"])
         ball = (shot.extra["labels"] == stage.world.names.index("ball")).flatten()
         found = shot.camera.rays(shot.camera.pixels()).at(shot.extra["depth"].flatten())[ball]
-        centre = torch.tensor(swing.ball_centre(float(shot.camera.time)))
+        centre = torch.tensor(ball_centre(float(shot.camera.time)))
         assert len(found) > 8 and ((found - centre).norm(dim=-1) - 0.2).abs().max() < 1e-3
     procedural.write_blender(stage, tmp_path / "swing", truth=False)
     again = open_scene(tmp_path / "swing")

@@ -10,8 +10,11 @@ from pathlib import Path
 
 import pytest
 from agreement import OPERATIONS, depends, folder
+from budgets import budget
 from conftest import PACKAGE
 from proofs import kept
+
+pytestmark = budget("kernels", 10)
 
 pytest.importorskip("triton")
 SCRIPT = Path(__file__).with_name("compile_for_gpus.py")

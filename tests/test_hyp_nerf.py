@@ -8,22 +8,25 @@ import pytest
 import tiny
 import tiny_collection
 import torch
+from budgets import budget
 
 from lumigraph import kernels
-from lumigraph.cli import main
-from lumigraph.collection import Collection
+from lumigraph.commands.cli import main
 from lumigraph.components.fields.hash_instance import HashInstance, HashShape
 from lumigraph.components.fields.hypernetwork import HyperNetwork
 from lumigraph.components.fields.instance_codes import AVERAGE, InstanceCodes
-from lumigraph.conversion.ways import way
+from lumigraph.datasets.collection import Collection
+from lumigraph.datasets.images import ImageStore
+from lumigraph.datasets.scene import Scene
+from lumigraph.derive.conversion.ways import way
 from lumigraph.errors import LumigraphError
-from lumigraph.images import ImageStore
 from lumigraph.kernels import HashLevels
 from lumigraph.methods import find
 from lumigraph.methods.hyp_nerf import FOUND, HypNeRF, around, held, patch
 from lumigraph.metrics import psnr
 from lumigraph.run import Run, State
-from lumigraph.scene import Scene
+
+pytestmark = budget("methods", 10)
 
 SHAPE = HashShape(HashLevels(2, 2, 6, 3, 8), (4, 6, 5), (5 + 1, 6, 3), 1)
 

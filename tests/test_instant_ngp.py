@@ -7,16 +7,21 @@ from dataclasses import replace
 import pytest
 import tiny
 import torch
+from budgets import budget
 
-from lumigraph.evaluate import evaluate
-from lumigraph.images import ImageStore
+from lumigraph.camera.rays import Rays
+from lumigraph.datasets.images import ImageStore
+from lumigraph.datasets.scene import Scene
+from lumigraph.evaluation import evaluate
+from lumigraph.files.ranges import changed
 from lumigraph.methods.instant_ngp import Config, InstantNGP
-from lumigraph.rays import Rays
 from lumigraph.run import Run, build
-from lumigraph.scene import Scene
-from lumigraph.train import fit
+from lumigraph.training import fit
 
-SMALL = Config(
+pytestmark = budget("methods", 10)
+
+SMALL = changed(
+    Config(),
     levels=4,
     log2_hashmap_size=11,
     base_resolution=4,
@@ -31,7 +36,7 @@ SMALL = Config(
 
 
 def method(scene: Scene, seed: int = 0, **options) -> InstantNGP:
-    return build(InstantNGP, scene.frame, replace(SMALL, **options), torch.device("cpu"), seed)
+    return build(InstantNGP, scene.frame, changed(SMALL, **options), torch.device("cpu"), seed)
 
 
 def black_room(reach: float = 1.0) -> Scene:
@@ -144,7 +149,7 @@ def test_an_unbounded_scene_trains_and_renders():
     made = method(scene)
     before = evaluate(made, scene).psnr
     train(made, scene, 60)
-    assert made.lattice.growth > 0 and len(made.occupancy.density) == 3
+    assert made.sampler.is_open and made.sampler.proposal.grid.values.grad is not None
     seen = made.render(scene.cameras[0])
     assert torch.isfinite(seen.rgb).all() and torch.isfinite(seen.opacity).all() and not seen.depth.isnan().any()
     assert seen.opacity.max() > 0.5 and evaluate(made, scene).psnr > before + 2
@@ -172,7 +177,7 @@ def test_an_empty_grid_renders_and_trains(reach):
     scene = black_room(reach)
     scene = replace(scene, frame=replace(scene.frame, background=(0.2, 0.4, 0.6)))
     made = method(scene, contraction=False)
-    made.occupancy.rule_out(torch.zeros_like(made.occupancy.possible))
+    made.sampler.grid.rule_out(torch.zeros_like(made.sampler.grid.possible))
     seen = made.render(scene.cameras[0])
     assert seen.rgb.shape == (tiny.SIZE, tiny.SIZE, 3)
     torch.testing.assert_close(seen.rgb[3, 5], torch.tensor([0.2, 0.4, 0.6]))
@@ -186,21 +191,24 @@ def test_photographs_with_alpha_carve_the_grid():
     scene = tiny.scene()
     made = method(scene)
     made.begin(scene)
-    assert made.occupancy.resolution == SMALL.occupancy_resolution and 0.02 < made.occupancy.share < 0.5
-    unbounded = method(black_room(4.0))
+    grid = made.sampler.grid
+    assert grid.resolution == SMALL.occupancy.occupancy_resolution and 0.02 < grid.share < 0.5
+    unbounded = method(black_room(4.0), contraction=False)
     unbounded.begin(black_room(4.0))
-    assert unbounded.occupancy.share == 1
+    assert unbounded.sampler.grid.share == 1 and len(unbounded.sampler.grid.density) == 3
 
 
 def test_batches_grow_to_the_wanted_number_of_samples():
     scene = tiny.scene()
     made = method(scene)
     train(made, scene, 60)
-    assert 0.6 < made.statistics()["samples"] / SMALL.samples_per_step < 1.6
+    assert 0.6 < made.statistics()["samples"] / SMALL.occupancy.samples_per_step < 1.6
     assert made.statistics()["visible_samples"] <= made.statistics()["samples"]
 
 
 def test_the_preset_of_a_cpu_is_smaller_than_the_papers():
     cpu, gpu = (InstantNGP.preset(torch.device(name)) for name in ("cpu", "cuda"))
-    assert gpu == Config() and (gpu.levels, gpu.features_per_level, gpu.log2_hashmap_size) == (16, 2, 19)
-    assert cpu.samples_per_step < gpu.samples_per_step and cpu.max_resolution < gpu.max_resolution
+    assert gpu == Config()
+    assert (gpu.table.levels, gpu.table.features_per_level, gpu.table.log2_hashmap_size) == (16, 2, 19)
+    assert cpu.occupancy.samples_per_step < gpu.occupancy.samples_per_step
+    assert cpu.table.max_resolution < gpu.table.max_resolution

@@ -9,9 +9,12 @@ import numpy as np
 import pytest
 import torch
 from agreement import DEVICES, ENGINES, OPERATIONS, assert_agrees, call, cases, depends, exact, facts, module, truth
+from budgets import budget
 from proofs import kept
 
 from lumigraph import kernels, metrics
+
+pytestmark = budget("kernels", 80)
 
 DIFFERENTIABLE = [name for name in OPERATIONS if facts(name).differentiable]
 

@@ -8,12 +8,15 @@ from dataclasses import replace
 
 import pytest
 import torch
+from budgets import budget
 
+from lumigraph.datasets.scene import Frame
 from lumigraph.errors import LumigraphError
 from lumigraph.files import write_json
 from lumigraph.geometry import to_matrix
 from lumigraph.paths.keyframes import CameraPath, Keyframe
-from lumigraph.scene import Frame
+
+pytestmark = budget("exports")
 
 
 def double(values: list[float]) -> torch.Tensor:

@@ -2,10 +2,13 @@
 
 import numpy as np
 import pytest
+from budgets import budget
 from numba import njit
 
 from lumigraph.kernels import _lanes
 from lumigraph.kernels._lanes import LANES, exp2, fetch, inverse, put, put_where
+
+pytestmark = budget("kernels")
 
 
 @njit

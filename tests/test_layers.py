@@ -15,15 +15,16 @@ from captures import FOCAL, HEIGHT, WIDTH, Tiny, write_json, write_ngp
 from deep_files import write_exr, write_png16
 from PIL import Image
 
-from lumigraph.blending import before, over
-from lumigraph.capture import READERS, assemble, multiscale, open_scene, procedural
+from lumigraph import synthetic as procedural
+from lumigraph.camera.lens import Pinhole
+from lumigraph.capture import READERS, assemble, multiscale, open_scene
 from lumigraph.capture.capture import Capture, Plane, Shot
-from lumigraph.capture.procedural import rendering
+from lumigraph.capture.readers import LISTED, NAMES
+from lumigraph.color.blending import before, over
+from lumigraph.datasets.images import ImageStore, Layer, LayerSource, resized
+from lumigraph.datasets.scene import Photograph, Scene
 from lumigraph.errors import LumigraphError, LumigraphWarning
-from lumigraph.images import ImageStore, Layer, LayerSource, resized
-from lumigraph.lens import Pinhole
-from lumigraph.readers import LISTED, NAMES
-from lumigraph.scene import Photograph, Scene
+from lumigraph.synthetic import rendering
 
 WHERE = pytest.mark.parametrize("memory", [None, 0], ids=["memory", "file"])
 WALL = -3.0  # the plane x = WALL of the source's frame, which every camera's depth shows

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from lumigraph.camera import Camera
-from lumigraph.lens import Equirectangular, Fisheye, Lens, Mixed, OmnidirectionalStereo, OpenCV, Pinhole, stretch
+from lumigraph.camera.lens import Equirectangular, Fisheye, Lens, Mixed, OmnidirectionalStereo, OpenCV, Pinhole, stretch
 
 CAMERAS, RAYS = 64, 4096
 FOX = [0.0578421, -0.0805099, -0.000980296, 0.00015575, 0.0, 0.0, 0.0, 0.0]  # a telephone's, OpenCV's order

@@ -12,20 +12,23 @@ from pathlib import Path
 
 import pytest
 import tiny
+from budgets import budget
 from conftest import PACKAGE
 
-from lumigraph import locks
 from lumigraph.capture.motion import reconstruct
-from lumigraph.cli import main
+from lumigraph.commands.cli import main
 from lumigraph.errors import LumigraphError
-from lumigraph.locks import held
+from lumigraph.files import locks
+from lumigraph.files.locks import held
 from lumigraph.run import Run
-from lumigraph.train import fit
+from lumigraph.training import fit
+
+pytestmark = budget("runs")
 
 HOLDER = """
 import sys
 from pathlib import Path
-from lumigraph.locks import held
+from lumigraph.files.locks import held
 with held(Path(sys.argv[1]), "trained"):
     print("held", flush=True)
     sys.stdin.read()

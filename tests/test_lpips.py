@@ -9,10 +9,10 @@ import safetensors.torch
 import tiny
 import torch
 
+from lumigraph.datasets.scene import Photograph
 from lumigraph.errors import LumigraphError
-from lumigraph.evaluate import compare
+from lumigraph.evaluation import compare
 from lumigraph.metrics.lpips import SHAPES, Lpips, load_lpips, named_files
-from lumigraph.scene import Photograph
 
 
 @pytest.fixture(scope="module")

@@ -22,9 +22,9 @@ from lumigraph.capture.objects.segment import segment
 from lumigraph.capture.objects.view import View
 from lumigraph.capture.photos import gather
 from lumigraph.capture.photos.track import untracked
+from lumigraph.datasets.scene import Scene
 from lumigraph.errors import LumigraphError, LumigraphWarning
-from lumigraph.evaluate import evaluate
-from lumigraph.scene import Scene
+from lumigraph.evaluation import evaluate
 
 
 def write_masks(folder: Path, names: list[str], times: int = 1) -> None:

@@ -9,21 +9,25 @@ import numpy as np
 import pytest
 import tiny
 import torch
+from budgets import budget
 
-from lumigraph import memory, methods
+from lumigraph import methods
 from lumigraph.errors import LumigraphError
 from lumigraph.export.film import film
-from lumigraph.memory import peak_memory, want_of_memory
 from lumigraph.run import build
 from lumigraph.run.needs import bytes_of
-from lumigraph.train import fit
+from lumigraph.system import memory
+from lumigraph.system.memory import peak_memory, want_of_memory
+from lumigraph.training import fit
+
+pytestmark = budget("runs", 12)
 
 TAKE = """
 import torch
 from lumigraph import memory, methods
 from lumigraph.errors import LumigraphError
 from lumigraph.export.film import film
-from lumigraph.memory import peak_memory, want_of_memory
+from lumigraph.system.memory import peak_memory, want_of_memory
 from lumigraph.run import build
 from lumigraph.run.needs import bytes_of
 before = peak_memory(torch.device("cpu"))

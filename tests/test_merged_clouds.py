@@ -8,11 +8,12 @@ import pytest
 import torch
 from balls import WHITE, Pictured, Splatted, eye
 
-from lumigraph.composition import PickedCloud, Placed, merged
-from lumigraph.crop import Box
+from lumigraph.camera.crop import Box
+from lumigraph.composition import PickedCloud, Placed
 from lumigraph.errors import LumigraphError
 from lumigraph.gaussians import Gaussians, joined
 from lumigraph.geometry import Similarity, to_matrix
+from lumigraph.large import merged
 
 GREY = (0.4, 0.5, 0.6)
 

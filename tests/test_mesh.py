@@ -13,28 +13,31 @@ import pytest
 import tiny
 import torch
 import trimesh
+from budgets import budget
 from listing import names
 from scipy.spatial import cKDTree
 from solids import SOLID, Seen, Solid, around, ball, painted, shell, together, torus
 
 from lumigraph.camera import Camera
-from lumigraph.cli import main
-from lumigraph.crop import Box, Sphere
+from lumigraph.camera.crop import Box, Sphere
+from lumigraph.camera.rays import Rendering
+from lumigraph.commands.cli import main
+from lumigraph.datasets.mesh import Mesh
+from lumigraph.datasets.scene import Frame
+from lumigraph.depth_maps import Tolerance, render_depth_maps
 from lumigraph.errors import LumigraphError
 from lumigraph.exchange import write_gaussians
 from lumigraph.export.mesh import extract_mesh, meshed_box
 from lumigraph.export.mesh_file import write_mesh
 from lumigraph.export.points import extract_points, thinned, write_points
 from lumigraph.export.polygons import BLOCK, Grid, zero_level
-from lumigraph.export.sightings import compare, look_around
 from lumigraph.export.surface import simplified, smoothed
 from lumigraph.gaussians import Gaussians
 from lumigraph.kernels.spherical_harmonics import K00
-from lumigraph.mesh import Mesh
-from lumigraph.rays import Rendering
 from lumigraph.run import Run
-from lumigraph.scene import Frame
-from lumigraph.train import fit
+from lumigraph.training import fit
+
+pytestmark = budget("exports", 25)
 
 CELL = 1 / 24
 # A scene that was shrunk to half, turned a quarter about z and moved.
@@ -203,17 +206,18 @@ def test_blocks_fit_together_and_unknown_places_are_left_open():
 
 
 def test_normals_and_depths_of_a_view():
-    seen = look_around(Seen(ball()), around(4), 96)[0]
+    method = Seen(ball())
+    seen = render_depth_maps(method.render, around(4), method.frame.background)[0]
     rays = seen.camera.rays(seen.camera.pixels())
-    points = rays.at(seen.depth.reshape(-1)).reshape(*seen.depth.shape, 3)
+    points = rays.at(seen.surface_depth.reshape(-1)).reshape(*seen.depth.shape, 3)
     squarely = seen.facing > 0.4
     assert squarely.sum() > 300
-    normals, outward = seen.normals[squarely], torch.nn.functional.normalize(points[squarely], dim=-1)
+    normals, outward = seen.surface_normals[squarely], torch.nn.functional.normalize(points[squarely], dim=-1)
     assert (normals * outward).sum(-1).min() > 0.98
     moved = points[squarely] - 0.1 * rays.directions.reshape(points.shape)[squarely]
-    compared = compare(seen, moved, 0.1)
+    compared = seen.compare(moved, Tolerance(0.1))
     assert (compared.ahead - 0.1).abs().median() < 1e-4
-    behind = compare(seen, seen.camera.position - seen.camera.forward, 0.1)
+    behind = seen.compare(seen.camera.position - seen.camera.forward, Tolerance(0.1))
     assert behind.ahead.isnan().all()
 
 

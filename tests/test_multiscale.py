@@ -8,15 +8,18 @@ import numpy as np
 import pytest
 import tiny
 import torch
+from budgets import budget
 from captures import HEIGHT, WIDTH, Tiny, write_colmap, write_ngp
 
 from lumigraph.capture import multiscale, open_scene
-from lumigraph.cli import main
+from lumigraph.commands.cli import main
+from lumigraph.datasets.images import ImageStore
+from lumigraph.datasets.scene import Scene
 from lumigraph.errors import LumigraphError
-from lumigraph.evaluate import evaluate
-from lumigraph.images import ImageStore
+from lumigraph.evaluation import evaluate
 from lumigraph.run import Run, State
-from lumigraph.scene import Scene
+
+pytestmark = budget("runs")
 
 
 @pytest.fixture

@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 
 from lumigraph.errors import LumigraphError
+from lumigraph.files.names import meant, natural
 from lumigraph.methods import available, check
-from lumigraph.names import meant, natural
 
 
 def test_numbers_in_names_count_as_numbers():

@@ -5,22 +5,25 @@ from __future__ import annotations
 import pytest
 import tiny
 import torch
+from budgets import budget
 
 from lumigraph.camera import Camera
+from lumigraph.camera.lens import Pinhole
+from lumigraph.camera.rays import Rays
 from lumigraph.components.fields.coordinate_network import CoordinateNetwork
 from lumigraph.components.sampling.occupancy_mask import OccupancyMask
+from lumigraph.datasets.images import ImageStore
+from lumigraph.datasets.scene import Forward, Frame, Scene
 from lumigraph.errors import LumigraphError
-from lumigraph.evaluate import evaluate
-from lumigraph.images import ImageStore
-from lumigraph.lens import Pinhole
+from lumigraph.evaluation import evaluate
 from lumigraph.method import RayMethod
 from lumigraph.methods import mip_nerf, nerf
 from lumigraph.metrics import psnr
-from lumigraph.rays import Rays
 from lumigraph.run import build
-from lumigraph.scene import Forward, Frame, Scene
-from lumigraph.train import fit
+from lumigraph.training import fit
 from lumigraph.volume import composite
+
+pytestmark = budget("methods", 24)
 
 SMALL = {
     "depth": 3,
@@ -54,8 +57,8 @@ def test_it_learns_held_out_views(kind, options):
         options = options | {"networks": 1, "transmittance_threshold": 1e-3}
     scene, made = tiny.scene(), method(kind, **options)
     before = evaluate(made, scene).psnr
-    fit(made, scene, steps=45, show=False, rehearsal=False)
-    assert evaluate(made, scene).psnr > max(before, 9) + 3
+    fit(made, scene, steps=100, show=False, rehearsal=False)
+    assert evaluate(made, scene).psnr > max(before, 9) + 6  # 6.3 to 9.0 after 90 steps
 
 
 @KIND
@@ -156,9 +159,9 @@ def wall(reach: float, forward: bool) -> Scene:
 def test_it_learns_in_every_space(kind, forward):
     scene = wall(4.0, forward)
     made = method(kind, scene.frame, **({"density_noise": 0.0} if kind is nerf.NeRF else {}))
-    fit(made, scene, steps=60, show=False, rehearsal=False)
+    fit(made, scene, steps=120, show=False, rehearsal=False)
     evaluation = evaluate(made, scene)
-    assert evaluation.psnr > 16.5
+    assert evaluation.psnr > 20
     seen = made.render(scene.cameras[4])
     assert (seen.opacity > 0.5).float().mean() > 0.6 and seen.depth[seen.opacity > 0.5].isfinite().all()
     assert float(1 / seen.depth.median()) == pytest.approx(1 / 2.0, abs=0.35)

@@ -8,23 +8,26 @@ import numpy as np
 import pytest
 import tiny
 import torch
+from budgets import budget
 
-from lumigraph.capabilities import HasDensity, HasField, HasLooks, can
+from lumigraph.camera.rays import Rays, Samples
 from lumigraph.components.fields.appearance import PhotographCodes
 from lumigraph.components.fields.code_space import fitted
 from lumigraph.components.fields.coded_field import Places
 from lumigraph.components.fields.wild_field import Passing, with_passing
-from lumigraph.controls import Control
+from lumigraph.datasets.images import ImageStore
+from lumigraph.datasets.scene import Scene
 from lumigraph.errors import LumigraphError
-from lumigraph.evaluate import evaluate
-from lumigraph.evaluate.halves import judged_by_halves, left_half
-from lumigraph.images import ImageStore
+from lumigraph.evaluation import evaluate
+from lumigraph.evaluation.halves import judged_by_halves, left_half
+from lumigraph.method.capabilities import HasDensity, HasField, HasLooks, can
+from lumigraph.method.controls import Control
 from lumigraph.methods.nerf_w import NeRFW
-from lumigraph.rays import Rays, Samples
 from lumigraph.run import build
-from lumigraph.scene import Scene
-from lumigraph.train import fit
+from lumigraph.training import fit
 from lumigraph.volume import composite
+
+pytestmark = budget("methods")
 
 NETWORK = {
     "field": "network", "depth": 2, "skip_layer": 1, "coarse_samples": 8, "fine_samples": 8, "rays_per_step": 64,

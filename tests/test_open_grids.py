@@ -3,11 +3,11 @@
 import tiny
 import torch
 
+from lumigraph.camera.rays import Rays
 from lumigraph.components.fields.voxels import VoxelGrid, corners
 from lumigraph.components.training.smoothness import variation
+from lumigraph.datasets.scene import Forward, Frame
 from lumigraph.methods.dvgo import DVGO
-from lumigraph.rays import Rays
-from lumigraph.scene import Forward, Frame
 from lumigraph.volume import weights_of
 
 CUBE = [[-1.0] * 3, [1.0] * 3]

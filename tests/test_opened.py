@@ -9,6 +9,7 @@ import pytest
 import tiny
 import torch
 from balls import RED, Splatted
+from budgets import budget
 
 import lumigraph
 from lumigraph.commands import render
@@ -22,6 +23,8 @@ from lumigraph.paths import film_cameras
 from lumigraph.run import Run, State, open_any
 from lumigraph.run.composition import Part, write_composition
 from lumigraph.run.settings import Settings
+
+pytestmark = budget("runs")
 
 
 @pytest.fixture(scope="module")

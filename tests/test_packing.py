@@ -11,13 +11,13 @@ import numpy as np
 import pytest
 import torch
 
-from lumigraph import packing
 from lumigraph.errors import LumigraphError
-from lumigraph.packing import Recipe, Stored, Table
-from lumigraph.packing.clusters import clustered, nearest
-from lumigraph.packing.file import HEAD, MAGIC
-from lumigraph.packing.forms import Coded, Half, Scaled, most_important
-from lumigraph.packing.streams import Stream, packed, unpacked
+from lumigraph.exchange import packing
+from lumigraph.exchange.packing import Recipe, Stored, Table
+from lumigraph.exchange.packing.clusters import clustered, nearest
+from lumigraph.exchange.packing.file import HEAD, MAGIC
+from lumigraph.exchange.packing.forms import Coded, Half, Scaled, most_important
+from lumigraph.exchange.packing.streams import Stream, packed, unpacked
 
 HERE = Path("weights.packed")
 

@@ -11,10 +11,14 @@ import numba
 import numpy as np
 import pytest
 import torch
+from budgets import budget
 from PIL import Image
 
 from lumigraph.camera import Camera
-from lumigraph.cli import main
+from lumigraph.camera.lens import Equirectangular, OmnidirectionalStereo, Pinhole
+from lumigraph.camera.rays import Rendering
+from lumigraph.commands.cli import main
+from lumigraph.datasets.scene import Frame
 from lumigraph.errors import LumigraphError
 from lumigraph.exchange import write_gaussians
 from lumigraph.export import panorama as panoramas
@@ -22,12 +26,11 @@ from lumigraph.export.panorama import level_camera, panorama, save_sphere, spher
 from lumigraph.export.stereo import columns_at_once, stereo_pair, surrounding_distances, top_bottom
 from lumigraph.gaussians import Gaussians
 from lumigraph.geometry import look_at
-from lumigraph.lens import Equirectangular, OmnidirectionalStereo, Pinhole
 from lumigraph.method import RayMethod
 from lumigraph.methods import find
 from lumigraph.metrics import psnr
-from lumigraph.rays import Rendering
-from lumigraph.scene import Frame
+
+pytestmark = budget("exports", 8)
 
 NORTH = torch.tensor([0.0, 1.0, 0.0])
 HERE = torch.tensor([0.1, -0.2, 0.05])

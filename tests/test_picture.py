@@ -10,7 +10,7 @@ import torch
 from PIL import Image
 
 from lumigraph.capture import open_scene
-from lumigraph.cli import main
+from lumigraph.commands.cli import main
 from lumigraph.errors import LumigraphError
 
 

@@ -9,19 +9,22 @@ import safetensors.torch
 import tiny
 import tiny_collection
 import torch
+from budgets import budget
 from torch.nn import functional as F
 
 from lumigraph import methods
 from lumigraph.camera import Camera
-from lumigraph.collection import Collection
+from lumigraph.camera.lens import Fisheye
 from lumigraph.components.fields.kept_photographs import KeptPhotographs, padded
 from lumigraph.components.fields.picture_encoder import PictureEncoder, finer
 from lumigraph.components.fields.picture_lookup import look_up
 from lumigraph.components.fields.residual_network import ResidualNetwork
+from lumigraph.datasets.collection import Collection
+from lumigraph.datasets.scene import Photograph
 from lumigraph.errors import LumigraphError
-from lumigraph.lens import Fisheye
 from lumigraph.run import build
-from lumigraph.scene import Photograph
+
+pytestmark = budget("methods", 10)
 
 CPU = torch.device("cpu")
 SMALL = {"widths": (8, 8, 8, 8), "blocks": (1, 1, 1)}

@@ -9,22 +9,25 @@ import numpy as np
 import pytest
 import tiny
 import torch
+from budgets import budget
 
-from lumigraph import memory
-from lumigraph.cli import main
+from lumigraph.camera.rays import Rays, Rendering
+from lumigraph.commands.cli import main
 from lumigraph.components.fields import leaves as leaves_module
 from lumigraph.components.fields.harmonic_field import colour
 from lumigraph.components.fields.leaves import Leaves, in_space, places_of
 from lumigraph.components.fields.octree_baking import fill, overlapping, tight_cube
+from lumigraph.datasets.scene import Frame
 from lumigraph.errors import LumigraphError
 from lumigraph.export.octree import contents, parents
 from lumigraph.geometry import Similarity
 from lumigraph.kernels.octree_cells import Tree, code_of, levels_of
 from lumigraph.methods.plenoctrees import PlenOctrees
 from lumigraph.metrics import psnr
-from lumigraph.rays import Rays, Rendering
 from lumigraph.run import Run, State, build
-from lumigraph.scene import Frame
+from lumigraph.system import memory
+
+pytestmark = budget("methods")
 
 RED, GREY = torch.tensor([0.9, 0.2, 0.1]), 0.5
 
@@ -157,7 +160,9 @@ def test_a_ball_looks_baked_as_it_does_itself(ball):
     depth = seen.depth.flatten()[within < 0.35]
     points = (rays.origins + seen.depth.flatten()[:, None] * rays.directions)[within < 0.35]
     expected = Ball().field(points, rays.directions[within < 0.35])[1]
-    assert depth.isfinite().all() and (seen.rgb.view(-1, 3)[within < 0.35] - expected).abs().mean() < 0.045
+    assert depth.isfinite().all()
+    # measured: 0.043 from this camera, 0.028 to 0.047 from all twelve
+    assert (seen.rgb.view(-1, 3)[within < 0.35] - expected).abs().mean() < 0.045
     nearest = -(rays.origins * rays.directions).sum(-1) - (0.25 - within**2).clamp_min(0).sqrt()
     surface = rays.origins + nearest[:, None] * rays.directions
     exact = torch.where((within < 0.5)[:, None], Ball().field(0.999 * surface, rays.directions)[1], ball.background)

@@ -12,8 +12,8 @@ import torch
 from PIL import Image
 
 from lumigraph import methods
-from lumigraph.alignment import aligning, moves
 from lumigraph.camera import Camera
+from lumigraph.camera.lens import Pinhole
 from lumigraph.capture import open_scene
 from lumigraph.capture.capture import Shot
 from lumigraph.capture.folds import about_fold
@@ -22,13 +22,14 @@ from lumigraph.components.clouds.seen_from import seen_from
 from lumigraph.components.fields.encodings import FrequencyEncoding
 from lumigraph.components.training.coarse_to_fine import BEGINS, ENDS, FIRST, band_weights
 from lumigraph.components.training.pose_refinement import PoseRefinement, seen_places
-from lumigraph.evaluate.held_out_poses import HeldOutPoses, held_out_poses, pose_scores
+from lumigraph.datasets.alignment import aligning, moves
+from lumigraph.datasets.images import ImageStore
+from lumigraph.evaluation.held_out_poses import HeldOutPoses, held_out_poses, pose_scores
 from lumigraph.gaussians.splatting import splat, view_of
 from lumigraph.geometry import Similarity
-from lumigraph.images import ImageStore
-from lumigraph.lens import Pinhole
+from lumigraph.method.capabilities import RefinesPoses, can
 from lumigraph.run import build
-from lumigraph.verdict import cameras_moved
+from lumigraph.training.verdict import cameras_moved
 
 CPU = torch.device("cpu")
 SMALL = {"nerf": {"position_frequencies": 3, "bfloat16": False}, "mip-nerf": {"bfloat16": False}, "instant-ngp": {}}
@@ -51,6 +52,15 @@ def slopes(value, twist: torch.nn.Parameter, image: int, step: float) -> torch.T
                 twist[image, i] -= way * step
         found.append((ends[0] - ends[1]) / (2 * step))
     return torch.tensor(found)
+
+
+def test_poses_are_a_capability_that_is_a_submodule():
+    """`inspect.getattr_static`, by which `isinstance` looks for a protocol's values, does not see submodules."""
+    method = refining("instant-ngp")
+    assert "poses" in method._modules and can(method, RefinesPoses)
+    method.poses = None
+    assert not can(method, RefinesPoses) and not can(tiny.method(), RefinesPoses)
+    assert not can(type(method), RefinesPoses)
 
 
 # Gradients
@@ -146,10 +156,10 @@ def test_waves_and_levels_are_weighted_in_their_order():
     method.network.table.data.uniform_(0.1, 1, generator=torch.Generator().manual_seed(0))
     width = method.config.features_per_level
     method.before_step(0, 0.0)
-    coarse = method._encoded(points - 0.5)
+    coarse = method.network.encode(points - 0.5)
     assert (coarse[:, :width] != 0).all() and (coarse[:, width:] == 0).all()
     method.poses.progress.fill_(1.0)
-    assert (method._encoded(points - 0.5) != 0).all() and method.poses.weights(4) is None
+    assert (method.network.encode(points - 0.5) != 0).all() and method.poses.weights(4) is None
 
 
 def test_a_method_that_refines_nothing_has_no_weights_and_one_rate():

@@ -10,18 +10,22 @@ import tiny
 import tiny_collection
 import tiny_shapes
 import torch
+from budgets import budget
 from PIL import Image
 
-from lumigraph import memory, methods
+from lumigraph import methods
 from lumigraph.capture import kind_of, open_dataset
-from lumigraph.cli import main
-from lumigraph.collection import KEPT, Collection
+from lumigraph.commands.cli import main
+from lumigraph.datasets.collection import KEPT, Collection
+from lumigraph.datasets.scene import Scene
 from lumigraph.errors import LumigraphError, LumigraphWarning
-from lumigraph.evaluate.reveal import reveal
-from lumigraph.prior import Prior
+from lumigraph.evaluation.reveal import reveal
+from lumigraph.method.prior import Prior
 from lumigraph.run import Run, State, build
 from lumigraph.run.inferred import Inferred
-from lumigraph.scene import Scene
+from lumigraph.system import memory
+
+pytestmark = budget("capture", 20)
 
 CPU = torch.device("cpu")
 
@@ -171,7 +175,7 @@ def test_a_split_without_members_is_one_sentence():
 
 def test_members_that_were_not_asked_for_are_let_go(monkeypatch):
     assert KEPT >= 8
-    monkeypatch.setattr("lumigraph.collection.KEPT", 2)
+    monkeypatch.setattr("lumigraph.datasets.collection.KEPT", 2)
     data = tiny_collection.collection()
     for name in ("amber", "blue", "amber", "green"):
         data[name]
@@ -201,7 +205,7 @@ def test_a_folder_of_a_categorys_name_stands_in_nobodys_way(tmp_path, monkeypatc
 
 @pytest.mark.parametrize("name", ["toys", "chairs", "cars"])
 def test_objects_keep_within_their_category_and_differ(name):
-    from lumigraph.capture.procedural import categories
+    from lumigraph.synthetic import categories
 
     stages = [categories.stage(name, member, 16, 2, 0) for member in range(60)]
     for stage in stages:
@@ -257,7 +261,7 @@ def test_where_there_is_nothing_it_is_said_to_be_of_no_kind(tmp_path, monkeypatc
 
 def test_a_run_that_cannot_begin_is_taken_back(tmp_path, monkeypatch, capsys):
     """A file that is found missing once the run has been made leaves nothing behind."""
-    monkeypatch.setattr("lumigraph.train.rehearse", lambda *_: 0.0)
+    monkeypatch.setattr("lumigraph.training.loop.rehearse", lambda *_: 0.0)
     asked, output = "procedural:toys,count=2,size=8,views=2", tmp_path / "run"
     assert (
         main(["train", "pixelnerf", asked, "--steps", "2", "--encoder-weights", "none.pth", "--output", str(output)])

@@ -9,27 +9,17 @@ import numpy as np
 import pytest
 import torch
 
+from lumigraph import synthetic as procedural
 from lumigraph.camera import Camera
-from lumigraph.capture import open_scene, procedural
-from lumigraph.capture.procedural import Lamp, Material, Object, Pose, Sky, Sun, World, scenes
-from lumigraph.capture.procedural.cameras import look_at, pinhole
-from lumigraph.capture.procedural.rendering import photograph, render, signed_distance, trace
-from lumigraph.capture.procedural.shapes import (
-    Arch,
-    Box,
-    Cone,
-    Cylinder,
-    Plane,
-    Shape,
-    Sphere,
-    Torus,
-    Triangle,
-    triangle_of,
-)
-from lumigraph.capture.procedural.textures import Bricks, Checker, Marble, Mottle, Plain, Rings, Sectors, Stripes, Wood
+from lumigraph.camera.lens import Equirectangular, Fisheye
+from lumigraph.camera.rays import Rays
+from lumigraph.capture import open_scene
 from lumigraph.errors import LumigraphError
-from lumigraph.lens import Equirectangular, Fisheye
-from lumigraph.rays import Rays
+from lumigraph.synthetic import Lamp, Material, Object, Pose, Sky, Sun, World, scenes
+from lumigraph.synthetic.cameras import look_at, pinhole
+from lumigraph.synthetic.rendering import photograph, render, signed_distance, trace
+from lumigraph.synthetic.shapes import Arch, Box, Cone, Cylinder, Plane, Shape, Sphere, Torus, Triangle, triangle_of
+from lumigraph.synthetic.textures import Bricks, Checker, Marble, Mottle, Plain, Rings, Sectors, Stripes, Wood
 
 SHAPES = [
     Sphere(0.5),
@@ -365,7 +355,7 @@ def test_the_room_is_closed_and_its_cameras_look_everywhere():
 
 
 def test_worlds_are_data_nothing_is_compiled_for_a_new_one(still_life):
-    from lumigraph.capture.procedural import tracer
+    from lumigraph.synthetic import tracer
 
     camera = camera_at((2.4, -2.2, 1.5), size=8)
     for world in (still_life.world, alone(Torus(0.4, 0.1)), World((Object(Plane(), CHALK),))):

@@ -8,12 +8,15 @@ import sys
 import time
 
 import pytest
+from budgets import budget
 from rich.tree import Tree
 
-from lumigraph import progress
 from lumigraph.commands.common import show
-from lumigraph.console import bold, console
-from lumigraph.progress import Stage, counting, track
+from lumigraph.system import progress
+from lumigraph.system.console import bold, console
+from lumigraph.system.progress import Stage, counting, track
+
+pytestmark = budget("runs")
 
 NAMES = ["[/bold]", "[red]a[/red]", ":smile: {0} {task}", "a 'quoted' \"name\"", "[link=file:///etc]x[/link]"]
 

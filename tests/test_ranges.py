@@ -11,14 +11,17 @@ from typing import Annotated, Any, Literal
 import pytest
 import tiny
 import torch
+from budgets import budget
 
 from lumigraph import methods
-from lumigraph.cli import COMMANDS, main
+from lumigraph.commands.cli import COMMANDS, main
 from lumigraph.errors import LumigraphError
 from lumigraph.files import write_json
-from lumigraph.ranges import Count, Share, between, check, domain, hints, numbers, outside, typed
+from lumigraph.files.ranges import Count, Share, between, check, domain, hints, numbers, outside, typed
 from lumigraph.run import Run, build
-from lumigraph.train import fit
+from lumigraph.training import fit
+
+pytestmark = budget("methods", 20)
 
 OURS = list(methods.COLOURED)
 

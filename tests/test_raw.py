@@ -14,13 +14,13 @@ from PIL import Image
 from lumigraph.capture import open_scene
 from lumigraph.capture.motion.reconstruction import also_unreadable
 from lumigraph.capture.photos import gather
-from lumigraph.capture.procedural.sensor import BLACK, PHOTON, READ_NOISE, WHITE, Sensor
 from lumigraph.capture.raw import RawPhoto, is_raw, open_raw
 from lumigraph.capture.raw.demosaic import demosaiced, repeated
 from lumigraph.capture.raw.library import turned_pattern
+from lumigraph.color.srgb import srgb_from_linear
+from lumigraph.datasets.images import resized
 from lumigraph.errors import LumigraphError, LumigraphWarning
-from lumigraph.images import resized
-from lumigraph.srgb import srgb_from_linear
+from lumigraph.synthetic.sensor import BLACK, PHOTON, READ_NOISE, WHITE, Sensor
 
 
 def bytes_of(rgb: np.ndarray) -> np.ndarray:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from lumigraph.rays import Rays, Rendering, Samples
+from lumigraph.camera.rays import Rays, Rendering, Samples
 
 
 def some_rays(count: int) -> Rays:

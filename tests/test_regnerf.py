@@ -8,7 +8,9 @@ from dataclasses import replace
 import pytest
 import tiny
 import torch
+from budgets import budget
 
+from lumigraph.camera.rays import Samples
 from lumigraph.components.training.fog import thickness_before
 from lumigraph.components.training.patch_flow import SIDE, PatchFlow, photographed
 from lumigraph.components.training.unseen_views import patches, roughness, unseen_cameras
@@ -17,8 +19,9 @@ from lumigraph.methods.instant_ngp import Config as NgpConfig
 from lumigraph.methods.instant_ngp import InstantNGP
 from lumigraph.methods.mip_nerf import Config as MipConfig
 from lumigraph.methods.regnerf import RegNeRF
-from lumigraph.rays import Samples
 from lumigraph.run import build
+
+pytestmark = budget("methods")
 
 
 def chance(seed: int = 0) -> torch.Generator:

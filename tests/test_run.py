@@ -13,15 +13,18 @@ from pathlib import Path
 import pytest
 import tiny
 import torch
+from budgets import budget
 from listing import names
 
 from lumigraph import methods
 from lumigraph.errors import LumigraphError
 from lumigraph.files import replacing, write_json
-from lumigraph.plain import alike, flatten, unflatten
-from lumigraph.ranges import typed
+from lumigraph.files.plain import alike, flatten, unflatten
+from lumigraph.files.ranges import typed
 from lumigraph.run import Run, State
-from lumigraph.train import fit
+from lumigraph.training import fit
+
+pytestmark = budget("runs", 8)
 
 
 @pytest.fixture(scope="module")

@@ -12,10 +12,10 @@ import pytest
 import torch
 
 from lumigraph.camera import Camera
+from lumigraph.camera.lens import Pinhole
+from lumigraph.datasets.images import ImageSource, ImageStore, Runs, shuffled_order, spread
+from lumigraph.datasets.scene import Frame, Scene
 from lumigraph.errors import LumigraphError
-from lumigraph.images import ImageSource, ImageStore, Runs, shuffled_order, spread
-from lumigraph.lens import Pinhole
-from lumigraph.scene import Frame, Scene
 
 SIZES = [(7, 5), (40, 30), (1, 1), (13, 64)]
 

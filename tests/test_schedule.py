@@ -7,12 +7,16 @@ from dataclasses import replace
 import pytest
 import tiny
 import torch
+from budgets import budget
 
-from lumigraph import methods, train
+from lumigraph import methods
 from lumigraph.components.clouds.density_control import AdaptiveDensity, MarkovChain
 from lumigraph.components.training.rhythm import Rhythm, haste
 from lumigraph.run import build
-from lumigraph.train import fit
+from lumigraph.training import fit
+from lumigraph.training import loop as train
+
+pytestmark = budget("methods", 25)
 
 PAPER = 30_000  # steps
 
@@ -105,5 +109,5 @@ def test_counting_goes_on_where_a_run_was_stopped():
 
 def test_a_run_of_few_steps_hurries():
     assert haste(0, 0.0, 2400, 4.0) == 1.0  # nothing is known yet
-    for budget, times in [(30_000, 1.0), (2400, 1.0), (600, 2.0), (150, 4.0), (15, 4.0)]:
-        assert haste(10, 10 / budget, 2400, 4.0) == pytest.approx(times)
+    for steps, times in [(30_000, 1.0), (2400, 1.0), (600, 2.0), (150, 4.0), (15, 4.0)]:
+        assert haste(10, 10 / steps, 2400, 4.0) == pytest.approx(times)

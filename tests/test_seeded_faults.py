@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import pytest
 from agreement import OPERATIONS, assert_agrees_in_all_cases, depends, faults, seeded, stand_in
+from budgets import budget
 from proofs import kept
 
-pytestmark = [  # what Numba does silently, plain Python does aloud: hashes wrap around, 1 / 0 is infinite
+pytestmark = [
+    budget("kernels", 40),
+    # what Numba does silently, plain Python does aloud: hashes wrap around, 1 / 0 is infinite
     pytest.mark.filterwarnings("ignore:overflow encountered"),
     pytest.mark.filterwarnings("ignore:divide by zero encountered"),
 ]

@@ -10,17 +10,20 @@ import numpy as np
 import pytest
 import tiny
 import torch
+from budgets import budget
 from torch.nn.functional import grid_sample, normalize
 
-from lumigraph.alignment import moves
 from lumigraph.camera import Camera
+from lumigraph.camera.lens import Pinhole
 from lumigraph.components.training.bundle_adjustment import adjusted, pixel_angle, rotation_vector
 from lumigraph.components.training.pose_refinement import PoseRefinement
 from lumigraph.components.training.shared_points import Seen, neighbours, tracks
+from lumigraph.datasets.alignment import moves
+from lumigraph.datasets.images import ImageStore
+from lumigraph.datasets.scene import Scene
 from lumigraph.geometry import look_at, rotated
-from lumigraph.images import ImageStore
-from lumigraph.lens import Pinhole
-from lumigraph.scene import Scene
+
+pytestmark = budget("methods", 8)
 
 SIZE = 160
 

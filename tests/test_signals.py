@@ -11,10 +11,13 @@ import sys
 import time
 
 import pytest
+from budgets import budget
 from conftest import PACKAGE
 
-from lumigraph.cli import main
-from lumigraph.signals import AGAIN, Interrupt, Stopped, go_on_unless, listening, until_interrupted
+from lumigraph.commands.cli import main
+from lumigraph.system.signals import AGAIN, Interrupt, Stopped, go_on_unless, listening, until_interrupted
+
+pytestmark = budget("runs", 15)
 
 BOTH = [signal.SIGINT, signal.SIGTERM]
 # What each command is doing when the signal comes: RUN and PICTURE are put in.
@@ -22,12 +25,12 @@ COMMANDS = {
     "eval RUN": "lumigraph.run.Run.dataset",
     "info RUN": "lumigraph.run.Run.evaluation",
     "render RUN --frames 2": "lumigraph.export.film.film",
-    "report RUN": "lumigraph.report.write_report",
+    "report RUN": "lumigraph.evaluation.report.write_report",
     "resume RUN --steps 100": "lumigraph.run.Run.dataset",
     "train voxel-grid SCENE": "lumigraph.capture.open_dataset",
     "demo --output OUT": "lumigraph.capture.open_dataset",
-    "export mesh RUN OUT.ply": "lumigraph.export.mesh.look_around",
-    "export points RUN OUT.ply": "lumigraph.export.points.look_around",
+    "export mesh RUN OUT.ply": "lumigraph.export.mesh.render_depth_maps",
+    "export points RUN OUT.ply": "lumigraph.export.points.render_depth_maps",
     "export panorama RUN OUT.png": "lumigraph.export.panorama.panorama",
     "export stereo RUN OUT.png": "lumigraph.export.stereo.stereo_pair",
     "export web RUN OUT.html": "lumigraph.export.page.views_page",
@@ -144,7 +147,7 @@ def test_what_control_c_is_meant_to_end_still_heeds_sigterm():
 
 SCRIPT = """
 import os, signal, sys
-from lumigraph.signals import listening, untouched
+from lumigraph.system.signals import listening, untouched
 with listening():
     with untouched():
         import pycolmap
@@ -155,7 +158,9 @@ with listening():
 def test_colmap_does_not_take_sigterm_away():
     environment = os.environ | {"PYTHONPATH": str(PACKAGE.parent)}
     done = subprocess.run([sys.executable, "-c", SCRIPT], env=environment, capture_output=True, text=True, timeout=60)
-    assert done.returncode != -signal.SIGTERM and done.stderr.splitlines()[-1].startswith("lumigraph.signals.Stopped")
+    assert done.returncode != -signal.SIGTERM and done.stderr.splitlines()[-1].startswith(
+        "lumigraph.system.signals.Stopped"
+    )
 
 
 def test_pycolmap_is_loaded_at_one_place():
@@ -171,7 +176,9 @@ def test_pycolmap_is_loaded_at_one_place():
 def test_children_die_with_their_parent(tmp_path):
     """A parent that is killed outright, and its child, which writes its number and sleeps."""
     child = "import os, sys, time; print(os.getpid(), flush=True); time.sleep(60)"
-    parent = f"import sys; from lumigraph.processes import start; start([sys.executable, '-c', {child!r}]).wait()"
+    parent = (
+        f"import sys; from lumigraph.system.processes import start; start([sys.executable, '-c', {child!r}]).wait()"
+    )
     environment = os.environ | {"PYTHONPATH": str(PACKAGE.parent)}
     with subprocess.Popen(
         [sys.executable, "-c", parent], env=environment, stdout=subprocess.PIPE, text=True

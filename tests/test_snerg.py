@@ -12,22 +12,25 @@ import pytest
 import tiny
 import tiny_atlas
 import torch
+from budgets import budget
 from PIL import Image
 from tiny_atlas import DENSITY, RADIUS
 
 from lumigraph import kernels
-from lumigraph.capabilities import HasAtlas, can
-from lumigraph.cli import main
+from lumigraph.camera.rays import Rays
+from lumigraph.commands.cli import main
 from lumigraph.components.fields.deferred import encoded
 from lumigraph.components.sampling.sightings import Sightings
 from lumigraph.errors import LumigraphError
 from lumigraph.exchange import snerg
 from lumigraph.kernels.block_march import ALPHA
+from lumigraph.method.capabilities import HasAtlas, can
 from lumigraph.methods.snerg import ATLAS, FIELD, VOXELS, SNeRG
 from lumigraph.metrics import psnr
-from lumigraph.rays import Rays
 from lumigraph.run import Run, State, open_any
-from lumigraph.train import fit
+from lumigraph.training import fit
+
+pytestmark = budget("methods", 12)
 
 
 @pytest.fixture(scope="module")

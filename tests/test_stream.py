@@ -9,8 +9,8 @@ import pytest
 import torch
 
 from lumigraph.capture import open_scene
+from lumigraph.datasets.images import ImageSource, ImageStream, Layer, LayerSource, stream
 from lumigraph.errors import LumigraphError
-from lumigraph.images import ImageSource, ImageStream, Layer, LayerSource, stream
 
 WIDTH, HEIGHT = 8, 6
 

@@ -9,15 +9,18 @@ from pathlib import Path
 import pytest
 import torch
 from balls import RED, Splatted, eye
+from budgets import budget
 from test_exchange import make, same
 
-from lumigraph import cli
+from lumigraph.commands import cli
 from lumigraph.errors import LumigraphError
 from lumigraph.exchange import is_splat_file, read_gaussians, size_of, sog, write_gaussians
 from lumigraph.exchange.streamed_sog import Detail
 from lumigraph.gaussians import Gaussians, joined, simplified, splatting
 from lumigraph.geometry import to_matrix
 from lumigraph.run import open_any
+
+pytestmark = budget("exports", 8)
 
 SMALL = Detail(levels=3, ratio=4, chunk=1024)
 
@@ -67,12 +70,15 @@ def test_from_afar_a_ball_of_a_quarter_is_the_ball():
     few = simplified(ball, len(ball) // 4)
     assert len(few) == len(ball) // 4
     picked = ball[torch.arange(0, len(ball), 4)]
-    for distance in (2.0, 8.0):
+    for distance, share in (
+        (2.0, 0.35),
+        (8.0, 0.9),
+    ):  # measured: 0.27; 0.85 to 0.86 where the ball is a few pixels wide
         true, merged, thinned = (
             splatting.render(cloud, eye((-distance, 0, 0)), (1.0, 1.0, 1.0)).rgb for cloud in (ball, few, picked)
         )
         error, left_out = ((true - other).square().mean().sqrt().item() for other in (merged, thinned))
-        assert error < 0.03 and error < 0.9 * left_out
+        assert error < 0.03 and error < share * left_out
 
 
 def test_coincident_gaussians_and_a_single_one_are_no_trouble():

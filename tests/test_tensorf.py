@@ -8,12 +8,15 @@ import numba
 import pytest
 import tiny
 import torch
+from budgets import budget
 
 from lumigraph import kernels
 from lumigraph.components.fields.factorised import FactorGrid, nodes_in
+from lumigraph.datasets.scene import Forward, Frame
 from lumigraph.kernels.factor_grid import Factors
 from lumigraph.methods.tensorf import UPSAMPLINGS, TensoRF
-from lumigraph.scene import Forward, Frame
+
+pytestmark = budget("methods")
 
 WHOLE = (torch.zeros(3), torch.ones(3))
 
@@ -104,31 +107,37 @@ def test_the_gradient_is_the_same_for_any_number_of_threads(kind, summed):
 def test_upsampling_is_even_in_the_logarithm_and_shrinks_the_box_once():
     """Section 5: from the first resolution to the last in as many equal ratios as there are upsamplings."""
     method = TensoRF(Frame(), TensoRF.smallest())
-    method.occupancy.box.copy_(torch.tensor([[-0.5, -0.5, -0.5], [0.5, 0.25, 0.5]]))
-    method._look_around = lambda *_: None
+    method.sampler.grid.box.copy_(torch.tensor([[-0.5, -0.5, -0.5], [0.5, 0.25, 0.5]]))
+    method.sampler.before_step = lambda *_: None
     sizes = []
     for number, share in enumerate(UPSAMPLINGS):
         method.before_step(number, share)
         sizes.append(float(method.network.density_grid.nodes.prod()) ** (1 / 3))
         if not number:
-            shrunk = method.box.clone()
-    assert method.box.equal(shrunk) and shrunk[1].tolist() == [0.5, 0.25, 0.5]
+            shrunk = method.network.box.clone()
+    assert method.network.box.equal(shrunk) and shrunk[1].tolist() == [0.5, 0.25, 0.5]
     first, last = method.config.initial_resolution, method.config.final_resolution
     assert sizes == pytest.approx([first * (last / first) ** (k / 5) for k in range(1, 6)], rel=0.1)
 
 
 def test_a_mask_without_cells_leaves_the_box_alone():
     method = TensoRF(Frame(), TensoRF.smallest())
-    method.occupancy.rule_out(torch.zeros(1, 4, 4, 4, dtype=torch.bool))
+    method.sampler.grid.rule_out(torch.zeros(1, 4, 4, 4, dtype=torch.bool))
     method._shrink()
-    assert method.box.tolist() == [[-1.0] * 3, [1.0] * 3]
+    assert method.network.box.tolist() == [[-1.0] * 3, [1.0] * 3]
 
 
 def test_nothing_is_outside_the_box():
     method = TensoRF(Frame(), TensoRF.smallest())
-    method.box = torch.tensor([[-0.5] * 3, [0.5] * 3])
+    method.network.box = torch.tensor([[-0.5] * 3, [0.5] * 3])
     found = method.density(torch.tensor([[0.6, 0.0, 0.0], [0.0, 0.0, 0.0]]))
     assert found[0] == 0 < found[1]
+
+
+def density_in_cube(field, places):
+    """Eq. 5 at places of the grid's cube, per unit of the coordinates."""
+    config, total = field.config, field.density_grid(places, summed=True)[:, 0]
+    return config.density_scale * torch.nn.functional.softplus(total + config.density_shift)
 
 
 AHEAD = Forward(((1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, -1.0)), (1.0, 1.0), 0.5)
@@ -139,14 +148,14 @@ def test_in_the_open_density_is_per_unit_of_the_scene(frame):
     """A length of the scene is `stretch` times as long in coordinates, on which the grid's density lies."""
     method = TensoRF(frame, TensoRF.smallest())
     points = torch.tensor([[0.1, 0.2, 0.3], [0.5, -0.4, 3.0], [-1.0, 1.0, 6.0]])
-    places = method.space.warp(points) / 2 + 0.5
-    expected = method.network.density(places) * method.space.stretch(points)
+    places = method.network.space.warp(points) / 2 + 0.5
+    expected = density_in_cube(method.network, places) * method.network.space.stretch(points)
     torch.testing.assert_close(method.density(points), expected)
     density, rgb = method.field(points, torch.tensor([[0.0, 0.0, 1.0]]).expand(3, 3))
-    assert density.equal(method.density(points)) and rgb.shape == (3, 3) and method._step() > 0
-    before = method.box.clone()
+    assert density.equal(method.density(points)) and rgb.shape == (3, 3) and method.network.step_length > 0
+    before = method.network.box.clone()
     method._shrink()
-    assert method.box.equal(before)
+    assert method.network.box.equal(before)
 
 
 def test_before_the_plane_of_a_forward_capture_is_nothing():

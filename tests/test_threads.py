@@ -12,14 +12,14 @@ from pathlib import Path
 import pytest
 import torch
 
-from lumigraph import threads
-from lumigraph.allocation import OWN
+from lumigraph.system import threads
+from lumigraph.system.allocation import OWN
 
 LOOP = """
 import lumigraph, torch, numpy
-from lumigraph.loops import unbend
+from lumigraph.camera.lens.undistortion import undistort
 none = numpy.zeros((0, 2), numpy.float32)
-unbend(none, numpy.zeros(0, int), none, none, none, none, 1, 0.1, numpy.zeros((0, 3), numpy.float32))
+undistort(none, numpy.zeros(0, int), none, none, none, none, 1, 0.1, numpy.zeros((0, 3), numpy.float32))
 print(torch.ones(1 << 18).exp().sum())
 """
 

@@ -8,12 +8,15 @@ import signal
 import pytest
 import tiny
 import torch
+from budgets import budget
 
 from lumigraph.errors import LumigraphError
-from lumigraph.evaluate import evaluate
+from lumigraph.evaluation import evaluate
 from lumigraph.run import Run
 from lumigraph.run.checkpoint import Checkpoints
-from lumigraph.train import Clock, finite, fit, rehearse, set_learning_rate
+from lumigraph.training import Clock, finite, fit, rehearse, set_learning_rate
+
+pytestmark = budget("runs", 16)
 
 
 def final_state(run: Run) -> tuple[dict[str, torch.Tensor], str]:

@@ -7,13 +7,14 @@ import pytest
 import torch
 from numba import njit
 
-from lumigraph import loops
+from lumigraph.camera.rays import Rays, Samples
 from lumigraph.components.sampling.proposal import Proposal, edges_of, overlooked
+from lumigraph.components.sampling.proposal_sampler import MIN_WEIGHT, ProposalNumbers, ProposalSampler
 from lumigraph.components.sampling.spaces import NDC, Contraction
-from lumigraph.components.sampling.unbounded import LEAST, OpenNumbers, Unbounded
 from lumigraph.components.training.fog import elsewhere, scaled_by_distance, spread
-from lumigraph.rays import Rays, Samples
-from lumigraph.scene import Forward
+from lumigraph.datasets.scene import Forward
+from lumigraph.kernels.sample_proposals.cpu import cube_root, exponential
+from lumigraph.method import Field
 from lumigraph.volume import composite
 
 AHEAD = Forward(((1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0)), (1.0, 1.0), 1.0)
@@ -111,24 +112,40 @@ def test_what_is_near_is_learnt_slowly():
     torch.testing.assert_close(rgb.grad, torch.tensor([0.25, 1.0, 1.0])[:, None].expand(3, 3))
 
 
+class Formula(Field):
+    """A field by a formula of density; colours of positions, and the number of samples that got one."""
+
+    def __init__(self, formula):
+        super().__init__()
+        self.formula, self.coloured = formula, []
+
+    def geometry(self, points, code=None):
+        return self.formula(points), 5 * points
+
+    def colour(self, features, directions, code=None):
+        self.coloured.append(len(features))
+        return features.sin().square()
+
+
+def sampler() -> ProposalSampler:
+    return ProposalSampler(SPACES["contracted"], ProposalNumbers(proposal_samples=32, samples_per_ray=16), 1024)
+
+
 def test_rays_end_at_places_that_are_known_until_half_of_the_budget_is_spent():
-    unbounded = Unbounded(SPACES["contracted"], OpenNumbers(proposal_samples=32, samples_per_ray=16))
-    generator = torch.Generator().manual_seed(0)
-    unbounded.seen, unbounded.seen_from = torch.tensor([[0.0, 0.0, 2.0]]), torch.zeros(1, 3)
-    unbounded.before_step(0.1)
+    made, generator = sampler(), torch.Generator().manual_seed(0)
+    made.surface, made.surface_from = torch.tensor([[0.0, 0.0, 2.0]]), torch.zeros(1, 3)
+    made.before_step(None, 0, 0.1)
 
     def wall(place: float):
         return lambda points: 30.0 * (points.norm(dim=-1) > place)
 
     errors = []
     for place in (2.0, 1.0):
-        proposed = unbounded.proposal.sample(rays(), torch.rand(5, 2, generator=generator))
-        density = wall(place)(proposed.samples.along(rays())[0])
-        terms = unbounded.terms(wall(place), proposed, density, generator)
-        errors.append(float(terms["depth"]))
+        (found,) = made.sample(rays(), Formula(wall(place)), generator=generator)
+        errors.append(float(made.terms(wall(place), found, generator)["depth"]))
     assert errors[0] < 0.8 * errors[1]
-    unbounded.before_step(0.9)
-    assert "depth" not in unbounded.terms(wall(1.0), proposed, density, generator)
+    made.before_step(None, 0, 0.9)
+    assert "depth" not in made.terms(wall(1.0), found, generator)
 
 
 def test_contraction_loops_as_it_is_written():
@@ -151,30 +168,23 @@ def test_proposals_loop_as_they_are_written(proposal, sharpness, generator):
     assert len(some) * 8 == len(found)
 
 
-def test_a_glance_shows_what_a_look_shows(generator):
-    """Colours that are hardly seen are not asked for, and the picture stays."""
-    unbounded = Unbounded(SPACES["contracted"], OpenNumbers(proposal_samples=32, samples_per_ray=16))
-    unbounded.proposal.grid.values.data = 2 * torch.randn(unbounded.proposal.grid.values.shape, generator=generator)
-    asked = []
+def test_a_rendering_without_faint_samples_is_that_of_all(generator):
+    """Colours that are hardly seen are not evaluated, and the picture stays."""
+    made = sampler()
+    made.proposal.grid.values.data = 2 * torch.randn(made.proposal.grid.values.shape, generator=generator)
 
-    def geometry(points):
-        return 8 * (3 * points).sin().prod(-1).clamp(min=0) + 20 * (points.norm(dim=-1) > 2.5), 5 * points
+    def density(points):
+        return 8 * (3 * points).sin().prod(-1).clamp(min=0) + 20 * (points.norm(dim=-1) > 2.5)
 
-    def colours(features, directions):
-        asked.append(len(features))
-        return features.sin().square()
-
-    def field(points, directions):
-        density, features = geometry(points)
-        return density, colours(features, directions)
-
-    many = rays(200)
+    field, many = Formula(density), rays(200)
+    (whole,) = made.sample(many, field)  # with gradients nothing is left out
     with torch.no_grad():
-        whole, part = unbounded.look(field, many), unbounded.glance(geometry, colours, many)
-    seen, expected = (composite(x.samples, x.density, x.rgb, torch.ones(1, 3)) for x in (part, whole))
-    assert asked[1] < 0.8 * asked[0] and len(part.samples) == asked[1]
-    torch.testing.assert_close(seen.rgb, expected.rgb, atol=16 * LEAST, rtol=0)
-    torch.testing.assert_close(seen.opacity, expected.opacity, atol=16 * LEAST, rtol=0)
+        (part,) = made.sample(many, field)
+    looks = [each.look(field) for each in (part, whole)]
+    seen, expected = (composite(x.samples, x.density, x.rgb, torch.ones(1, 3)) for x in looks)
+    assert field.coloured[0] < 0.8 * field.coloured[1] and len(part.samples) == field.coloured[0]
+    torch.testing.assert_close(seen.rgb, expected.rgb, atol=16 * MIN_WEIGHT, rtol=0)
+    torch.testing.assert_close(seen.opacity, expected.opacity, atol=16 * MIN_WEIGHT, rtol=0)
     assert (seen.rgb - expected.rgb).square().mean() < 1e-6  # 60 dB
 
 
@@ -191,6 +201,6 @@ def both(x):
     """Of numbers x their exponential, and the cube root of e^x."""
     powers, roots = np.empty_like(x), np.empty_like(x)
     for i in range(len(x)):
-        powers[i] = loops.exponential(x[i])
-        roots[i] = loops.cube_root(np.float32(math.exp(max(x[i], np.float32(-60)))))
+        powers[i] = exponential(x[i])
+        roots[i] = cube_root(np.float32(math.exp(max(x[i], np.float32(-60)))))
     return powers, roots

@@ -12,9 +12,9 @@ import trimesh
 from listing import names
 from PIL import Image
 
+from lumigraph.datasets.mesh import Mesh
 from lumigraph.export.mesh_file import write_mesh
 from lumigraph.export.usdz import ALIGNED, baked, z_curve
-from lumigraph.mesh import Mesh
 
 UP = np.array([0.6, 0.0, 0.8])
 

@@ -6,14 +6,17 @@ import numpy as np
 import pytest
 import tiny
 import torch
+from budgets import budget
 
 from lumigraph import methods
-from lumigraph.budget import Budget
 from lumigraph.commands.eval import beside_training
 from lumigraph.commands.outcome import advice, more_time, next_commands, photographed, seen
 from lumigraph.run import Run, build
-from lumigraph.train import fit
-from lumigraph.verdict import Trend, last_psnr, loss_trend
+from lumigraph.run.budget import Budget
+from lumigraph.training import fit
+from lumigraph.training.verdict import Trend, last_psnr, loss_trend
+
+pytestmark = budget("runs")
 
 FLAT, FALLING = Trend(0.01, 0.01), Trend(0.3, 0.02)
 

@@ -18,19 +18,20 @@ import numpy as np
 import pytest
 import tiny
 import torch
+from budgets import budget
 from torch import nn
 from viewer_client import Client
 
-from lumigraph.cli import main
-from lumigraph.crop import Box
+from lumigraph.camera.crop import Box
+from lumigraph.camera.rays import Rendering
+from lumigraph.commands.cli import main
 from lumigraph.errors import LumigraphError, LumigraphWarning
 from lumigraph.figures import NOTHING, RAMP, hex_colour
 from lumigraph.gaussians import Gaussians, splatting
 from lumigraph.gaussians.cleaning import cleaned
 from lumigraph.method import Method, RayMethod
-from lumigraph.rays import Rendering
 from lumigraph.run import Run
-from lumigraph.train import fit
+from lumigraph.training import fit
 from lumigraph.viewer import Subject, Viewer, choose_address
 from lumigraph.viewer.cameras import angle_for, angles, pose_of, rows
 from lumigraph.viewer.crop import render_inside
@@ -45,7 +46,7 @@ from lumigraph.viewer.view_request import ViewRequest
 
 WHITE = (1.0, 1.0, 1.0)
 # A client may leave at any moment; viser warns of what was still on its way.
-pytestmark = pytest.mark.filterwarnings("ignore:Queued a .* on a closed connection")
+pytestmark = [budget("exports", 10), pytest.mark.filterwarnings("ignore:Queued a .* on a closed connection")]
 
 
 @pytest.fixture(scope="module")

@@ -9,17 +9,18 @@ import numpy as np
 import pytest
 import tiny
 import torch
+from budgets import budget
 from viewer_client import Client
 
 from lumigraph import methods
-from lumigraph.controls import Control
 from lumigraph.gaussians import Gaussians, splatting
 from lumigraph.method import Method
+from lumigraph.method.controls import Control
 from lumigraph.run import build
 from lumigraph.viewer import Subject, Viewer, choose_address
 
 # A client may leave at any moment; viser warns of what was still on its way.
-pytestmark = pytest.mark.filterwarnings("ignore:Queued a .* on a closed connection")
+pytestmark = [budget("exports"), pytest.mark.filterwarnings("ignore:Queued a .* on a closed connection")]
 
 
 def subject(scene, folder) -> Subject:

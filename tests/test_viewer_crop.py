@@ -9,18 +9,19 @@ import numpy as np
 import pytest
 import tiny
 import torch
+from budgets import budget
 from test_viewer import some_cloud, subject
 from viewer_client import Client
 
 import lumigraph.methods
-from lumigraph.crop import Box, Sphere
+from lumigraph.camera.crop import Box, Sphere
 from lumigraph.errors import LumigraphError
 from lumigraph.gaussians.cleaning import ISOLATION, MAX_SCALE, cleaned
 from lumigraph.viewer import Viewer, choose_address
 from lumigraph.viewer.crop_panel import BOX, SPHERE, circles, edges
 
 # A client may leave at any moment; viser warns of what was still on its way.
-pytestmark = pytest.mark.filterwarnings("ignore:Queued a .* on a closed connection")
+pytestmark = [budget("exports"), pytest.mark.filterwarnings("ignore:Queued a .* on a closed connection")]
 
 
 def until(happens, seconds: float = 20.0) -> None:

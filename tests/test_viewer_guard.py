@@ -13,6 +13,7 @@ import msgspec
 import pytest
 import tiny
 import viser
+from budgets import budget
 from test_viewer import subject
 from viewer_client import Client
 from websockets.exceptions import ConnectionClosed, InvalidStatus
@@ -23,7 +24,7 @@ from lumigraph.viewer import Viewer
 from lumigraph.viewer.address import Address, choose_address, free_port
 from lumigraph.viewer.frames import LARGEST, understood
 
-pytestmark = pytest.mark.filterwarnings("ignore:Queued a .* on a closed connection")
+pytestmark = [budget("exports"), pytest.mark.filterwarnings("ignore:Queued a .* on a closed connection")]
 TOKEN = "a-token-nobody-guesses"
 
 

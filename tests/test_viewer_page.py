@@ -11,19 +11,20 @@ import numpy as np
 import pytest
 import tiny
 import torch
+from budgets import budget
 from PIL import Image
 from test_nerf_w import made, two_lights
 from test_viewer import some_cloud, subject
 
 import lumigraph.methods
+from lumigraph.datasets.scene import Frame
 from lumigraph.paths.keyframes import CameraPath
 from lumigraph.run import build
-from lumigraph.scene import Frame
-from lumigraph.train import fit
+from lumigraph.training import fit
 from lumigraph.viewer import Viewer, choose_address
 
 # A client may leave at any moment; viser warns of what was still on its way.
-pytestmark = pytest.mark.filterwarnings("ignore:Queued a .* on a closed connection")
+pytestmark = [budget("exports", 20), pytest.mark.filterwarnings("ignore:Queued a .* on a closed connection")]
 
 SIZE = (800, 420)
 SHARPEST = 400  # pixels of a streamed picture's longer side, so that the tests are quick

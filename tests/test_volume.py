@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from lumigraph import kernels
-from lumigraph.rays import Samples
+from lumigraph.camera.rays import Samples
 from lumigraph.volume import STRETCH, visible
 
 

@@ -10,23 +10,26 @@ import pytest
 import tiny
 import torch
 import volumes
+from budgets import budget
 from test_viewer import subject
 from test_web import OPENING
 from windows import SIZE, psnr, some_camera
 
-import lumigraph.conversion
+import lumigraph.derive.conversion
 import lumigraph.methods
-from lumigraph.baked import Octree
-from lumigraph.baked.browser import atlas_for_browser, breadth_first, clearance, octree_for_browser
 from lumigraph.camera import Camera
-from lumigraph.cli import main
-from lumigraph.conversion import Aim, convert
+from lumigraph.camera.rays import Rays
+from lumigraph.commands.cli import main
+from lumigraph.derive.conversion import Aim, convert
 from lumigraph.errors import LumigraphError
+from lumigraph.exchange.baked import Octree
+from lumigraph.exchange.baked.browser import atlas_for_browser, breadth_first, clearance, octree_for_browser
 from lumigraph.export import page as pages
 from lumigraph.export.page import volume_bytes, volume_page
-from lumigraph.rays import Rays
 from lumigraph.run import open_any
 from lumigraph.viewer import Viewer, choose_address
+
+pytestmark = budget("exports", 30)
 
 GROUND = torch.tensor(OPENING.background)
 LEVELS = 5
@@ -136,7 +139,7 @@ def test_a_baked_run_is_seen_as_it_renders(grid, tmp_path, window, capsys, name,
 
 
 def test_a_field_becomes_an_octree_on_the_way(grid, tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(lumigraph.conversion, "Aim", lambda seconds: small("plenoctrees", 4))
+    monkeypatch.setattr(lumigraph.derive.conversion, "Aim", lambda seconds: small("plenoctrees", 4))
     assert main(["export", "web", str(grid), str(tmp_path / "page.html")]) == 0
     told = capsys.readouterr().out
     assert "leaves of an octree" in told and "--as views is quicker" in told and "dB to plenoxels" in told

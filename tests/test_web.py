@@ -11,18 +11,21 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from budgets import budget
 from tiny import method as tiny_method
 from tiny import new_run, scene
 from windows import SIZE, psnr, some_camera
 
 from lumigraph.camera import Camera
-from lumigraph.cli import main
+from lumigraph.commands.cli import main
+from lumigraph.datasets.mesh import Mesh
 from lumigraph.export.page import WEB, Opening, mesh_page, opening_of_scene, splats_page, views, views_page
 from lumigraph.gaussians import Gaussians
 from lumigraph.gaussians.splatting import render
-from lumigraph.mesh import Mesh
 from lumigraph.paths import Surroundings
 from lumigraph.run import State
+
+pytestmark = budget("exports", 15)
 
 PACKAGES = Path(__file__).parent.parent / "web" / "package.json"
 OPENING = Opening(

@@ -8,28 +8,29 @@ import numpy as np
 import pytest
 import tiny
 import torch
+from budgets import budget
 from test_gaussian_splatting import new
 from test_gaussians import cloud
 from test_nerf_w import two_lights
 
 from lumigraph import kernels
-from lumigraph.blending import over
+from lumigraph.color.blending import over
 from lumigraph.components.clouds.tidying import CLOSE, GIANT, NEEDLE, before_a_lens, confined, nearest_camera
 from lumigraph.components.clouds.witnesses import FEWEST, MARKS, hold_back, marked, witnesses
 from lumigraph.components.fields.affine_colours import changed, changed_harmonics, found
 from lumigraph.components.fields.own_sky import backdrop_loss, harmonics, mean_skies, sky
 from lumigraph.components.training.lights import spread_of_light
 from lumigraph.components.training.trimming import BINS, KEPT, Trimming, inliers
+from lumigraph.datasets.images import ImageStore
+from lumigraph.datasets.scene import Photograph
 from lumigraph.errors import LumigraphError, LumigraphWarning
-from lumigraph.evaluate import evaluate
-from lumigraph.evaluate.halves import judged_by_halves, left_half
-from lumigraph.images import ImageStore
+from lumigraph.evaluation import evaluate
+from lumigraph.evaluation.halves import judged_by_halves, left_half
 from lumigraph.methods.gaussian_splatting import STOPS, GaussianSplatting
 from lumigraph.run import Run, build
-from lumigraph.scene import Photograph
-from lumigraph.train import fit
+from lumigraph.training import fit
 
-pytestmark = pytest.mark.filterwarnings("ignore:The cloud stops growing")
+pytestmark = [budget("methods", 10), pytest.mark.filterwarnings("ignore:The cloud stops growing")]
 
 
 def code(seed: int = 0) -> torch.Tensor:

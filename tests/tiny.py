@@ -15,10 +15,10 @@ from PIL import Image
 
 import lumigraph.methods
 from lumigraph.camera import Camera
-from lumigraph.images import ImageStore
-from lumigraph.lens import Pinhole
+from lumigraph.camera.lens import Pinhole
+from lumigraph.datasets.images import ImageStore
+from lumigraph.datasets.scene import Frame, Scene
 from lumigraph.run import Run, build
-from lumigraph.scene import Frame, Scene
 
 SIZE, FOCAL, DISTANCE = 24, 32.0, 3.0
 

@@ -6,8 +6,8 @@ import torch
 
 from lumigraph import methods
 from lumigraph.components.fields.deferred import Deferred
+from lumigraph.datasets.scene import Frame
 from lumigraph.method import Method
-from lumigraph.scene import Frame
 
 RADIUS, DENSITY = 0.6, 4.0
 WALL, WIDE = 1.0, 0.4

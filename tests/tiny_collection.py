@@ -8,9 +8,9 @@ from functools import cache
 import numpy as np
 import tiny
 
-from lumigraph.collection import Collection
-from lumigraph.images import ImageStore
-from lumigraph.scene import Scene
+from lumigraph.datasets.collection import Collection
+from lumigraph.datasets.images import ImageStore
+from lumigraph.datasets.scene import Scene
 
 TINTS = {  # the first one by name is for testing
     "amber": (1.0, 0.7, 0.1),

@@ -9,9 +9,9 @@ import numpy as np
 import torch
 import trimesh
 
-from lumigraph.dataset import splits_of
-from lumigraph.mesh import Mesh
-from lumigraph.shapes import Shape, Shapes, normalised
+from lumigraph.datasets.dataset import splits_of
+from lumigraph.datasets.mesh import Mesh
+from lumigraph.datasets.shapes import Shape, Shapes, normalised
 
 RADIUS = 0.9  # of the ball, once it is normalised
 

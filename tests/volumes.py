@@ -10,8 +10,8 @@ import torch
 from solids import Distance, ball, painted, together, torus
 
 from lumigraph import kernels
-from lumigraph.baked import Atlas, Octree, ViewNetwork
-from lumigraph.rays import Rays
+from lumigraph.camera.rays import Rays
+from lumigraph.exchange.baked import Atlas, Octree, ViewNetwork
 
 SOLID = 60.0  # density per scene unit
 

@@ -13,7 +13,7 @@ from PIL import Image
 from tiny import poses
 
 from lumigraph.camera import Camera
-from lumigraph.lens import Pinhole
+from lumigraph.camera.lens import Pinhole
 
 SIZE = 256
 

@@ -107,7 +107,7 @@ def width(hint: Any) -> int:
 
 
 def of_command(name: str) -> dict[str, int]:
-    from lumigraph.cli import COMMANDS as KINDS
+    from lumigraph.commands.cli import COMMANDS as KINDS
 
     first, _, second = name.partition(" ")
     kind = KINDS[first]

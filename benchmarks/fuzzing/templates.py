@@ -203,7 +203,7 @@ def write_path(file: Path) -> None:
 
 def must(*command: object) -> None:
     """Run a command that has to go well."""
-    from lumigraph.cli import main
+    from lumigraph.commands.cli import main
 
     if code := main([str(word) for word in command]):
         raise RuntimeError(f"lumigraph {' '.join(map(str, command))} ended with {code}")

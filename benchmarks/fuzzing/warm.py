@@ -15,13 +15,13 @@ from types import ModuleType
 import torch
 from numba.core.dispatcher import Dispatcher
 
-LATE = ("torch._dynamo", "av", "pycolmap", "trimesh", "matplotlib.pyplot", "PIL.ImageFile", "msgspec", "scipy.spatial")
+LATE = ("torch._dynamo", "av", "pycolmap", "trimesh", "PIL.ImageFile", "msgspec", "scipy.spatial")
 
 
 def warm() -> None:
     """Load every module of the package, what they load late, and the kernels that were compiled before."""
     torch.set_num_threads(1)
-    from lumigraph.signals import untouched
+    from lumigraph.system.signals import untouched
 
     with untouched():
         for name in LATE:

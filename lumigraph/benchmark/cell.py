@@ -8,12 +8,12 @@ from pathlib import Path
 from typing import Any
 
 from .. import files
-from ..budget import Budget
 from ..capture import requested
-from ..capture.procedural import is_category
 from ..errors import LumigraphError
 from ..run import Run
+from ..run.budget import Budget
 from ..run.inferred import Inferred
+from ..synthetic import is_category
 
 SHEET = "views.png"
 MEMBERS = "-members"  # behind a collection's name: its members, averaged
@@ -21,10 +21,10 @@ MEMBERS = "-members"  # behind a collection's name: its members, averaged
 
 @dataclass(frozen=True)
 class Settings:
-    """What all cells of a benchmark share; the command line's options of the same names.
+    """Settings of all cells of a benchmark: the command line's options of the same names.
 
-    eval_views: held-out views that are compared; None for all
-    lpips:      files with the weights of LPIPS, if it is wanted
+    eval_views: number of held-out views to compare; `None` for all
+    lpips:      files with the weights of LPIPS; empty for none
     """
 
     downscale: int | None = None
@@ -70,7 +70,7 @@ class Cell:
 
     @property
     def seconds(self) -> float:
-        """What is known of how long it learns; 0 where nothing is."""
+        """Expected training seconds; 0 if unknown."""
         return 0.0 if self.prior else self.budget.seconds or 0.0
 
     @property
@@ -87,7 +87,7 @@ def duration(budget: Budget) -> str:
 
 
 def training(cell: Cell, folder: Path, settings: Settings) -> list[str]:
-    """What one would type after `lumigraph` to train the cell, or to go on with it; nothing if it is trained."""
+    """Arguments of `lumigraph` that train or resume the cell; empty if it is trained."""
     if (folder / "config.json").exists():
         return [] if trained(folder) else ["resume", str(folder)]
     return [*train_command(cell, settings), "--output", str(folder)]
@@ -111,13 +111,13 @@ def train_command(cell: Cell, settings: Settings) -> list[str]:
 
 
 def reduced(source: str, downscale: int | None) -> int | None:
-    """How many times photographs are made smaller; objects of a procedural category are as large as asked for."""
+    """Downscale of a source; `None` for objects of a procedural category, whose size is in their name."""
     request = requested(source)
     return None if request is not None and is_category(request) else downscale
 
 
 def evaluation(cell: Cell, folder: Path, settings: Settings) -> list[str]:
-    """What one would type after `lumigraph` to compare the cell's held-out views; nothing if that is done."""
+    """Arguments of `lumigraph` that evaluate the cell; empty if that is done."""
     if evaluated(folder, settings):
         return []
     weights = ["--lpips", *map(str, settings.lpips)] if settings.lpips else []
@@ -132,7 +132,7 @@ def options(told: dict[str, Any]) -> list[str]:
 
 
 def trained(folder: Path) -> bool:
-    """Whether a run has spent its budget, or was made without learning."""
+    """True if a run has spent its budget, or was inferred by a prior."""
     run = Run(folder)
     if Inferred.of(run.settings, folder / "config.json"):
         return run.has_state
@@ -140,7 +140,7 @@ def trained(folder: Path) -> bool:
 
 
 def evaluated(folder: Path, settings: Settings) -> bool:
-    """Whether a run's latest state has been compared as the settings want it."""
+    """True if a run's latest state was evaluated with these settings."""
     run = Run(folder)
     result = run.evaluation()
     if result is None or result["steps"] != run.state.step:
@@ -156,7 +156,7 @@ def evaluated(folder: Path, settings: Settings) -> bool:
 
 @dataclass(frozen=True)
 class Claim:
-    """What settings.json says: what all cells share, and where each scene is."""
+    """Content of settings.json: the settings of all cells, and the source of each scene."""
 
     settings: dict[str, str | int | None]
     scenes: dict[str, str]

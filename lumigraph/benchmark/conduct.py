@@ -8,8 +8,8 @@ from pathlib import Path
 
 from .. import files
 from ..errors import LumigraphError
-from ..locks import check_place, held
-from ..progress import clock, counting
+from ..files.locks import check_place, held
+from ..system.progress import clock, counting
 from .cell import Cell, Settings, claim, evaluation, training
 from .launch import STOPPED, Launch, claim_log, launch, reason
 from .pictures import draw_charts, draw_views
@@ -92,7 +92,7 @@ def unfinished(cell: Cell, output: Path, settings: Settings) -> bool:
 
 
 class Patience:
-    """How long the rest will take, by what cells have needed beside their seconds of training so far."""
+    """Estimate of the remaining time, from the overhead of past cells beyond their training seconds."""
 
     def __init__(self) -> None:
         self.needed: list[float] = []

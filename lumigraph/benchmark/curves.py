@@ -8,15 +8,15 @@ from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 from .. import methods
-from ..budget import Budget
 from ..figures.charts import COLOURS, Series
 from ..metrics import scores_of
+from ..run.budget import Budget
 from .cell import duration
 from .results import Row
 
 
 def together(row: Row) -> str:
-    """What a row is averaged with: its scene, or the collection whose member that is."""
+    """Key that rows are averaged by: the scene, or the collection that the scene is a member of."""
     return row.get("collection") or row["scene"]
 
 
@@ -45,7 +45,7 @@ def point_of(row: Row) -> tuple[str, int, str]:
 
 
 def learnt_for(row: Row) -> str:
-    """How long a row's cell learnt, or those beside it if a prior made it."""
+    """Budget of a row's cell as text; for a prior's cell, that of the other cells."""
     return duration(Budget.from_json(row["budget"]))
 
 

@@ -10,8 +10,8 @@ from pathlib import Path
 
 from .. import files
 from ..errors import LumigraphError
-from ..processes import start
-from ..signals import Interrupt
+from ..system.processes import start
+from ..system.signals import Interrupt
 
 Launch = Callable[[Sequence[str], Path], int]
 STOPPED = (130, 143)  # after Ctrl-C and SIGTERM

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from .. import files
 from ..capture.pictures import readable
-from ..evaluate import file_name
+from ..evaluation import file_name
 from ..figures import Row as Line
 from ..figures import contact_sheet, save_picture
 from ..figures.charts import line_chart, standalone

@@ -55,5 +55,5 @@ FEW: tuple[Few, ...] = (
 
 
 def published(method: str, scene: str) -> Published | None:
-    """What the method's own paper reports of a scene of this name; None if nothing is known here."""
+    """Figure of the method's own paper for a scene of this name; `None` if unknown."""
     return FIGURES.get((method, scene.lower()))

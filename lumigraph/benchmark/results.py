@@ -1,4 +1,4 @@
-"""What came of a cell, in one row; and all rows of a benchmark in a file."""
+"""Results of a cell as one row, and all rows of a benchmark in a file."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from typing import Annotated, Any
 import msgspec
 
 from .. import files
-from ..budget import Budget
+from ..files.ranges import Lasted, Tally, typed
 from ..metrics import Score
-from ..ranges import Lasted, Tally, typed
 from ..run import Run
+from ..run.budget import Budget
 from ..run.measured import Protocol, View
 from .cell import Cell, Settings, train_command
 from .published import Published, published
@@ -38,7 +38,7 @@ MEASURED = (
 
 @dataclass(frozen=True)
 class Begun:
-    """What results.json says of every cell, as far as anybody relies on it. run: its folder, within the output's"""
+    """Validated fields of every cell in results.json. run: its folder, within the output's"""
 
     method: str
     scene: str
@@ -53,7 +53,7 @@ class Begun:
 
 @dataclass(frozen=True)
 class Measured:
-    """And of those that did not fail."""
+    """Validated fields of cells that did not fail."""
 
     protocol: Protocol
     train_views: Tally

@@ -126,7 +126,7 @@ def in_order(rows: Sequence[Row]) -> list[Row]:
 
 
 def trained_for(row: Row) -> str:
-    """How long a cell learnt, or by which prior it was made."""
+    """Budget of a cell as text, or the name of its prior."""
     return f"by {row['prior']}" if row.get("prior") else learnt_for(row)
 
 
@@ -141,7 +141,7 @@ def published(row: Row) -> str:
 
 
 def protocol(row: Row) -> str:
-    """How the cell was compared, in a few words."""
+    """Protocol of the cell's evaluation, in a few words."""
     how = row["protocol"]
     count = how["views"] if "views" in how else how["shapes"]
     some = f"{count} of {how['of']} of {how['split']}, evenly spread"

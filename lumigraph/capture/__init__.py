@@ -1,5 +1,5 @@
-"""What lies in files becomes a dataset: photographs a Scene (one reader per format, procedural scenes, one place that
-finds bounds and splits), meshes Shapes, and folders of either a Collection."""
+"""Open files as a dataset: photographs as a Scene (one reader per format, procedural scenes, one place that finds
+bounds and splits), meshes as Shapes, and folders of either as a Collection."""
 
 from __future__ import annotations
 
@@ -9,15 +9,14 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from ..collection import Collection
-from ..dataset import Dataset
+from ..datasets.collection import Collection
+from ..datasets.dataset import Dataset
+from ..datasets.scene import Scene
+from ..datasets.shapes import Shapes
 from ..errors import LumigraphError
 from ..files import exists, expanded
-from ..names import natural
-from ..ranges import typed
-from ..readers import LISTED, NAMES
-from ..scene import Scene
-from ..shapes import Shapes
+from ..files.names import natural
+from ..files.ranges import typed
 from . import meshes, single_image
 from .assemble import Before as Before
 from .assemble import assemble as assemble
@@ -32,6 +31,7 @@ from .pictures import list_images
 from .places import Places as Places
 from .places import places_of as places_of
 from .raw import with_raw
+from .readers import LISTED, NAMES
 
 READERS: dict[str, ModuleType] = {n: import_module(f".{n.replace('-', '_')}", __package__) for n in NAMES}
 PROCEDURAL = "procedural:"
@@ -39,10 +39,10 @@ KINDS: dict[str, type[Any]] = {kind.kind: kind for kind in (Scene, Shapes, Colle
 
 
 def open_dataset(source: str | Path, wanted: type[Any] | None = None, **options: Any) -> Dataset:
-    """What can be learnt from a source, whatever kind it is: the one door.
+    """Open a source of any kind as a dataset.
 
     wanted:  the kind to open it as, where it can be several: Scene, Shapes or Collection; see `kind_of`
-    options: what `open_scene` is told of photographs, of those in a collection too
+    options: those of `open_scene` for photographs, also for those in a collection
     Raises LumigraphError for anything that keeps the source from becoming a dataset.
     """
     kind, path = kind_of(source, wanted), expanded(source)
@@ -58,7 +58,7 @@ def open_dataset(source: str | Path, wanted: type[Any] | None = None, **options:
 
 
 def kind_of(source: str | Path, wanted: type[Any] | None = None) -> type[Any]:
-    """What `open_dataset` makes of a source, without opening it.
+    """Kind of dataset that `open_dataset` makes of a source, without opening it.
 
     A mesh, and a folder of meshes, are Shapes. A folder of several scenes or shapes is a Collection where it is no
     scene itself, or where one is wanted; so is a procedural category of objects. Everything else is left to the readers
@@ -81,7 +81,7 @@ def kind_of(source: str | Path, wanted: type[Any] | None = None) -> type[Any]:
 
 
 def sources_of(collection: str | Path) -> dict[str, str]:
-    """Where each member of a collection is, by its name: what `open_dataset` opens it from."""
+    """Source of each member of a collection for `open_dataset`, by its name."""
     if (request := requested(collection)) is None:
         return {name: str(place) for name, place in members_of(expanded(collection)).items()}
     from . import procedural
@@ -90,7 +90,7 @@ def sources_of(collection: str | Path) -> dict[str, str]:
 
 
 def requested(source: str | Path) -> str | None:
-    """What is asked for after "procedural:"; None of a path."""
+    """Request after "procedural:"; None for a path."""
     return str(source).removeprefix(PROCEDURAL) if str(source).startswith(PROCEDURAL) else None
 
 
@@ -163,7 +163,7 @@ def confirm(source: str | Path) -> None:
 
 
 def read_capture(source: str | Path, reader: str | None = None) -> Capture:
-    """What a reader finds of photographs with poses: none of their pixels. source, reader: as of `open_scene`"""
+    """Photographs with poses as a reader finds them, without pixels. source, reader: as of `open_scene`"""
     if (request := requested(source)) is not None:
         from . import procedural
 

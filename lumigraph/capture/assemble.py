@@ -13,13 +13,13 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from ..camera import Camera
+from ..camera.lens import Equirectangular, Lens, Pinhole
+from ..datasets.images import ImageSource, ImageStore, in_parallel, load
+from ..datasets.scene import Forward, Frame, Scene
 from ..errors import LumigraphError, LumigraphWarning
+from ..files.names import counted, natural
 from ..geometry import RIGID
-from ..images import ImageSource, ImageStore, in_parallel, load
-from ..lens import Equirectangular, Lens, Pinhole
-from ..names import counted, natural
-from ..progress import counting
-from ..scene import Forward, Frame, Scene
+from ..system.progress import counting
 from .beside import make_about, make_layers
 from .capture import Capture, Shot
 from .forward import find_forward
@@ -34,7 +34,7 @@ NAMED = 20  # missing files at most in a warning; further ones are counted
 
 @dataclass(frozen=True)
 class Before:
-    """How photographs were opened when a run began, so that they are numbered and turned the same way again.
+    """Names and orientation of a run's photographs at its start, so that a later opening numbers and turns them alike.
 
     names:   of the photographs, in order
     upright: the rotation from the source's frame that brought up to +z
@@ -264,7 +264,7 @@ def with_mask(picture: ImageSource, trusted: np.ndarray, why: str) -> ImageSourc
 
 
 def within_reach(lens: Lens, size: tuple[int, int]) -> np.ndarray | None:
-    """Which pixels a lens maps to directions and back; None if all, which a look at the edges tells."""
+    """Mask of pixels that a lens maps to directions and back; None if all do, as a test of the edges shows."""
     if isinstance(lens, Pinhole | Equirectangular):
         return None
     width, height = size
@@ -295,7 +295,7 @@ def about_missing(capture: Capture) -> str:
 
 
 def about_small(source: str, chosen: list[Chosen]) -> list[str]:
-    """Whether the photographs at hand are smaller than what was asked for."""
+    """Warning of photographs that are smaller than requested."""
     small = [c for c in chosen if max(c.picture.size) < 0.9 * max(c.wanted)]
     if not small:
         return []

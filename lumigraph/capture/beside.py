@@ -1,4 +1,4 @@
-"""What lies beside photographs becomes a scene's layers: of one kind for all of them, at the size they are used in."""
+"""Layers from files beside photographs: one kind for all photographs, at the size in which they are used."""
 
 from __future__ import annotations
 
@@ -14,16 +14,20 @@ from jaxtyping import Float
 from PIL import Image
 from torch import Tensor
 
+from ..camera import Camera
+from ..datasets.images import ImageStore, Layer, LayerSource, in_parallel, resized
+from ..datasets.images.layer import known
+from ..depth_maps import back_project
 from ..errors import LumigraphError
-from ..images import ImageStore, Layer, LayerSource, in_parallel, resized
-from ..images.layer import known
-from .capture import Plane, Shot
+from ..geometry.choice import evenly
+from .capture import Capture, Plane, Shot
 from .numbers import kind_of, read_numbers
 from .photos.exif import exposure
-from .pictures import Chosen, readable, same_shape, stat
+from .pictures import Chosen, read_image, readable, same_shape, stat
 
 CAMERAS_WRITE = (".jpg", ".jpeg")  # files that say how long they were exposed
 LENGTHS = ("distance", "z-depth")
+DEPTH_VIEWS, POINTS_PER_VIEW = 64, 300  # depth maps that sparse points are drawn from at most, and points of each
 
 
 def make_layers(
@@ -128,8 +132,32 @@ def read_plane(
     return resized(values, size, plane.encoding, known(values, plane.unknown, plane.channels))
 
 
+def with_depth_points(capture: Capture) -> Capture:
+    """An RGB-D capture with sparse points: random pixels of some photographs, back-projected by their z-depth, with
+    their colours. Unchanged where there is no depth."""
+    chosen = evenly([shot for shot in capture.shots if "depth" in shot.planes], DEPTH_VIEWS)
+    if not chosen:
+        return capture
+    positions, colours, random = [], [], np.random.default_rng(0)
+    for shot in chosen:
+        assert shot.size is not None and isinstance(shot.image, dict)
+        plane = settled(shot.planes["depth"], "depth")
+        assert plane.dtype is not None and plane.encoding == "z-depth"
+        stored = read_plane(plane, "depth", plane.dtype, shot.size, np.eye(3))
+        rows, columns = np.nonzero(known(stored, plane.unknown, 1))
+        some = random.permutation(len(rows))[:POINTS_PER_VIEW]
+        y, x = rows[some], columns[some]
+        camera = Camera(torch.from_numpy(shot.pose)[None].float(), shot.lens, torch.tensor([shot.size]))
+        pixels = torch.from_numpy(np.stack([x, y], -1) + 0.5).float()
+        depth = torch.from_numpy(plane.scale * stored[y, x]).float()
+        positions.append(back_project(camera, pixels, depth, along_axis=True).double().numpy())
+        colours.append(read_image(shot.image[1], False, shot.size)[y, x, :3])
+    points = np.concatenate(positions)
+    return replace(capture, points=points, point_colours=np.concatenate(colours), sightings=np.full(len(points), 2))
+
+
 def make_about(shots: list[Shot]) -> dict[str, Tensor]:
-    """What is known of each photograph, by name; NaN where it is not. The first axis is the photograph."""
+    """Facts of each photograph, by name; NaN where unknown. The first axis is the photograph."""
     found = in_parallel(lambda i: taken(shots[i]) | shots[i].about, range(len(shots)))
     about = {}
     for name in dict.fromkeys(name for facts in found for name in facts):

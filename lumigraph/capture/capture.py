@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from ..lens import Lens
+from ..camera.lens import Lens
 
 Pixels = np.ndarray  # uint8, (height, width, 3) or (height, width, 4); alpha last, colours not multiplied by it
 

@@ -10,10 +10,10 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from ..camera.lens import Equirectangular, Fisheye, Lens, OpenCV, Pinhole
 from ..errors import LumigraphError
-from ..lens import Equirectangular, Fisheye, Lens, OpenCV, Pinhole
-from ..library import pycolmap
-from ..names import natural
+from ..files.names import natural
+from ..system.library import pycolmap
 from .capture import Capture, Shot
 from .pictures import reductions, versions
 from .points import SparsePoints, read_points3d
@@ -176,7 +176,7 @@ def check_text(path: Path) -> None:
 
 
 def positions(model: pycolmap.Reconstruction) -> dict[str, np.ndarray]:
-    """Where each photograph was taken."""
+    """Camera position of each photograph."""
     return {i.name: i.cam_from_world().inverse().translation for i in model.images.values() if i.has_pose}
 
 

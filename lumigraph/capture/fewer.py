@@ -9,8 +9,8 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from ..camera import Camera
+from ..datasets.scene import Scene
 from ..errors import LumigraphError
-from ..scene import Scene
 
 
 def with_fewer_views(scene: Scene, views: int) -> Scene:

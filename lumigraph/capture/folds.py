@@ -21,7 +21,7 @@ STEADY = 0.5  # distance of neighbours, as a share of that of any two, up to whi
 
 
 def jumps(poses: Float[np.ndarray, "photo 3 4"], overlapping: Collection[int] = ()) -> list[tuple[int, float]]:
-    """Where cameras in order leap, though they see the same: the one before, and how many times the usual step it is.
+    """Leaps between consecutive cameras that see the same: the camera before, and the leap over the usual step.
 
     A model that is folded, with parts of the place in it twice or two parts in one place, leaps where the fold is.
     poses:       camera-to-world
@@ -38,7 +38,7 @@ def jumps(poses: Float[np.ndarray, "photo 3 4"], overlapping: Collection[int] = 
 
 
 def in_steps(positions: Float[np.ndarray, "photo 3"]) -> bool:
-    """Whether neighbours in the list were taken near each other, as one walks."""
+    """True if neighbours in the list were taken near each other, as on a walk."""
     if len(positions) < 8:
         return False
     steps = np.linalg.norm(np.diff(positions, axis=0), axis=-1)
@@ -78,7 +78,7 @@ def leaps_alike(shots: Sequence[Shot], poses: Float[np.ndarray, "photo 3 4"]) ->
 
 
 def alike(four: Sequence[Shot]) -> bool:
-    """Whether the middle two of four photographs in a row differ no more than the outer pairs do."""
+    """True if the middle two of four photographs in a row differ no more than the outer pairs do."""
     seen = [picture for shot in four if (picture := thumbnail(shot)) is not None]
     if len(seen) < len(four):
         return False

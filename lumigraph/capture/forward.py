@@ -10,7 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ..camera import Camera
-from ..scene import Forward
+from ..datasets.scene import Forward
 from .capture import Capture, Shot
 from .normalise import reliable_points
 
@@ -25,7 +25,7 @@ STRAY = 0.005  # share of sparse points that may lie nearer by mistake
 def find_forward(
     capture: Capture, shots: list[Shot], cameras: Camera, scene_from_source: Float[np.ndarray, "4 4"], near: float
 ) -> Forward | None:
-    """How the cameras of an unbounded capture look one way; None if they do not.
+    """Forward-facing frame of an unbounded capture; None if its cameras do not all look one way.
 
     shots, cameras: those to learn from; cameras in the scene's frame
     near:           distance from every camera within which nothing is, in scene units
@@ -64,8 +64,8 @@ def mean_pose(cameras: Camera) -> Float[Tensor, "3 4"]:
 
 
 def fitting_scale(cameras: Camera, pose: Float[Tensor, "3 4"], plane: float) -> tuple[float, float] | None:
-    """What x / z and y / z in the mean camera are multiplied by, so that all that cameras see beyond the plane lies
-    within [-1, 1]; None for lenses that see too widely.
+    """Factors on x / z and y / z in the mean camera that bring everything visible beyond the plane into [-1, 1]; None
+    for lenses of too wide an angle.
 
     Mildenhall 2020 takes the focal lengths over half the picture. Cameras beside the mean one then see places beyond 1,
     which a positional encoding cannot tell from others.

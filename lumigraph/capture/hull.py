@@ -1,4 +1,4 @@
-"""Where an object is, from its silhouettes: the box around a coarse visual hull (Laurentini 1994)."""
+"""Bounding box of an object from its silhouettes, by a coarse visual hull (Laurentini 1994)."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from torch import Tensor
 from torch.nn import functional
 
 from ..camera import Camera
-from ..images import ImageStore
-from ..lens import OpenCV, Pinhole
-from ..scene import Vector
+from ..camera.lens import OpenCV, Pinhole
+from ..datasets.images import ImageStore
+from ..datasets.scene import Vector
 
 VIEWS = 24
 GRIDS = (32, 32, 64)  # cells along each side of the box that is searched; each round searches what the last one found
@@ -26,7 +26,7 @@ SLACKS = (0.0, 0.1)  # share of the views that may disagree: first none, then so
 
 @dataclass(frozen=True)
 class Silhouette:
-    """Where one camera sees the object."""
+    """Silhouette of the object in one camera."""
 
     camera: Camera
     inside: Bool[Tensor, "height width"]
@@ -107,7 +107,7 @@ def hull_box(
 
 
 def ends_inside(found: tuple[np.ndarray, np.ndarray, np.ndarray], low: np.ndarray, high: np.ndarray) -> bool:
-    """Whether a found box keeps a cell's distance from the walls of the box that was searched."""
+    """True if a found box is at least a cell away from the walls of the searched box."""
     inner_low, inner_high, cell = found
     return bool((inner_low > low + cell).all() and (inner_high < high - cell).all())
 
@@ -122,14 +122,10 @@ def carve(
     radius = 0.5 * float(np.linalg.norm(cell))  # so that no part of a cell is overlooked
     seen, missed = torch.zeros(len(points)), torch.zeros(len(points))
     for outline in outlines:
-        pixels, valid = outline.camera.project(points)
-        size = outline.camera.size[0]
-        inside_picture = valid & (pixels >= 0).all(-1) & (pixels < size).all(-1)
+        places, inside_picture = outline.camera.locate(points)
         pooled, times = widened(outline, points.mean(0), radius)
-        x, y = (pixels[inside_picture] / times).long().unbind(-1)
-        hit = pooled[y.clamp(max=pooled.shape[0] - 1), x.clamp(max=pooled.shape[1] - 1)]
         seen += inside_picture
-        missed[inside_picture] += ~hit
+        missed += inside_picture & ~pooled[(places // times).unbind(-1)]
         keep = missed <= slack * len(outlines)
         points, seen, missed = points[keep], seen[keep], missed[keep]
         if not len(points):

@@ -13,8 +13,8 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from ..camera.lens import Lens, OpenCV, Pinhole
 from ..errors import LumigraphError
-from ..lens import Lens, OpenCV, Pinhole
 from .capture import Capture, Shot
 from .numbers import load_array
 from .pictures import list_images, reductions, versions

@@ -10,13 +10,13 @@ import numpy as np
 from jaxtyping import Float, UInt8
 from plyfile import PlyData
 
-from ..dataset import splits_of
+from ..datasets.dataset import splits_of
+from ..datasets.mesh import Mesh
+from ..datasets.shapes import Shape, Shapes, normalised
 from ..errors import LumigraphError, LumigraphWarning
-from ..memory import free_memory
-from ..mesh import Mesh
-from ..names import natural
-from ..progress import track
-from ..shapes import Shape, Shapes, normalised
+from ..files.names import natural
+from ..system.memory import free_memory
+from ..system.progress import track
 
 SUFFIXES = (".obj", ".ply", ".off", ".stl", ".glb", ".gltf")
 STANDING = (".stl", ".off")  # by custom with +z up; the others have +y up
@@ -26,7 +26,7 @@ GREY = 160  # of what has no colour
 
 
 def recognises(path: Path) -> bool:
-    """Whether a path is a mesh or a cloud of points, or a folder that holds some at its top."""
+    """True if a path is a mesh or a point cloud, or a folder with some at its top."""
     return is_mesh(path) or (path.is_dir() and any(is_mesh(file) for file in path.iterdir()))
 
 
@@ -84,7 +84,7 @@ def read_shape(path: Path, name: str) -> Shape:
 
 
 def is_sound(part: Any) -> bool:
-    """Whether each corner has three numbers, and each triangle three of the corners that there are."""
+    """True if each corner has three numbers, and each triangle three existing corners."""
     vertices, faces = np.asarray(part.vertices), np.asarray(getattr(part, "faces", np.zeros((0, 3), np.int64)))
     threes = vertices.ndim == faces.ndim == 2 and vertices.shape[1] == faces.shape[1] == 3
     return threes and not (len(faces) and (faces.min() < 0 or faces.max() >= len(vertices)))

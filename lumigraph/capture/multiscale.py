@@ -13,10 +13,10 @@ import numpy as np
 import torch
 
 from ..camera import Camera
+from ..datasets.images import ImageSource, LayerSource, load
+from ..datasets.scene import Scene
 from ..errors import LumigraphError
-from ..images import ImageSource, LayerSource, load
 from ..metrics import WINDOW
-from ..scene import Scene
 
 
 def multiscale(scene: Scene, scales: int, memory: int | None = None, cache: Path | None = None) -> Scene:

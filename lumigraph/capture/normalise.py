@@ -1,4 +1,4 @@
-"""Where a capture is: the similarity that brings what is worth seeing into [-1, 1]^3, and how far the rest reaches.
+"""Place a capture: the similarity that maps its box of interest into [-1, 1]^3, and the reach of the rest.
 
 Three kinds of knowledge, best first: what the source says itself, silhouettes of an object, and sparse points together
 with where the cameras look. Nothing here depends on which program found the poses, nor on a user's numbers.
@@ -14,9 +14,9 @@ import torch
 from jaxtyping import Float
 
 from ..camera import Camera
-from ..choice import evenly
-from ..images import ImageStore
-from ..scene import Vector
+from ..datasets.images import ImageStore
+from ..datasets.scene import Vector
+from ..geometry.choice import evenly
 from .capture import Capture
 from .hull import hull_box, silhouettes
 from .up import find_upright, upright_by
@@ -58,7 +58,7 @@ def find_place(
     views: list[int],
     upright: Float[np.ndarray, "4 4"] | None = None,
 ) -> Place:
-    """Where the capture is.
+    """Placement of the capture.
 
     cameras: in the source's frame
     views:   the images that may be looked at, not held out
@@ -109,7 +109,7 @@ def part_place(capture: Capture, cameras: Camera, upright: np.ndarray, backgroun
 
 
 def stated_place(capture: Capture, cameras: Camera, background: Vector) -> Place:
-    """What the source says: bounds, and where it says them, reach and near."""
+    """Placement that the source states: bounds, and reach and near if it states them."""
     assert capture.bounds is not None
     low, high = np.array(capture.bounds, np.float64)
     centre, half = 0.5 * (low + high), 0.5 * float((high - low).max())
@@ -145,7 +145,7 @@ class WeightedPoints:
 
 @dataclass(frozen=True)
 class Gaze:
-    """What the cameras look at, in the turned frame.
+    """Point and region that the cameras look at, in the rotated frame.
 
     centre:     the middle of it
     distance:   typical, from the cameras
@@ -239,8 +239,7 @@ def visible_depths(cameras: Camera, cloud: WeightedPoints) -> Float[np.ndarray, 
     depths = []
     for i in evenly(range(len(cameras)), SAMPLED_CAMERAS):
         camera = cameras[i]
-        pixels, valid = camera.project(sampled)
-        inside = (valid & (pixels >= 0).all(-1) & (pixels < camera.size[0]).all(-1)).numpy()
+        inside = camera.locate(sampled)[1].numpy()
         away = np.linalg.norm(points[inside] - camera.position[0].numpy(), axis=-1)
         depths.append([quantile(away, weights[inside], q) if inside.any() else math.nan for q in (0.02, 0.5)])
     return None if np.isnan(depths).all() else np.array(depths)

@@ -16,8 +16,8 @@ import av
 import numpy as np
 from PIL import ExifTags, Image, TiffImagePlugin
 
-from ..memory import free_memory
-from ..srgb import srgb_from_linear
+from ..color.srgb import srgb_from_linear
+from ..system.memory import free_memory
 
 Tag = ExifTags.Base
 PNG, EXR = b"\x89PNG\r\n\x1a\n", b"\x76\x2f\x31\x01"  # how these files begin
@@ -31,7 +31,7 @@ ARRAYS = {"labels": ("labels", "ids", "semantics")}  # what an .npz may call the
 
 @dataclass(frozen=True)
 class Kind:
-    """What a file's header says of its numbers.
+    """Description of a file's numbers from its header.
 
     size:     (width, height)
     channels: of a pixel
@@ -48,12 +48,12 @@ class Kind:
 
     @property
     def deep(self) -> bool:
-        """Whether eight bits do not hold it, and this file can give more."""
+        """True if it holds more than eight bits, in 1, 3 or 4 channels."""
         return self.dtype.itemsize > 1 and self.channels in (1, 3, 4)
 
     @property
     def encoding(self) -> str:
-        """Of the layer that holds it; in floating point colours come multiplied by alpha."""
+        """Encoding of the layer that holds it; floating-point colours are premultiplied by alpha."""
         if not self.linear:
             return "sRGB"
         return "linear premultiplied" if self.dtype.kind == "f" and self.channels == 4 else "linear"
@@ -75,7 +75,7 @@ def check_pixels(size: tuple[int, int], each: int = 4) -> None:
 
 
 def load_array(path: Path) -> Any:
-    """What np.load gives of a file, never pickled, without asking for more memory than its bytes or the machine have.
+    """Load a file by np.load without pickles, and within the memory of its bytes and of the machine.
 
     Raises ValueError, and what np.load raises.
     """
@@ -89,7 +89,7 @@ def load_array(path: Path) -> Any:
 
 
 def kind_of(path: Path, name: str = "") -> Kind:
-    """What a file's header says. name: of the array, in a file of several."""
+    """Read a file's header. name: of the array, in a file of several."""
     suffix = path.suffix.lower()
     if suffix in (".npy", ".npz"):
         array = read_array(path, name)
@@ -129,7 +129,7 @@ def tiff_tags(path: Path) -> Mapping[int, Any]:
 
 
 def exr_kind(path: Path) -> Kind:
-    """What an OpenEXR header says: attributes as name, type, size and data, ended by an empty name."""
+    """Read an OpenEXR header: attributes as name, type, size and data, ended by an empty name."""
     with open(path, "rb") as file:
         data = file.read(1 << 16)
     if not data.startswith(EXR):

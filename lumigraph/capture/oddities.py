@@ -1,4 +1,4 @@
-"""What is well-formed and yet cannot be meant: said in a sentence each, before anybody waits for what it gives."""
+"""Warn of captures that are well-formed but implausible, in a sentence each, before training begins."""
 
 from __future__ import annotations
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ..errors import LumigraphError
-from ..ranges import Point, Positive
+from ..files.ranges import Point, Positive
 from .assemble import HOLD_OUT, in_order
 from .capture import Capture, Shot
 

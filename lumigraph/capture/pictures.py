@@ -13,9 +13,9 @@ from pathlib import Path
 import numpy as np
 from PIL import Image, ImageOps
 
+from ..datasets.images import ImageSource, resized
 from ..errors import LumigraphError
 from ..files import is_file
-from ..images import ImageSource, resized
 from .capture import Plane, Shot
 from .numbers import TIFF_SUFFIXES, Kind, as_bytes, check_pixels, colours, kind_of, read_numbers, tiff_tags, turned
 
@@ -97,7 +97,7 @@ class Chosen:
 
 
 def choose(shot: Shot, downscale: int | None) -> Chosen:
-    """Which file of a shot to read and how far to reduce it: `downscale` times what the lens was calibrated for.
+    """File of a shot to read, and its reduction: `downscale` times the size that the lens was calibrated for.
 
     Raises LumigraphError for a file that is no image or whose shape contradicts the lens.
     """
@@ -177,7 +177,7 @@ def smaller(own: Size, wanted: Size) -> Size:
 
 
 def same_shape(a: Size, b: Size) -> bool:
-    """Whether two sizes have the same ratio of sides, up to 1% and one pixel of rounding."""
+    """True if two sizes have the same ratio of sides, up to 1% and one pixel of rounding."""
     return abs(math.log(a[0] * b[1] / (a[1] * b[0]))) < 0.01 + 1 / min(*a, *b)
 
 
@@ -209,7 +209,7 @@ def read_image(path: Path, turn: bool, size: Size) -> np.ndarray:
 
 
 def deep(path: Path) -> Kind | None:
-    """What a photograph's header says, if it holds more than eight bits."""
+    """Header of a photograph, if it holds more than eight bits."""
     if path.suffix.lower() not in DEEP_SUFFIXES:
         return None
     with readable(path):
@@ -258,7 +258,7 @@ def resize(image: Image.Image, size: Size) -> Image.Image:
 def masked(
     make: Callable[[], np.ndarray], shot: Shot, size: Size, turn: bool
 ) -> Callable[[], tuple[np.ndarray, np.ndarray | None]]:
-    """What reads a shot's pixels, with the alpha that its silhouette gives them, and which of them to trust."""
+    """Reader of a shot's pixels with the alpha of its silhouette, and of its mask."""
 
     def read() -> tuple[np.ndarray, np.ndarray | None]:
         pixels = make() if shot.alpha is None else with_alpha(make(), read_alpha(shot.alpha, size, turn))
@@ -292,7 +292,7 @@ def read_grey(path: Path, size: Size, turn: bool) -> np.ndarray:
 
 
 def read_mask(mask: Path | np.ndarray, size: Size, turn: bool) -> np.ndarray:
-    """Which pixels to trust: those whose whole area the mask calls good (brighter than half)."""
+    """Mask of the pixels whose whole area is unmasked (brighter than half)."""
     if isinstance(mask, np.ndarray):
         grey = Image.fromarray(mask.astype(bool))
     else:

@@ -1,4 +1,4 @@
-"""Where photographs of a capture were taken from, without any of their pixels."""
+"""Camera poses of a capture, without any pixels."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ import torch
 from jaxtyping import Float
 
 from ..camera import Camera
+from ..camera.lens import Pinhole
 from ..errors import LumigraphError
-from ..lens import Pinhole
 from .assemble import checked_pose, in_order
 from .capture import Capture
 from .normalise import upright_of

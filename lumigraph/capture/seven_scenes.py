@@ -13,10 +13,10 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from ..camera.lens import Pinhole
 from ..errors import LumigraphError
-from ..lens import Pinhole
+from .beside import with_depth_points
 from .capture import Capture, Plane, Shot
-from .depth_points import depth_points
 from .pictures import find_file, measure
 
 LOOKED_FOR = "frame-*.color and frame-*.pose.txt (7-Scenes, 3DMatch)"
@@ -54,10 +54,7 @@ def read(folder: Path) -> Capture:
             continue
         planes = {"depth": Plane(depth, "z-depth", 1e-3, unknown=(0, 65535))} if depth.is_file() else {}
         shots.append(Shot(name, pose[:3], lens, measure(picture)[0], {1: picture}, planes=planes))
-    points = depth_points(shots)
-    if points is None:
-        return Capture(str(folder), shots, missing=missing)
-    return Capture(str(folder), shots, points.positions, points.colours, points.sightings, missing)
+    return with_depth_points(Capture(str(folder), shots, missing=missing))
 
 
 def read_matrix(path: Path, size: int) -> np.ndarray:

@@ -12,8 +12,8 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from ..camera.lens import Pinhole
 from ..errors import LumigraphError
-from ..lens import Pinhole
 from .capture import Capture, Shot
 from .pictures import EXIF_SIDEWAYS, SUFFIXES, check_downscale, measure, read_image, reduced
 

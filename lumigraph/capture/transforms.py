@@ -14,10 +14,10 @@ from typing import Annotated, Any
 import numpy as np
 import torch
 
+from ..camera.lens import Equirectangular, Fisheye, Lens, OpenCV, Pinhole
 from ..errors import LumigraphError
 from ..files import is_file, read_json
-from ..lens import Equirectangular, Fisheye, Lens, OpenCV, Pinhole
-from ..ranges import Coordinate, Name, Point, Positive, Row, between, typed
+from ..files.ranges import Coordinate, Name, Point, Positive, Row, between, typed
 from . import colmap
 from .capture import Capture, Plane, Shot
 from .pictures import EXIF_SIDEWAYS, find_file, measure, reductions, versions
@@ -47,7 +47,7 @@ Angle = Annotated[float, between(1e-6, 3.14159)]  # radians
 
 @dataclass(frozen=True)
 class Whole:
-    """What a file says beside lenses. Paths may lead anywhere: many captures name ../images, some absolute paths."""
+    """Contents of a file beside lenses. Paths may lead anywhere: many captures name ../images, some absolute paths."""
 
     frames: list[Json]
     aabb_scale: Positive | None = None
@@ -61,7 +61,7 @@ class Whole:
 
 @dataclass(frozen=True)
 class Made:
-    """Of capture.json, what a scene was made from, by which name its making is known, and what was said of it."""
+    """Fields of capture.json: the source of a scene, the name of its making, and the messages about it."""
 
     sources: list[str] = field(default_factory=list)
     key: str = ""
@@ -140,14 +140,14 @@ def read(folder: Path) -> Capture:
 
 
 def folded(folder: Path) -> list[str]:
-    """What `lumigraph capture` said of folds, where it made the folder: it has seen what photographs share."""
+    """Folds that `lumigraph capture` reported, if it made the folder: it knows the matches of photographs."""
     path = folder / "capture.json"
     said = read_json(path, Made).warnings if path.is_file() else []
     return [f"{folder}: {warning}" for warning in said if "folded" in warning]
 
 
 def read_frames_file(path: Path) -> tuple[Whole, Json]:
-    """What a file says, with types for what concerns all of it, and as it stands there."""
+    """Contents of a file: typed for what concerns all of it, and unchanged."""
     plain = read_json(path)
     return typed(Whole, plain, path), plain
 
@@ -191,7 +191,7 @@ def called(frame: Json, number: int = 0) -> str:
 
 
 def fact(value: Any, name: str, where: str) -> np.ndarray:
-    """What is known of a photograph: a number, or a small array of them. Raises LumigraphError for anything else."""
+    """Fact of a photograph: a number, or a small array of them. Raises LumigraphError for anything else."""
     try:
         numbers = np.asarray(value, np.float64)
     except (ValueError, TypeError, OverflowError) as fault:

@@ -13,12 +13,12 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from ..camera.lens import Lens, OpenCV, Pinhole
 from ..errors import LumigraphError
 from ..files import is_file
 from ..geometry import to_matrix
-from ..lens import Lens, OpenCV, Pinhole
+from .beside import with_depth_points
 from .capture import Capture, Plane, Shot
-from .depth_points import depth_points
 
 LOOKED_FOR = "rgb.txt and groundtruth.txt (TUM's RGB-D benchmark)"
 APART = 0.02  # seconds that two moments may differ by and still be one, as in the benchmark's own tools
@@ -64,10 +64,7 @@ def read(folder: Path) -> Capture:
         shots.append(
             Shot(name, read_pose(poses[pose]), lens, SIZE, {1: folder / name}, time=float(moment), planes=planes)
         )
-    points = depth_points(shots)
-    if points is None:
-        return Capture(str(folder), shots, missing=missing)
-    return Capture(str(folder), shots, points.positions, points.colours, points.sightings, missing)
+    return with_depth_points(Capture(str(folder), shots, missing=missing))
 
 
 def read_rows(path: Path, columns: int) -> list[list[str]]:
@@ -111,7 +108,7 @@ def read_lens(folder: Path) -> Lens:
 
 
 def nearest(moments: np.ndarray, moment: float) -> int | None:
-    """Which moment is the nearest, if one is near enough."""
+    """Index of the nearest moment, if one is near enough."""
     if not len(moments):
         return None
     found = int(np.abs(moments - moment).argmin())

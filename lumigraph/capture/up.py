@@ -1,4 +1,4 @@
-"""Which way was up: from how people hold cameras, from where drones fly, and from what both see."""
+"""Up direction from how people hold cameras, from drones' positions, and from what both see."""
 
 from __future__ import annotations
 
@@ -98,7 +98,7 @@ def from_above(
 def upwards(
     axis: Float[np.ndarray, " 3"], own: Float[np.ndarray, " 3"], gaze: Float[np.ndarray, " 3"]
 ) -> Float[np.ndarray, " 3"]:
-    """That side of an axis on which the pictures' own up is; where that says nothing, the one that is looked from."""
+    """Side of an axis with the pictures' own up; if that is undecided, the side that cameras look from."""
     side = axis @ own
     return axis * np.sign(side if abs(side) > HELD else -axis @ gaze)
 

@@ -1,4 +1,4 @@
-"""`lumigraph bench`: how fast kernels are, how good methods are, how many photographs they need."""
+"""`lumigraph bench`: the speed of kernels, the quality of methods, and PSNR against the number of photographs."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from .benches.kernels import BenchKernels
 from .benches.methods import BenchMethods
 from .benches.views import BenchViews
 
-# One line for each thing that can be measured; the files are in benches/.
+# One line for each benchmark; the files are in benches/.
 What = (
     Annotated[BenchKernels, subcommand("kernels")]
     | Annotated[BenchMethods, subcommand("methods")]
@@ -21,7 +21,7 @@ What = (
 
 @dataclass(frozen=True)
 class Bench:
-    """Measure kernels on this machine, or methods on scenes."""
+    """Benchmark kernels on this machine, or methods on scenes."""
 
     what: OmitSubcommandPrefixes[OmitArgPrefixes[What]]
 

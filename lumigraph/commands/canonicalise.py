@@ -1,4 +1,4 @@
-"""`lumigraph canonicalise`: runs of one category in any poses, turned to stand as the others do."""
+"""`lumigraph canonicalise`: align runs of one category."""
 
 from __future__ import annotations
 
@@ -10,38 +10,38 @@ from tyro.conf import Positional
 
 from ..errors import LumigraphError
 from ..files import claim_folder
-from ..ranges import Seed, Steps, between
+from ..files.ranges import Seed, Steps, between
 from .common import choose_device, needed, option, show, typed
 
 
 @dataclass(frozen=True)
 class Canonicalise:
-    """Find the rotation, place and size that make runs of one category stand alike, from their density alone.
+    """Align runs of one category (rotation, position, scale) from their density fields.
 
-    Nobody has to say which way any of them stands. Each run gets a file NAME.json in the new folder, which opens as
-    that run in the frame that all of them share: `export`, `render`, `view` and `compose` take it in the run's place.
-    The runs stay as they are. Beside the files lies a picture, before and after: look at it.
+    No orientation labels are needed. The new folder gets a file NAME.json for each run. It opens as that run in the
+    common frame: `export`, `render`, `view` and `compose` accept it in place of the run. The runs do not change.
+    canonical.png in the folder shows some runs before and after; check it.
     """
 
     runs: Annotated[Positional[Path], needed("FOLDER")]
-    """A folder in which each folder is a run, of a method that knows density: instant-ngp, tensorf, plenoxels ..."""
+    """Folder of runs whose methods have density: instant-ngp, tensorf, plenoxels ..."""
     output: Annotated[Path | None, option("NEW", "FOLDER-canonical")] = None
     """The new folder."""
     like: Annotated[str | None, option("NAME", "the first")] = None
-    """The run that stays as it stands in its scene; all others are turned to stand like it."""
+    """Name of the reference run, whose orientation the canonical frame has; all others are aligned with it."""
     preset: Literal["draft", "standard", "thorough"] = "standard"
-    """How long to learn, and how large the network is: some seconds, a minute, or several."""
+    """Training steps and network size: draft takes seconds, standard a minute, thorough several and aligns better."""
     cells: Annotated[Annotated[int, between(8, 256)], option("N")] = 40
-    """Cells of the density grids along the longest side of each box of interest."""
+    """Cells of the density grids along the longest side of each box of interest; more are finer and slower."""
     steps: Annotated[Steps | None, option("N", "those of the preset")] = None
-    """Steps of learning."""
+    """Training steps of the network, in place of the preset's."""
     seed: Seed = 0
-    """Of all that is drawn at random."""
+    """Seed of all random choices."""
     device: Annotated[str, option("NAME")] = "auto"
-    """Where fields are asked and pictures rendered: auto, cpu, cuda, cuda:1."""
+    """Device for density and pictures: auto (a GPU if there is one), cpu, cuda, cuda:1."""
 
     def run(self) -> int:
-        from ..canonical import PRESETS, canonicalise, found_in
+        from ..derive.canonical import PRESETS, canonicalise, found_in
 
         output = self.output or self.runs.resolve().with_name(f"{self.runs.resolve().name}-canonical")
         if output.resolve() == self.runs.resolve():

@@ -1,4 +1,4 @@
-"""`lumigraph capture`: bare photographs or a video become a folder with poses."""
+"""`lumigraph capture`: find the camera poses of photographs or a video."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Annotated, Any, Literal
 from tyro.conf import Positional
 
 from ..errors import LumigraphError
-from ..ranges import Count, between
+from ..files.ranges import Count, between
 from .common import needed, option, say, scene_name, show, typed
 
 NAMELESS = ("images", "photos", "photographs", "pictures", "input", "frames")  # folders named after what is in them
@@ -20,10 +20,10 @@ INDENT = " " * 13
 
 @dataclass(frozen=True)
 class CaptureCommand:
-    """Find where photographs were taken from: a folder, a list of files, or a video.
+    """Find the camera poses of photographs: a folder, a list of files, or a video.
 
     The result is a folder that this and other programs open: images, sparse/0 (COLMAP), transforms.json, and two
-    pictures of how it went. Ctrl-C stops; the same command goes on.
+    pictures of the result. Ctrl-C stops; the same command continues.
     """
 
     what: Annotated[Positional[tuple[Path, ...]], needed("PHOTOS_OR_VIDEO")]
@@ -31,19 +31,19 @@ class CaptureCommand:
     output: Annotated[Path | None, option("SCENE", "scenes/NAME")] = None
     """Folder for the scene."""
     frames: Annotated[Count | None, option("N", "by the video's length")] = None
-    """How many frames of a video to use."""
+    """Number of frames to take from a video; more cover it better and take longer."""
     mapper: Literal["incremental", "global"] = "incremental"
-    """One photograph after the other, or all at once, which is quicker for hundreds."""
+    """Structure from motion: incremental, one photograph after the other, or global, quicker for hundreds."""
     matching: Literal["auto", "sequential", "exhaustive", "retrieval"] = "auto"
-    """What is compared: neighbours in order, all pairs, or those that look alike; auto goes by kind and number."""
+    """Pairs to match: neighbours in order, all, or those that look alike; auto decides by kind and number."""
     camera: Literal["auto", "single", "per-device", "per-image"] = "auto"
-    """Which photographs share a lens; auto goes by what the files say."""
+    """Photographs that share a lens model: all, those of one device, or none; auto decides by the metadata."""
     max_size: Annotated[int, between(200, 65_536), option("PIXELS")] = 1600
-    """Longer side to which photographs are reduced when details are looked for."""
+    """Longer side of photographs for feature detection; larger finds more features and is slower."""
 
     mask_object: bool = False
-    """For one thing before a backdrop: find it in every photograph, so that training learns it alone. Writes
-    object_masks/ and object.png into the scene; look at that picture before you train."""
+    """Mask one object in front of a backdrop, so that training learns it alone. Writes object_masks/ and object.png
+    into the scene; check that picture before you train."""
 
     def run(self) -> int:
         from ..capture.motion import Options
@@ -64,7 +64,7 @@ def tell_masks(folder: Path, onward: str) -> None:
     from ..capture import choose_reader
     from ..capture.masks import OBJECT_MASKS
     from ..capture.objects import mask_object
-    from ..progress import track
+    from ..system.progress import track
 
     if (folder / OBJECT_MASKS).exists():
         show({"masks": f"{folder / OBJECT_MASKS}, as they are; delete them to have them made anew", "next": onward})
@@ -108,7 +108,7 @@ def scene_folder(what: tuple[Path, ...]) -> Path:
 def find_cameras(what: tuple[Path, ...], folder: Path, options: Any = None) -> dict[str, Any]:
     """reconstruct(), with bars; Ctrl-C says how to go on."""
     from ..capture.motion import reconstruct
-    from ..progress import track
+    from ..system.progress import track
 
     try:
         return reconstruct([path.expanduser() for path in what], folder, options, track)
@@ -118,7 +118,7 @@ def find_cameras(what: tuple[Path, ...], folder: Path, options: Any = None) -> d
 
 
 def tell(folder: Path, result: dict[str, Any], onward: str | None = None) -> None:
-    """What became of the photographs, and what to do next: results to stdout, warnings to stderr."""
+    """Print the result for the photographs and the next command: results to stdout, warnings to stderr."""
     show(rows(folder, result) | ({"next": onward} if onward else {}))
     for sentence in result["warnings"]:
         say(f"warning: {sentence}")

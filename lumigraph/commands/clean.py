@@ -1,4 +1,4 @@
-"""`lumigraph clean`: a cloud of Gaussians without floaters, or a part of it, kept."""
+"""`lumigraph clean`: remove floaters from a cloud of Gaussians, or crop it."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ SIZE = 400  # pixels of the longer side of the pictures that compare
 
 @dataclass(frozen=True)
 class Clean:
-    """Remove floaters from a trained cloud of Gaussians, or all but a part of it, and keep the rest.
+    """Remove floaters from a trained cloud of Gaussians, or crop it to a box or a sphere.
 
-    A run becomes a new run, which opens, renders and resumes, or a splat file, if --output ends like one. The source
-    stays as it is. Beside the result lies a picture: before, after, and what went. --no-clean with --box or --sphere
-    crops and leaves floaters.
+    The result is a new run, which opens, renders and resumes, or a splat file, if --output ends like one. The source
+    does not change. A picture beside the result shows the cloud before and after, and the removed Gaussians. To crop
+    without removing floaters, give --no-clean with --box or --sphere.
     """
 
     source: Annotated[Positional[Path], needed("RUN_OR_FILE")]
@@ -31,13 +31,13 @@ class Clean:
     overwrite: Overwrite = False
     part: OmitArgPrefixes[Keeping] = Keeping(clean=True)
     device: Annotated[str, option("NAME")] = "auto"
-    """Where the pictures are rendered: auto, cpu, cuda, cuda:1."""
+    """Device for the pictures: auto (a GPU if there is one), cpu, cuda, cuda:1."""
 
     def run(self) -> int:
-        from ..capabilities import HasGaussians, needs
         from ..exchange import names_splats, place_of
         from ..figures import save_picture
         from ..gaussians.cleaning import gone
+        from ..method.capabilities import HasGaussians, needs
         from ..run import open_any
         from ..run.picking import check_output, save_picked
 
@@ -64,10 +64,10 @@ class Clean:
 def before_and_after(opened: Any, gaussians: Any, gone: Any) -> Any:
     """A sheet of some views: all Gaussians, those that stay, those that went. Some from afar, where floaters show."""
     from ..camera import ring
-    from ..choice import evenly
     from ..composition import PickedCloud
     from ..figures import Row, contact_sheet
-    from ..progress import track
+    from ..geometry.choice import evenly
+    from ..system.progress import track
 
     clouds = [PickedCloud(opened.frame, some) for some in (gaussians, gaussians[~gone], gaussians[gone])]
     around = ring(opened.frame.bounds, size=SIZE)

@@ -1,23 +1,24 @@
-"""What several commands share: options' looks, devices, scenes, and where things go."""
+"""Parts of several commands: the format of options, devices, scenes, output paths."""
 
 from __future__ import annotations
 
 import itertools
 import shlex
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
-from ..budget import Budget
-from ..console import console, dim
+from .. import methods
+from ..capture.readers import LISTED, NAMES
 from ..errors import LumigraphError
 from ..files import scene_name as scene_name
-from ..quality import MEANS, Quality
-from ..readers import LISTED, NAMES
-from ..signals import exit_code as exit_code
+from ..method.quality import MEANS, Quality
+from ..run.budget import Budget
+from ..system.console import console, dim
+from ..system.signals import exit_code as exit_code
 
 if TYPE_CHECKING:
     Reader = str
@@ -26,28 +27,26 @@ else:
 
 
 def option(metavar: str, default: str | None = None, about: str | None = None) -> Any:
-    """How an option looks in --help: what to put there, what happens without it, what it is about."""
+    """An option in --help: its placeholder, its default in words, its description."""
     return tyro.conf.arg(metavar=metavar, help_behavior_hint=default and f"(default: {default})", help=about)
 
 
 def needed(metavar: str) -> Any:
-    """How an argument without a default looks in --help."""
+    """An argument without a default in --help."""
     return tyro.conf.arg(metavar=metavar, help_behavior_hint="")
 
 
 ReaderOption = Annotated[
     Reader | None,
-    tyro.conf.arg(
-        metavar="NAME", help_behavior_hint="(default: found by looking)", help=f"Layout of the folder: {LISTED}."
-    ),
+    tyro.conf.arg(metavar="NAME", help_behavior_hint="(default: detected)", help=f"Layout of the folder: {LISTED}."),
 ]
 
 
 Overwrite = Annotated[
     bool,
     tyro.conf.arg(
-        help="Replace files that are there, whoever wrote them. What Lumigraph wrote and nobody changed is replaced "
-        "anyway; folders with anything else in them never are."
+        help="Replace existing files of other origin too. Unchanged files that Lumigraph wrote are replaced "
+        "anyway; folders with other files in them never are."
     ),
 ]
 
@@ -69,37 +68,65 @@ def choose_device(name: str) -> Any:
     return device
 
 
+def option_group(name: str) -> str:
+    """The field that holds a method's own numbers; help shows its name above them."""
+    return methods.check(name).replace("-", "_")
+
+
+def method_config(command: Any, name: str) -> Any:
+    """A method's Config, which the command line adds as another field; see `with_options_of`."""
+    given = getattr(command, option_group(name), None)
+    return given or methods.find(name).preset(preset_device(command.device, command.preset))
+
+
+def preset_device(device: str, preset: str) -> Any:
+    """The kind of machine whose defaults are wanted; it need not be here."""
+    import torch
+
+    return choose_device(device) if preset == "auto" else torch.device("cuda" if preset == "paper" else "cpu")
+
+
+def value_of(name: str, arguments: Sequence[str], default: str) -> str:
+    """The value of an option, before all options are known."""
+    for i, argument in enumerate(arguments):
+        if argument.startswith(f"{name}="):
+            return argument.partition("=")[2]
+        if argument == name and i + 1 < len(arguments):
+            return arguments[i + 1]
+    return default
+
+
 def told_budget(steps: int | None, seconds: float | None, quality: Quality | None = None) -> Budget | None:
-    """What --steps or --seconds say; None where they say nothing. Raises LumigraphError, before anything is opened, for
-    what makes no sense, and for more than one of these options."""
+    """The Budget of --steps or --seconds; `None` without them. Raises LumigraphError, before anything is opened, for an
+    impossible value, and for more than one of these options."""
     if sum(told is not None for told in (steps, seconds, quality)) > 1:
         raise LumigraphError("--steps, --seconds and --quality are ways to say how long; give one of them")
     return None if steps is None and seconds is None else Budget(steps, seconds)
 
 
 def quality_budget(quality: Quality, method: Any, data: Any) -> Budget:
-    """The steps that --quality asks a method for on its data."""
+    """The steps of --quality for a method on its data."""
     return Budget(method.steps_for(quality, data), quality=quality)
 
 
 def about_quality(kind: Any = None) -> str:
-    """What --quality means, in help texts; of a kind of method with its numbers."""
-    told = "Train for as many steps as the method needs for so many photographs of this size. "
+    """Help text of --quality; with the numbers of a kind of method, if given."""
+    told = "Choose the steps by method, number of photographs and their size. "
     return told + "; ".join(f"{name}, {means}{numbers(kind, name)}" for name, means in MEANS.items()) + "."
 
 
 def numbers(kind: Any, quality: Quality) -> str:
-    """What a quality asks of a kind of method: passes and steps."""
+    """The epochs and the least steps of a quality, for a kind of method."""
     if kind is None:
         return ""
     from ..method import RayMethod
 
     effort, unit = kind.efforts[quality], "pixel" if issubclass(kind, RayMethod) else "photograph"
-    return f": each {unit} {effort.passes:g} times, at least {effort.at_least:,} steps"
+    return f": {effort.passes:g} epochs over all {unit}s, at least {effort.at_least:,} steps"
 
 
 def say(text: str) -> None:
-    """To stderr, where it does not mix with results."""
+    """Print to stderr, separate from results."""
     print(text, file=sys.stderr, flush=True)
 
 
@@ -111,7 +138,7 @@ def show(rows: Mapping[str, Any]) -> None:
 
 
 def typed(*words: object) -> str:
-    """A command to go on with, as a shell understands it whatever names are in it."""
+    """A command to type next, quoted for a shell."""
     return shlex.join(["lumigraph", *map(str, words)])
 
 

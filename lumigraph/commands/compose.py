@@ -1,4 +1,4 @@
-"""`lumigraph compose`: one trained scene inside another."""
+"""`lumigraph compose`: place one trained scene in another."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from tyro.conf import Positional, arg
 
 from ..errors import LumigraphError
 from ..files import claim
-from ..ranges import Coordinate, Positive, between
+from ..files.ranges import Coordinate, Positive, between
 from .common import Overwrite, needed, option, show, typed
 
 Triple = tuple[Coordinate, Coordinate, Coordinate]
@@ -18,36 +18,36 @@ Triple = tuple[Coordinate, Coordinate, Coordinate]
 
 @dataclass(frozen=True)
 class Compose:
-    """Write a composition, a small JSON file: one thing that opens, and another one in it.
+    """Place one scene in another, and write both as a composition, a small JSON file.
 
-    `view`, `render` and `export` open it like a run. Both lie as their photographs' frames say, which is right for two
-    runs of one capture. With --at, --scale or --turn the second stands upright in the first, on the spot that --at
-    names. A composition may be a part of another one, so three are two in one.
+    `view`, `render` and `export` open it like a run. By default both keep the frames of their photographs, which is
+    right for two runs of one capture. With --at, --scale or --turn the second is upright in the first, and --at is its
+    position. A composition may be a part of another one: compose twice for three scenes.
     """
 
     lead: Annotated[Positional[Path], needed("RUN_OR_FILE")]
-    """Whose cameras, background and vertical count: a run's folder, a splat file, or a composition."""
+    """Scene that gives cameras, background and vertical: a run's folder, a splat file, or a composition."""
     part: Annotated[Positional[Path], needed("RUN_OR_FILE")]
-    """What is put into it."""
+    """Scene to place in it."""
     output: Annotated[Path, needed("FILE.json")]
-    """The new file. It names its parts by their paths from where it lies."""
-    at: Annotated[Triple | None, arg(metavar="X Y Z", help_behavior_hint="(default: the lead's foot)")] = None
-    """Where the middle of the part's foot stands, in the frame of the lead's photographs."""
+    """The new file. It holds the paths of its parts relative to its own folder."""
+    at: Annotated[Triple | None, arg(metavar="X Y Z", help_behavior_hint="(default: the lead's lower side)")] = None
+    """Position of the middle of the part's lower side, in the frame of the lead's photographs."""
     scale: Annotated[Positive | None, option("TIMES", "1")] = None
-    """Size of the part: units of the lead's photographs to one of its own."""
+    """Scale of the part: units of the lead's photographs per unit of its own."""
     turn: Annotated[Annotated[float, between(-1e6, 1e6)] | None, option("DEGREES", "0")] = None
-    """About the vertical, counterclockwise from above."""
+    """Rotation of the part about the vertical, counterclockwise from above."""
     box: Annotated[
         tuple[Triple, Triple] | None, arg(metavar="X Y Z X Y Z", help_behavior_hint="(default: all of it)")
     ] = None
-    """Show only what lies between two corners of the part, in its scene's frame: `lumigraph info` tells its bounds."""
+    """Crop the part to the box between two corners, in its scene's frame; `lumigraph info` shows its bounds."""
     overwrite: Overwrite = False
 
     def run(self) -> int:
         import torch
 
+        from ..camera.crop import Box
         from ..composition import standing
-        from ..crop import Box
         from ..geometry import Similarity
         from ..run import open_any
         from ..run.composition import Part, relative, write_composition

@@ -1,4 +1,4 @@
-"""`lumigraph compress`: a trained run becomes a smaller one."""
+"""`lumigraph compress`: make a trained run smaller."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from typing import Annotated, Any
 
 from tyro.conf import Positional, arg
 
-from ..console import console
 from ..errors import LumigraphError
-from ..quality import Quality
-from ..ranges import Codes, Count, Decibels, Seconds, Steps
+from ..files.ranges import Codes, Count, Decibels, Seconds, Steps
+from ..method.quality import Quality
+from ..system.console import console
 from .common import choose_device, needed, option, show, typed
 
 LOSSES: Mapping[Quality, float] = {"draft": 1.0, "good": 0.3, "best": 0.1}  # dB that each quality may lose
@@ -21,42 +21,42 @@ DEFAULT: Quality = "good"
 DEFAULT_SECONDS = 60.0
 UNITS = {"": 1, "k": 1e3, "m": 1e6, "g": 1e9, "ki": 2**10, "mi": 2**20, "gi": 2**30}
 SIZE = re.compile(r"\s*(\d+(?:\.\d+)?)\s*([kmg]?i?)b?\s*", re.IGNORECASE)
-ABOUT = "How much may be lost: " + ", ".join(f"{name} {dB:g} dB" for name, dB in LOSSES.items()) + "."
+ABOUT = "PSNR that may be lost: " + ", ".join(f"{name} {dB:g} dB" for name, dB in LOSSES.items()) + "."
 
 
 @dataclass(frozen=True)
 class Compress:
-    """Make a trained run small enough to send; what comes of it opens like any other run.
+    """Compress a trained run to a size, or to a loss of PSNR.
 
-    What pictures hardly need goes, features become rows of a codebook, numbers get 8 or 16 bits, and what is left is
-    tuned on the photographs and packed. NEW opens wherever RUN does, but cannot be resumed. NEW/compress.json says size
-    and PSNR of held-out views before and after. Without its photographs a run is compared with its own renderings.
+    Unimportant rows are pruned, features become rows of a codebook, numbers get 8 or 16 bits; the rest is tuned on the
+    photographs and packed. NEW opens wherever RUN does, but cannot be resumed. NEW/compress.json has size and PSNR of
+    held-out views before and after. Without its photographs a run is compared with its own renderings.
     """
 
     run_folder: Annotated[Positional[Path], needed("RUN")]
-    """Folder of the run, which stays as it is."""
+    """Folder of the run, which does not change."""
     output: Annotated[Path, arg(metavar="NEW", help_behavior_hint="")]
     """New folder for the smaller run."""
     to: Annotated[str | None, option("SIZE", "as --quality")] = None
-    """Make the model as small as this, losing as little as that allows: 5MB, 800kB, 2MiB."""
+    """Upper limit of the model's size: 5MB, 800kB, 2MiB. A smaller one loses more PSNR."""
     quality: Annotated[Quality | None, option("draft|good|best", DEFAULT, ABOUT)] = None
     max_loss: Annotated[Decibels | None, option("DB", "as --quality")] = None
-    """Make it as small as possible with so much PSNR lost at most, of photographs that it learnt from."""
-    codebook: Annotated[Codes | None, option("N", "up to 4096, fewer where much may be lost")] = None
-    """Rows of the codebook."""
+    """Largest loss of PSNR on training photographs, in dB; the model becomes as small as it allows."""
+    codebook: Annotated[Codes | None, option("N", "up to 4096, fewer for a larger loss")] = None
+    """Rows of the codebook; more lose less PSNR and take more bytes."""
     seconds: Annotated[Seconds | None, option("S", f"{DEFAULT_SECONDS:.0f}")] = None
-    """Tune for so long, all that is tried together."""
+    """Total tuning time in seconds; longer recovers more PSNR."""
     steps: Annotated[Steps | None, option("N", "as long as --seconds")] = None
-    """Tune for so many steps instead."""
+    """Tune for this number of steps instead."""
     views: Annotated[Count | None, option("N", "all")] = None
-    """Compare so many held-out views only, evenly spread."""
-    scene: Annotated[str | None, option("SCENE", "where they were")] = None
-    """Where the photographs are now, if they have moved."""
+    """Compare only this number of held-out views, evenly spread."""
+    scene: Annotated[str | None, option("SCENE", "the path used in training")] = None
+    """Path of the photographs, if they were moved since training."""
     device: Annotated[str, option("NAME")] = "auto"
-    """auto, cpu, cuda, cuda:1."""
+    """Device to compute on: auto (a GPU if there is one), cpu, cuda, cuda:1."""
 
     def run(self) -> int:
-        from ..compression import Aim, compress
+        from ..derive.compression import Aim, compress
         from ..run import Run
 
         if sum(told is not None for told in (self.to, self.quality, self.max_loss)) > 1:

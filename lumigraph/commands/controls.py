@@ -1,4 +1,4 @@
-"""`--set` and `--animate`: what a user tells a method on the command line."""
+"""`--set` and `--animate`: controls of a method on the command line."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ Set = UseAppendAction[
         arg(
             name="set",
             metavar="NAME=VALUE",
-            help="Tell the method something; `lumigraph info RUN` lists its controls. Can be given several times.",
+            help="Set a control of the method; `lumigraph info RUN` lists them. Can be given several times.",
             help_behavior_hint="",
         ),
     ]
@@ -26,7 +26,7 @@ Animate = UseAppendAction[
         arg(
             name="animate",
             metavar="NAME=A:B",
-            help="Turn a control from A to B over the film, or further, A:B:C. Can be given several times.",
+            help="Change a control from A to B over the film, or on to C with A:B:C. Can be given several times.",
             help_behavior_hint="",
         ),
     ]
@@ -34,8 +34,8 @@ Animate = UseAppendAction[
 
 
 def open_method(source: Any, device: str, told: Iterable[str] = ()) -> tuple[Any, Any, Any]:
-    """What opens at a path, its method as told by --set, and the cameras of its photographs by split, with what the
-    method has learnt of their poses."""
+    """The opened run or file, its method with the controls of --set, and the cameras of its photographs by split, as
+    the method has refined them."""
     from ..run import open_any
     from .common import choose_device
 
@@ -45,13 +45,13 @@ def open_method(source: Any, device: str, told: Iterable[str] = ()) -> tuple[Any
 
 
 def tell(opened: Any, method: Any, told: Iterable[str]) -> Any:
-    """The method given what --set says. Raises LumigraphError for what it cannot be told."""
+    """The method with the controls of --set. Raises LumigraphError for controls that it does not have."""
     values = dict(parted("--set", "NAME=VALUE", text) for text in told)
     return method.given(**{name: by_number(opened, method, name, value) for name, value in values.items()})
 
 
 def animate(opened: Any, method: Any, told: Iterable[str], frames: int) -> Any:
-    """The method of each frame of a film as --animate says; the method itself where that says nothing."""
+    """The method of each frame of a film by --animate; the method itself without --animate."""
     from ..export.film import animated
 
     stations = {}

@@ -1,4 +1,4 @@
-"""`lumigraph convert`: a trained run becomes one of another method."""
+"""`lumigraph convert`: turn a trained run into one of another method."""
 
 from __future__ import annotations
 
@@ -8,60 +8,59 @@ from typing import Annotated, Any, Literal
 
 from tyro.conf import Positional, arg
 
-from ..console import console
 from ..errors import LumigraphError
-from ..quality import Quality
-from ..ranges import Count, Seconds, Seed, Steps
-from .common import about_quality, choose_device, option, show, told_budget, typed
+from ..files.ranges import Count, Seconds, Seed, Steps
+from ..method.quality import Quality
+from ..system.console import console
+from .common import about_quality, choose_device, method_config, option, show, told_budget, typed
 from .compress import size
-from .train import option_group, preset_device
 
 DEFAULT_SECONDS = 30.0
 LONG = 4096  # letters; a table cuts its lines where the console ends
-ABOUT = " What began as a field has half of it behind it."
+ABOUT = " A conversion from a field trains for half of these steps."
 
 
 @dataclass(frozen=True)
 class Convert:
-    """Make a run of another method out of a trained one, or out of a splat file.
+    """Turn a trained run, or a splat file, into a run of another method.
 
-    The new one begins as what the old one holds: grids and networks by its density and colour at points, Gaussians on
-    its surfaces. Then it learns on, from the photographs where they are at hand, otherwise from what the old one
-    renders. NEW/convert.json says how alike the two are in views that neither has learnt from, and what each takes.
-    The same command goes on after Ctrl-C. `lumigraph convert RUN METHOD --help` adds the method's own options.
+    The new method is initialised from the old one: grids and networks from its density and colour at points, Gaussians
+    on its surfaces. Then it trains on the photographs if they are available, otherwise on renderings of the old one.
+    NEW/convert.json has the PSNR between the two on held-out views, and the size and speed of each. After Ctrl-C the
+    same command continues. `lumigraph convert RUN METHOD --help` adds the method's own options.
     """
 
     source: Annotated[Positional[Path | None], arg(metavar="RUN_OR_FILE", help_behavior_hint="")] = None
-    """Folder of a run, which stays as it is, or a splat file."""
+    """Folder of a run, which does not change, or a splat file."""
     method: Annotated[Positional[str | None], arg(metavar="METHOD", help_behavior_hint="")] = None
-    """What to make of it, for example plenoxels."""
+    """Method to convert to, for example plenoxels."""
     output: Annotated[Path | None, arg(metavar="NEW", help_behavior_hint="")] = None
     """New folder for the run."""
     list: bool = False
-    """Say what goes into what, and how, and do nothing else."""
+    """Print the table of possible conversions, and exit."""
     seconds: Annotated[Seconds | None, option("S", f"{DEFAULT_SECONDS:.0f}")] = None
-    """Learn on for so long, once the old one is taken over."""
+    """Training time in seconds after initialisation; longer improves the new method."""
     steps: Annotated[Steps | None, option("N", "as long as --seconds")] = None
-    """Learn on for so many steps instead."""
+    """Train for this number of steps instead."""
     quality: Annotated[Quality | None, option("draft|good|best", "as long as --seconds", about_quality() + ABOUT)] = (
         None
     )
     distil: bool = False
-    """Learn from what the old one renders, even where photographs are at hand."""
-    scene: Annotated[str | None, option("SCENE", "where they were")] = None
-    """Where the photographs are now, if they have moved."""
+    """Train on renderings of the old method, even if photographs are available."""
+    scene: Annotated[str | None, option("SCENE", "the path used in training")] = None
+    """Path of the photographs, if they were moved since training."""
     views: Annotated[Count, option("N")] = 8
-    """Compare so many held-out views at most, evenly spread."""
+    """Compare at most this number of held-out views, evenly spread."""
     seed: Annotated[Seed, option("N")] = 0
-    """Of all random choices."""
+    """Seed of all random choices."""
     device: Annotated[str, option("NAME")] = "auto"
-    """auto, cpu, cuda, cuda:1."""
+    """Device to compute on: auto (a GPU if there is one), cpu, cuda, cuda:1."""
     preset: Literal["auto", "laptop", "paper"] = "auto"
-    """The method's own defaults: the paper's, or what learns most on a plain CPU; auto looks at --device."""
+    """Defaults of the method's options: the paper's, or those tuned for a CPU; auto decides by --device."""
 
     def run(self) -> int:
         from .. import methods
-        from ..conversion import Aim, convert
+        from ..derive.conversion import Aim, convert
         from ..run import open_any
 
         if self.list:
@@ -73,7 +72,7 @@ class Convert:
         name, device = methods.check(self.method), choose_device(self.device)
         counted = self.steps is not None or self.quality is not None
         aim = Aim(
-            config=self.method_config(name),
+            config=method_config(self, name),
             steps=self.steps,
             seconds=None if counted else self.seconds or DEFAULT_SECONDS,
             quality=self.quality,
@@ -90,13 +89,6 @@ class Convert:
         show(rows | {"next": typed("view", self.output)})
         return 0
 
-    def method_config(self, name: str) -> Any:
-        """The method's Config, which the command line adds as another field; see `train.with_options_of`."""
-        from .. import methods
-
-        given = getattr(self, option_group(name), None)
-        return given or methods.find(name).preset(preset_device(self.device, self.preset))
-
 
 def table(made: Any) -> Any:
     """Both methods, side by side."""
@@ -112,10 +104,10 @@ def table(made: Any) -> Any:
 
 
 def listed() -> Any:
-    """What goes into what: a row for each method as it is, a column for each that it may become."""
+    """Table of conversions: a row for each source method, a column for each target."""
     from rich.table import Table
 
-    from ..conversion import ways
+    from ..derive.conversion import ways
 
     found = ways()
     rows = Table("from / into", *found)

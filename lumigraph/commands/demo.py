@@ -1,4 +1,4 @@
-"""`lumigraph demo`: everything once, on a scene that the package makes itself."""
+"""`lumigraph demo`: every step once, on a procedural scene."""
 
 from __future__ import annotations
 
@@ -6,9 +6,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
-from ..budget import Budget
-from ..console import bold
-from ..ranges import Count, Seconds
+from ..files.ranges import Count, Seconds
+from ..run.budget import Budget
+from ..system.console import bold
 from .common import choose_device, exit_code, next_free, option, say, show, typed
 
 FRAMES = 90
@@ -16,34 +16,34 @@ FRAMES = 90
 
 @dataclass(frozen=True)
 class Demo:
-    """From photographs to a film and a report in a few minutes: make a scene, train, compare, film.
+    """Go from photographs to a film and a report in a few minutes: make a scene, train, evaluate, render.
 
-    The photographs are drawn by a small ray tracer, so that nothing needs to be downloaded.
+    A small ray tracer renders the photographs, so nothing is downloaded.
     """
 
     output: Annotated[Path | None, option("RUN", "demo/run-N")] = None
     """New folder for the run."""
     seconds: Annotated[Seconds, option("S")] = 60.0
-    """How long to train."""
+    """Training time in seconds."""
     method: Annotated[str, option("METHOD")] = "instant-ngp"
-    """What to train."""
+    """Method to train."""
     scene: Annotated[str, option("SCENE")] = "procedural:still-life"
-    """What to train it on."""
+    """Scene to train on."""
     frames: Annotated[Count, option("N")] = FRAMES
-    """Length of the film."""
+    """Number of frames of the film."""
     device: Annotated[str, option("NAME")] = "auto"
-    """auto, cpu, cuda, cuda:1."""
+    """Device to compute on: auto (a GPU if there is one), cpu, cuda, cuda:1."""
 
     def run(self) -> int:
         from .. import methods
         from ..capture import open_dataset
-        from ..evaluate import evaluate_run
+        from ..evaluation import evaluate_run
+        from ..evaluation.report import write_report
         from ..export.film import film
         from ..metrics import scores_of
         from ..paths import film_cameras
-        from ..report import write_report
         from ..run import Run, build, check_new
-        from ..train import fit
+        from ..training import fit
 
         budget = Budget(seconds=self.seconds)
         kind, device = methods.find(self.method), choose_device(self.device)

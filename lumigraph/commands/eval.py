@@ -1,4 +1,4 @@
-"""`lumigraph eval`: how well a run does on what it has not learnt."""
+"""`lumigraph eval`: score a run on held-out photographs or shapes."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from typing import Annotated, Any, Literal
 
 from tyro.conf import Positional
 
-from ..console import bold
-from ..ranges import Count
+from ..files.ranges import Count
+from ..system.console import bold
 from .common import Overwrite, choose_device, needed, option, show
 from .controls import Set, tell
 
@@ -19,38 +19,39 @@ MEMORISED = 4.0  # dB by which photographs learnt from are better than held-out 
 
 @dataclass(frozen=True)
 class Eval:
-    """Compare a run with photographs that it has not seen, or its surface with the shapes that it learnt.
+    """Compare a run with held-out photographs, or its surface with the training shapes.
 
     Writes RUN/eval.json (per view and mean PSNR and SSIM, also by resolution where there are several, the protocol,
-    timings) and RUN/eval.png, a contact sheet of photograph, rendering, error and depth. Other splits than test have
-    their names in the files'. LPIPS is measured where you have the weights: torchvision's AlexNet and the LPIPS
-    authors' v0.1/alex.pth. Shapes have IoU, chamfer distance and normal consistency instead.
+    timings) and RUN/eval.png, a contact sheet of photograph, rendering, error and depth. File names
+    of other splits than test contain the split. LPIPS needs weights: torchvision's AlexNet and the LPIPS authors'
+    v0.1/alex.pth. Shapes have IoU, chamfer distance and normal consistency instead.
     """
 
     run_folder: Annotated[Positional[Path], needed("RUN")]
     """Folder of the run."""
     split: Literal["test", "val", "train"] = "test"
-    """Which photographs, shapes or members of a collection."""
+    """Split of photographs, shapes or members of a collection to compare with."""
     views: Annotated[Count | None, option("N", "all")] = None
-    """Compare so many views or shapes only, evenly spread."""
+    """Compare only this number of views or shapes, evenly spread."""
     lpips: Annotated[tuple[Path, ...], option("FILE", "those in LUMIGRAPH_LPIPS, if any")] = ()
-    """Files with the weights of LPIPS, .pth or .safetensors."""
+    """Files with the weights of LPIPS, .pth or .safetensors; adds LPIPS to the scores."""
     save_images: bool = False
-    """Keep every rendering, as RUN/eval/NAME.png."""
+    """Save every rendering as RUN/eval/NAME.png."""
     right_halves: bool = False
-    """Compare right halves of photographs alone, as of methods that are told their left halves."""
+    """Compare only the right halves of photographs, as for methods that fit a code on the left halves."""
     overwrite: Overwrite = False
-    scene: Annotated[str | None, option("SCENE", "where they were")] = None
-    """Where what it learnt from is now, if it has moved."""
+    scene: Annotated[str | None, option("SCENE", "the path used in training")] = None
+    """Path of the training data, if it was moved since training."""
     told: Set = ()
     device: Annotated[str, option("NAME")] = "auto"
-    """auto, cpu, cuda, cuda:1."""
+    """Device to compute on: auto (a GPU if there is one), cpu, cuda, cuda:1."""
 
     def run(self) -> int:
-        from ..evaluate import claim_evaluation, evaluate_run, stem
+        from ..evaluation import claim_evaluation, evaluate_run, stem
+        from ..large import BlockRun
         from ..metrics import scores_of
-        from ..run import BlockRun, open_run
-        from ..verdict import last_psnr
+        from ..run import open_run
+        from ..training.verdict import last_psnr
         from .outcome import next_commands
 
         run = open_run(self.run_folder)
@@ -93,7 +94,7 @@ def chosen_lpips(given: Sequence[Path]) -> Any:
 
 
 def compared(result: dict[str, Any]) -> dict[str, str]:
-    """What was compared, for people: views of which size and how fast, or shapes."""
+    """Compared views with their size and rendering time, or shapes, as text."""
     protocol = result["protocol"]
     what = "views" if "views" in protocol else "shapes"
     count, there = protocol[what], protocol["of"]

@@ -1,4 +1,4 @@
-"""`lumigraph explain`: the mathematics of a paper as pictures of what it does to one's own data."""
+"""`lumigraph explain`: pictures of a paper's equations on your own data."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from .explains.activation import ExplainActivation
 from .explains.encodings import ExplainEncodings
 from .explains.ray import ExplainRay
 
-# One line for each thing that can be explained; the files are in explains/.
+# One line for each explanation; the files are in explains/.
 What = (
     Annotated[ExplainActivation, subcommand("activation")]
     | Annotated[ExplainEncodings, subcommand("encodings")]
@@ -21,7 +21,7 @@ What = (
 
 @dataclass(frozen=True)
 class Explain:
-    """Draw what happens inside: a page, its pictures, and the figures behind them."""
+    """Draw the equations of a paper on your own data: a page, its pictures, and the figures behind them."""
 
     what: OmitSubcommandPrefixes[OmitArgPrefixes[What]]
 

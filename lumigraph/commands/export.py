@@ -1,4 +1,4 @@
-"""`lumigraph export`: what was trained, in the formats of other programs."""
+"""`lumigraph export`: a trained scene in the formats of other programs."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from .exports.splats import ExportSplats
 from .exports.stereo import ExportStereo
 from .exports.web import ExportWeb
 
-# One line for each thing that can be written; the files are in exports/.
+# One line for each export; the files are in exports/.
 What = (
     Annotated[ExportMesh, subcommand("mesh")]
     | Annotated[ExportOctree, subcommand("octree")]
@@ -31,7 +31,7 @@ What = (
 
 @dataclass(frozen=True)
 class Export:
-    """Write a trained scene for other programs."""
+    """Export a trained scene in the formats of other programs."""
 
     what: OmitSubcommandPrefixes[OmitArgPrefixes[What]]
 

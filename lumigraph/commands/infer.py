@@ -1,4 +1,4 @@
-"""`lumigraph infer`: what a prior makes of one scene, from a few photographs."""
+"""`lumigraph infer`: reconstruct a scene from a few photographs with a prior."""
 
 from __future__ import annotations
 
@@ -9,18 +9,18 @@ from typing import Annotated, Any
 from tyro.conf import Positional
 
 from ..errors import LumigraphError
-from ..ranges import Count, Downscale, Seed
+from ..files.ranges import Count, Downscale, Seed
 from .common import ReaderOption, choose_device, needed, next_free, option, scene_name, show
 
 
 @dataclass(frozen=True)
 class Infer:
-    """Make a run of one scene out of a few of its photographs, by what a prior has learnt across many scenes.
+    """Reconstruct a scene from a few photographs with a trained prior.
 
-    A prior is a run of a method that learns from a collection: lumigraph train pixelnerf procedural:toys. It takes
-    seconds: pixelnerf looks at the photographs once, hyp-nerf finds the object that looks like them. The new run keeps
-    what was found in them, and evaluates, renders, exports and opens in the viewer like any other. With --seed in the
-    place of a scene, hyp-nerf makes an object up.
+    A prior is a run of a method that learns from a collection: lumigraph train pixelnerf procedural:toys. Inference
+    takes seconds: pixelnerf encodes the photographs once, hyp-nerf optimises a code for them. The new run stores the
+    result, and evaluates, renders, exports and opens in the viewer like any other. With --seed instead of a scene,
+    hyp-nerf samples a new object.
     """
 
     prior: Annotated[Positional[Path], needed("PRIOR")]
@@ -28,20 +28,20 @@ class Infer:
     scene: Annotated[Positional[str | None], option("SCENE", "none, with --seed")] = None
     """A folder of photographs with poses, or procedural:NAME."""
     seed: Annotated[Seed | None, option("N")] = None
-    """Instead of a scene: draw a new object at random, another one by each number."""
+    """Sample a new object instead of a scene; each number gives another one."""
     output: Annotated[Path | None, option("RUN", "runs/SCENE-METHOD-N")] = None
     """New folder for the run."""
-    views: Annotated[Count | None, option("N", "as many as the prior looked at while it learnt")] = None
-    """Look at so many photographs, spread evenly over the cameras. Where there are no more, at all, and none is held
-    out to test by, unless the source says which are."""
-    downscale: Annotated[Downscale | None, option("N", "none, or what suits the photographs")] = None
-    """Shrink photographs by a whole number."""
+    views: Annotated[Count | None, option("N", "the prior's number in training")] = None
+    """Number of input photographs, spread evenly over the cameras. If the scene has no more, all are input, and none is
+    held out unless the source names its test photographs."""
+    downscale: Annotated[Downscale | None, option("N", "to at most about 1000 pixels")] = None
+    """Reduce photographs by this whole number; a larger one is faster and loses detail."""
     reader: ReaderOption = None
     device: Annotated[str, option("NAME")] = "auto"
-    """auto, cpu, cuda, cuda:1."""
+    """Device to compute on: auto (a GPU if there is one), cpu, cuda, cuda:1."""
 
     def run(self) -> int:
-        from ..prior import Prior
+        from ..method.prior import Prior
         from ..run import Run, check_new
         from ..run.inferred import draw
         from .outcome import next_commands
@@ -67,10 +67,10 @@ class Infer:
         from ..capture import PROCEDURAL, kind_of, open_dataset, single_image, sources_of
         from ..capture.assemble import HOLD_OUT
         from ..capture.photos import is_bare
-        from ..collection import Collection
-        from ..dataset import check_kind
+        from ..datasets.collection import Collection
+        from ..datasets.dataset import check_kind
+        from ..datasets.scene import Scene
         from ..run.inferred import infer
-        from ..scene import Scene
 
         assert self.scene is not None
         name, path = made_by.method_name, Path(self.scene).expanduser()

@@ -1,4 +1,4 @@
-"""`lumigraph info`: what a run, a folder of photographs, a mesh, a file of splats or a composition is."""
+"""`lumigraph info`: contents of a run, a folder of photographs, a mesh, a splat file or a composition."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from typing import Annotated, Any
 
 from tyro.conf import Positional
 
-from ..console import console
-from ..ranges import Downscale
+from ..files.ranges import Downscale
+from ..system.console import console
 from .common import ReaderOption, needed, option
 
 LONG = 4096  # letters; a tree cuts its lines where the console ends, and folders have long names
@@ -17,18 +17,19 @@ LONG = 4096  # letters; a tree cuts its lines where the console ends, and folder
 
 @dataclass(frozen=True)
 class Info:
-    """Say what a run, a scene, meshes, a splat file or a composition hold."""
+    """Show the contents of a run, scene, mesh, splat file or composition."""
 
     what: Annotated[Positional[str], needed("RUN_OR_SCENE")]
     """Folder of a run, of photographs or of meshes, a picture, a mesh, procedural:NAME, a splat file, a composition."""
-    downscale: Annotated[Downscale | None, option("N", "none, or what suits the photographs")] = None
-    """Shrink a scene's photographs by a whole number."""
+    downscale: Annotated[Downscale | None, option("N", "to at most about 1000 pixels")] = None
+    """Reduce a scene's photographs by this whole number before reading."""
     reader: ReaderOption = None
 
     def run(self) -> int:
         from ..capture import open_dataset
         from ..exchange import is_splat_file, read_gaussians, snerg
-        from ..run.block_run import BlockRun, is_block_run
+        from ..large import BlockRun
+        from ..run import is_block_run
         from .info_tree import (
             atlas_tree,
             blocks_tree,

@@ -1,4 +1,4 @@
-"""What a run or a scene is, as a printed tree."""
+"""Contents of a run or a scene as a printed tree."""
 
 from __future__ import annotations
 
@@ -6,23 +6,24 @@ from typing import Any
 
 from rich.tree import Tree
 
-from ..alignment import Moves
-from ..budget import Budget
-from ..choice import evenly
-from ..console import bold, dim
-from ..dataset import Dataset
+from ..datasets.alignment import Moves
+from ..datasets.dataset import Dataset
+from ..datasets.scene import Frame, Scene
+from ..datasets.shapes import Shapes
 from ..errors import LumigraphError
 from ..exchange import size_of
+from ..files.names import natural
 from ..gaussians import Gaussians
+from ..geometry.choice import evenly
+from ..large import BlockRun
 from ..metrics import scores_of
-from ..names import natural
-from ..run import BlockRun, Run
+from ..run import Run
+from ..run.budget import Budget
 from ..run.compressed import Compressed
 from ..run.converted import Converted
 from ..run.inferred import Inferred
-from ..scene import Frame, Scene
-from ..shapes import Shapes
-from ..verdict import cameras_moved
+from ..system.console import bold, dim
+from ..training.verdict import cameras_moved
 
 MEMBERS = 12  # of many shapes, that are told of one by one
 
@@ -74,8 +75,8 @@ def run_tree(run: Run) -> Tree:
 
 def blocks_tree(run: BlockRun) -> Tree:
     """A run in blocks, with a line for each."""
-    from ..blocks.planning import place_of
-    from ..blocks.watch import described, stand_of
+    from ..large.monitor import described, stand_of
+    from ..large.planning import place_of
 
     tree, plan = Tree(bold(run.folder) + f"  a run of {run.method_name} in {len(run.plan.blocks)} blocks"), run.plan
     branch(tree, "scene", {"source": plan.scene.source, **run.settings.splits, **plan.scene.options})
@@ -95,21 +96,21 @@ def blocks_tree(run: BlockRun) -> Tree:
 
 
 def opened_with(options: dict[str, Any]) -> dict[str, Any]:
-    """What photographs were opened with; of a block, how many were chosen rather than which."""
+    """Options that photographs were opened with; for a block, the number of chosen photographs."""
     part = options.get("part")
     return options if part is None else options | {"part": f"{len(part['photographs'])} photographs of a larger scene"}
 
 
 def moves_of(run: Run) -> Moves | None:
-    """How far the method has moved cameras; None where it refines none, or has not begun."""
+    """Movement of the refined cameras; `None` without pose refinement, or before training."""
     if not (run.has_state and run.settings.config.get("refine_cameras")):
         return None
     return cameras_moved(run.method("cpu"), run.cameras()["train"])
 
 
 def control_rows(run: Run) -> dict[str, str]:
-    """What each of the method's controls can be, some of which only the learnt weights tell; empty where it has none,
-    or where it cannot be opened."""
+    """Ranges or choices of the method's controls, some of which depend on the weights; empty without controls, or if
+    the method cannot be opened."""
     try:
         controls = (run.method() if run.has_state else run.new_method()).controls
     except LumigraphError:
@@ -118,7 +119,7 @@ def control_rows(run: Run) -> dict[str, str]:
 
 
 def dataset_tree(data: Dataset) -> Tree:
-    """What can be learnt from, whatever kind it is."""
+    """A dataset of any kind."""
     if isinstance(data, Scene):
         return scene_tree(data)
     return shapes_tree(data) if isinstance(data, Shapes) else collection_tree(data)

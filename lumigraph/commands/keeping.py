@@ -1,4 +1,4 @@
-"""`--box`, `--sphere`, `--clean` and what goes with them: how much of a trained scene is wanted."""
+"""`--box`, `--sphere`, `--clean` and related options: crop a trained scene and remove floaters."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal
 from tyro.conf import arg
 
 from ..errors import LumigraphError
-from ..ranges import Coordinate, Positive, Share
+from ..files.ranges import Coordinate, Positive, Share
 from .common import option
 
 Six = tuple[Coordinate, Coordinate, Coordinate, Coordinate, Coordinate, Coordinate]
@@ -18,23 +18,23 @@ Four = tuple[Coordinate, Coordinate, Coordinate, Positive]
 
 @dataclass(frozen=True)
 class Keeping:
-    """Which part of the scene is wanted, and which Gaussians are not: crop and floaters."""
+    """Crop the scene, and remove floaters from Gaussians."""
 
     box: Annotated[Six | None, arg(metavar="X0 Y0 Z0 X1 Y1 Z1", help_behavior_hint="(default: everything)")] = None
-    """Crop: only what lies between two corners."""
+    """Crop to the box between two corners."""
     sphere: Annotated[Four | None, arg(metavar="X Y Z RADIUS", help_behavior_hint="(default: everything)")] = None
-    """Crop: only what lies inside a sphere."""
+    """Crop to the inside of a sphere."""
     units: Literal["scene", "source"] = "scene"
-    """The frame of --box and --sphere: the scene's, in which `lumigraph info` tells bounds and the viewer crops, or
-    that of the photographs, in which exports lie."""
+    """Frame of --box and --sphere: scene, as in `lumigraph info` and the viewer, or source, as in the photographs and
+    exports."""
     clean: bool = False
-    """Leave out floaters, where the scene is Gaussians: faint, huge or isolated ones, as much as is safe for most."""
+    """Remove floaters from Gaussians: faint, huge or isolated ones, with limits that suit most scenes."""
     min_opacity: Annotated[Share | None, option("SHARE", "0, with --clean 0.02")] = None
-    """Leave out Gaussians that are fainter."""
+    """Remove Gaussians with a lower opacity; a larger value removes more."""
     max_scale: Annotated[Positive | None, option("SHARE", "any, with --clean 1")] = None
-    """Leave out Gaussians whose standard deviation is larger, in extents of the cloud."""
+    """Remove Gaussians with a larger standard deviation, in extents of the cloud; a smaller value removes more."""
     isolation: Annotated[Positive | None, option("DEVIATIONS", "any, with --clean 3")] = None
-    """Leave out Gaussians that are farther from their neighbours than most, by so many standard deviations."""
+    """Remove Gaussians farther from neighbours than most, in standard deviations; a smaller value removes more."""
 
     @property
     def crops(self) -> bool:
@@ -42,7 +42,7 @@ class Keeping:
 
     @property
     def floaters(self) -> Mapping[str, float]:
-        """What `cleaned` is told of floaters: the numbers that were given, with --clean the defaults of the rest."""
+        """Arguments of `cleaned` for floaters: the given numbers, with --clean the defaults of the rest."""
         from ..gaussians.cleaning import ISOLATION, MAX_SCALE, MIN_OPACITY
 
         usual = {"min_opacity": MIN_OPACITY, "max_scale": MAX_SCALE, "isolation": ISOLATION}
@@ -58,7 +58,7 @@ class Keeping:
 
     def crop(self, frame: Any) -> Any:
         """The Crop, in the scene's frame; None where there is none."""
-        from ..crop import Box, Crop, Sphere
+        from ..camera.crop import Box, Crop, Sphere
 
         crop: Crop
         if self.box is not None:
@@ -70,7 +70,7 @@ class Keeping:
         return crop if self.units == "scene" else crop.moved(frame.to_source.inverse)
 
     def unwanted(self, gaussians: Any, crop: Any) -> Any:
-        """Which Gaussians are not wanted, by the reason. Raises LumigraphError if that is all of them."""
+        """Masks of the Gaussians to remove, by reason. Raises LumigraphError if that is all of them."""
         from ..gaussians.cleaning import gone, unwanted
 
         reasons = unwanted(gaussians, crop, **self.floaters)
@@ -89,8 +89,8 @@ class Keeping:
 
     def of_method(self, method: Any) -> Any:
         """The part of a method that is wanted, ready to render. Raises LumigraphError where it can have no floaters."""
-        from ..capabilities import HasGaussians, can, needs
         from ..composition import PickedCloud, cropped
+        from ..method.capabilities import HasGaussians, can, needs
 
         crop = self.crop(method.frame)
         if self.floaters or (crop is not None and can(method, HasGaussians)):

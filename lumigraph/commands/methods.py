@@ -1,4 +1,4 @@
-"""`lumigraph methods`: what can be trained."""
+"""`lumigraph methods`: the list of methods."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from .common import show
 
 @dataclass(frozen=True)
 class Methods:
-    """List the methods that are installed."""
+    """List the installed methods."""
 
     def run(self) -> int:
         show({name: methods.summary(name) for name in methods.available()})

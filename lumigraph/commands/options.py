@@ -14,7 +14,7 @@ from tyro.conf import arg
 from tyro.constructors import ConstructorRegistry, StructConstructorSpec, StructTypeInfo
 
 from ..errors import LumigraphError
-from ..ranges import coherent, domain, outside, shown
+from ..files.ranges import coherent, domain, outside, shown
 
 RULES = ConstructorRegistry()
 beneath = False  # whether tyro is asked for what it would do without our rule

@@ -1,14 +1,14 @@
-"""What `train` and `resume` say at the end: what became of the training, what would help, and what to do next."""
+"""Report of `train` and `resume` at the end: result, advice and next commands."""
 
 from __future__ import annotations
 
 import math
 from typing import Any
 
-from ..budget import Budget
+from ..datasets.scene import Scene
 from ..method import Method, RayMethod
-from ..quality import QUALITIES
-from ..scene import Scene
+from ..method.quality import QUALITIES
+from ..run.budget import Budget
 from .common import say, show, typed
 
 TOTALS = (10.0, 30.0, 60.0, 180.0, 600.0, 1800.0, 3600.0, 7200.0)  # seconds that are suggested
@@ -21,8 +21,8 @@ NEXT = {
 
 
 def tell_outcome(run: Any, outcome: Any, method: Method, data: Any) -> None:
-    """Where a Run is after an Outcome, and how to go on."""
-    from ..verdict import cameras_moved, last_psnr, loss_trend
+    """Print the state of a Run after an Outcome, and the next commands."""
+    from ..training.verdict import cameras_moved, last_psnr, loss_trend
 
     state, budget = outcome.state, Budget.from_json(run.settings.budget)
     besides = f"{state.compile_seconds:.1f} s compiling, {outcome.saving_seconds:.1f} s saving"
@@ -50,14 +50,14 @@ def tell_outcome(run: Any, outcome: Any, method: Method, data: Any) -> None:
 
 
 def seen(passes: float, what: str) -> str:
-    """How often each photograph or pixel was learnt from, on average."""
+    """Mean number of uses of each photograph or pixel in training, as text."""
     if passes >= 1:
         return f"each {what} {passes:.{0 if passes >= 10 else 1}f} times"
     return f"one {what} in {1 / passes:.{0 if passes < 0.1 else 1}f}"
 
 
 def advice(trend: Any, enough: bool, more: str, photographed: bool) -> str:
-    """What would help most, in one sentence.
+    """Advice in one sentence: more time or more photographs.
 
     trend:  of the loss, see `verdict.loss_trend`
     enough: whether there were as many steps as a draft has
@@ -76,7 +76,7 @@ def advice(trend: Any, enough: bool, more: str, photographed: bool) -> str:
 
 
 def photographed(run: Any, data: Any) -> bool:
-    """Whether a run learnt from photographs of a place, to which some could be added."""
+    """True if a run learnt from photographs of a place, to which some could be added."""
     return run.photographed and len(data.splits["train"]) > 1 and not data.source.startswith("procedural:")
 
 
@@ -95,7 +95,7 @@ def more_time(folder: Any, budget: Budget) -> str:
 
 
 def next_commands(run: Any, *but: str) -> dict[str, str]:
-    """What to type next, with the run's own path. but: commands to leave out."""
+    """Next commands, with the run's own path. but: commands to leave out."""
     page = run.folder / f"{run.title}.html"
     commands = {"eval": typed("eval", run.folder), "view": typed("view", run.folder)}
     commands["export"] = typed("export", "web", run.folder, page)

@@ -1,4 +1,4 @@
-"""`lumigraph render`: films of a trained scene. No photographs are needed."""
+"""`lumigraph render`: render films of a trained scene. No photographs are needed."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from typing import Annotated, Any, Literal
 from tyro.conf import Positional
 
 from ..errors import LumigraphError
-from ..ranges import Count, FramesPerSecond, Pixels
+from ..files.ranges import Count, FramesPerSecond, Pixels
 from .common import Overwrite, needed, option, show
 from .controls import Animate, Set, animate, open_method
 
-# As `paths.film` has them, which help does not wait for.
+# As in `paths.film`, which help must not import.
 PATHS = ("orbit", "sweep", "spiral", "interpolate", "held-out")
 LONGEST, AUTO = 480, "auto"
 CHOSEN = {
@@ -24,33 +24,33 @@ CHOSEN = {
 
 @dataclass(frozen=True)
 class Render:
-    """Fly a camera through a run, a splat file or a composition: colour and depth, as films and as pictures.
+    """Render a film of a run, a splat file or a composition: colour and depth, as videos and as pictures.
 
-    Paths keep to where the photographs were taken from. orbit goes round (or to and fro), sweep makes an oval among
-    cameras that look the same way, as from a drone; auto is one of these two. spiral goes twice round while rising,
-    interpolate passes smoothly through photographs' places, held-out visits the test photographs' own cameras.
-    A path of your own is a JSON file: keyframes saved in the viewer, or what lies beside a film of the same capture.
+    Paths stay near the positions of the photographs. orbit goes round (or to and fro). sweep is an oval among cameras
+    that look the same way, as from a drone. auto is one of these two. spiral goes twice round while rising, interpolate
+    passes smoothly through the photographs' cameras, held-out visits the test photographs' own cameras. A path of your
+    own is a JSON file: keyframes saved in the viewer, or the JSON beside a film of the same capture.
     """
 
     source: Annotated[Positional[Path], needed("RUN_OR_FILE")]
     """Folder of the run, a splat file (.ply, .spz, .sog, .glb, .splat), or a composition (.json)."""
     path: Annotated[str, option("{" + ",".join((AUTO, *PATHS)) + ",FILE.json}")] = AUTO
-    """Where the camera goes."""
-    frames: Annotated[Count | None, option("N", "120; every held-out view; as long as keyframes say")] = None
-    """Length in frames."""
-    fps: Annotated[FramesPerSecond | None, option("N", "30, or what the path's file says")] = None
-    """Frames per second."""
+    """Camera path: the name of one, or a JSON file."""
+    frames: Annotated[Count | None, option("N", "120; for held-out every view; for keyframes by their seconds")] = None
+    """Number of frames; more make a longer film."""
+    fps: Annotated[FramesPerSecond | None, option("N", "30, or that of the path's file")] = None
+    """Frames per second of the film."""
     size: Annotated[Pixels | None, option("PIXELS", f"that of the photographs, at most {LONGEST}")] = None
-    """Longer side of the picture."""
+    """Longer side of the picture in pixels; larger renders slower."""
     output: Annotated[Path | None, option("FILE", "RUN/renders/PATH.mp4, or renders/FILE/PATH.mp4")] = None
-    """The film: .mp4, .gif or .webp. Depth (FILE-depth), FILE.json and the folder FILE of pictures go beside it."""
+    """The film: .mp4, .gif or .webp. Depth (FILE-depth), FILE.json and the folder FILE of pictures are beside it."""
     format: Annotated[Literal["png", "exr"], option("{png,exr}")] = "png"
-    """Of the pictures beside the film. exr: their linear light too, FILE/0000.exr, with all its range."""
+    """Format of the pictures beside the film. exr adds linear light with its full range, FILE/0000.exr."""
     overwrite: Overwrite = False
     told: Set = ()
     animated: Animate = ()
     device: Annotated[str, option("NAME")] = "auto"
-    """auto, cpu, cuda, cuda:1."""
+    """Device to compute on: auto (a GPU if there is one), cpu, cuda, cuda:1."""
 
     def run(self) -> int:
         from ..export.film import claim_film, film

@@ -1,4 +1,4 @@
-"""`lumigraph report`: a run on one page."""
+"""`lumigraph report`: write a report of a run."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from .common import Overwrite, needed, show
 
 @dataclass(frozen=True)
 class Report:
-    """Put everything about a run into one self-contained page, RUN/report.html.
+    """Write everything about a run into one self-contained page, RUN/report.html.
 
-    Curves, settings and timings are always there; the contact sheet once `eval` has run, a film once `render` has.
+    It always has curves, settings and timings; it has the contact sheet after `eval`, and a film after `render`.
     """
 
     run_folder: Annotated[Positional[Path], needed("RUN")]
@@ -23,9 +23,9 @@ class Report:
     overwrite: Overwrite = False
 
     def run(self) -> int:
-        from ..progress import counting
-        from ..report import claim_report, write_report
+        from ..evaluation.report import claim_report, write_report
         from ..run import Run
+        from ..system.progress import counting
 
         run = Run(self.run_folder)
         claim_report(run, self.overwrite)

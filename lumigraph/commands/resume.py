@@ -1,4 +1,4 @@
-"""`lumigraph resume`: training goes on where it stopped."""
+"""`lumigraph resume`: continue training."""
 
 from __future__ import annotations
 
@@ -8,45 +8,44 @@ from typing import Annotated, Any
 
 from tyro.conf import Positional
 
-from ..budget import Budget
 from ..errors import LumigraphError
-from ..quality import Quality
-from ..ranges import Port, Seconds, Steps
+from ..files.ranges import Port, Seconds, Steps
+from ..method.quality import Quality
+from ..run.budget import Budget
 from .common import choose_device, exit_code, needed, option, quality_budget, told_budget, typed
 
 
 @dataclass(frozen=True)
 class Resume:
-    """Go on with a run that was interrupted, exactly as if it had not been; or give it a larger budget.
+    """Continue an interrupted run as if it had not been interrupted, or extend a run with a larger budget.
 
-    A run that is done may get a larger budget too. Its schedules then follow the new total: learning rates rise again
-    and fall anew, and clouds may grow; what is coarse at the beginning of a run is not repeated.
+    A finished run may get a larger budget too. Its schedules then follow the new total: learning rates rise again and
+    decay again, and clouds may grow; coarse stages at the beginning of a run are not repeated.
     """
 
     run_folder: Annotated[Positional[Path], needed("RUN")]
     """Folder of the run."""
-    seconds: Annotated[Seconds | None, option("S", "as begun")] = None
-    """New total of seconds, those already trained included."""
-    steps: Annotated[Steps | None, option("N", "as begun")] = None
-    """New total of steps, those already done included."""
-    quality: Annotated[Quality | None, option("draft|good|best", "as begun")] = None
+    seconds: Annotated[Seconds | None, option("S", "unchanged")] = None
+    """New total training time in seconds, including the time already trained."""
+    steps: Annotated[Steps | None, option("N", "unchanged")] = None
+    """New total of steps, including the steps already done."""
+    quality: Annotated[Quality | None, option("draft|good|best", "unchanged")] = None
     """New total of steps, as for `lumigraph train`."""
-    scene: Annotated[str | None, option("SCENE", "where they were")] = None
-    """Where what it learns from is now, if it has moved."""
-    device: Annotated[str, option("NAME", "the one it began on")] = "same"
-    """auto, cpu, cuda, cuda:1."""
+    scene: Annotated[str | None, option("SCENE", "the path used in training")] = None
+    """Path of the training data, if it was moved since training."""
+    device: Annotated[str, option("NAME", "the one of its training")] = "same"
+    """Device to compute on: auto (a GPU if there is one), cpu, cuda, cuda:1."""
     pause_at: Annotated[Steps | None, option("STEP", "never")] = None
-    """Stop at this step as if interrupted."""
+    """Stop at this step as if interrupted. The schedule still follows the whole budget."""
     view: bool = False
-    """Show the scene in the browser while it is learnt, and afterwards until Ctrl-C."""
-    host: Annotated[str, option("ADDRESS", "127.0.0.1, this machine alone")] = "127.0.0.1"
-    """Where --view listens; 0.0.0.0 lets other machines look too."""
-    port: Annotated[Port | None, option("N", "8080, or the next that is free")] = None
+    """Show the scene in the browser during training, and afterwards until Ctrl-C."""
+    host: Annotated[str, option("ADDRESS", "127.0.0.1, this machine only")] = "127.0.0.1"
+    """Address that --view listens at; 0.0.0.0 gives access to other machines."""
+    port: Annotated[Port | None, option("N", "8080, or the next free port")] = None
     """Port that --view listens at."""
 
     def run(self) -> int:
-        from ..run import Run
-        from ..run.block_run import is_block_run
+        from ..run import Run, is_block_run
 
         if is_block_run(self.run_folder):
             raise LumigraphError(
@@ -59,7 +58,7 @@ class Resume:
 
     def _go_on(self, run: Any) -> int:
         from ..run.inferred import Inferred
-        from ..train import fit
+        from ..training import fit
         from .outcome import tell_outcome
         from .view import keep_showing, watching
 
@@ -87,7 +86,7 @@ class Resume:
 
 
 def budget_from_now(run: Any, told: Budget | None) -> Budget:
-    """The run's own budget, or another total that it was told. Raises LumigraphError where nothing is left of it."""
+    """The run's own budget, or another given total. Raises LumigraphError if nothing is left of it."""
     said = run.settings.budget
     budget = told or Budget.from_json(said)
     if not run.has_state:

@@ -1,104 +1,108 @@
-"""`lumigraph train`: photographs, or whatever else a method learns from, become a trained method."""
+"""`lumigraph train`: train a method on photographs or other data."""
 
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from tyro.conf import Fixed, OmitArgPrefixes, Positional, Suppress
 
 from .. import methods
-from ..budget import Budget
-from ..quality import Quality
-from ..ranges import Count, Downscale, Port, Scales, Seconds, Seed, Steps
+from ..files.ranges import Count, Downscale, Port, Scales, Seconds, Seed, Steps
+from ..method.quality import Quality
+from ..run.budget import Budget
 from .capture import posed
 from .common import (
     ReaderOption,
     about_quality,
     choose_device,
     exit_code,
+    method_config,
     needed,
     next_free,
     option,
+    option_group,
+    preset_device,
     quality_budget,
     scene_name,
     told_budget,
+    value_of,
 )
+from .train_blocks import Blocks
 
 DEFAULT_SECONDS = 60.0
 
 
 @dataclasses.dataclass(frozen=True)
 class Train:
-    """Learn a scene from its photographs.
+    """Train a method on the photographs of a scene.
 
     The scene is a folder of photographs, a video, a single picture, or procedural:NAME. Methods that learn from shapes
-    take a mesh or a folder of meshes, those that learn from a collection a folder of scenes, or procedural:toys. Where
+    take a mesh or a folder of meshes, those that learn from a collection a folder of scenes, or procedural:toys. If
     photographs have no poses, `lumigraph capture` finds them first. `lumigraph train METHOD --help` adds the method's
-    own options, `lumigraph methods` lists the methods. Ctrl-C saves; `lumigraph resume` goes on.
+    own options, `lumigraph methods` lists the methods. Ctrl-C saves; `lumigraph resume` continues.
     """
 
     method: Annotated[Positional[str], needed("METHOD")]
-    """What to train, for example instant-ngp."""
+    """Method to train, for example instant-ngp."""
     scene: Annotated[Positional[str], needed("SCENE")]
-    """What to train it on."""
+    """Photographs, a video, or other data to train on."""
     output: Annotated[Path | None, option("RUN", "runs/SCENE-METHOD-N")] = None
     """New folder for the run."""
     seconds: Annotated[Seconds | None, option("S", f"{DEFAULT_SECONDS:.0f}")] = None
-    """Train for so long. Compiling kernels on first use comes before and is reported beside."""
+    """Training time in seconds; longer gives a higher PSNR. Compiling kernels on first use is not counted."""
     steps: Annotated[Steps | None, option("N", "as long as --seconds")] = None
-    """Train for so many steps instead."""
+    """Train for this number of steps instead."""
     quality: Annotated[Quality | None, option("draft|good|best", "as long as --seconds", about_quality())] = None
-    downscale: Annotated[Downscale | None, option("N", "none, or what suits the photographs")] = None
-    """Shrink photographs by a whole number."""
+    downscale: Annotated[Downscale | None, option("N", "to at most about 1000 pixels")] = None
+    """Reduce photographs by this whole number; a larger one trains faster and loses detail."""
     reader: ReaderOption = None
     views: Annotated[Count | None, option("N", "all")] = None
-    """Learn from so many photographs only, spread evenly over the cameras."""
+    """Train on only this number of photographs, spread evenly over the cameras."""
     scales: Annotated[Scales, option("N")] = 1
-    """Have every photograph so many times, each half as large as the one before; evaluation counts them all."""
+    """Number of resolutions of every photograph, each half of the one before; evaluation averages over all."""
     seed: Annotated[Seed, option("N")] = 0
-    """Of all random choices."""
+    """Seed of all random choices."""
     device: Annotated[str, option("NAME")] = "auto"
-    """auto, cpu, cuda, cuda:1."""
+    """Device to compute on: auto (a GPU if there is one), cpu, cuda, cuda:1."""
     preset: Literal["auto", "laptop", "paper"] = "auto"
-    """The method's own defaults: the paper's, or what learns most on a plain CPU; auto looks at --device."""
+    """Defaults of the method's options: the paper's, or those tuned for a CPU; auto decides by --device."""
     pause_at: Annotated[Steps | None, option("STEP", "never")] = None
     """Stop at this step as if interrupted. The schedule still follows the whole budget."""
     view: bool = False
-    """Show the scene in the browser while it is learnt, and afterwards until Ctrl-C."""
-    host: Annotated[str, option("ADDRESS", "127.0.0.1, this machine alone")] = "127.0.0.1"
-    """Where --view listens; 0.0.0.0 lets other machines look too."""
-    port: Annotated[Port | None, option("N", "8080, or the next that is free")] = None
+    """Show the scene in the browser during training, and afterwards until Ctrl-C."""
+    host: Annotated[str, option("ADDRESS", "127.0.0.1, this machine only")] = "127.0.0.1"
+    """Address that --view listens at; 0.0.0.0 gives access to other machines."""
+    port: Annotated[Port | None, option("N", "8080, or the next free port")] = None
     """Port that --view listens at."""
 
     def run(self) -> int:
         from ..capture import confirm, kind_of, open_dataset
-        from ..dataset import check_kind
+        from ..datasets.dataset import check_kind
         from ..run import Run, build, check_new
-        from ..train import fit
+        from ..training import fit
         from .outcome import tell_outcome
         from .view import keep_showing, watching
 
+        blocks: Blocks | None = getattr(self, "blocks", None)
+        if blocks is not None and (code := blocks.run(self)) is not None:
+            return code
         budget = told_budget(self.steps, self.seconds, self.quality)
         kind, device = methods.find(self.method), choose_device(self.device)
         if self.output is not None:
             check_new(self.output)
         found = kind_of(self.scene, kind.learns_from)
         if found is not kind.learns_from:
-            confirm(self.scene)  # what is not there is of no kind
+            confirm(self.scene)  # a missing path has no kind
         check_kind(methods.check(self.method), kind.learns_from, found, self.scene, methods.learning_from(found))
         source = posed(self.scene)
         output = self.output or next_free(f"runs/{scene_name(source)}-{methods.check(self.method)}")
         check_new(output)
-        options: dict[str, Any] = {
-            "downscale": self.downscale,
-            "reader": self.reader,
-            "views": self.views,
-            "scales": self.scales,
-        }
+        options: dict[str, Any] = {name: getattr(self, name) for name in ("downscale", "reader", "views", "scales")}
         data = open_dataset(source, kind.learns_from, **options)
-        config = self.method_config(kind)
+        config = method_config(self, self.method)
         seed = getattr(config, "seed", self.seed)
         method = build(kind, data.frame, config, device, seed, learning=True)
         if budget is None:
@@ -112,35 +116,30 @@ class Train:
             keep_showing(watch, outcome.signal)
         return exit_code(outcome.signal)
 
-    def method_config(self, kind: Any) -> Any:
-        """The method's Config, which the command line adds as another field; see `with_options_of`."""
-        return getattr(self, option_group(self.method), None) or kind.preset(preset_device(self.device, self.preset))
 
-
-def option_group(name: str) -> str:
-    """The field that holds a method's own numbers; help shows its name above them."""
-    return methods.check(name).replace("-", "_")
-
-
-def with_options_of(name: str, device: str, preset: str, command: type = Train) -> type[Any]:
-    """A command, `train` or one like it, with a method's own numbers among its options."""
+def with_options_of(name: str, arguments: Sequence[str], command: type = Train) -> type[Any]:
+    """A command, `train` or one like it, with a method's own numbers among its options. Where the method is trained in
+    blocks, `train` has the options of `Blocks` too, and the numbers of the method that --field names for each block."""
+    in_blocks = command is Train and methods.find(name).in_blocks
+    if in_blocks and (field := value_of("--field", arguments, "").replace("_", "-")) in methods.available():
+        name = field
     kind = methods.find(name)
-    default = kind.preset(preset_device(device, preset))
-    extra: list[Any] = [
-        (option_group(name), Annotated[kind.Config, OmitArgPrefixes], dataclasses.field(default=default))
-    ]
-    for common in dataclasses.fields(command):  # where a method has a number of that name, it is the one to ask for
-        if common.name in {field.name for field in dataclasses.fields(kind.Config)}:
-            extra.append((common.name, Annotated[Any, Fixed, Suppress], dataclasses.field(default=common.default)))
+    device, preset = value_of("--device", arguments, "auto"), value_of("--preset", arguments, "auto")
     asked = option("draft|good|best", "as long as --seconds", about_quality(kind))
-    extra.append(("quality", Annotated[Quality | None, asked], dataclasses.field(default=None)))
-    made = dataclasses.make_dataclass(command.__name__, extra, bases=(command,), frozen=True)
-    made.__doc__ = command.__doc__
+    extra: dict[str, tuple[Any, Any]] = {"quality": (Annotated[Quality | None, asked], None)}
+    if in_blocks:
+        blocks = derived(Blocks, kind.Config, {})
+        extra["blocks"] = Annotated[blocks, OmitArgPrefixes], blocks()
+    extra[option_group(name)] = Annotated[kind.Config, OmitArgPrefixes], kind.preset(preset_device(device, preset))
+    return derived(command, kind.Config, extra)
+
+
+def derived(base: type, config: type, extra: dict[str, tuple[Any, Any]]) -> type[Any]:
+    """A dataclass of options with further ones, annotation and default by name. Options that a method's Config has too
+    are hidden, for the Config's are asked for."""
+    names = {x.name for x in dataclasses.fields(config)}
+    hidden = {x.name: (Annotated[Any, Fixed, Suppress], x.default) for x in dataclasses.fields(base) if x.name in names}
+    options = [(name, kind, dataclasses.field(default=default)) for name, (kind, default) in (hidden | extra).items()]
+    made = dataclasses.make_dataclass(base.__name__, options, bases=(base,), frozen=True)
+    made.__doc__ = base.__doc__
     return made
-
-
-def preset_device(device: str, preset: str) -> Any:
-    """The kind of machine whose defaults are wanted; it need not be here."""
-    import torch
-
-    return choose_device(device) if preset == "auto" else torch.device("cuda" if preset == "paper" else "cpu")

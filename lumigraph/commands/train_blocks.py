@@ -1,4 +1,5 @@
-"""`lumigraph train block-nerf`: a scene too large for one field becomes many, here or on the machines of a cluster."""
+"""`lumigraph train` of a large scene in blocks: options of methods that divide one, and training of all its blocks, on
+this machine or on a cluster."""
 
 from __future__ import annotations
 
@@ -11,93 +12,98 @@ from tyro.conf import arg
 
 from .. import methods
 from ..errors import LumigraphError
-from ..names import counted
-from ..ranges import Count
+from ..files.names import counted
+from ..files.ranges import Count
 from .capture import posed
-from .common import choose_device, exit_code, next_free, option, say, scene_name, show, told_budget, typed
-from .train import Train, option_group, preset_device, with_options_of
+from .common import (
+    choose_device,
+    exit_code,
+    method_config,
+    next_free,
+    option,
+    say,
+    scene_name,
+    show,
+    told_budget,
+    typed,
+)
 
-IN_BLOCKS = "block-nerf"
 MEMORY = 2 << 30  # bytes that a block asks of its machine
+OPTIONS = "downscale", "reader", "scales"  # of `open_dataset`, for the whole scene
 
 
 @dataclass(frozen=True)
-class TrainBlocks(Train):
-    """Learn a large scene in blocks, each a run of its own; from few photographs one block, an ordinary run.
+class Blocks:
+    """A large scene is trained in blocks, each a run of its own; from few photographs one block, an ordinary run.
 
-    --steps and --seconds are for all blocks together and shared out evenly; a minute each, if nothing is said. What is
-    done stays done: after Ctrl-C, a crash or a lost machine the same command goes on. RUN/blocks.png shows the plan.
-    `eval`, `render`, `view` and `export` open the run as one scene. --field METHOD, such as gaussian-splatting, has
-    each block learnt by another method; of clouds each block then gives its own cell to one file, RUN/cloud.ply.
+    --steps and --seconds are for all blocks together and divided evenly; the default is a minute for each block. After
+    Ctrl-C, a crash or a lost machine the same command continues; finished blocks are kept. RUN/blocks.png shows the
+    plan. `eval`, `render`, `view` and `export` open the run as one scene. --field METHOD, such as gaussian-splatting,
+    trains each block with another method; for clouds, RUN/cloud.ply joins each block's own cell.
     """
 
     blocks: Annotated[str | None, option("auto|N|FILE", "auto from 200 photographs on, else one block")] = None
-    """Where blocks are: at street crossings or spread evenly, so many of them, or as a JSON file says, in the frame of
-    the photographs: {"blocks": [{"centre": [x, y, z], "radius": r}, ...]}. With --into, a block's name."""
+    """Positions of blocks: auto (street crossings, or evenly spread), a number of evenly spread ones, or a JSON file in
+    the frame of the photographs: {"blocks": [{"centre": [x, y, z], "radius": r}, ...]}. With --into, a block's name."""
     workers: Annotated[Count | None, option("N", "1, in this process")] = None
-    """Learn so many blocks at a time on this machine, by Ray."""
+    """Number of blocks to train at a time on this machine, with Ray."""
     address: Annotated[str | None, option("HOST:PORT", "this machine")] = None
-    """Learn blocks on a Ray cluster that is there already; --output lies on storage that all its machines share."""
+    """Train blocks on an existing Ray cluster; --output must be on storage that all its machines share."""
     into: Annotated[Path | None, option("RUN", "a new run")] = None
     """Learn one block of this run again, from other photographs, as the run's own were learnt; the rest stays."""
+    field: Annotated[str, arg(metavar="METHOD", help="The method that learns each block.")] = ""
 
-    def run(self) -> int:
+    def run(self, train: Any) -> int | None:
+        """Train all blocks of a scene. Returns the exit code; None for a scene that `train` learns as a whole.
+
+        train: the command's other options, a `Train`
+        """
         from ..capture import kind_of
-        from ..scene import Scene
+        from ..datasets.scene import Scene
+        from ..large.layout import LARGE
+        from ..large.planning import survey
 
         if self.into is not None:
-            return self._again(self.into)
-        told = [name for name in ("view", "pause_at", "views") if getattr(self, name)]
-        source = posed(self.scene)
-        if kind_of(source, Scene) is not Scene or Path(source).is_file():  # of a single picture
-            return super().run()
-        if self.blocks == "1" and self._own:
-            return super().run()
-        from ..blocks.layout import LARGE
-        from ..blocks.planning import survey
+            return self._again(train, self.into)
+        source, other = posed(train.scene), bool(self.field)
+        if kind_of(source, Scene) is not Scene or Path(source).is_file() or (self.blocks == "1" and not other):
+            return None  # a file is a single picture
+        places = survey(source, train.reader)
+        few = places.splits.count("train") < LARGE
+        if few and not other and (self.blocks, self.workers, self.address) == (None, None, None):
+            return None
+        for name in ("view", "pause_at", "views"):
+            if getattr(train, name):
+                raise LumigraphError(f"--{name.replace('_', '-')} is for one block; leave it out, or give --blocks 1")
+        return self._all(train, source, places)
 
-        places = survey(source, self.reader)
-        many = places.splits.count("train") >= LARGE
-        if self.blocks is None and not many and self._own and (self.workers, self.address) == (None, None):
-            return super().run()
-        if told:
-            raise LumigraphError(f"--{told[0].replace('_', '-')} is for one block; leave it out, or give --blocks 1")
-        return self._all(source, places)
+    def _all(self, train: Any, source: str, places: Any) -> int:
+        import torch
 
-    @property
-    def _field(self) -> str:
-        """The method of each block."""
-        return IN_BLOCKS
+        from ..large.on_ray import Workers
+        from ..large.planning import Recipe, begin, make_plan
+        from ..large.training import conduct, finish
+        from ..system.memory import free_memory
 
-    @property
-    def _own(self) -> bool:
-        return self._field == IN_BLOCKS
-
-    def _all(self, source: str, places: Any) -> int:
-        from ..blocks.conduct import conduct
-        from ..blocks.finishing import finish
-        from ..blocks.planning import begin, make_plan
-        from ..blocks.workers import Workers
-        from ..memory import free_memory
-
-        budget = told_budget(self.steps, self.seconds, self.quality)
-        kind, device = methods.find(self._field), self._device()
-        options = {"downscale": self.downscale, "reader": self.reader, "scales": self.scales}
-        config = getattr(self, option_group(self._field), None) or kind.preset(preset_device(self.device, self.preset))
-        seed = getattr(config, "seed", self.seed)
-        wish = self.blocks or "auto"
-        plan = make_plan(
-            source, places, wish, kind, config, options, budget, self.quality, seed, device, self.address is None
-        )
-        output = self.output or unfinished(f"runs/{scene_name(source)}-{IN_BLOCKS}", plan)
+        here = self.address is None
+        budget = told_budget(train.steps, train.seconds, train.quality)
+        if here or train.device == "auto":
+            device = choose_device(train.device)
+        else:  # of the cluster's machines
+            device = torch.device("cuda" if train.device == "gpu" else train.device)
+        method = methods.check(self.field or train.method)
+        config = method_config(train, method)
+        seed = getattr(config, "seed", train.seed)
+        options = {name: getattr(train, name) for name in OPTIONS}
+        recipe = Recipe(method, config, options, budget, train.quality, seed, str(device), here)
+        plan = make_plan(source, places, self.blocks or "auto", recipe)
+        output = train.output or unfinished(f"runs/{scene_name(source)}-{methods.check(train.method)}", plan)
         cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
         cpus = max(1, cores // self.workers) if self.workers else 1
-        shared_out = self.workers is not None or self.address is not None
-        plan = begin(output, plan, places, cpus if shared_out else None)
+        plan = begin(output, plan, places, None if here and self.workers is None else cpus)
         tell_plan(output, plan, budget)
         gpus = 1.0 if device.type == "cuda" else 0.0
-        here = self.address is None and self.workers is not None
-        memory = min(MEMORY, free_memory() // (2 * (self.workers or 1))) if here else MEMORY
+        memory = min(MEMORY, free_memory() // (2 * self.workers)) if here and self.workers else MEMORY
         found = conduct(output, plan, Workers(self.workers, self.address, cpus, gpus, memory))
         if found.signal is not None:
             say(f"Stopped and saved, {len(found.done)} of {len(plan.blocks)} blocks done; the same command goes on")
@@ -112,24 +118,15 @@ class TrainBlocks(Train):
         tell_done(output, found)
         return 0
 
-    def _device(self) -> Any:
-        """Where blocks learn: of this machine, or as --device says of the cluster's."""
-        import torch
-
-        if self.address is None or self.device == "auto":
-            return choose_device(self.device)
-        return torch.device("cuda" if self.device == "gpu" else self.device)
-
-    def _again(self, run: Path) -> int:
-        from ..blocks.planning import survey
-        from ..blocks.update import update
+    def _again(self, train: Any, run: Path) -> int:
+        from ..large.planning import survey
+        from ..large.update import update
 
         if self.blocks is None or not self.blocks.isdigit():
             raise LumigraphError("--into needs the name of the block to learn again; give it as --blocks 3")
-        source = posed(self.scene)
-        options = {"downscale": self.downscale, "reader": self.reader, "scales": self.scales}
-        budget = told_budget(self.steps, self.seconds, self.quality)
-        ended = update(run, self.blocks, source, survey(source, self.reader), options, budget)
+        source, budget = posed(train.scene), told_budget(train.steps, train.seconds, train.quality)
+        options = {name: getattr(train, name) for name in OPTIONS}
+        ended = update(run, self.blocks, source, survey(source, train.reader), options, budget)
         if ended.done is None:
             say("Stopped and saved; the same command goes on")
             return exit_code(ended.signal)
@@ -138,35 +135,10 @@ class TrainBlocks(Train):
         return 0
 
 
-@dataclass(frozen=True)
-class TrainOthers(TrainBlocks):
-    """As TrainBlocks, with blocks of another method."""
-
-    field: Annotated[str, arg(metavar="METHOD", help="The method that learns each block.")] = ""
-
-    @property
-    def _field(self) -> str:
-        return methods.check(self.field)
-
-
-TrainOthers.__doc__ = TrainBlocks.__doc__
-
-
-def with_options_of_blocks(field: str, device: str, preset: str) -> type[Any]:
-    """The command, with the numbers of what learns each block among its options.
-
-    field: what --field says: another method, or else a kind of Block-NeRF's own
-    """
-    name = field.replace("_", "-")
-    if name in methods.available():
-        return with_options_of(name, device, preset, TrainOthers)
-    return with_options_of(IN_BLOCKS, device, preset, TrainBlocks)
-
-
 def unfinished(prefix: str, plan: Any) -> Path:
     """The latest run of this name, if it is the same and not done; else the next name that is free."""
-    from ..blocks.planning import difference, place_of
-    from ..run.block_plan import DONE, NAME, Plan
+    from ..large.plan import DONE, NAME, Plan
+    from ..large.planning import difference, place_of
 
     free = next_free(prefix)
     number = int(free.name.rpartition("-")[2])
@@ -178,7 +150,7 @@ def unfinished(prefix: str, plan: Any) -> Path:
 
 
 def tell_plan(output: Path, plan: Any, budget: Any) -> None:
-    """What is about to be learnt."""
+    """Print the plan before training."""
     counts = [len(block.photographs) for block in plan.blocks]
     each = " ".join(
         f"{value:g} {name}" if name != "quality" else f"as {value} asks" for name, value in plan.budget.items()
@@ -190,7 +162,7 @@ def tell_plan(output: Path, plan: Any, budget: Any) -> None:
 
 
 def tell_done(output: Path, found: Any) -> None:
-    """What it took."""
+    """Print the cost of all blocks."""
     done = list(found.done.values())
     rows = {"run": str(output), "blocks": f"{len(done)}, {sum(x.bytes for x in done) / 1e6:.1f} MB of weights"}
     steps, seconds = sum(x.steps for x in done), sum(x.seconds for x in done)
@@ -202,8 +174,7 @@ def tell_done(output: Path, found: Any) -> None:
 
 def onward(run: Path, source: str | None = None) -> dict[str, str]:
     """What to type next."""
+    from .outcome import NEXT
+
     again = ["--scene", source] if source else []
-    return {
-        "compare with what it has not seen": typed("eval", run, *again),
-        "look at it in the browser": typed("view", run),
-    }
+    return {NEXT["eval"]: typed("eval", run, *again), NEXT["view"]: typed("view", run)}

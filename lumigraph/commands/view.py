@@ -1,4 +1,4 @@
-"""`lumigraph view`: a trained scene in the browser."""
+"""`lumigraph view`: show a trained scene in the browser."""
 
 from __future__ import annotations
 
@@ -12,29 +12,29 @@ from typing import Annotated, Any
 from tyro.conf import Positional
 
 from ..errors import LumigraphError
-from ..ranges import Port
-from ..signals import until_interrupted
+from ..files.ranges import Port
+from ..system.signals import until_interrupted
 from .common import needed, option, show
 from .controls import Set, open_method
 
 
 @dataclass(frozen=True)
 class ViewCommand:
-    """Look at a run, a splat file or a composition in the browser: fly, orbit, crop, and set paths for films.
+    """Show a run, a splat file or a composition in the browser: fly, orbit, crop, and make paths for films.
 
-    Gaussians are drawn by the browser, everything else here. Ctrl-C ends it. `lumigraph train --view` shows a scene
-    while it is learnt.
+    The browser draws Gaussians; this machine renders everything else. Ctrl-C ends it. `lumigraph train --view` shows a
+    scene during training.
     """
 
     source: Annotated[Positional[Path], needed("RUN_OR_FILE")]
     """Folder of the run, a splat file (.ply, .spz, .sog, .glb, .splat), or a composition (.json)."""
-    host: Annotated[str, option("ADDRESS", "127.0.0.1, this machine alone")] = "127.0.0.1"
-    """Where to listen; 0.0.0.0 lets other machines look too."""
-    port: Annotated[Port | None, option("N", "8080, or the next that is free")] = None
+    host: Annotated[str, option("ADDRESS", "127.0.0.1, this machine only")] = "127.0.0.1"
+    """Address to listen at; 0.0.0.0 gives access to other machines."""
+    port: Annotated[Port | None, option("N", "8080, or the next free port")] = None
     """Port to listen at."""
     told: Set = ()
     device: Annotated[str, option("NAME")] = "auto"
-    """auto, cpu, cuda, cuda:1."""
+    """Device to compute on: auto (a GPU if there is one), cpu, cuda, cuda:1."""
 
     def run(self) -> int:
         from ..viewer import Viewer, choose_address
@@ -49,7 +49,7 @@ class ViewCommand:
 
 
 def page_of(opened: Any, method: Any, cameras: Any) -> Any:
-    """What makes a page that draws a baked method in the browser; None for any other, and while it is not baked yet."""
+    """A function that makes the page of a baked method; `None` for any other method, and before it is baked."""
     from .exports.volumes import browsable, is_baked
 
     if not is_baked(method):
@@ -68,11 +68,11 @@ def page_of(opened: Any, method: Any, cameras: Any) -> Any:
 
 
 def subject_of(opened: Any, cameras: Any = None, finished: bool = True, page: Any = None) -> Any:
-    """Something Opened, as the viewer wants it.
+    """The viewer's Subject for an Opened run or file.
 
-    cameras:  by split, where the method sees them otherwise
-    finished: whether what is opened is what is shown, so that part of it can be saved
-    page:     makes a page on which the browser draws it, where it can
+    cameras:  by split, if the method has refined them
+    finished: False during training, when no part of it can be saved
+    page:     function that makes a page on which the browser draws it, if possible
     """
     from ..viewer import Subject
 
@@ -90,11 +90,11 @@ def subject_of(opened: Any, cameras: Any = None, finished: bool = True, page: An
 
 
 def saver(opened: Any) -> Any:
-    """What saves a part of a cloud of Gaussians beside it, as `lumigraph clean` does: a splat file or a new run."""
+    """A function that saves a part of a cloud of Gaussians, as `lumigraph clean` does: a splat file or a new run."""
 
     def save(name: str, crop: Any, floaters: Mapping[str, float]) -> str:
-        from ..capabilities import HasGaussians, needs
         from ..gaussians.cleaning import gone, unwanted
+        from ..method.capabilities import HasGaussians, needs
         from ..run.picking import save_picked
 
         output = opened.path.parent / name
@@ -112,7 +112,7 @@ def saver(opened: Any) -> Any:
 
 @contextlib.contextmanager
 def watching(wanted: bool, method: Any, data: Any, run: Any, host: str, port: int | None) -> Iterator[Any]:
-    """A Viewer for `fit(..., watch=...)` while it trains a run; None if nobody wants to look."""
+    """A Viewer for `fit(..., watch=...)` while it trains a run; `None` without --view."""
     if not wanted:
         yield None
         return
@@ -129,7 +129,7 @@ def watching(wanted: bool, method: Any, data: Any, run: Any, host: str, port: in
 
 
 def keep_showing(viewer: Any, signal: int | None) -> None:
-    """After training: go on until Ctrl-C, unless that is what ended it."""
+    """Serve the viewer after training until Ctrl-C, unless Ctrl-C ended the training."""
     if viewer is not None and signal is None:
         viewer.end_training()
         with until_interrupted():

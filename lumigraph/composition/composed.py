@@ -17,13 +17,13 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from ..camera import Camera
-from ..capabilities import HasDensity, HasGaussians, HasLooks, can
-from ..controls import Control, Value
+from ..camera.rays import Look, Rays, Rendering, Samples
+from ..datasets.scene import Frame
 from ..errors import LumigraphError
 from ..gaussians import Gaussians, joined, splatting
 from ..method import Method, RayMethod
-from ..rays import Look, Rays, Rendering, Samples
-from ..scene import Frame
+from ..method.capabilities import HasDensity, HasGaussians, HasLooks, can
+from ..method.controls import Control, Value
 from ..volume import composite, packed
 from .placed import Placed
 from .union import union

@@ -8,13 +8,13 @@ from typing import Any, NoReturn
 import torch
 
 from ..camera import Camera
-from ..crop import Crop
+from ..camera.crop import Crop
+from ..camera.rays import Rendering
+from ..datasets.scene import Frame
 from ..errors import LumigraphError
 from ..gaussians import Gaussians, splatting
 from ..geometry import Similarity
 from ..method import Method
-from ..rays import Rendering
-from ..scene import Frame
 from .composed import NEAR, compose
 from .placed import Placed
 

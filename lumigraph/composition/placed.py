@@ -9,14 +9,14 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from ..camera import Camera
-from ..capabilities import HasDensity, HasGaussians, HasLooks, needs
-from ..controls import Value
-from ..crop import Crop
+from ..camera.crop import Crop
+from ..camera.rays import Look, Rays, Rendering, Samples
 from ..gaussians import Gaussians
 from ..gaussians.cleaning import cleaned
 from ..geometry import Similarity
 from ..method import Method
-from ..rays import Look, Rays, Rendering, Samples
+from ..method.capabilities import HasDensity, HasGaussians, HasLooks, needs
+from ..method.controls import Value
 
 
 @dataclass(frozen=True)

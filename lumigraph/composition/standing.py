@@ -10,9 +10,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from ..crop import Box
+from ..camera.crop import Box
+from ..datasets.scene import Frame
 from ..geometry import Similarity
-from ..scene import Frame
 
 LARGEST_REACH = 64.0
 

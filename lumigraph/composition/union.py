@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from ..rays import Look, Samples
+from ..camera.rays import Look, Samples
 from ..volume import packed
 
 

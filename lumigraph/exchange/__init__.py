@@ -8,8 +8,8 @@ from pathlib import Path
 from ..errors import LumigraphError
 from ..files import claim, claim_folder, exists, expanded, explained
 from ..gaussians import Gaussians
-from ..memory import free_memory
-from ..progress import counting
+from ..system.memory import free_memory
+from ..system.progress import counting
 from . import compressed_ply, glb, ply, sog, splat, spz, streamed_sog
 from .checks import checked
 from .ply_header import read_header
@@ -76,8 +76,8 @@ def claim_splats(path: Path, overwrite: bool | None = None, reads: Iterable[Path
 
 
 def is_splat_file(path: Path | str) -> bool:
-    """Whether `read_gaussians` takes what lies there, or would if something did: known by its name, but for a .glb that
-    is of meshes, and for folders, of which those of SOG, streamed or not, are."""
+    """True if `read_gaussians` accepts a path, by its name, existing or not. A .glb of meshes is no splat file; a
+    folder is one if it has SOG, streamed or not."""
     path = place_of(expanded(path))
     if path.is_dir():
         return layout_of(path) is not None
@@ -88,7 +88,7 @@ def is_splat_file(path: Path | str) -> bool:
 
 
 def names_splats(path: Path | str) -> bool:
-    """Whether `write_gaussians` takes a name, whatever lies there."""
+    """True if `write_gaussians` accepts a name, independent of existing files."""
     path = expanded(path)
     return path.name in FOLDERS or (path.name.lower().endswith(SUFFIXES) and not path.is_dir())
 
@@ -100,7 +100,7 @@ def place_of(path: Path) -> Path:
 
 
 def layout_of(folder: Path) -> str | None:
-    """Which of FOLDERS a folder is; None for any other, and for a file."""
+    """The entry of FOLDERS that a folder matches; `None` for any other, and for a file."""
     return next((name for name, layout in FOLDERS.items() if folder.is_dir() and layout.recognises(folder)), None)
 
 

@@ -8,7 +8,7 @@ import zlib
 from pathlib import Path
 
 from ..errors import LumigraphError
-from ..ranges import shown
+from ..files.ranges import shown
 from .checks import PLAUSIBLE, SMALL
 
 DATE = (1980, 1, 1, 0, 0, 0)  # the earliest that an archive can say, so that like files have like bytes

@@ -9,7 +9,7 @@ import torch
 
 from ..errors import LumigraphError
 from ..gaussians import Gaussians
-from ..memory import free_memory
+from ..system.memory import free_memory
 
 SPOKEN = {"means": "means", "quaternions": "rotations", "log_scales": "scales", "harmonics": "colours"}
 CERTAIN = 20.0  # a logit whose sigmoid is 1 in float32

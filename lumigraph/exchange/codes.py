@@ -62,7 +62,7 @@ def from_scales(scales: Float[np.ndarray, "gaussian 3"]) -> Float[np.ndarray, "g
 
 
 def unit(quaternions: Float[np.ndarray, "gaussian 4"]) -> Float[np.ndarray, "gaussian 4"]:
-    """Of length 1, in double precision, where no float32 overflows."""
+    """Quaternions of length 1, in double precision, which does not overflow for float32 input."""
     quaternions = quaternions.astype(np.float64)
     return quaternions / np.linalg.norm(quaternions, axis=-1, keepdims=True)
 
@@ -70,7 +70,7 @@ def unit(quaternions: Float[np.ndarray, "gaussian 4"]) -> Float[np.ndarray, "gau
 def without_largest(
     quaternions: Float[np.ndarray, "gaussian 4"],
 ) -> tuple[Int[np.ndarray, " gaussian"], Float[np.ndarray, "gaussian 3"]]:
-    """Which component is the largest, and the other three, at most sqrt(1/2), of the sign that makes it positive."""
+    """Index of the largest component, and the other three, at most sqrt(1/2), signed to make the largest positive."""
     quaternions = unit(quaternions)
     largest = np.abs(quaternions).argmax(-1)
     sign = np.sign(np.take_along_axis(quaternions, largest[:, None], -1))

@@ -20,13 +20,13 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
+from ..color.srgb import linear_from_srgb
 from ..errors import LumigraphError
 from ..files import write_bytes
+from ..files.ranges import shown
 from ..gaussians import Gaussians
 from ..geometry import is_similarity, to_matrix
 from ..kernels.spherical_harmonics import K00
-from ..ranges import shown
-from ..srgb import linear_from_srgb
 from . import gltf
 from .axes import TURN_HARMONICS, TURN_MEAN, TURN_ROTATION
 from .checks import check_room
@@ -43,7 +43,7 @@ LONGEST = 1 << 24  # bytes of JSON
 
 
 def recognises(path: Path) -> bool:
-    """Whether a .glb file is of Gaussians rather than of meshes: its JSON names the extension."""
+    """True if a .glb file has Gaussians, not meshes: its JSON names the extension."""
     with open(path, "rb") as file:
         head = file.read(gltf.HEADER.size + gltf.CHUNK.size)
         return head[:4] == gltf.MAGIC and f'"{EXTENSION}"'.encode() in file.read(min(LONGEST, _length(head)))
@@ -110,8 +110,8 @@ def _matrix(file: gltf.File, node: gltf.Node) -> Float[np.ndarray, "4 4"]:
 
 
 def _bands(file: gltf.File, primitive: gltf.Primitive) -> int:
-    """How many bands of harmonics a primitive has. Raises LumigraphError if that or anything else is not as it must
-    be."""
+    """Number of bands of harmonics of a primitive. Raises LumigraphError if the primitive is of another kind,
+    compressed or incomplete."""
     said = primitive.extensions[EXTENSION]
     said = said if isinstance(said, dict) else {}
     if primitive.mode != POINTS or any(said.get(name) != value for name, value in SHAPED.items()):
@@ -131,7 +131,7 @@ def _bands(file: gltf.File, primitive: gltf.Primitive) -> int:
 
 
 def _count(file: gltf.File, primitive: gltf.Primitive) -> int:
-    """How many Gaussians. Raises LumigraphError unless all attributes have as many."""
+    """Number of Gaussians. Raises LumigraphError unless all attributes have equally many."""
     names = ["POSITION", ROTATION, SCALE, OPACITY, *(name for name in HARMONICS if name in primitive.attributes)]
     counts = {file.accessor(primitive.attributes[name]).count for name in names}
     if len(counts) > 1:

@@ -17,7 +17,7 @@ import numpy as np
 
 from ..errors import LumigraphError
 from ..files import from_json
-from ..ranges import Coordinate, Tally, between, shown, typed
+from ..files.ranges import Coordinate, Tally, between, shown, typed
 
 HEADER, CHUNK = struct.Struct("<4sII"), struct.Struct("<I4s")
 MAGIC, JSON, BINARY = b"glTF", b"JSON", b"BIN\0"
@@ -84,7 +84,7 @@ class Scene(msgspec.Struct, rename="camel"):
 
 
 class About(msgspec.Struct, rename="camel"):
-    """What the JSON says, as far as it is of use here."""
+    """The used parts of the JSON chunk."""
 
     accessors: list[Accessor] = []
     buffer_views: list[View] = []
@@ -180,10 +180,10 @@ class File:
         return things[index]
 
     def numbers(self, index: int, widths: tuple[int, ...]) -> np.ndarray:
-        """What an accessor holds, float32 [row, component]; whole numbers that are normalised within [-1, 1].
+        """Values of an accessor, float32 [row, component]; normalised integers are within [-1, 1].
 
-        widths: how many components it may have
-        Raises LumigraphError if it is of another shape or kind, or reaches beyond what is there.
+        widths: allowed numbers of components
+        Raises LumigraphError if it is of another shape or kind, or reaches beyond its buffer.
         """
         accessor = self.accessor(index)
         kind, width = KINDS.get(accessor.component_type), SHAPES.get(accessor.type)

@@ -1,4 +1,4 @@
-"""What a PLY file promises: its header, understood before any row is read, and held against the size of the file."""
+"""Header of a PLY file: parsed before any row is read, and checked against the size of the file."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ ANTIALIASED = ["antialiased 1", "SplatRenderMode: mip"]
 
 @dataclass(frozen=True)
 class Header:
-    """Of each element how many rows it has and its plain properties (lists left out); and all comments."""
+    """Row count and plain properties of each element (lists left out), and all comments."""
 
     counts: dict[str, int]
     properties: dict[str, list[str]]

@@ -31,12 +31,12 @@ from jaxtyping import UInt8
 from PIL import Image, UnidentifiedImageError
 from torch import Tensor
 
-from ..baked import Atlas, ViewNetwork
 from ..errors import LumigraphError
 from ..files import claim_folder, from_json, replacing_folder
-from ..memory import free_memory, gigabytes
-from ..progress import track
-from ..ranges import Coordinate, Positive, Row, between, typed
+from ..files.ranges import Coordinate, Positive, Row, between, typed
+from ..system.memory import free_memory, gigabytes
+from ..system.progress import track
+from .baked import Atlas, ViewNetwork
 from .bundle import Bundle
 
 META, INDICES = "scene_params.json", "atlas_indices.png"
@@ -55,7 +55,7 @@ Bias = Annotated[tuple[Coordinate, ...], msgspec.Meta(min_length=1, max_length=1
 
 @dataclass(frozen=True)
 class Params:
-    """What scene_params.json says; "0_weights" is called weights_0 here."""
+    """Content of scene_params.json; "0_weights" is called weights_0 here."""
 
     voxel_size: Positive
     block_size: Blocks
@@ -138,7 +138,7 @@ class Params:
 
 
 def recognises(folder: Path) -> bool:
-    """Whether a folder has such a scene."""
+    """True if a folder has a SNeRG scene."""
     return (folder / META).is_file() or (folder / INDICES).is_file()
 
 
@@ -185,7 +185,7 @@ def arranged(
 
 
 def indices(index: np.ndarray, blocks: tuple[int, int, int]) -> UInt8[np.ndarray, "row column 3"]:
-    """Where in the atlas each block of the grid is; rows are z, then y."""
+    """Position of each grid block in the atlas; rows are z, then y."""
     x, y, _ = blocks
     places = np.stack([index % x, index // x % y, index // (x * y)], -1)
     places = np.where(index[..., None] < 0, NOWHERE, places).astype(np.uint8)

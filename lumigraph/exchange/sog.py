@@ -31,14 +31,14 @@ from PIL import Image, UnidentifiedImageError
 
 from ..errors import LumigraphError
 from ..files import from_json, replacing_folder, write_bytes
+from ..files.ranges import Coordinate, Name, Tally, between, shown, typed
 from ..gaussians import Gaussians
-from ..packing.clusters import clustered
-from ..ranges import Coordinate, Name, Tally, between, shown, typed
 from .bundle import Bundle, zipped
 from .checks import check_room
 from .codes import LOGITS, alpha_to_byte, array, cloud, to_byte, with_largest, without_largest
 from .levels import levels, nearest_level
 from .morton import morton_order
+from .packing.clusters import clustered
 
 VERSION = 2
 META = "meta.json"
@@ -89,7 +89,7 @@ class Palette:
 
 @dataclass(frozen=True)
 class Meta:
-    """What meta.json says in version 2. antialias: an earlier word for a model that is "antialiased"."""
+    """Content of meta.json in version 2. antialias: earlier name of the model "antialiased"."""
 
     count: Tally
     means: Means
@@ -134,7 +134,7 @@ class OldPalette:
 
 @dataclass(frozen=True)
 class OldMeta:
-    """What it said before it said its version."""
+    """Content of meta.json in version 1, which has no version number."""
 
     means: OldMeans
     scales: OldScales
@@ -144,7 +144,7 @@ class OldMeta:
 
 
 def recognises(folder: Path) -> bool:
-    """Whether a folder has a meta.json that speaks of pictures of means; a run's folder has none."""
+    """True if a folder has a meta.json with pictures of means; a run's folder has none."""
     try:
         return b'"means"' in (folder / META).read_bytes()
     except OSError:

@@ -32,11 +32,11 @@ from jaxtyping import Float, UInt8
 from ..errors import LumigraphError
 from ..files import write_bytes
 from ..gaussians import Gaussians
-from ..packing.streams import DENSEST as DENSEST_ZSTD
-from ..packing.streams import take
 from .axes import TURN_HARMONICS, TURN_MEAN, TURN_ROTATION
 from .checks import check_room
 from .codes import LOGITS, alpha_to_byte, array, cloud, to_byte, with_largest, without_largest
+from .packing.streams import DENSEST as DENSEST_ZSTD
+from .packing.streams import take
 
 HEADER = struct.Struct("<4sIIBBBB")  # magic, version, count, degree, bits behind the point, flags, reserved
 MAGIC, GZIPPED, NEWEST = b"NGSP", 3, 4
@@ -72,7 +72,7 @@ def read(path: Path) -> Gaussians:
 
 @contextlib.contextmanager
 def _told(path: Path) -> Iterator[None]:
-    """What goes wrong in unpacking, as one sentence."""
+    """Raise faults of unpacking as a LumigraphError of one sentence."""
     try:
         yield
     except (EOFError, zlib.error, gzip.BadGzipFile, zstandard.ZstdError) as fault:

@@ -25,10 +25,10 @@ from jaxtyping import Float, Int
 
 from ..errors import LumigraphError
 from ..files import read_json, replacing_folder
+from ..files.ranges import Name, Point, Tally, between, shown, typed
 from ..gaussians import Gaussians, joined, simplified
 from ..geometry import to_matrix
-from ..progress import track
-from ..ranges import Name, Point, Tally, between, shown, typed
+from ..system.progress import track
 from . import sog
 from .checks import check_room
 from .codes import array
@@ -45,11 +45,11 @@ Bounds = tuple[Float[np.ndarray, " 3"], Float[np.ndarray, " 3"]]
 
 @dataclass(frozen=True)
 class Detail:
-    """How a scene is told more and more coarsely.
+    """Parameters of levels of detail.
 
-    levels: of detail, the finest among them
-    ratio:  Gaussians of a level to one of the next
-    chunk:  Gaussians of a file at most
+    levels: number of levels, including the finest
+    ratio:  Gaussians of a level per Gaussian of the next
+    chunk:  largest number of Gaussians in a file
     """
 
     levels: Annotated[int, between(1, 10)] = 4
@@ -59,7 +59,7 @@ class Detail:
 
 @dataclass(frozen=True)
 class Row:
-    """Where a leaf is at a level: the number of a file, its first Gaussian there, and how many are its own."""
+    """Location of a leaf at a level: file number, its first Gaussian, and its number of Gaussians."""
 
     file: Annotated[int, between(0, 10**6)]
     offset: Tally
@@ -81,7 +81,7 @@ class Node:
 
 @dataclass(frozen=True)
 class Meta:
-    """What lod-meta.json says."""
+    """Content of lod-meta.json."""
 
     lodLevels: Annotated[int, between(1, MOST_LEVELS)]  # noqa: N815
     filenames: Annotated[list[Name], msgspec.Meta(min_length=1, max_length=10**6)]
@@ -92,7 +92,7 @@ class Meta:
 
 
 def recognises(folder: Path) -> bool:
-    """Whether a folder has a lod-meta.json."""
+    """True if a folder has a lod-meta.json."""
     return (folder / META).is_file()
 
 
@@ -249,5 +249,5 @@ def along_curve(cloud: Gaussians) -> Gaussians:
 
 
 def plain(number: np.floating[Any]) -> float:
-    """As many digits as a float32 has."""
+    """A number rounded to the digits of a float32."""
     return float(f"{number:.8g}")

@@ -1,1 +1,1 @@
-"""What papers say, measured and drawn on one's own data: pages with pictures and the figures behind them."""
+"""Equations of papers, measured and drawn on your own data: pages with pictures and the figures behind them."""

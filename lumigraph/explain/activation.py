@@ -41,7 +41,7 @@ ORDERS: dict[str, Callable[[Grid], Picture]] = {
 
 @dataclass(frozen=True)
 class Fit:
-    """What one order makes of the edge, and its PSNR in dB."""
+    """Fitted picture of the edge with one order, and its PSNR in dB."""
 
     name: str
     picture: Float[Tensor, "height width"]

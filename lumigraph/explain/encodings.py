@@ -10,13 +10,13 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from ..datasets.scene import Scene
 from ..methods.fourier_features import Config, Encoding, FourierFeatures
 from ..metrics import psnr
-from ..progress import track
 from ..run import build
-from ..scene import Scene
-from ..signals import go_on_unless
-from ..train import fit
+from ..system.progress import track
+from ..system.signals import go_on_unless
+from ..training import fit
 from .tangent_kernel import spectrum, tangent_kernel
 
 FLAT: tuple[Encoding, ...] = ("none", "basic")
@@ -76,7 +76,7 @@ class Comparison:
 
     @property
     def peak_inside(self) -> bool:
-        """Whether the best scale of Gaussian features is neither the smallest nor the largest that was tried."""
+        """True if the best scale of Gaussian features is neither the smallest nor the largest one."""
         return self.best("gaussian") not in (self.of("gaussian")[0], self.of("gaussian")[-1])
 
     def to_json(self) -> dict[str, Any]:

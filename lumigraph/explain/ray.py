@@ -10,10 +10,10 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ..camera import Camera
-from ..capabilities import HasLooks, needs
+from ..camera.rays import Look
 from ..errors import LumigraphError
 from ..method import Method
-from ..rays import Look
+from ..method.capabilities import HasLooks, needs
 from ..volume import composite, weights_of
 
 SEEN = 1e-3  # weight from which on a sample shows in a picture of 256 levels
@@ -120,7 +120,7 @@ def triple(rgb: Float[Tensor, " 3"]) -> str:
 
 @torch.no_grad()
 def along_ray(method: Method, camera: Camera, pixel: tuple[int, int]) -> Sight:
-    """What a method in eval mode finds along the ray through the middle of a camera's pixel (column, row).
+    """Samples and passes of a method in eval mode along the ray through the middle of a pixel (column, row).
 
     Raises LumigraphError if the method does not march along rays, the pixel lies outside the picture, or there are no
     samples on its ray.

@@ -133,7 +133,7 @@ def caption(top: float, symbol: str, words: str) -> str:
 
 
 def beside(top: float, equation: str, words: str) -> str:
-    """What stands in the column at the side, halfway down a panel."""
+    """Equation and words in the side column, halfway down a panel."""
     return (
         f"<text class='label symbol' x='{SIDE}' y='{top + PANEL / 2}'>{escape(equation)}</text>"
         f"<text x='{SIDE}' y='{top + PANEL / 2 + 20}'>{escape(words)}</text>"
@@ -217,7 +217,7 @@ def inset(sight: Sight, top: float) -> str:
 
 
 def ends(sight: Sight, top: float) -> str:
-    """What the strip ends in, and what the photograph has there."""
+    """Final colour of the strip, and the photograph's colour."""
     parts = [f"<text class='label symbol' x='{SIDE}' y='{top + STRIP + 42}'>C = Σ wᵢ cᵢ + T background</text>"]
     for i, (name, rgb) in enumerate((("pixel", sight.rgb), ("photograph", sight.photograph))):
         if rgb is not None:

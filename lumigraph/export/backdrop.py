@@ -1,4 +1,4 @@
-"""What lies behind an open scene where no photograph looked: its own colours; and a floor to stay above."""
+"""Background of an open scene in unobserved directions, from its own colours; and its floor, for camera limits."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ..camera import Camera
-from ..choice import evenly
+from ..datasets.scene import Vector
+from ..geometry.choice import evenly
 from ..method import Method
-from ..scene import Vector
 
 VIEWS, SIZE = 12, 96  # pictures that are looked at, and the longer side of each in pixels
 CLOSED = 0.97  # share of them that must be opaque, or the scene's background is part of what it shows
@@ -34,9 +34,9 @@ class Backdrop:
 
 @torch.no_grad()
 def backdrop(method: Method, cameras: Camera) -> Backdrop | None:
-    """What some of the photographs' cameras see of the sky, the horizon and the ground.
+    """Colours of sky, horizon and ground from some of the photographs' cameras.
 
-    None for an object alone, and where they see through the scene: then its background belongs to it.
+    `None` for an object, and for a scene that is not opaque: its background belongs to the picture.
     """
     frame = method.frame
     if frame.has_alpha or frame.reach == 1:

@@ -9,8 +9,8 @@ import numpy as np
 from jaxtyping import Float
 from torch import Tensor
 
+from ..camera.rays import Rendering
 from ..components.fields.development import decoded
-from ..rays import Rendering
 
 PIXELS = "gbrpf32le"  # planes of 32-bit floats
 

@@ -12,13 +12,13 @@ import torch
 from PIL import Image
 
 from ..camera import Camera
-from ..choice import evenly
-from ..controls import Value
 from ..figures import Range, colour_depth, depth_range, to_bytes
 from ..files import claim, claim_folder, replacing_folder, write_json
-from ..memory import ask_for_picture
+from ..geometry.choice import evenly
 from ..method import Method
-from ..progress import track
+from ..method.controls import Value
+from ..system.memory import ask_for_picture
+from ..system.progress import track
 from .exr import exr, light_of
 from .video import open_video
 
@@ -85,7 +85,7 @@ def claim_film(path: Path, overwrite: bool | None = None, reads: Collection[Path
 
 
 def depth_beside(path: Path) -> Path:
-    """Where the film of depth goes."""
+    """Path of the depth film."""
     return path.with_stem(f"{path.stem}-depth")
 
 

@@ -14,16 +14,15 @@ from torch import Tensor
 from torch.nn.functional import grid_sample
 
 from ..camera import Camera
-from ..capabilities import HasDensity, can, needs
-from ..crop import Box, Crop
+from ..camera.crop import Box, Crop
+from ..datasets.mesh import Mesh
+from ..datasets.scene import Frame
+from ..depth_maps import TSDF, DepthMap, Tolerance, fused_colours, hidden, render_depth_maps
 from ..errors import LumigraphError
-from ..mesh import Mesh
 from ..method import Method
-from ..progress import counting, track
-from ..scene import Frame
-from .fusion import Fusion
+from ..method.capabilities import HasDensity, can, needs
+from ..system.progress import counting, track
 from .polygons import BLOCK, Grid, zero_level
-from .sightings import FAR, Sighting, colours, look_around, unseen
 from .surface import larger_pieces, simplified, smoothed, vertex_normals
 
 CELLS = 256  # along the longest side of what is meshed, if nobody asks for more
@@ -31,7 +30,7 @@ OPEN_BOX = 1.5  # times the box of interest, which holds the middle of what is l
 FEWEST, MOST = 8, 2048  # cells along it that make sense
 PROBES = 160  # looks along it that tell where the surface may be
 SOFTNESS = 2.0  # logarithm of the density over its level at which it is as good as solid, or empty
-TRUNCATION = 5  # cells from the surface that depth pictures are fused over
+TRUNCATION = 5  # cells from the surface that depth maps are fused over
 INWARD, OUTWARD = 1, 2  # cells from the fused surface within which the density decides
 ONSET = 0.2  # share of a ray's light that is spent where the surface is said to be
 AT_ONCE = 1 << 18  # points
@@ -77,20 +76,20 @@ def extract_mesh(
     limits = meshed_box(method.frame, extent) if crop is None else within_reach(method.frame, crop)
     holds = limits.holds if crop is None else lambda points: limits.holds(points) & crop.holds(points)
     grid = make_grid(limits, cell)
-    sightings = look_around(method, cameras, size, views)
+    depth_maps = render_depth_maps(method.render, cameras, method.frame.background, views, size)
     step = max(2, math.ceil(max(grid.shape) / PROBES))
-    seen = from_depth(sightings, grid.cell, closed)
+    seen = from_depth(depth_maps, grid.cell, closed)
     if way == "depth" or (way == "auto" and not can(method, HasDensity)):
         value = seen
     else:
-        level = surface_level(method, sightings, holds) if level is None else level
+        level = surface_level(method, depth_maps, holds) if level is None else level
         value = from_density(method, level, interpolated(seen, grid, step))
     vertices, triangles = find_surface(grid, step, holds, value, -1.0 if closed else math.nan)
     if len(triangles):
-        hidden = unseen(torch.from_numpy(vertices).float(), sightings, 2 * grid.cell).numpy()
+        unseen = hidden(torch.from_numpy(vertices).float(), depth_maps, Tolerance(2 * grid.cell)).numpy()
         if not closed:
-            triangles = triangles[~hidden[triangles].all(-1)]
-        vertices, triangles = larger_pieces(vertices, triangles, keep, ~hidden)
+            triangles = triangles[~unseen[triangles].all(-1)]
+        vertices, triangles = larger_pieces(vertices, triangles, keep, ~unseen)
     if not len(triangles):
         raise LumigraphError(
             "Nothing inside the box is solid at this density, so there is no surface; train for longer, or "
@@ -101,7 +100,7 @@ def extract_mesh(
         if faces is not None:
             vertices, triangles = simplified(vertices, triangles, faces)
     points, normals = (torch.from_numpy(x).float() for x in (vertices, vertex_normals(vertices, triangles)))
-    rgb = colours(points, normals, sightings, 3 * grid.cell)
+    rgb = fused_colours(points, normals, depth_maps, Tolerance(3 * grid.cell))
     return Mesh(vertices, triangles, (rgb * 255).round().to(torch.uint8).numpy())
 
 
@@ -145,16 +144,16 @@ Value = Callable[[Float[Tensor, "point 3"]], Float[Tensor, " point"]]
 Holds = Callable[[Float[Tensor, "point 3"]], Bool[Tensor, " point"]]
 
 
-def from_depth(sightings: Sequence[Sighting], cell: float, closed: bool) -> Value:
-    """A function of points: 0 at the surface of the fused depth pictures, 1 well inside, -1 well outside.
+def from_depth(depth_maps: Sequence[DepthMap], cell: float, closed: bool) -> Value:
+    """A function of points: 0 at the surface of the fused depth maps, 1 well inside, -1 well outside.
 
     closed: whether what is pictured but hidden from all cameras counts as solid, rather than as unknown (NaN)
     """
-    fusion = Fusion(sightings, TRUNCATION * cell)
+    fused = TSDF(depth_maps, Tolerance(TRUNCATION * cell))
 
     def value(points: Float[Tensor, "point 3"]) -> Float[Tensor, " point"]:
-        distance, pictured = fusion(points)
-        return torch.where(distance.isnan() & closed, torch.where(pictured, 1.0, -1.0), distance)
+        distance, _, pictured = fused(points)
+        return torch.where(distance.isnan() & closed, torch.where(pictured, 1.0, -1.0), -distance)
 
     return value
 
@@ -176,19 +175,14 @@ def from_density(method: Method, level: float, depth: Value) -> Value:
     return value
 
 
-def surface_level(method: Method, sightings: Sequence[Sighting], holds: Holds) -> float:
+def surface_level(method: Method, depth_maps: Sequence[DepthMap], holds: Holds) -> float:
     """The density where rays begin to end, found from the field itself, whatever its units and however sharp it is.
 
     At the rendered depth half of a ray's light is spent; the median density there is known. But fields begin at the
     surface and grow behind it, where nothing tells them not to. On a ramp that grows exponentially the optical
     thickness so far is proportional to the density, so a share q is spent where it is log(1 - q) / log(1 / 2) as large.
     """
-    points = []
-    for seen in sightings:
-        rays = seen.camera.rays(seen.camera.pixels())
-        good = (seen.opacity > 0.9) & (seen.depth < FAR) & (seen.facing > 0.3)
-        points.append(rays.at(seen.depth.reshape(-1))[good.reshape(-1)])
-    found = torch.cat(points)
+    found = torch.cat([x.positions(x.solid & (x.opacity > 0.9) & (x.facing > 0.3)) for x in depth_maps])
     found = found[holds(found)]
     if not len(found):
         raise LumigraphError(

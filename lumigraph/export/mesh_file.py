@@ -9,13 +9,13 @@ import torch
 import trimesh
 from jaxtyping import Float
 
+from ..color.srgb import linear_from_srgb
+from ..datasets.mesh import Mesh
 from ..errors import LumigraphError
 from ..exchange import gltf
 from ..files import write_bytes
 from ..geometry import to_quaternion, turning
-from ..mesh import Mesh
-from ..progress import counting
-from ..srgb import linear_from_srgb
+from ..system.progress import counting
 from .surface import vertex_normals
 from .usdz import usdz
 
@@ -73,7 +73,7 @@ def glb(mesh: Mesh, upright: Float[np.ndarray, "3 3"]) -> bytes:
         "nodes": [
             {
                 "name": "upright",
-                "rotation": quaternion(upright),
+                "rotation": to_quaternion(torch.from_numpy(upright)).roll(-1).tolist(),  # glTF has w last
                 "extras": {"source_from_upright": upright.T.tolist()},
                 "children": [1],
             },
@@ -90,12 +90,6 @@ def glb(mesh: Mesh, upright: Float[np.ndarray, "3 3"]) -> bytes:
         ],
     }
     return gltf.encoded(about, columns)
-
-
-def quaternion(rotation: Float[np.ndarray, "3 3"]) -> list[float]:
-    """(x, y, z, w), as glTF has it."""
-    w, x, y, z = to_quaternion(torch.from_numpy(rotation)).tolist()
-    return [x, y, z, w]
 
 
 def as_trimesh(mesh: Mesh) -> trimesh.Trimesh:

@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 import torch
 
-from ..baked import Octree
+from ..datasets.scene import Frame
+from ..exchange.baked import Octree
 from ..files import replacing
 from ..geometry import Similarity
-from ..scene import Frame
 
 HALF = 65504.0  # the largest number of float16
 STRAIGHT = 1e-4  # of a rotation's entries, below which there is none

@@ -24,18 +24,18 @@ from PIL import Image
 from torch import Tensor
 
 from .. import __version__
-from ..baked.browser import Browsable
 from ..camera import Camera
+from ..datasets.mesh import Mesh
+from ..datasets.scene import Frame, Vector
 from ..errors import LumigraphError
 from ..exchange import spz
+from ..exchange.baked.browser import Browsable
 from ..figures import to_bytes
 from ..files import write_bytes
 from ..gaussians import Gaussians
-from ..mesh import Mesh
 from ..method import Method
 from ..paths import Surroundings, angle_of_view, camera_path, film_size, pivot
-from ..progress import counting, track
-from ..scene import Frame, Vector
+from ..system.progress import counting, track
 from .backdrop import Backdrop
 
 WEB = Path(__file__).parent / "web"
@@ -154,7 +154,7 @@ def volume_page(path: Path, volume: Browsable, opening: Opening) -> None:
 
 
 def volume_bytes(volume: Browsable, opening: Opening) -> bytes:
-    """What `volume_page` writes."""
+    """Bytes of the page of `volume_page`."""
     packed = gzip.compress(volume.data, 6, mtime=0)
     if (size := len(packed) * 4 / 3) > LARGEST:
         smaller = f"give --degree {volume.degree - 1}" if volume.degree else "bake larger voxels, or give --as views"
@@ -214,7 +214,7 @@ def write_page(path: Path, program: str, settings: dict[str, Any], data: bytes) 
 
 
 def page_bytes(program: str, settings: dict[str, Any], data: bytes) -> bytes:
-    """What `write_page` writes."""
+    """Bytes of the page of `write_page`."""
     mouse, touch = AROUND if settings["inward"] else ON_THE_SPOT
     bright = float(np.dot(settings["background"], (0.299, 0.587, 0.114))) > 0.5
     ink, edge = ("#16181c", "#ffffff") if bright else ("#ffffff", "#000000")

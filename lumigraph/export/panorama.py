@@ -18,17 +18,17 @@ from PIL.PngImagePlugin import PngInfo
 from torch import Tensor
 
 from ..camera import Camera
+from ..camera.lens import Equirectangular, Pinhole
+from ..camera.rays import Rendering
+from ..datasets.scene import Frame
 from ..errors import LumigraphError
 from ..figures import to_image
 from ..files import replacing
 from ..geometry import look_at
-from ..lens import Equirectangular, Pinhole
-from ..memory import ask_for_picture
 from ..method import Method
 from ..paths import Surroundings
-from ..progress import track
-from ..rays import Rendering
-from ..scene import Frame
+from ..system.memory import ask_for_picture
+from ..system.progress import track
 
 AT_ONCE = 1 << 18  # pixels rendered between two looks at the progress
 BANDS = 3  # of rows, each seen by flat pictures that are pitched towards it
@@ -42,18 +42,18 @@ Vector = tuple[float, float, float]
 
 
 def panorama(method: Method, place: Float[Tensor, " 3"], heading: Float[Tensor, " 3"], width: int) -> Rendering:
-    """What is seen from a place in the scene's frame, (width / 2, width) pixels; up is +z.
+    """Panorama from a point in the scene's frame, (width / 2, width) pixels; up is +z.
 
-    heading: what lies in the middle, once it is made level
+    heading: direction of the middle column, made level
     """
     return sphere(method, level_camera(place, heading, Equirectangular(sphere_size(width))), "Panorama")
 
 
 def sphere(method: Method, camera: Camera, name: str, columns: int | None = None) -> Rendering:
-    """What an upright camera behind an `Equirectangular` lens, or a kind of it, sees.
+    """Rendering of an upright camera with an `Equirectangular` lens, or a subclass of it.
 
-    columns: of the flat pictures that others than ray methods need; None where all rays begin at one place, which
-             gives eight pictures around, fading into each other
+    columns: width of the flat pictures for methods other than ray methods; `None` if all rays have one origin, which
+             gives eight blended pictures around
     """
     method.eval()
     width, height = camera.size[0].tolist()
@@ -160,10 +160,10 @@ def level_camera(place: Float[Tensor, " 3"], heading: Float[Tensor, " 3"], lens:
 
 
 def standpoint(cameras: Camera, frame: Frame, source: Vector | None = None) -> tuple[Tensor, Tensor, str]:
-    """Where to stand and what to face, in the scene's frame, and where that is in words.
+    """Position and heading of a panorama in the scene's frame, and the position in words.
 
-    source: the place in the source's frame. Without one it is where the camera nearest to the middle of all stood: a
-            place that is free for certain, and that photographs tell about.
+    source: the position in the source's frame. By default that of the camera nearest to the middle of all: it is free
+            for certain, and photographs observe its surroundings.
     """
     around = Surroundings(cameras, frame)
     if source is None:

@@ -12,18 +12,18 @@ from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
 from ..camera import Camera
-from ..crop import Crop
+from ..camera.crop import Crop
+from ..datasets.scene import Frame
+from ..depth_maps import DepthMap, SurfacePoints, Tolerance, render_depth_maps
 from ..errors import LumigraphError
 from ..files import replacing
 from ..method import Method
-from ..progress import counting, track
-from ..scene import Frame
-from .sightings import FAR, Sighting, compare, look_around
+from ..system.progress import counting, track
 
 CANDIDATES = 4  # as many pixels are looked at as points are wanted, times this
 SQUARELY = 0.2  # cosine between a surface's normal and the ray from which on its depth is trusted
 TOLERANCE = 0.01  # of the distance from the camera: depths that agree
-WITNESSES = 2  # further cameras that must see a surface at the same place, where there are so many
+MIN_VIEWS = 2  # further cameras that must see a surface at the same place, where there are so many
 
 
 @dataclass(frozen=True)
@@ -63,17 +63,16 @@ def extract_points(
     LumigraphError where nothing is solid.
     """
     method.eval()
-    sightings = look_around(method, cameras, size, views)
-    good = [wanted(seen, crop) for seen in sightings]
+    depth_maps = render_depth_maps(method.render, cameras, method.frame.background, views, size)
+    good = [wanted(seen, crop) for seen in depth_maps]
     share = min(1.0, CANDIDATES * count / max(1, sum(int(x.sum()) for x in good)))
     chance = torch.Generator().manual_seed(0)
     found = []
-    for seen, mask in zip(sightings, good, strict=True):
-        some = mask & (torch.rand(mask.shape, generator=chance) < share)
-        positions = seen.camera.rays(seen.camera.pixels()).at(seen.depth.reshape(-1))[some.reshape(-1)]
-        found.append(torch.cat([positions, seen.normals[some], seen.rgb[some]], -1))
-    all_found = torch.cat(found)
-    kept = all_found[witnessed(all_found[:, :3], sightings)].double().numpy()
+    for seen, mask in zip(depth_maps, good, strict=True):
+        found.append(seen.points(mask & (torch.rand(mask.shape, generator=chance) < share)))
+    points = SurfacePoints.cat(found)
+    points = points[confirmed(points.points, depth_maps)]
+    kept = torch.cat([points.points, points.normals, points.colours], -1).double().numpy()
     if not len(kept):
         raise LumigraphError(
             "No two cameras agree on where anything solid is"
@@ -85,24 +84,23 @@ def extract_points(
     return PointCloud(columns[:, :3], normals, (columns[:, 6:] * 255).round().astype(np.uint8))
 
 
-def wanted(seen: Sighting, crop: Crop | None) -> Bool[Tensor, "height width"]:
-    """Which pixels show a surface squarely, inside the crop."""
-    good = (seen.depth < FAR) & (seen.facing > SQUARELY)
-    if crop is None:
-        return good
-    rays = seen.camera.rays(seen.camera.pixels())
-    return good & crop.holds(rays.at(seen.depth.reshape(-1).nan_to_num(0, 0, 0))).view(good.shape)
+def wanted(seen: DepthMap, crop: Crop | None) -> Bool[Tensor, "height width"]:
+    """Mask of pixels that show a surface squarely, inside the crop."""
+    good = seen.solid & (seen.facing > SQUARELY)
+    if crop is not None:
+        good[good.clone()] = crop.holds(seen.positions(good))
+    return good
 
 
-def witnessed(points: Float[Tensor, "point 3"], sightings: list[Sighting]) -> Bool[Tensor, " point"]:
-    """Which points enough cameras see as a surface, and not many see through."""
+def confirmed(points: Float[Tensor, "point 3"], depth_maps: list[DepthMap]) -> Bool[Tensor, " point"]:
+    """Mask of points that enough cameras see as a surface, and not many see through."""
     agree, through = torch.zeros(len(points), dtype=torch.int64), torch.zeros(len(points), dtype=torch.int64)
-    for sighting in track(sightings, "Comparing what cameras see", len(sightings)):
-        away = (points - sighting.camera.position).norm(dim=-1)
-        seen = compare(sighting, points, TOLERANCE * float(away.median()))
+    for depth_map in track(depth_maps, "Comparing depth maps", len(depth_maps)):
+        away = (points - depth_map.camera.position).norm(dim=-1)
+        seen = depth_map.compare(points, Tolerance(TOLERANCE * float(away.median())))
         agree += seen.smooth & (seen.ahead.abs() < TOLERANCE * away)
         through += seen.ahead > TOLERANCE * away
-    return (agree > min(WITNESSES, len(sightings) - 1)) & (through <= agree / 2)
+    return (agree > min(MIN_VIEWS, len(depth_maps) - 1)) & (through <= agree / 2)
 
 
 def thinned(columns: Float[np.ndarray, "point column"], count: int) -> Float[np.ndarray, "thinned column"]:

@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float, Int
 from skimage.measure import marching_cubes
 from torch import Tensor
 
-from ..progress import track
+from ..system.progress import track
 
 BLOCK = 16  # corners of a block along each axis
 AT_ONCE = 64  # blocks whose corners are asked about together

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from ..datasets.scene import Frame
 from ..exchange import write_gaussians
 from ..exchange.streamed_sog import Detail
 from ..gaussians import Gaussians
-from ..scene import Frame
 
 
 def export_splats(gaussians: Gaussians, frame: Frame, path: Path, detail: Detail | None = None) -> Gaussians:

@@ -10,10 +10,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from ..camera.lens import Equirectangular, OmnidirectionalStereo
+from ..camera.rays import Rendering
 from ..errors import LumigraphError
-from ..lens import Equirectangular, OmnidirectionalStereo
 from ..method import Method
-from ..rays import Rendering
 from .panorama import level_camera, sphere, sphere_size
 
 SHARE = 1 / 50  # of the distance to what is around: 64 mm in a room of some three metres
@@ -31,11 +31,11 @@ def stereo_pair(
     interpupillary: float,
     nearest: float,
 ) -> tuple[Rendering, Rendering]:
-    """What the left and the right eye see, (width / 2, width) pixels each; up is +z.
+    """Panoramas of the left and the right eye, (width / 2, width) pixels each; up is +z.
 
     place:          the middle between the eyes, in the scene's frame
     interpupillary: the distance between them, scene units
-    nearest:        distance to what is near, scene units: the nearer, the more flat pictures it takes to be exact
+    nearest:        distance to near surfaces, scene units; smaller needs more flat pictures
     """
     columns = columns_at_once(interpupillary / 2, nearest)
     eyes = []
@@ -54,9 +54,9 @@ def top_bottom(left: Rendering, right: Rendering) -> Float[Tensor, "height width
 def surrounding_distances(
     method: Method, place: Float[Tensor, " 3"], heading: Float[Tensor, " 3"]
 ) -> tuple[float, float]:
-    """How far away things are from a place: near ones (the 2nd percentile) and half of all, scene units.
+    """Near (2nd percentile) and median distance of surfaces around a point, scene units.
 
-    Each direction counts by its share of the sphere. Raises LumigraphError where nothing is around.
+    Directions are weighted by solid angle. Raises LumigraphError if no surface is around.
     """
     seen = sphere(method, level_camera(place, heading, Equirectangular(sphere_size(PROBE))), "Looking around")
     rows = torch.arange(PROBE // 2) + 0.5
@@ -71,10 +71,10 @@ def surrounding_distances(
 
 
 def columns_at_once(radius: float, nearest: float) -> int:
-    """How many columns one flat picture may serve.
+    """Largest number of columns that one flat picture may have.
 
-    Its camera stands where the middle column's rays begin. Those of a column k / 2 away begin k / 2 pixels' angle
-    further along the circle, which is ahead or behind by r k / 2 pixels' angle: things at a distance d and high up are
+    Its camera is at the origin of the middle column's rays. Rays of a column k / 2 away begin k / 2 pixels' angle
+    further along the circle, which is ahead or behind by r k / 2 pixels' angle: points at a distance d and high up are
     off by up to r k / (2 d) pixels.
     """
     return max(1, min(MOST_COLUMNS, int(2 * SHIFT * nearest / max(radius, 1e-9))))

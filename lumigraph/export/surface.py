@@ -1,4 +1,4 @@
-"""What is done to triangles once they are found: pieces, smoothing, fewer of them."""
+"""Postprocessing of triangle meshes: removal of small pieces, smoothing, simplification."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ def face_normals(
 
 
 def adjacency(count: int, faces: Int[np.ndarray, "face 3"]) -> sparse.csr_array:
-    """Which vertices share an edge: ones, symmetric."""
+    """Adjacency matrix of vertices: 1 for each shared edge, symmetric."""
     a, b = np.concatenate([faces, np.roll(faces, 1, 1)]).ravel(), np.concatenate([np.roll(faces, 1, 1), faces]).ravel()
     matrix = sparse.coo_array((np.ones(len(a)), (a, b)), (count, count)).tocsr()
     matrix.data[:] = 1

@@ -16,8 +16,8 @@ import numpy as np
 from jaxtyping import Float, Int, UInt8
 from PIL import Image
 
+from ..datasets.mesh import Mesh
 from ..exchange.morton import morton_order
-from ..mesh import Mesh
 
 ALIGNED = 64  # bytes: every file's data begins at a multiple of it (Usdz File Format Specification 1.3, "Layout")
 HEADER = 30  # bytes of a zip file's header before the name

@@ -21,7 +21,7 @@ from torch import Tensor
 
 from ..errors import LumigraphError
 from ..files import Kind, replacing
-from ..progress import counting, track
+from ..system.progress import counting, track
 
 CRF = 17  # x264's constant rate factor: 0 is lossless, 18 looks it, 28 is small
 WEBP_QUALITY = 85  # of 100
@@ -50,7 +50,7 @@ def open_video(path: Path, fps: float = 30.0, what: Kind = "film") -> Iterator[V
 
 
 def kind_of(path: Path, fps: float) -> type[Video]:
-    """What an ending stands for. Raises LumigraphError where there is no such film."""
+    """Video class of a file ending. Raises LumigraphError for an unknown one, or a frame rate that it cannot have."""
     kind = KINDS.get(path.suffix.lower())
     if kind is None:
         raise LumigraphError(f"{path} should end in {', '.join(KINDS)}, the kinds of film there are; rename it")
@@ -211,7 +211,7 @@ def dithered(
 
 
 def spacing(colours: UInt8[np.ndarray, "colour 3"]) -> float:
-    """How far colours lie apart along one channel, in the middle of them."""
+    """Median distance between neighbouring colours of a palette, along one channel."""
     if len(colours) < 2:
         return 0.0
     apart = np.abs(colours[:, None].astype(np.int32) - colours[None]).max(-1) + 1000 * np.eye(len(colours), dtype=int)

@@ -178,7 +178,7 @@ def look(series: Series) -> str:
 
 
 def letters(series: Series) -> float:
-    """How much room its name takes in a legend, with the piece of line before the name of a dashed one."""
+    """Width of a series' name in a legend, in letters, including the line sample of a dashed one."""
     return len(series.name) + (SAMPLE / LETTER if series.dash else 0)
 
 

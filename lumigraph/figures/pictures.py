@@ -9,7 +9,7 @@ from jaxtyping import Float, UInt8
 from PIL import Image
 from torch import Tensor
 
-from ..blending import before
+from ..color.blending import before
 from ..files import Kind, replacing
 
 # Bright and warm to dark and cool, evenly falling in lightness.

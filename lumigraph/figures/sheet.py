@@ -72,7 +72,7 @@ class Layout:
 
     @cached_property
     def heights(self) -> list[int]:
-        """Of each row, with its label."""
+        """Height of each row, including its label."""
         return [max(height for _, height in shapes) + LINE + GAP for shapes in self.shapes]
 
     @cached_property
@@ -108,7 +108,7 @@ class Layout:
 
     @property
     def oddness(self) -> float:
-        """How far from a screen's shape."""
+        """Distance of the aspect ratio from a screen's, as an absolute logarithm."""
         return abs(math.log(self.size[0] / self.size[1] * SCREEN[1] / SCREEN[0]))
 
     def drawn(self, title: str) -> Image.Image:

@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from ..crop import Crop
+from ..camera.crop import Crop
 from .cloud import Gaussians
 
 NEIGHBOURS = 16  # whose distances say how isolated a Gaussian is
@@ -32,7 +32,7 @@ def cleaned(
 
 
 def gone(reasons: dict[str, Bool[Tensor, " gaussian"]]) -> Bool[Tensor, " gaussian"]:
-    """Which Gaussians go, for whatever reason."""
+    """Mask of all Gaussians to remove."""
     return torch.stack(list(reasons.values())).any(0)
 
 
@@ -44,7 +44,7 @@ def unwanted(
     max_scale: float | None = None,
     isolation: float | None = None,
 ) -> dict[str, Bool[Tensor, " gaussian"]]:
-    """Which Gaussians go, by the reason, in the order of the arguments; each under the first that it goes for.
+    """Masks of Gaussians to remove, by reason, in the order of the arguments; each under its first reason.
 
     crop:        keeps those whose centres it holds, in the cloud's frame
     min_opacity: that is left, in [0, 1]

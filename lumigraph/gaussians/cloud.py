@@ -46,7 +46,7 @@ class Gaussians:
 
     @property
     def degree(self) -> int:
-        """Of the spherical harmonics, 0 to 3."""
+        """Degree of the spherical harmonics, 0 to 3."""
         return math.isqrt(self.harmonics.shape[1]) - 1
 
     def transformed(self, similarity: Float[Tensor, "4 4"]) -> Gaussians:

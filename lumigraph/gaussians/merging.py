@@ -159,7 +159,7 @@ def _neighbours(means: Float[Tensor, "gaussian 3"]) -> tuple[Int[Tensor, " pair"
 
 
 def _matching(one: Int[Tensor, " pair"], other: Int[Tensor, " pair"], count: int) -> Int[Tensor, " chosen"]:
-    """Which pairs, best first, one takes that takes the best one left again and again; none shares a Gaussian."""
+    """Greedy matching of pairs that are sorted best first: indices of those chosen; none shares a Gaussian."""
     left, chosen = torch.arange(len(one)), []
     while len(left):
         a, b = one[left], other[left]

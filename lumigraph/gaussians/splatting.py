@@ -9,11 +9,11 @@ from jaxtyping import Float
 from torch import Tensor
 
 from .. import kernels
-from ..blending import over
 from ..camera import Camera
+from ..camera.lens import Mixed, OpenCV, Pinhole
+from ..camera.rays import Rendering
+from ..color.blending import over
 from ..errors import LumigraphError
-from ..lens import Mixed, OpenCV, Pinhole
-from ..rays import Rendering
 from .cloud import Gaussians
 
 BLUR = 0.3  # square pixels by which every footprint is widened (Kerbl 2023; the original release)
@@ -70,7 +70,7 @@ def render(
     bands: int = 4,
     blur: float = BLUR,
 ) -> Rendering:
-    """What one camera sees of a cloud, in front of a background colour."""
+    """Render a cloud for one camera over a background colour."""
     seen = splat(cloud, view_of(camera, near).to(cloud.means.device), bands, blur=blur)
     rgb = over(seen.rgb, seen.opacity, torch.tensor(background, device=seen.rgb.device))
     # Depth along the optical axis, of what is opaque, becomes distance along each pixel's ray.

@@ -5,6 +5,7 @@ from ._dispatch import using as using
 from .block_march import Blocks as Blocks
 from .block_march import block_march as block_march
 from .composite import composite as composite
+from .contract import contract as contract
 from .dense_grid import dense_grid as dense_grid
 from .distortion import distortion as distortion
 from .factor_grid import Factors as Factors
@@ -21,6 +22,8 @@ from .plane_sweep import plane_sweep as plane_sweep
 from .project import View as View
 from .project import project as project
 from .rasterize import rasterize as rasterize
+from .sample_proposals import Resampling as Resampling
+from .sample_proposals import sample_proposals as sample_proposals
 from .sparse_grid import Nodes as Nodes
 from .sparse_grid import sparse_grid as sparse_grid
 from .spherical_harmonics import spherical_harmonics as spherical_harmonics

@@ -7,7 +7,7 @@ import contextvars
 import importlib
 import os
 from collections.abc import Callable, Iterator
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 from torch import Tensor
@@ -39,3 +39,18 @@ def empty(*shape: int, dtype: torch.dtype = torch.float32, device: torch.device 
     if os.environ.get("LUMIGRAPH_DEBUG") and dtype.is_floating_point:
         out.fill_(torch.nan)
     return out
+
+
+def differentiable(forward: Callable, backward: Callable) -> Callable:
+    """The `run` of an engine from its ways there and back, which are as in `torch.autograd.Function`.
+
+    Tensors are contiguous when they come to `forward`; gradients come to `backward` as they are.
+    """
+    once = torch.autograd.function.once_differentiable(backward)
+    ways = {"forward": staticmethod(forward), "backward": staticmethod(once)}
+    function: Any = type(forward.__module__.split(".")[-2], (torch.autograd.Function,), ways)
+
+    def run(*inputs: Any) -> Any:
+        return function.apply(*(x.contiguous() if isinstance(x, Tensor) else x for x in inputs))
+
+    return run

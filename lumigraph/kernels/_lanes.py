@@ -1,7 +1,8 @@
-"""Sixteen numbers as one value, for the Numba engines: `Lanes` add, multiply and compare as a number does.
+"""Several numbers as one value, for the Numba engines: lanes add, multiply and compare as a number does.
 
-Numba has no vector type; this one lives in a register, so that a pixel block's sums never touch memory. Without Numba
-(NUMBA_DISABLE_JIT) the same code runs on rows of a NumPy array, which check what is loaded and stored.
+Numba has no vector type; this one lives in registers, so that a block's sums never touch memory. There are sixteen
+lanes, or as many as a tuple `like` is long: its length tells the compiler. Without Numba (NUMBA_DISABLE_JIT) the same
+code runs on rows of a NumPy array, which check what is loaded and stored. Arrays are flat.
 """
 
 from __future__ import annotations
@@ -16,91 +17,122 @@ from numba.core.datamodel import models
 from numba.core.typing.templates import AbstractTemplate, infer_global, signature
 from numba.extending import intrinsic, lower_builtin, lower_cast, overload, register_model
 
-from ._vectors import FLOATS, I32, INTS, LANES, all_lanes, data, load, store, vector_at
-
-BOOLS = ir.VectorType(ir.IntType(1), LANES)
+LANES = 16
+I32 = ir.IntType(32)
+ELEMENTS = {"real": ir.FloatType(), "whole": I32, "mask": ir.IntType(1)}  # float32, uint32, bits
+SCALARS = {"real": types.Float, "whole": types.Integer, "mask": ()}  # what stands for lanes that are all the same
+FLOATS, INTS = (ir.VectorType(kind, LANES) for kind in (ir.FloatType(), I32))
 FMA = ("contract", "nsz")  # products and sums may fuse; infinities and NaN keep their meaning
+# Operators without flags of their own get those of the function's `fastmath`.
 
 
 class LanesType(types.Type):
-    def __init__(self):
-        super().__init__("lanes")
+    def __init__(self, kind="real", count=LANES):
+        self.kind, self.count = kind, count
+        super().__init__(f"lanes({kind}, {count})")
 
     def can_convert_from(self, typingctx, other):
-        return 1 if isinstance(other, types.Float) else None
-
-
-class MaskType(types.Type):
-    def __init__(self):
-        super().__init__("mask")
-
-
-lanes, mask = LanesType(), MaskType()
+        return 1 if isinstance(other, SCALARS[self.kind]) else None
 
 
 @register_model(LanesType)
 class LanesModel(models.PrimitiveModel):
     def __init__(self, dmm, fe_type):
-        super().__init__(dmm, fe_type, FLOATS)
+        super().__init__(dmm, fe_type, ir.VectorType(ELEMENTS[fe_type.kind], fe_type.count))
 
 
-@register_model(MaskType)
-class MaskModel(models.PrimitiveModel):
-    def __init__(self, dmm, fe_type):
-        super().__init__(dmm, fe_type, BOOLS)
+lanes, mask = LanesType(), LanesType("mask")
 
 
-@lower_cast(types.Float, LanesType)
+@lower_cast(types.Number, LanesType)
 def _spread(context, builder, fromty, toty, value):
-    return all_lanes(builder, context.cast(builder, value, fromty, types.float32))
+    x = context.cast(builder, value, fromty, types.float32 if toty.kind == "real" else types.uint32)
+    nothing = ir.Constant(ir.VectorType(x.type, toty.count), ir.Undefined)
+    first = builder.insert_element(nothing, x, ir.Constant(I32, 0))
+    return builder.shuffle_vector(first, nothing, ir.Constant(ir.VectorType(I32, toty.count), [0] * toty.count))
 
 
-def _binary(symbol, result, operands, emit):
-    """Make an operator of Python's act on lanes."""
+def _common(args):
+    """The type of those of several values that are lanes, where all can be of it."""
+    among = [x for x in args if isinstance(x, LanesType)]
+    fits = among and all(x == among[0] or isinstance(x, SCALARS[among[0].kind]) for x in args)
+    return among[0] if fits else None
+
+
+def _binary(symbol, compares=False, **emit):
+    """Make an operator of Python's act on lanes. emit: what it does to each kind"""
 
     @infer_global(symbol)
     class Template(AbstractTemplate):
         def generic(self, args, kws):
-            fits = len(args) == 2 and any(isinstance(x, type(operands)) for x in args)
-            if fits and all(isinstance(x, type(operands) | types.Float) for x in args):
-                return signature(result, operands, operands)
+            operands = _common(args) if len(args) == 2 else None
+            if operands and operands.kind in emit:
+                return signature(LanesType("mask", operands.count) if compares else operands, operands, operands)
 
-    @lower_builtin(symbol, type(operands), type(operands))
+    @lower_builtin(symbol, LanesType, LanesType)
     def lower(context, builder, sig, args):
-        return emit(builder, *args)
+        return emit[sig.args[0].kind](builder, *args)
 
 
-_binary(operator.add, lanes, lanes, lambda b, x, y: b.fadd(x, y, flags=FMA))
-_binary(operator.sub, lanes, lanes, lambda b, x, y: b.fsub(x, y, flags=FMA))
-_binary(operator.mul, lanes, lanes, lambda b, x, y: b.fmul(x, y, flags=FMA))
-_binary(operator.truediv, lanes, lanes, lambda b, x, y: b.fdiv(x, y, flags=("arcp", *FMA)))
-_binary(operator.ge, mask, lanes, lambda b, x, y: b.fcmp_ordered(">=", x, y))
-_binary(operator.lt, mask, lanes, lambda b, x, y: b.fcmp_ordered("<", x, y))
-_binary(operator.and_, mask, mask, lambda b, x, y: b.and_(x, y))
+_binary(operator.add, real=lambda b, x, y: b.fadd(x, y), whole=lambda b, x, y: b.add(x, y))
+_binary(operator.sub, real=lambda b, x, y: b.fsub(x, y))
+_binary(operator.mul, real=lambda b, x, y: b.fmul(x, y), whole=lambda b, x, y: b.mul(x, y))
+_binary(operator.truediv, real=lambda b, x, y: b.fdiv(x, y, flags=("arcp", *FMA)))
+_binary(operator.ge, compares=True, real=lambda b, x, y: b.fcmp_ordered(">=", x, y))
+_binary(operator.gt, compares=True, real=lambda b, x, y: b.fcmp_ordered(">", x, y))
+_binary(operator.lt, compares=True, real=lambda b, x, y: b.fcmp_ordered("<", x, y))
+_binary(operator.and_, mask=lambda b, x, y: b.and_(x, y), whole=lambda b, x, y: b.and_(x, y))
+_binary(operator.xor, whole=lambda b, x, y: b.xor(x, y))
 
 
 # Functions: in Python first, which is what they mean, then for the compiler.
 
 
 def fetch(array, at):
-    """The sixteen numbers of a flat array from `at` on."""
-    if not 0 <= at <= len(array) - LANES:
-        raise IndexError(f"lanes from {at} of {len(array)}")
-    return array[at : at + LANES].copy()
+    """The sixteen numbers of an array from `at` on."""
+    return array[_places(array, at, LANES)].copy()
+
+
+def fetch_like(array, at, like):
+    """As many numbers of an array from `at` on as the tuple is long."""
+    return array[_places(array, at, len(like))].copy()
 
 
 def put(array, at, x):
-    """array[at : at + 16] = x."""
-    if not 0 <= at <= len(array) - LANES:
-        raise IndexError(f"lanes from {at} of {len(array)}")
-    array[at : at + LANES] = x
+    """array[at : at + len(x)] = x."""
+    array[_places(array, at, len(x))] = x
+
+
+def gather(array, at, stride, like):
+    """Numbers `at`, `at` + `stride` and so on of an array, as many as the tuple is long."""
+    return array[at + stride * np.arange(len(like))]
+
+
+def scatter(array, at, stride, x):
+    """Lane k becomes number `at` + k `stride` of an array."""
+    array[at + stride * np.arange(len(x))] = x
+
+
+def filled(x, like):
+    """As many lanes as the tuple is long, all the same."""
+    return np.full(len(like), x)
+
+
+def turn(array, at, to, apart):
+    """Column i of the square of sixteen rows from `at` on becomes row i of that from `to` on. apart: from row to row"""
+    square = apart * np.arange(LANES)[:, None] + np.arange(LANES)
+    array[to + square] = array[at + square].T
+
+
+def _places(array, at, count):
+    if not 0 <= at <= len(array) - count:
+        raise IndexError(f"{count} lanes from {at} of {len(array)}")
+    return slice(at, at + count)
 
 
 def put_where(condition, array, at, x):
     """array[at : at + 16] = x where the mask holds; the other numbers are not touched."""
-    if not 0 <= at <= len(array) - LANES:
-        raise IndexError(f"lanes from {at} of {len(array)}")
-    array[at : at + LANES][condition] = x[condition]
+    array[_places(array, at, LANES)][condition] = x[condition]
 
 
 def where(condition, x, y):
@@ -116,6 +148,16 @@ def lowest(x, y):
 def highest(x, y):
     """The larger of each pair."""
     return np.maximum(x, y)
+
+
+def whole(x):
+    """Numbers from 0 to below 2^31 without what follows the point."""
+    return x.astype(np.uint32)
+
+
+def real(x):
+    """Whole numbers below 2^31 as floating-point numbers."""
+    return x.astype(np.float32)
 
 
 def root(x):
@@ -156,31 +198,48 @@ def first_bit(x):
     return (int(x) & -int(x)).bit_length() - 1
 
 
-@intrinsic
-def _fetch(typing, array, at):
-    def generate(context, builder, sig, args):
-        (array_,) = data(context, builder, sig, args, 0)
-        return load(builder, vector_at(builder, array_, args[1]))
+def _vector(context, builder, sig, args, at, of):
+    """Pointer to the lanes of type `of` that begin with element args[at] of the array args[at - 1]."""
+    kind = ir.VectorType(ELEMENTS[of.kind], of.count)
+    return builder.bitcast(builder.gep(_data(context, builder, sig, args, at - 1), [args[at]]), kind.as_pointer())
 
-    return lanes(array, types.int64), generate
+
+def _data(context, builder, sig, args, number=0):
+    """Pointer to the first element of an argument that is an array."""
+    return context.make_array(sig.args[number])(context, builder, args[number]).data
+
+
+def _apart(context, builder, sig, args, count):
+    """Pointers to elements args[1], args[1] + args[2] and so on of the array args[0]."""
+    array = _data(context, builder, sig, args)
+    for k in range(count):
+        yield builder.gep(array, [builder.add(args[1], builder.mul(args[2], ir.Constant(ir.IntType(64), k)))])
+
+
+@intrinsic
+def _fetch(typing, array, at, like):
+    found = LanesType(count=like.count)
+
+    def generate(context, builder, sig, args):
+        return builder.load(_vector(context, builder, sig, args, 1, found), align=4)
+
+    return found(array, types.int64, like), generate
 
 
 @intrinsic
 def _put(typing, array, at, x):
     def generate(context, builder, sig, args):
-        (array_,) = data(context, builder, sig, args, 0)
-        store(builder, args[2], vector_at(builder, array_, args[1]))
+        builder.store(args[2], _vector(context, builder, sig, args, 1, x), align=4)
         return context.get_dummy_value()
 
-    return types.void(array, types.int64, lanes), generate
+    return types.void(array, types.int64, x), generate
 
 
 @intrinsic
 def _put_where(typing, condition, array, at, x):
     def generate(context, builder, sig, args):
-        (array_,) = data(context, builder, sig, args, 1)
-        place = vector_at(builder, array_, args[2])
-        kind = ir.FunctionType(ir.VoidType(), [FLOATS, FLOATS.as_pointer(), I32, BOOLS])
+        place = _vector(context, builder, sig, args, 2, lanes)
+        kind = ir.FunctionType(ir.VoidType(), [FLOATS, FLOATS.as_pointer(), I32, args[0].type])
         name = f"llvm.masked.store.v{LANES}f32.p0"
         masked = cgutils.get_or_insert_function(builder.module, kind, name)
         builder.call(masked, [args[3], place, ir.Constant(I32, 4), args[0]])
@@ -190,24 +249,105 @@ def _put_where(typing, condition, array, at, x):
 
 
 @intrinsic
+def _gather(typing, array, at, stride, like):
+    found = LanesType(count=like.count)
+
+    def generate(context, builder, sig, args):
+        x = ir.Constant(ir.VectorType(ir.FloatType(), like.count), ir.Undefined)
+        for k, place in enumerate(_apart(context, builder, sig, args, like.count)):
+            x = builder.insert_element(x, builder.load(place), ir.Constant(I32, k))
+        return x
+
+    return found(array, types.int64, types.int64, like), generate
+
+
+@intrinsic
+def _scatter(typing, array, at, stride, x):
+    def generate(context, builder, sig, args):
+        for k, place in enumerate(_apart(context, builder, sig, args, x.count)):
+            builder.store(builder.extract_element(args[3], ir.Constant(I32, k)), place)
+        return context.get_dummy_value()
+
+    return types.void(array, types.int64, types.int64, x), generate
+
+
+@intrinsic
+def _filled(typing, x, like):
+    found = LanesType(count=like.count)
+    return found(found, like), lambda context, builder, sig, args: args[0]
+
+
+@intrinsic
+def _turn(typing, array, at, to, apart):
+    """Swap the square's off-diagonal quarters, then those of each quarter, down to single lanes."""
+
+    def generate(context, builder, sig, args):
+        def rows(first):
+            array_ = _data(context, builder, sig, args)
+            for i in range(LANES):
+                begin = builder.add(first, builder.mul(args[3], ir.Constant(ir.IntType(64), i)))
+                yield builder.bitcast(builder.gep(array_, [begin]), FLOATS.as_pointer())
+
+        lines = [builder.load(place, align=4) for place in rows(args[1])]
+        for size in (8, 4, 2, 1):
+            upper, lower = _swapped(size)
+            for i in range(LANES):
+                if not i & size:
+                    a, b = lines[i], lines[i + size]
+                    lines[i], lines[i + size] = (builder.shuffle_vector(a, b, pattern) for pattern in (upper, lower))
+        for line, place in zip(lines, rows(args[2]), strict=True):
+            builder.store(line, place, align=4)
+        return context.get_dummy_value()
+
+    return types.void(array, types.int64, types.int64, types.int64), generate
+
+
+def _swapped(size):
+    """For rows a and b of a square's halves: the lanes of (a, b) that belong into a, and those that belong into b."""
+    upper = [LANES + lane - size if lane & size else lane for lane in range(LANES)]
+    lower = [LANES + lane if lane & size else lane + size for lane in range(LANES)]
+    return ir.Constant(INTS, upper), ir.Constant(INTS, lower)
+
+
+@intrinsic
 def _where(typing, condition, x, y):
-    return lanes(mask, lanes, lanes), lambda context, builder, sig, args: builder.select(*args)
+    found = LanesType(count=condition.count)
+    return found(condition, found, found), lambda context, builder, sig, args: builder.select(*args)
+
+
+def _chosen(real, whole):
+    """The one of each pair that comes first by an order of LLVM's."""
+
+    @intrinsic
+    def choose(typing, x, y):
+        kind = _common((x, y))
+
+        def generate(context, builder, sig, args):
+            first = builder.fcmp_ordered(real, *args) if kind.kind == "real" else builder.icmp_signed(whole, *args)
+            return builder.select(first, *args)
+
+        return kind(kind, kind), generate
+
+    return choose
+
+
+_lowest, _highest = _chosen("<", "<"), _chosen(">", ">")
 
 
 @intrinsic
-def _lowest(typing, x, y):
+def _whole(typing, x):
     def generate(context, builder, sig, args):
-        return builder.select(builder.fcmp_ordered("<", *args), *args)
+        return builder.fptosi(args[0], ir.VectorType(I32, x.count))
 
-    return lanes(lanes, lanes), generate
+    return LanesType("whole", x.count)(x), generate
 
 
 @intrinsic
-def _highest(typing, x, y):
+def _real(typing, x):
     def generate(context, builder, sig, args):
-        return builder.select(builder.fcmp_ordered(">", *args), *args)
+        return builder.sitofp(args[0], ir.VectorType(ir.FloatType(), x.count))
 
-    return lanes(lanes, lanes), generate
+    return LanesType(count=x.count)(x), generate
 
 
 def _each(builder, name, x):
@@ -328,7 +468,15 @@ def _first_bit(typing, x):
     return types.int64(types.uint64), generate
 
 
-overload(fetch)(lambda array, at: lambda array, at: _fetch(array, at))
+SIXTEEN = (0,) * LANES
+overload(fetch)(lambda array, at: lambda array, at: _fetch(array, at, SIXTEEN))
+overload(fetch_like)(lambda array, at, like: lambda array, at, like: _fetch(array, at, like))
+overload(gather)(lambda array, at, stride, like: lambda array, at, stride, like: _gather(array, at, stride, like))
+overload(scatter)(lambda array, at, stride, x: lambda array, at, stride, x: _scatter(array, at, stride, x))
+overload(filled)(lambda x, like: lambda x, like: _filled(x, like))
+overload(turn)(lambda array, at, to, apart: lambda array, at, to, apart: _turn(array, at, to, apart))
+overload(whole)(lambda x: lambda x: _whole(x))
+overload(real)(lambda x: lambda x: _real(x))
 overload(put)(lambda array, at, x: lambda array, at, x: _put(array, at, x))
 overload(put_where)(lambda condition, array, at, x: lambda condition, array, at, x: _put_where(condition, array, at, x))
 overload(where)(lambda condition, x, y: lambda condition, x, y: _where(condition, x, y))

@@ -17,9 +17,9 @@ from rich.console import Console
 from rich.table import Table
 from torch import Tensor
 
-from ..console import console as plain_console
 from ..files import claim, write_json
-from ..progress import track
+from ..system.console import console as plain_console
+from ..system.progress import track
 from ._dispatch import Engine, using
 from ._facts import operations as all_operations
 from ._facts import tensors

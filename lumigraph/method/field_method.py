@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from abc import ABC
 from dataclasses import replace
-from typing import Any
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from ..rays import Look, Rays
-from ..scene import Batch, Scene
+from ..camera.rays import Look, Rays
+from ..datasets.scene import Batch, Scene
 from ..volume import composite
 from .field import Field
 from .ray_method import RayMethod

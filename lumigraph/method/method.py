@@ -14,13 +14,13 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from ..camera import Camera
-from ..controls import Control, Value
+from ..camera.rays import Rays, Rendering
+from ..datasets.scene import Frame, Scene
 from ..errors import LumigraphError
-from ..packing import Stored
-from ..quality import BY_PHOTOGRAPH, Efforts, Quality
-from ..rays import Rays, Rendering
-from ..scene import Frame, Scene
+from ..exchange.packing import Stored
+from .controls import Control, Value
 from .part import Part
+from .quality import BY_PHOTOGRAPH, Efforts, Quality
 
 
 @runtime_checkable
@@ -57,6 +57,7 @@ class Method(nn.Module, ABC):
     Config: ClassVar[type]
     learns_from: ClassVar[type] = Scene  # the kind of dataset
     accepts: ClassVar[tuple[type, ...]] = ()  # the kinds of evidence that `given` takes
+    in_blocks: ClassVar[bool] = False  # whether `train` divides a large scene into blocks, each a run of its own
     any_lens: ClassVar[bool] = False  # whether `render` follows every lens, or flat pictures alone
     efforts: ClassVar[Efforts] = BY_PHOTOGRAPH  # what each --quality asks for
     _place: Tensor
@@ -119,7 +120,7 @@ class Method(nn.Module, ABC):
         return None
 
     def learning_rates(self, step: int, progress: float) -> dict[str, float]:
-        """Learning rates by the names of groups: those of the parts and `learning_rate`, "" for groups without a name."""
+        """Learning rates by the names of groups, "" for groups without one: the parts' and `learning_rate`."""
         rates = {name: rate for part in self.parts for name, rate in part.learning_rates(step, progress).items()}
         own = self.learning_rate(step, progress)
         return rates if own is None else rates | (own if isinstance(own, dict) else {"": own})

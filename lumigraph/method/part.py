@@ -9,9 +9,9 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from ..camera import Camera
-from ..controls import Control
-from ..packing import Stored
-from ..rays import Rays
+from ..camera.rays import Rays
+from ..exchange.packing import Stored
+from .controls import Control
 
 
 class Part(nn.Module):

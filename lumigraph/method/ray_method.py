@@ -10,12 +10,12 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ..camera import Camera
-from ..capabilities import HasLooks, needs
-from ..quality import BY_RAY, Efforts
-from ..rays import Rays, Rendering
-from ..scene import Batch, Scene
+from ..camera.rays import Rays, Rendering
+from ..datasets.scene import Batch, Scene
 from ..volume import composite
+from .capabilities import HasLooks, needs
 from .method import Method
+from .quality import BY_RAY, Efforts
 
 
 class RayMethod(Method):

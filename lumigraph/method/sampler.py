@@ -12,7 +12,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 from torch.nn.functional import embedding
 
-from ..rays import Look, Rays, Samples
+from ..camera.rays import Look, Rays, Samples
 from .field import Features, Field
 from .part import Part
 

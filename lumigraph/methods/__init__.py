@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import LumigraphError
-from ..names import meant
+from ..files.names import meant
 
 # A method that is added comes behind these, so that no colour of theirs changes from one release to the next.
 COLOURED = ("gaussian-splatting", "instant-ngp", "mip-nerf", "nerf", "fourier-features")

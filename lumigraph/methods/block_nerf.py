@@ -1,6 +1,6 @@
 """Block-NeRF: one block of a city, in the light of each photograph (Tancik et al. 2022, arXiv 2202.05263).
 
-The field of one block learns from any scene. `composition.in_blocks` makes one picture of many.
+The field of one block learns from any scene. `large.compositing` makes one picture of many.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from torch import Tensor
 from torch.nn.functional import huber_loss
 
 from ..camera import Camera
+from ..camera.rays import Look, Rays, Rendering
 from ..components.clouds.dense_points import compile_sweep
 from ..components.fields import hash_field
 from ..components.fields.appearance import Appearance, Patches, PhotographCodes, drawn
@@ -32,10 +33,9 @@ from ..components.training.moving import Moving
 from ..components.training.photometric import backdrop
 from ..components.training.pose_refinement import PoseRefinement
 from ..components.training.schedules import falling, held
-from ..controls import Control, Value
+from ..datasets.scene import Batch, Frame, Photograph, Scene
 from ..errors import LumigraphError
-from ..method import Method, RayMethod
-from ..ranges import (
+from ..files.ranges import (
     BatchSize,
     Depth,
     Layers,
@@ -50,8 +50,8 @@ from ..ranges import (
     Width,
     between,
 )
-from ..rays import Look, Rays, Rendering
-from ..scene import Batch, Frame, Photograph, Scene
+from ..method import Method, RayMethod
+from ..method.controls import Control, Value
 from ..volume import composite, weights_of
 
 Code = Annotated[int, between(1, 1024)]  # numbers of a photograph's code
@@ -120,6 +120,7 @@ class BlockNeRF(RayMethod):
     """Colours that depend on a photograph's appearance and exposure, and a network that knows what was seen."""
 
     Config = Config
+    in_blocks = True
 
     def __init__(self, frame: Frame, config: Any = None):
         config = config or Config()

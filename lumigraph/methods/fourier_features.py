@@ -11,12 +11,12 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
+from ..camera.rays import Rays, Rendering
 from ..components.fields.dense import Dense
 from ..components.fields.encodings import FourierFeatures as Waves
+from ..datasets.scene import Batch, Frame, Scene
+from ..files.ranges import BatchSize, Depth, LearningRate, NonNegative, Seed, Width, between
 from ..method import RayMethod
-from ..ranges import BatchSize, Depth, LearningRate, NonNegative, Seed, Width, between
-from ..rays import Rays, Rendering
-from ..scene import Batch, Frame, Scene
 
 Encoding = Literal["none", "basic", "positional", "gaussian"]
 FEW = 16  # inputs to a layer below which it multiplies in float32: in bfloat16 alone they tell no pixel from the next
@@ -26,15 +26,15 @@ FEW = 16  # inputs to a layer below which it multiplies in float32: in bfloat16 
 class Config:
     """The paper's numbers for pictures (section 6.1, and its appendix on implementation); those of a step are ours."""
 
-    encoding: Encoding = "gaussian"
-    scale: NonNegative = 10.0  # sigma, cycles across the picture: of gaussian the deviation, of positional the highest
-    frequencies: Annotated[int, between(2, 65_536)] = 256  # rows of B, for positional and gaussian
-    layers: Depth = 4  # the last of them gives colours
-    hidden_width: Width = 256  # of the others
-    learning_rate: LearningRate = 1e-3  # Adam's
-    pixels_per_step: BatchSize = 1 << 13  # the paper takes all of them
-    exact: bool = False  # multiply in float32 even where bfloat16 is faster
-    seed: Seed = 0
+    encoding: Encoding = "gaussian"  # encoding of coordinates ahead of the network, section 6.1; none gives a blur
+    scale: NonNegative = 10.0  # sigma, section 6.1: of gaussian the deviation, of positional the highest; higher: finer
+    frequencies: Annotated[int, between(2, 65_536)] = 256  # rows of B, for positional and gaussian; more cost time
+    layers: Depth = 4  # layers of the network, the last of which gives colours; more cost time
+    hidden_width: Width = 256  # channels of hidden layers; wider learns more detail, and costs time
+    learning_rate: LearningRate = 1e-3  # Adam's learning rate; higher learns faster, and may diverge
+    pixels_per_step: BatchSize = 1 << 13  # random pixels in a step; more reduce noise, and cost time. The paper: all
+    exact: bool = False  # multiply in float32 even where bfloat16 is faster; slower and more precise
+    seed: Seed = 0  # seed of all random numbers; another seed gives another run
 
 
 class FourierFeatures(RayMethod):

@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from ..camera import Camera
-from ..collection import Collection
+from ..camera.rays import Look, Rays, Rendering
 from ..components.fields.code_space import fitted
 from ..components.fields.hash_field import HashNumbers, check_levels
 from ..components.fields.hash_instance import HashInstance, HashShape
@@ -28,25 +28,14 @@ from ..components.training.lazy_adam import LazyAdam
 from ..components.training.members import chance, photographed, rays_through
 from ..components.training.photometric import backdrop, residuals
 from ..components.training.schedules import falling
-from ..controls import Control, Value, blend
+from ..datasets.collection import Collection
+from ..datasets.scene import Batch, Frame, Photograph, Scene
 from ..errors import LumigraphError
+from ..files.ranges import BatchSize, Count, Layers, LearningRate, NonNegative, Positive, Seed, Share, Width, between
 from ..geometry import look_at
 from ..method import Method, RayMethod
-from ..quality import Effort, Efforts
-from ..ranges import (
-    BatchSize,
-    Count,
-    Layers,
-    LearningRate,
-    NonNegative,
-    Positive,
-    Seed,
-    Share,
-    Width,
-    between,
-)
-from ..rays import Look, Rays, Rendering
-from ..scene import Batch, Frame, Photograph, Scene
+from ..method.controls import Control, Value, blend
+from ..method.quality import Effort, Efforts
 from ..volume import composite
 
 Tally = Annotated[int, between(0, 100_000)]
@@ -54,44 +43,44 @@ Tally = Annotated[int, between(0, 100_000)]
 
 @dataclass(frozen=True)
 class Config(HashNumbers):
-    """The paper's numbers where it or its published code gives them; `HypNeRF.preset` says what a plain CPU does."""
+    """The paper's numbers where it or its published code gives them; `HypNeRF.preset` has those of a plain CPU."""
 
-    shape_code: Width = 512  # numbers of the code that table and density are made of
-    colour_code: Width = 512  # of the code that the colour network is made of
-    code_deviation: Positive = 0.01  # of codes at first
-    hyper_width: Width = 512  # of the hypernetwork's hidden layers
-    hyper_layers: Layers = 2  # hidden ones, for each tensor
-    members: Count = 4096  # of a collection at most, which there are codes for
-    log2_hashmap_size: Annotated[int, between(1, 24)] = 11
-    hidden_width: Width = 64  # of an instance's networks
-    density_layers: Layers = 1  # hidden ones
-    colour_layers: Layers = 2  # hidden ones
-    geometry_features: Annotated[int, between(1, 256)] = 16  # from density to colour network
-    sh_bands: Annotated[int, between(1, 4)] = 4  # of spherical harmonics
-    steps_per_diagonal: Annotated[int, between(4, 16_384)] = 512
-    transmittance_threshold: Share = 1e-4  # at which a ray is spent
-    occupancy_resolution: Annotated[int, between(4, 256)] = 64  # cells per axis
-    occupancy_threshold: NonNegative = 0.05  # optical thickness across a cell below which it is empty
-    members_per_step: Annotated[int, between(1, 1024)] = 1
-    rays_per_member: BatchSize = 4096
-    targets: Annotated[int, between(1, 64)] = 4  # photographs of a member that its rays go through
-    empty_points: Tally = 1024  # of a member, where photographs see that nothing is
-    empty_weight: NonNegative = 0.01  # of density there
-    code_weight: NonNegative = 0.0  # of the codes' squares
-    learning_rate: LearningRate = 1e-3
-    final_learning_rate: LearningRate = 1e-4  # at the end of the budget
-    denoiser_width: Width = 32  # channels
-    denoiser_start: Share = 0.7  # share of the budget from which on the denoiser learns
-    # Of finding one scene
-    code_steps: Tally = 200  # in which its code is found
-    code_learning_rate: LearningRate = 0.1  # in deviations of the learnt codes
-    code_prior: NonNegative = 1e-3  # weight of the code's distance from the average, in deviations
-    tune_steps: Tally = 60  # in which the field's own tensors are tuned to its photographs
-    tune_learning_rate: LearningRate = 2e-3
-    denoise_views: Tally = 12  # renderings around it that are denoised and learnt from
-    denoise_steps: Tally = 60
-    denoise_weight: NonNegative = 0.5  # of these beside its photographs
-    seed: Seed = 0
+    shape_code: Width = 512  # numbers of the code of table and density, section 3.2; more hold more shapes
+    colour_code: Width = 512  # numbers of the code of the colour network, section 3.2; more hold more colours
+    code_deviation: Positive = 0.01  # standard deviation of codes at first; larger ones start farther apart
+    hyper_width: Width = 512  # channels of the hypernetwork's hidden layers; wider costs memory and time
+    hyper_layers: Layers = 2  # hidden layers of the hypernetwork for each tensor; more cost time
+    members: Count = 4096  # members of a collection at most; each has a code, so more cost memory
+    log2_hashmap_size: Annotated[int, between(1, 24)] = 11  # log2 of entries of a level; one more doubles the table
+    hidden_width: Width = 64  # channels of an object's density and colour networks; wider costs time
+    density_layers: Layers = 1  # hidden layers of an object's density network; more cost time
+    colour_layers: Layers = 2  # hidden layers of an object's colour network; more cost time
+    geometry_features: Annotated[int, between(1, 256)] = 16  # features from density to colour network
+    sh_bands: Annotated[int, between(1, 4)] = 4  # spherical-harmonics bands of the direction; 1: no view dependence
+    steps_per_diagonal: Annotated[int, between(4, 16_384)] = 512  # samples across the diagonal; fewer are faster
+    transmittance_threshold: Share = 1e-4  # transmittance at which a ray terminates; higher is faster, less exact
+    occupancy_resolution: Annotated[int, between(4, 256)] = 64  # cells per axis of the occupancy grid; more skip more
+    occupancy_threshold: NonNegative = 0.05  # optical thickness of a cell below which it is empty; higher skips more
+    members_per_step: Annotated[int, between(1, 1024)] = 1  # members in a step; more reduce noise, and cost time
+    rays_per_member: BatchSize = 4096  # rays of each member in a step; more reduce noise, and cost time
+    targets: Annotated[int, between(1, 64)] = 4  # photographs of a member that a step's rays come from
+    empty_points: Tally = 1024  # random points of a member in empty space, for empty_weight; 0: no such term
+    empty_weight: NonNegative = 0.01  # weight of density in known empty space; higher removes floating density
+    code_weight: NonNegative = 0.0  # weight of the codes' squares in the loss; higher keeps codes near zero
+    learning_rate: LearningRate = 1e-3  # Adam's learning rate at first; higher learns faster, and may diverge
+    final_learning_rate: LearningRate = 1e-4  # learning rate at the end of the budget, reached exponentially
+    denoiser_width: Width = 32  # channels of the denoiser, section 3.3; wider costs time
+    denoiser_start: Share = 0.7  # share of the budget before the denoiser is trained; later leaves it fewer steps
+    # Fitting one scene.
+    code_steps: Tally = 200  # steps that fit the code of a new scene, section 3.3; more take longer
+    code_learning_rate: LearningRate = 0.1  # rate of that fit, in deviations of the learnt codes
+    code_prior: NonNegative = 1e-3  # weight of a new code's distance from the average; higher: closer to learnt ones
+    tune_steps: Tally = 60  # steps that tune the field to the photographs, section 3.3; 0: code alone
+    tune_learning_rate: LearningRate = 2e-3  # learning rate of tuning; higher changes the field more
+    denoise_views: Tally = 12  # denoised renderings around the object to tune on, section 3.3; 0: none
+    denoise_steps: Tally = 60  # steps of tuning with denoised renderings, section 3.3; 0: none
+    denoise_weight: NonNegative = 0.5  # weight of denoised renderings beside the photographs, in tuning
+    seed: Seed = 0  # seed of all random numbers; another seed gives another run
 
     def check(self) -> None:
         """Raises LumigraphError for numbers that contradict each other."""

@@ -13,7 +13,14 @@ from ..camera import Camera
 from ..components.fields.hash_field import CPU_TABLE, TINY_TABLE, HashField, HashNumbers
 from ..components.fields.taken_over import taken_over
 from ..components.sampling.importance import importance
-from ..components.sampling.occupancy_sampler import OccupancyNumbers, StepNumbers
+from ..components.sampling.occupancy_sampler import (
+    CPU_OCCUPANCY,
+    CPU_STEPS,
+    TINY_OCCUPANCY,
+    TINY_STEPS,
+    OccupancyNumbers,
+    StepNumbers,
+)
 from ..components.sampling.proposal_sampler import ProposalNumbers
 from ..components.sampling.samplers import sampler_for
 from ..components.sampling.spaces import Box, space_of
@@ -22,10 +29,10 @@ from ..components.training.exposure import Exposure, Setting
 from ..components.training.photometric import backdrop, residuals
 from ..components.training.pose_refinement import PoseNumbers, poses_for
 from ..components.training.schedules import held
+from ..datasets.scene import Batch, Frame
+from ..exchange.packing import most_important
+from ..files.ranges import LearningRate, NonNegative, PositiveShare, Seed, Width, between
 from ..method import FieldMethod
-from ..packing import most_important
-from ..ranges import LearningRate, NonNegative, PositiveShare, Seed, Width, between
-from ..scene import Batch, Frame
 from ..volume import composite
 
 
@@ -47,12 +54,6 @@ class Config:
     contraction: bool = True  # contract scenes without bounds (Barron 2022); no: section 5.4's cascades around them
     exposure_correction: Setting = "auto"  # learn a gain per photograph; auto: where they are found to differ
     seed: Seed = 0
-
-
-CPU_OCCUPANCY = OccupancyNumbers(samples_per_step=1 << 15, transmittance_threshold=1e-3, occupancy_threshold=0.15)
-CPU_STEPS = StepNumbers(steps_per_diagonal=384, cone_angle=1 / 96)
-TINY_OCCUPANCY = OccupancyNumbers(samples_per_step=2048, occupancy_resolution=16)
-TINY_STEPS = StepNumbers(steps_per_diagonal=128)
 
 
 class InstantNGP(FieldMethod):
@@ -131,7 +132,7 @@ class InstantNGP(FieldMethod):
         self.sampler.settle(self.density, chance)
 
     def importance(self, camera: Camera) -> dict[str, Float[Tensor, " row"]]:
-        """Sum of the weights with which each entry of the table adds to one picture; see `components.sampling.importance`."""
+        """Weight of each entry of the table in one picture; see `components.sampling.importance`."""
         (shares,) = importance(self, camera, self.network.encode, [self.network.table])
         return {"network.table": shares.mean(-1)}
 

@@ -12,6 +12,7 @@ from torch import Tensor
 from torch.nn.functional import pad, softplus
 
 from ..camera import Camera
+from ..camera.rays import Look, Rays, Rendering
 from ..components.fields.coordinate_network import CoordinateNetwork, bytes_kept
 from ..components.fields.dense import in_chunks
 from ..components.fields.encodings import FrequencyEncoding, IntegratedEncoding
@@ -24,10 +25,21 @@ from ..components.training.coarse_to_fine import band_weights
 from ..components.training.distillation import distil
 from ..components.training.pose_refinement import PoseRefinement
 from ..components.training.schedules import falling
+from ..datasets.scene import Batch, Frame, Scene
+from ..files.ranges import (
+    BatchSize,
+    Cells,
+    Depth,
+    Layers,
+    LearningRate,
+    NonNegative,
+    Octaves,
+    RaySamples,
+    Seed,
+    Share,
+    Width,
+)
 from ..method import RayMethod
-from ..ranges import BatchSize, Cells, Depth, Layers, LearningRate, NonNegative, Octaves, RaySamples, Seed, Share, Width
-from ..rays import Look, Rays, Rendering
-from ..scene import Batch, Frame, Scene
 from ..volume import composite, weights_of
 
 

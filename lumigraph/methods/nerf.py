@@ -14,6 +14,7 @@ from torch import Tensor
 from torch.nn.functional import softplus
 
 from ..camera import Camera
+from ..camera.rays import Look, Rays, Rendering, Samples
 from ..components.fields.coordinate_network import CoordinateNetwork, bytes_kept
 from ..components.fields.dense import in_chunks
 from ..components.fields.encodings import FrequencyEncoding
@@ -24,9 +25,9 @@ from ..components.sampling.spaces import space_of
 from ..components.training.distillation import distil
 from ..components.training.pose_refinement import PoseRefinement
 from ..components.training.schedules import falling
+from ..datasets.scene import Batch, Frame, Scene
 from ..errors import LumigraphError
-from ..method import RayMethod
-from ..ranges import (
+from ..files.ranges import (
     BatchSize,
     Cells,
     Depth,
@@ -40,8 +41,7 @@ from ..ranges import (
     Width,
     between,
 )
-from ..rays import Look, Rays, Rendering, Samples
-from ..scene import Batch, Frame, Scene
+from ..method import RayMethod
 from ..volume import composite, weights_of
 
 

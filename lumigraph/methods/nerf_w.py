@@ -10,6 +10,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from ..camera.rays import Look, Rays, Rendering, Samples
 from ..components.clouds.dense_points import compile_sweep
 from ..components.fields import hash_field
 from ..components.fields.appearance import PhotographCodes, drawn
@@ -24,9 +25,8 @@ from ..components.sampling.unbounded import OpenNumbers, Unbounded
 from ..components.training.corrections import AVERAGE
 from ..components.training.photometric import backdrop
 from ..components.training.schedules import held
-from ..controls import Control, Value
-from ..method import Method, RayMethod
-from ..ranges import (
+from ..datasets.scene import Batch, Frame, Photograph, Scene
+from ..files.ranges import (
     BatchSize,
     Depth,
     Layers,
@@ -41,8 +41,8 @@ from ..ranges import (
     Width,
     between,
 )
-from ..rays import Look, Rays, Rendering, Samples
-from ..scene import Batch, Frame, Photograph, Scene
+from ..method import Method, RayMethod
+from ..method.controls import Control, Value
 from ..volume import composite, weights_of
 
 Code = Annotated[int, between(1, 1024)]  # numbers of a photograph's code

@@ -13,8 +13,8 @@ from torch import Tensor
 from torch.nn.functional import softplus
 
 from ..camera import Camera
+from ..camera.rays import Look, Rays, Samples
 from ..capture.fewer import spread_out
-from ..collection import Collection
 from ..components.fields.dense import in_chunks
 from ..components.fields.encodings import FrequencyEncoding
 from ..components.fields.kept_photographs import KeptPhotographs, padded
@@ -25,11 +25,10 @@ from ..components.sampling.sampling import inverse_transform, midpoints, stratif
 from ..components.sampling.spaces import space_of
 from ..components.training.members import chance, photographed, rays_through
 from ..components.training.schedules import falling
-from ..controls import Control, Value
+from ..datasets.collection import Collection
+from ..datasets.scene import Batch, Frame, Photograph, Scene
 from ..errors import LumigraphError
-from ..method import Method, RayMethod
-from ..quality import Effort, Efforts
-from ..ranges import (
+from ..files.ranges import (
     BatchSize,
     Layers,
     LearningRate,
@@ -42,8 +41,9 @@ from ..ranges import (
     Width,
     between,
 )
-from ..rays import Look, Rays, Samples
-from ..scene import Batch, Frame, Photograph, Scene
+from ..method import Method, RayMethod
+from ..method.controls import Control, Value
+from ..method.quality import Effort, Efforts
 from ..volume import composite, weights_of
 
 Views = Annotated[int, between(1, 64)]
@@ -53,36 +53,34 @@ Views = Annotated[int, between(1, 64)]
 class Config:
     """The paper's numbers (appendix B), with where its published code gives them; below them what saves time."""
 
-    hidden_width: Width = 512  # of the network's layers, appendix B.1
-    blocks: Annotated[int, between(1, 32)] = 5  # residual ones, appendix B.1
-    view_blocks: Annotated[int, between(1, 32)] = 3  # of them before the mean over views
-    encoder_widths: tuple[Width, Width, Width, Width] = (64, 64, 128, 256)  # of ResNet-34: its stem and three stages
-    encoder_blocks: tuple[Layers, Layers, Layers] = (3, 4, 6)  # of these stages
-    encoder_pool: bool = True  # halve the resolution after the stem
-    encoder_weights: str = ""  # a file of torchvision's resnet34 to begin with; without, the encoder begins at random
-    position_frequencies: Octaves = 6  # appendix B.1; the lowest turns by 1.5 radians a unit
-    centred: bool = (
-        True  # objects: positions turn with each camera about the middle; else they are seen from the camera
-    )
-    coarse_samples: RaySamples = 64  # of a ray, appendix B.2
-    fine_samples: RaySamples = 16  # drawn where the first found something
-    depth_samples: Annotated[int, between(0, 4096)] = 16  # drawn around the depth that the first found
-    depth_deviation: Positive = 0.01  # of those, as a share of the ray's length in the scene
-    networks: Annotated[int, between(1, 2)] = 2  # one for each look; 1 asks the same about all samples, once
-    coarse_loss_weight: NonNegative = 1.0  # of the first look's colours
-    density: Literal["relu", "softplus"] = "relu"
-    density_scale: Positive = 1.0  # density, per scene unit, of an output of 1
-    source_views: Views = 3  # at most, in a step; how many is drawn anew each time
-    members_per_step: Annotated[int, between(1, 1024)] = 4  # scenes
-    rays_per_member: BatchSize = 128
-    targets: Views = 4  # photographs of a member that its rays go through
-    boxed: Share = 0.75  # share of the budget in which rays go through boxes around what is opaque
-    learning_rate: LearningRate = 1e-4
-    final_learning_rate: LearningRate = 1e-4
-    warmup: Share = 0.0  # share of the budget in which the learning rate grows
-    empty_threshold: Share = 0.0  # opacity, as the first look found it, below which rays are not looked at again
-    bfloat16: bool = True  # multiply in bfloat16 where the machine is fast at it
-    seed: Seed = 0
+    hidden_width: Width = 512  # channels of the network's layers, appendix B.1; wider costs memory and time
+    blocks: Annotated[int, between(1, 32)] = 5  # residual blocks of the network, appendix B.1; more cost time
+    view_blocks: Annotated[int, between(1, 32)] = 3  # blocks of these before the mean over views, appendix B.1
+    encoder_widths: tuple[Width, Width, Width, Width] = (64, 64, 128, 256)  # channels of ResNet-34's stem and 3 stages
+    encoder_blocks: tuple[Layers, Layers, Layers] = (3, 4, 6)  # blocks of the encoder's three stages; more cost time
+    encoder_pool: bool = True  # halve the resolution after the encoder's stem; off: finer features, slower
+    encoder_weights: str = ""  # file of torchvision's resnet34 weights to begin with; without, begin at random
+    position_frequencies: Octaves = 6  # octaves of positions, appendix B.1; the lowest turns by 1.5 radians a unit
+    centred: bool = True  # positions relative to an object's centre, as published; off: to each camera
+    coarse_samples: RaySamples = 64  # coarse samples of a ray, appendix B.2; more find thinner things, slower
+    fine_samples: RaySamples = 16  # fine samples of a ray, by the coarse weights, appendix B.2; more are sharper
+    depth_samples: Annotated[int, between(0, 4096)] = 16  # samples around the coarse depth, appendix B.2; 0: none
+    depth_deviation: Positive = 0.01  # standard deviation of these, as a share of the ray's length in the scene
+    networks: Annotated[int, between(1, 2)] = 2  # networks: one for each pass, or 1 for both, which is faster
+    coarse_loss_weight: NonNegative = 1.0  # weight of the coarse pass's colours; 0: it only guides the fine one
+    density: Literal["relu", "softplus"] = "relu"  # activation of density; softplus has a gradient below zero too
+    density_scale: Positive = 1.0  # density per scene unit of an output of 1; higher starts more opaque
+    source_views: Views = 3  # given photographs in a step at most, a random number, section 5.1
+    members_per_step: Annotated[int, between(1, 1024)] = 4  # scenes in a step; more reduce noise, and cost time
+    rays_per_member: BatchSize = 128  # rays of each scene in a step; more reduce noise, and cost time
+    targets: Views = 4  # photographs of a member that a step's rays come from
+    boxed: Share = 0.75  # share of the budget in which rays go through boxes around opaque pixels, appendix B.2
+    learning_rate: LearningRate = 1e-4  # Adam's learning rate at first; higher learns faster, and may diverge
+    final_learning_rate: LearningRate = 1e-4  # learning rate at the end of the budget, reached exponentially
+    warmup: Share = 0.0  # share of the budget in which the learning rate rises; 0: none
+    empty_threshold: Share = 0.0  # coarse opacity below which a ray has no fine pass; higher is faster
+    bfloat16: bool = True  # multiply in bfloat16 where the processor is fast at it; off: float32, slower
+    seed: Seed = 0  # seed of all random numbers; another seed gives another run
 
     def check(self) -> None:
         """Raises LumigraphError for numbers that contradict each other."""

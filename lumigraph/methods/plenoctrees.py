@@ -11,9 +11,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from ..baked import Octree
 from ..camera import Camera
-from ..capabilities import HasField, HasLooks, can
+from ..camera.rays import Look, Rays, Rendering
 from ..components.fields.harmonic_field import HarmonicHash, HarmonicNetwork, colour
 from ..components.fields.hash_field import TABLE_ON_A_CPU, TINY_TABLE, HashNumbers, check_levels
 from ..components.fields.leaves import Leaves, ask_for_octree
@@ -34,10 +33,11 @@ from ..components.training.lazy_adam import LazyAdam
 from ..components.training.lazy_rmsprop import LazyRMSprop
 from ..components.training.photometric import backdrop, residuals
 from ..components.training.schedules import falling, held
+from ..datasets.scene import Batch, Frame, Scene
 from ..errors import LumigraphError
-from ..method import RayMethod
-from ..packing import Stored, most_important
-from ..ranges import (
+from ..exchange.baked import Octree
+from ..exchange.packing import Stored, most_important
+from ..files.ranges import (
     BatchSize,
     Depth,
     Layers,
@@ -52,8 +52,8 @@ from ..ranges import (
     Width,
     between,
 )
-from ..rays import Look, Rays, Rendering
-from ..scene import Batch, Frame, Scene
+from ..method import RayMethod
+from ..method.capabilities import HasField, HasLooks, can
 from ..volume import composite, weights_of
 
 DensityRate = Annotated[float, between(1e-6, 1e4)]
@@ -61,38 +61,38 @@ DensityRate = Annotated[float, between(1e-6, 1e4)]
 
 @dataclass(frozen=True)
 class Config(HashNumbers):
-    """The paper's numbers, with where it or its release gives them; `PlenOctrees.preset` says what a CPU does."""
+    """The paper's numbers, with where it or its release gives them; `PlenOctrees.preset` has those of a plain CPU."""
 
-    field: Literal["hash", "network"] = "network"  # what is learnt first: the paper's network, or a hash table
-    depth: Depth = 8  # hidden layers of the network, as in NeRF
-    skip_layer: Layers = 5  # the layer whose activation its input joins again
-    position_frequencies: Octaves = 10  # octaves that it sees places in
-    hidden_width: Width = 256  # channels of a layer, of either
-    hidden_layers: Layers = 2  # after the hash table
-    sh_bands: Annotated[int, between(1, 4)] = 4  # of harmonics: 16 coefficients, section 5.1
-    sparsity_weight: NonNegative = 1e-3  # of density at random points, eq. 4; the release's
-    sparsity_length: Positive = 0.05  # lambda in it: scene units over which that density would stop light
-    sparsity_points: Annotated[int, between(1, 1 << 20)] = 10_000  # K in it
-    samples_per_step: Annotated[int, between(64, 1 << 24)] = 1 << 18  # of the first stage: as many rays as need them
-    steps_per_diagonal: Annotated[int, between(4, 16_384)] = 1024  # of the unit cube, along rays
-    occupancy_resolution: Annotated[int, between(4, 512)] = 128  # cells per axis of the grid that says where
-    occupancy_threshold: NonNegative = 0.05  # optical thickness across a cell below which it is empty
-    occupancy_interval: Steps = 16  # steps between looks at it
-    occupancy_decay: Share = 0.95  # of the densities it remembers
-    learning_rate: LearningRate = 5e-4  # of the field, section 5.1
-    final_learning_rate: LearningRate = 5e-5  # at the end of the first stage
+    field: Literal["hash", "network"] = "network"  # first field: the paper's network, or a faster hash table
+    depth: Depth = 8  # hidden layers of the network, as in NeRF; more hold more detail, and cost time
+    skip_layer: Layers = 5  # layer of the network whose activation the input is concatenated to again
+    position_frequencies: Octaves = 10  # octaves of positions of the network; more give finer detail, and noise
+    hidden_width: Width = 256  # channels of a hidden layer, of either field; wider costs memory and time
+    hidden_layers: Layers = 2  # hidden layers after the hash table; more cost time
+    sh_bands: Annotated[int, between(1, 4)] = 4  # spherical-harmonics bands, section 5.1: 4 have 16 coefficients
+    sparsity_weight: NonNegative = 1e-3  # weight of density at random points, eq. 4; higher empties more; the release's
+    sparsity_length: Positive = 0.05  # lambda of eq. 4: scene units over which that density absorbs light
+    sparsity_points: Annotated[int, between(1, 1 << 20)] = 10_000  # K, random points of eq. 4; more cost time
+    samples_per_step: Annotated[int, between(64, 1 << 24)] = 1 << 18  # samples in a step of the first stage
+    steps_per_diagonal: Annotated[int, between(4, 16_384)] = 1024  # samples across the cube's diagonal, first stage
+    occupancy_resolution: Annotated[int, between(4, 512)] = 128  # cells per axis of the occupancy grid, first stage
+    occupancy_threshold: NonNegative = 0.05  # optical thickness of a cell below which it is empty; higher skips more
+    occupancy_interval: Steps = 16  # steps between updates of the occupancy grid; more are faster, less current
+    occupancy_decay: Share = 0.95  # share of a cell's density kept at each update; higher forgets more slowly
+    learning_rate: LearningRate = 5e-4  # the field's learning rate at first, section 5.1; higher may diverge
+    final_learning_rate: LearningRate = 5e-5  # learning rate of the field at the end of the first stage
     decay_start: Annotated[float, between(0, 0.99)] = 0.0  # share of the first stage before that rate falls
-    teacher_share: Share = 0.9  # of the budget, after which the field is baked
-    octree_depth: Annotated[int, between(1, 10)] = 9  # levels below the cube: 512 cells along an axis, section 4.1
-    leaf_points: Annotated[int, between(1, 4096)] = 256  # of a leaf, over which harmonics are averaged, section 4.1
-    weight_threshold: PositiveShare = 1e-3  # that a leaf must have in some photograph, section 4.1
-    rays_per_step: BatchSize = 4096  # in the last stage
-    density_learning_rate: DensityRate = 10.0  # of leaves: density is per scene unit
-    final_density_learning_rate: DensityRate = 1.0
-    harmonics_learning_rate: LearningRate = 0.02  # of leaves
-    final_harmonics_learning_rate: LearningRate = 0.002
-    transmittance_threshold: Share = 0.01  # at which a ray is spent, section 4.2
-    seed: Seed = 0
+    teacher_share: Share = 0.9  # share of the budget after which the field is baked; the leaves have the rest
+    octree_depth: Annotated[int, between(1, 10)] = 9  # levels of the octree, section 4.1; 9 has 512 cells per axis
+    leaf_points: Annotated[int, between(1, 4096)] = 256  # points of a leaf that are averaged, section 4.1
+    weight_threshold: PositiveShare = 1e-3  # least weight of a leaf on some ray, section 4.1; higher drops more leaves
+    rays_per_step: BatchSize = 4096  # rays in a step of the last stage; more reduce noise, and cost time
+    density_learning_rate: DensityRate = 10.0  # rate of the leaves' density at first, per scene unit
+    final_density_learning_rate: DensityRate = 1.0  # rate of the leaves' density at the end
+    harmonics_learning_rate: LearningRate = 0.02  # rate of the leaves' harmonics at first
+    final_harmonics_learning_rate: LearningRate = 0.002  # rate of the leaves' harmonics at the end
+    transmittance_threshold: Share = 0.01  # transmittance at which a ray terminates, section 4.2; higher is faster
+    seed: Seed = 0  # seed of all random numbers; another seed gives another run
 
     def check(self) -> None:
         """Raises LumigraphError for numbers that contradict each other."""

@@ -4,35 +4,32 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Annotated, Any
+from typing import Annotated, Any, ClassVar
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
 from ..camera import Camera
-from ..components.clouds.dense_points import compile_sweep
 from ..components.fields.sparse_voxels import Cells, Part, SparseVoxels
 from ..components.fields.taken_over import logit, taken_over
-from ..components.sampling.carving import visual_hull
 from ..components.sampling.importance import importance
-from ..components.sampling.occupancy import OccupancyGrid
-from ..components.sampling.spaces import NDC, space_of
-from ..components.sampling.unbounded import RAYS, OpenNumbers, Unbounded, rays_of, unbounded
-from ..components.training.corrections import Setting
-from ..components.training.exposed import Exposed
+from ..components.sampling.occupancy_sampler import GridSchedule, OccupancyNumbers, OccupancySampler
+from ..components.sampling.proposal_sampler import ProposalNumbers
+from ..components.sampling.samplers import sampler_for
+from ..components.sampling.spaces import NDC, Space, space_of
+from ..components.training.exposure import Exposure, Setting
 from ..components.training.lazy_rmsprop import LazyRMSprop
 from ..components.training.photometric import backdrop, residuals
 from ..components.training.schedules import falling
 from ..components.training.sparsity import cauchy
+from ..datasets.scene import Batch, Frame, Scene
 from ..errors import LumigraphError
+from ..exchange.packing import Stored, most_important
+from ..files.ranges import BatchSize, LearningRate, NonNegative, Positive, PositiveShare, Seed, Share, Steps, between
 from ..kernels import total_variation
 from ..kernels.harmonic_grid import BANDS
-from ..method import RayMethod
-from ..packing import Stored, most_important
-from ..ranges import BatchSize, LearningRate, NonNegative, Positive, PositiveShare, Seed, Share, Steps, between
-from ..rays import Look, Rays, Rendering, Samples
-from ..scene import Batch, Frame, Scene
+from ..method import Field, FieldMethod
 from ..volume import composite, weights_of
 
 Resolution = Annotated[int, between(4, 1024)]
@@ -40,10 +37,18 @@ DensityRate = Annotated[float, between(1e-6, 1e4)]
 
 
 @dataclass(frozen=True)
-class Config(OpenNumbers):
+class Config:
     """The paper's numbers for synthetic scenes (section 3, and the authors' release); `Plenoxels.preset` says what a
     plain CPU does otherwise."""
 
+    occupancy: OccupancyNumbers = OccupancyNumbers(
+        samples_per_step=1 << 20,
+        occupancy_resolution=256,
+        occupancy_threshold=1e-2,
+        occupancy_interval=64,
+        occupancy_decay=0.9,
+    )
+    proposals: ProposalNumbers = ProposalNumbers()
     base_resolution: Resolution = 256  # voxels per axis at first, section 3.3
     max_resolution: Resolution = 512  # and in the end, doubled in between
     open_base_resolution: Resolution = 128  # the same where there is no bound, the release's
@@ -51,13 +56,8 @@ class Config(OpenNumbers):
     refine_until: Share = 0.3  # share of the budget at which the grid is as fine as it gets
     step_size: Annotated[float, between(0.05, 4)] = 0.5  # of samples along a ray, in voxels
     initial_density: Positive = 0.1  # per unit of coordinates
-    transmittance_threshold: Share = 1e-4  # at which a ray is spent
     weight_threshold: Share = 5e-3  # of a sample in a picture, below which its voxel is pruned, section 3.3
-    occupancy_resolution: Annotated[int, between(4, 512)] = 256  # cells per axis of the grid that rays march through
-    occupancy_threshold: NonNegative = 1e-2  # optical thickness across a cell below which it is skipped
-    occupancy_interval: Steps = 64  # steps between updates of the occupancy grid
     rays_per_step: BatchSize = 5000  # section 4; at most
-    samples_per_step: Annotated[int, between(64, 1 << 24)] = 1 << 20  # that these may meet where there is no bound
     density_learning_rate: DensityRate = 30.0  # per unit of coordinates, of 256 voxels per axis; in proportion to them
     final_density_learning_rate: DensityRate = 0.05
     density_delay: Share = 0.12  # share of the budget in which the density's learning rate comes up to that
@@ -91,34 +91,85 @@ class Config(OpenNumbers):
 
 
 DELAYED = 0.01  # what the density's learning rate begins with, as a share
-REMEMBERED = 0.9  # of a cell's density and a voxel's weight, from one look of the occupancy grid to the next
-NOTED = 4  # steps between those whose samples' weights are remembered for pruning
-LEAST = 1e-2  # density of a node at least, where another method is taken over: what is not above 0 learns nothing
+WEIGHT_DECAY = 0.9  # of a voxel's remembered weight, from one update of the occupancy grid to the next
+SCHEDULE = GridSchedule(begins=1e-9, early_steps=0, probes=1.0)  # the whole grid, but not in the first step
+NOTE_INTERVAL = 4  # steps between those whose samples' weights are remembered for pruning
+MIN_DENSITY = 1e-2  # density of a node at least, where another method is taken over: what is not above 0 learns nothing
 EDGE = 1e-3  # opacities are kept so far from 0 and 1 in the beta loss
 
 
-class Plenoxels(Exposed, RayMethod):  # type: ignore[override]  # what is accepted
-    """Rays are sampled in occupied cells; a first pass looks up density alone, and what light reaches is looked up once
-    more, with colour. Values belong to the nodes of a grid over the coordinates of a `Space`: an object as it is, a
-    forward-facing capture in normalised device coordinates, anything else contracted into a ball."""
+class HarmonicField(Field):
+    """Density and spherical harmonics at the nodes of a sparse grid over a space's coordinates (section 3.1).
+
+    touched: rows that the last evaluation with gradients touched, and a small table of these: gradients of others are
+             not made
+    """
+
+    cheap_density: ClassVar[bool] = True
+    joint: ClassVar[bool] = True
+
+    def __init__(self, config: Config, frame: Frame, space: Space):
+        super().__init__()
+        self.config, self.space = config, space
+        first, _ = config.resolutions(space.is_open)
+        self.voxels = SparseVoxels(cells_of(space, first), config.initial_density)
+        self.touched: tuple[Tensor, Part]
+
+    def geometry(
+        self, points: Float[Tensor, "point 3"], code: Tensor | None = None
+    ) -> tuple[Float[Tensor, " point"], Float[Tensor, "point 3"]]:
+        """Density, and as features the points' coordinates."""
+        places = self.space.warp(points)
+        return self.voxels.density_at(places).relu() * self.space.stretch(points), places
+
+    def colour(
+        self, features: Float[Tensor, "point 3"], directions: Float[Tensor, "point 3"], code: Tensor | None = None
+    ) -> Float[Tensor, "point 3"]:
+        return self.voxels.at(features, directions)[1].sigmoid()
+
+    def forward(
+        self, points: Float[Tensor, "point 3"], directions: Float[Tensor, "point 3"], code: Tensor | None = None
+    ) -> tuple[Float[Tensor, " point"], Float[Tensor, "point 3"]]:
+        voxels: SparseVoxels | Part = self.voxels
+        if torch.is_grad_enabled():
+            rows = self.voxels.touched(self.space.warp(points))
+            voxels = self.voxels.part(rows)
+            self.touched = rows, voxels
+        density, rgb = voxels.at(self.space.warp(points), directions)
+        return density.relu() * self.space.stretch(points), rgb.sigmoid()
+
+    @property
+    def step_length(self) -> float:
+        return self.config.step_size * 2 / int(self.voxels.cells.amax())
+
+    def storage(self) -> dict[str, Stored]:
+        """Harmonics by a codebook, density as whole numbers."""
+        coded = {"voxels.density": Stored("scaled"), "voxels.harmonics": Stored("coded")}
+        return coded | {"voxels.weights": Stored("nothing")}
+
+
+class Plenoxels(FieldMethod):
+    """A sparse grid in occupied cells. Its values belong to nodes in the coordinates of a `Space`: an object as it is,
+    a forward-facing capture in normalised device coordinates, anything else contracted into a ball."""
 
     Config = Config
-    rays_per_step: Tensor
+    network: HarmonicField
 
     def __init__(self, frame: Frame, config: Any = None):
-        config = config or Config()
-        super().__init__(frame, config)
-        self.space = space_of(frame)
-        first, _ = config.resolutions(frame.reach > 1)
-        self.voxels = SparseVoxels(cells_of(frame, first), config.initial_density)
-        self.occupancy = OccupancyGrid(1.0, config.occupancy_resolution)
-        self.expose(frame, config.exposure_correction)
-        self.unbounded, rays = unbounded(frame, self.space, config), config.rays_per_step
-        if self.unbounded:
-            self.rays_per_chunk, rays = RAYS, min(rays, rays_of(config.samples_per_step, config))
-        self.register_buffer("rays_per_step", torch.tensor(rays))
-        self._touched: tuple[Tensor, Part]
+        c = config or Config()
+        super().__init__(frame, c)
+        space = space_of(frame)
+        self.network = HarmonicField(c, frame, space)
+        self.sampler = sampler_for(
+            frame, space, c.occupancy, c.proposals, SCHEDULE, max_rays=c.rays_per_step, adapts=False
+        )
+        learns_gains = c.exposure_correction != "no"
+        self.exposure = Exposure(frame.image_count, c.exposure_correction, "harmonics") if learns_gains else None
         self._table: LazyRMSprop | None = None
+
+    @property
+    def voxels(self) -> SparseVoxels:
+        return self.network.voxels
 
     @classmethod
     def preset(cls, device: torch.device) -> Any:
@@ -130,14 +181,12 @@ class Plenoxels(Exposed, RayMethod):  # type: ignore[override]  # what is accept
             max_resolution=192,
             open_base_resolution=64,
             open_max_resolution=192,
-            occupancy_resolution=128,
             rays_per_step=4096,
-            samples_per_step=1 << 16,
+            occupancy=OccupancyNumbers(
+                samples_per_step=1 << 16, transmittance_threshold=1e-3, occupancy_threshold=0.02, occupancy_decay=0.9
+            ),
             refine_until=0.4,
             step_size=1.0,
-            transmittance_threshold=1e-3,
-            occupancy_threshold=0.02,
-            occupancy_interval=16,
             density_learning_rate=40.0,
             final_density_learning_rate=4.0,
             density_delay=0.2,
@@ -158,8 +207,13 @@ class Plenoxels(Exposed, RayMethod):  # type: ignore[override]  # what is accept
             open_max_resolution=32,
             refine_until=0.5,
             step_size=1.0,
-            occupancy_resolution=16,
-            occupancy_interval=4,
+            occupancy=OccupancyNumbers(
+                samples_per_step=1 << 20,
+                occupancy_resolution=16,
+                occupancy_threshold=1e-2,
+                occupancy_interval=4,
+                occupancy_decay=0.9,
+            ),
             rays_per_step=128,
             density_delay=0.1,
             density_learning_rate=60.0,
@@ -175,125 +229,55 @@ class Plenoxels(Exposed, RayMethod):  # type: ignore[override]  # what is accept
 
     @classmethod
     def further_bytes(cls, frame: Frame, config: Any, learning: bool) -> int:
-        _, last = config.resolutions(frame.reach > 1)
-        grown = SparseVoxels.bytes_of(cells_of(frame, last), learning)
-        return grown + OccupancyGrid.bytes_of(1.0, config.occupancy_resolution) + Unbounded.bytes_of(frame, learning)
+        _, last = config.resolutions(frame.is_open)
+        grown = SparseVoxels.bytes_of(cells_of(space_of(frame), last), learning)
+        return super().further_bytes(frame, config, learning) + grown
 
-    def rays_in_a_step(self, data: Scene) -> float:
-        return int(self.rays_per_step)
-
-    def batch(self, data: Scene, generator: torch.Generator) -> Batch:
-        return data.sample_rays(int(self.rays_per_step), generator).to(self.device)
-
-    # Being seen
-
-    def render_rays(self, rays: Rays, background: Float[Tensor, "#ray 3"]) -> Rendering:
-        (look,) = self.looks(rays)
-        return composite(look.samples, look.density, look.rgb, background)
-
-    def looks(self, rays: Rays) -> list[Look]:
-        if self.unbounded:
-            return [self.unbounded.look(self.field, rays)]
-        samples, _ = self._reached(rays)
-        return [Look("samples", samples, *self.field(*samples.along(rays)))]
-
-    def _reached(
-        self, rays: Rays, jitter: Float[Tensor, " ray"] | None = None
-    ) -> tuple[Samples, Float[Tensor, " sample"]]:
-        """The samples of rays that light reaches and that are not clear, and how much each weighs in a picture."""
-        step = self.config.step_size * 2 / int(self.voxels.cells.amax())
-        found = self.occupancy.sample(rays, self.frame.near, step, jitter=jitter)
-        with torch.no_grad():  # a lookup of density is so quick that all are asked about at once
-            density = self.density(found.along(rays)[0])
-            weights = weights_of(found, density, self.config.transmittance_threshold)
-        seen = weights > 0
-        samples = found.keep(seen)
-        self.figures |= {"rays": len(rays), "samples": len(found), "visible_samples": len(samples)}
-        return samples, weights[seen]
-
-    def field(
-        self, points: Float[Tensor, "point 3"], directions: Float[Tensor, "point 3"]
-    ) -> tuple[Float[Tensor, " point"], Float[Tensor, "point 3"]]:
-        """Density per scene unit, and sRGB-encoded colour seen along unit directions."""
-        density, rgb = self._field(points, directions, self.voxels)
-        return density, self.exposed(rgb)
-
-    def _field(
-        self, points: Float[Tensor, "point 3"], directions: Float[Tensor, "point 3"], voxels: SparseVoxels | Part
-    ) -> tuple[Float[Tensor, " point"], Float[Tensor, "point 3"]]:
-        density, rgb = voxels.at(self.space.warp(points), directions)
-        return density.relu() * self.space.stretch(points), rgb.sigmoid()
-
-    def density(self, points: Float[Tensor, "point 3"]) -> Float[Tensor, " point"]:
-        """Density per scene unit."""
-        return self._density(self.space.warp(points)) * self.space.stretch(points)
-
-    def _density(self, places: Float[Tensor, "point 3"]) -> Float[Tensor, " point"]:
-        """Density per unit of coordinates."""
-        return self.voxels.density_at(places).relu()
-
-    def storage(self) -> dict[str, Stored]:
-        """Harmonics by a codebook, density as whole numbers; of the grid, marks alone are needed for pictures."""
-        return {
-            "voxels.density": Stored("scaled"),
-            "voxels.harmonics": Stored("coded"),
-            "voxels.weights": Stored("nothing"),
-            "occupancy.density": Stored("nothing"),
-            "occupancy.possible": Stored("nothing", fill=1.0),
-            **(self.unbounded.storage() if self.unbounded else {}),
-        }
+    # Compression
 
     def importance(self, camera: Camera) -> dict[str, Float[Tensor, " row"]]:
         """How much each voxel adds to one picture; see `components.sampling.importance`."""
 
         def lookup(points: Float[Tensor, "sample 3"]) -> Float[Tensor, "sample 1"]:
-            return self.voxels.density_at(self.space.warp(points))[:, None]
+            return self.voxels.density_at(self.network.space.warp(points))[:, None]
 
         (shares,) = importance(self, camera, lookup, [self.voxels.density])
-        return {"voxels.harmonics": shares[:, 0]}
+        return {"network.voxels.harmonics": shares[:, 0]}
 
     @torch.no_grad()
     def thin(self, importance: dict[str, Float[Tensor, " row"]], share: float) -> dict[str, Float[Tensor, " kept"]]:
         """Leave the least important voxels out."""
-        weights = importance["voxels.harmonics"]
+        weights = importance["network.voxels.harmonics"]
         kept = most_important(weights, 1 - share)
         self.voxels.keep(kept)
-        return {"voxels.harmonics": weights[kept]}
+        return {"network.voxels.harmonics": weights[kept]}
 
-    # Learning
+    # Training
 
-    def begin(self, scene: Scene, seconds: float = math.inf) -> None:
-        self.tell_exposed(scene)
-        if scene.images.has_alpha and self.frame.reach == 1:
-            hull = visual_hull(scene, self.config.occupancy_resolution)
-            self.occupancy.rule_out(hull[None])
-            self.voxels.rebuild(hull, self.cells, self._table)
-        if self.unbounded:
-            self.unbounded.begin(scene, seconds, self.random(1))
+    def begin(self, data: Scene, seconds: float = math.inf) -> None:
+        super().begin(data, seconds)
+        if isinstance(self.sampler, OccupancySampler) and data.images.has_alpha:
+            self.voxels.rebuild(self.sampler.grid.possible[0], self.cells, self._table)
 
     @torch.no_grad()
     def from_field(self, teacher: Any, cameras: Camera) -> None:
         """Density and harmonics of the teacher at the finest grid's nodes, where it holds something."""
-        known, c, chance = taken_over(teacher, cameras), self.config, self.random(3)
-        occupied = known.occupied(self.space, c.occupancy_resolution, c.occupancy_threshold, chance)
-        cells = cells_of(self.frame, c.resolutions(self.frame.reach > 1)[1])
+        known, c, chance, space = taken_over(teacher, cameras), self.config, self.random(3), self.network.space
+        n = c.occupancy
+        occupied = known.occupied(space, n.occupancy_resolution, n.occupancy_threshold, chance)
+        cells = cells_of(space, c.resolutions(space.is_open)[1])
         self.voxels.rebuild(occupied.to(self.device), cells, self._table)
-        points = self.space.unwarp(self.voxels.places.cpu())
-        stretch = self.space.stretch(points)
+        points = space.unwarp(self.voxels.places.cpu())
+        stretch = space.stretch(points)
         density = known.density_around(points, 2 / max(cells) / stretch, chance) / stretch
-        self.voxels.density.copy_(density.clamp_min(LEAST)[:, None])
-        dense = self.voxels.dense(c.occupancy_threshold * max(cells) / 2)
+        self.voxels.density.copy_(density.clamp_min(MIN_DENSITY)[:, None])
+        dense = self.voxels.dense(n.occupancy_threshold * max(cells) / 2)
         self.voxels.rebuild(dense, cells, self._table)
-        points = self.space.unwarp(self.voxels.places.cpu())
+        points = space.unwarp(self.voxels.places.cpu())
         self.voxels.harmonics.copy_(known.harmonics(points, BANDS, logit).flatten(1))
-        if self.unbounded:
-            self.unbounded.begin_at(known.surface.points, known.surface.origins)
-        else:
-            self.occupancy.update(self.density, c.occupancy_threshold, chance)
-
-    def rehearse_begin(self) -> None:
-        if self.unbounded:
-            compile_sweep()
+        if self.sampler.is_open:
+            self.sampler.begin_from(known, chance)
+        self.sampler.settle(self.density, chance)
 
     @property
     def cells(self) -> Cells:
@@ -301,57 +285,36 @@ class Plenoxels(Exposed, RayMethod):  # type: ignore[override]  # what is accept
         return x, y, z
 
     def loss(self, batch: Batch, step: int) -> dict[str, Tensor]:
-        config, generator = self.config, self.random(step)
-        jitter = torch.rand(len(batch), 2 if self.unbounded else 1, generator=generator).to(self.device)
-        further = dict[str, Tensor]()
-        if self.unbounded:
-            look, proposed = self.unbounded.learn(self._learnt, batch.rays, jitter)
-            rows, part = self._touched
-            further = self.unbounded.terms(self.density, proposed, look.density, generator)
-            self.figures |= {"rays": len(batch), "samples": len(look.samples)}
-        else:
-            samples, weights = self._reached(batch.rays, jitter[:, 0])
-            points, directions = samples.along(batch.rays)
-            if step % NOTED == 0:
-                self.voxels.note(self.space.warp(points), weights)
-            look = Look("samples", samples, *self._learnt(points, directions))
-            rows, part = self._touched
-        background = backdrop(batch, self.background, generator, self.frame.reach > 1)
+        config, generator, is_open = self.config, self.random(step), self.sampler.is_open
+        (samples,), terms = self.learn(batch.rays, generator)
+        look, (rows, part) = samples.look(self.network), self.network.touched
+        if not is_open and step % NOTE_INTERVAL == 0:
+            places = self.network.space.warp(look.samples.along(batch.rays)[0])
+            self.voxels.note(places, weights_of(look.samples, look.density.detach()))
+        background = backdrop(batch, self.background, generator, is_open)
         rendering = composite(look.samples, look.density, look.rgb, background)
-        residual, self.figures["mse"] = residuals(rendering, batch, background, self.gains)
+        residual, self.figures["mse"] = residuals(rendering, batch, background, self.exposure)
         self.figures |= {"voxels": len(self.voxels), "touched": len(rows)}
-        terms = {"colour": residual.square().mean(), **further}
+        terms |= {"colour": residual.square().mean()}
         if config.sparsity:
             terms["sparsity"] = config.sparsity * cauchy(look.density, len(batch))
         if step % config.tv_interval == 0:
             drawn = torch.rand(len(rows), generator=generator).to(rows.device) < config.tv_share
             chosen = self.voxels.numbers[rows[drawn]].long()
-            open_ = config.open_tv_density, config.open_tv_harmonics
-            variations = open_ if self.frame.reach > 1 else (config.tv_density, config.tv_harmonics)
-            for name, weight in zip(("density", "harmonics"), variations, strict=True):
+            bounded = config.tv_density, config.tv_harmonics
+            weights = (config.open_tv_density, config.open_tv_harmonics) if is_open else bounded
+            for name, weight in zip(("density", "harmonics"), weights, strict=True):
                 if weight:
                     terms[f"tv_{name}"] = weight * total_variation(chosen, part.nodes, getattr(part, name))
         if config.beta and batch.alpha is None:
             terms["beta"] = config.beta * undecided(rendering.opacity)
         return terms
 
-    def _learnt(
-        self, points: Float[Tensor, "point 3"], directions: Float[Tensor, "point 3"]
-    ) -> tuple[Float[Tensor, " point"], Float[Tensor, "point 3"]]:
-        """`field` of the rows that points touch alone, which are remembered: gradients of the others are not made."""
-        rows = self.voxels.touched(self.space.warp(points))
-        self._touched = rows, self.voxels.part(rows)
-        return self._field(points, directions, self._touched[1])
-
     def optimizers(self) -> list[torch.optim.Optimizer]:
         density = {"params": [self.voxels.density], "name": "density"}
         harmonics = {"params": [self.voxels.harmonics], "name": "harmonics"}
         self._table = LazyRMSprop([density, harmonics])
-        optimizers: list[torch.optim.Optimizer] = [self._table]
-        if self.exposure:
-            gains = {"params": [*self.exposure.parameters()], "name": "harmonics", "scale": 0.05}
-            optimizers.append(torch.optim.Adam([gains]))
-        return [*optimizers, self.unbounded.optimizer()] if self.unbounded else optimizers
+        return [self._table, *super().optimizers()]
 
     def learning_rate(self, step: int, progress: float) -> dict[str, float]:
         """Exponential decay; the density's rate comes up slowly at first (the release's delayed rates). It is in
@@ -362,43 +325,40 @@ class Plenoxels(Exposed, RayMethod):  # type: ignore[override]  # what is accept
         return {
             "density": share * (DELAYED + (1 - DELAYED) * up) * falling(*density, progress),
             "harmonics": falling(c.harmonics_learning_rate, c.final_harmonics_learning_rate, progress),
-            "proposal": Unbounded.rate(progress),
         }
 
     def before_step(self, step: int, progress: float) -> None:
-        c = self.config
-        wanted = cells_of(self.frame, self._resolution(progress))
-        finer = wanted > self.cells
-        if finer:
+        c, sampler = self.config, self.sampler
+        wanted = cells_of(self.network.space, self._resolution(progress))
+        if wanted > self.cells:
             self.voxels.rebuild(self._kept(), wanted, self._table)
-            self.occupancy.density.zero_()
-        if step % c.occupancy_interval == 0:
-            self.voxels.weights *= REMEMBERED
-        if self.unbounded:
-            self.unbounded.before_step(progress)
-        elif finer or (step and step % c.occupancy_interval == 0):
-            self.occupancy.update(self.density, c.occupancy_threshold, self.random(~step), REMEMBERED)
+            if isinstance(sampler, OccupancySampler):
+                sampler.grid.density.zero_()
+                sampler.stale = True
+        if step % c.occupancy.occupancy_interval == 0:
+            self.voxels.weights *= WEIGHT_DECAY
+        super().before_step(step, progress)
 
     def _kept(self) -> Bool[Tensor, "x y z"]:
         """Cells that are not pruned. Where there is no bound, a step's few long rays leave most nodes without a known
         weight; there a voxel goes that would stop less light than the threshold, as in the release."""
         least = self.config.weight_threshold
-        if self.frame.reach <= 1:
+        if not self.sampler.is_open:
             return self.voxels.important(least)
         return self.voxels.dense(least * int(self.voxels.cells.amax()) / 2)
 
     def _resolution(self, progress: float) -> int:
         """Voxels per axis at a share of the budget: doubled at equal intervals up to `refine_until`."""
         c = self.config
-        first, last = c.resolutions(self.frame.reach > 1)
+        first, last = c.resolutions(self.sampler.is_open)
         doublings = math.ceil(math.log2(last / first))
         done = doublings if progress >= c.refine_until else int(doublings * progress / c.refine_until)
         return min(first << done, last)
 
 
-def cells_of(frame: Frame, resolution: int) -> Cells:
+def cells_of(space: Space, resolution: int) -> Cells:
     """Voxels along each axis. A forward-facing capture has few depths and many pixels."""
-    if isinstance(space_of(frame), NDC):
+    if isinstance(space, NDC):
         return resolution + resolution // 2, resolution + resolution // 2, resolution // 2
     return resolution, resolution, resolution
 

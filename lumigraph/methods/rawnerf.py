@@ -7,111 +7,93 @@ from __future__ import annotations
 
 import math
 import warnings
-from dataclasses import dataclass, fields
-from typing import Annotated, Any
+from dataclasses import dataclass
+from typing import Any
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
-from .. import kernels
 from ..camera import Camera
+from ..camera.rays import Rays, Rendering
 from ..components.fields.activations import truncated_exp
 from ..components.fields.development import CONTROLS, decoded, exposed, toned
-from ..components.fields.hash_field import HashField, HashNumbers, side_by_side
-from ..components.sampling.spaces import Space
+from ..components.fields.hash_field import CPU_TABLE, TINY_TABLE, HashField, HashNumbers
+from ..components.sampling.occupancy_sampler import (
+    CPU_OCCUPANCY,
+    CPU_STEPS,
+    TINY_OCCUPANCY,
+    TINY_STEPS,
+    OccupancyNumbers,
+    StepNumbers,
+)
+from ..components.sampling.proposal_sampler import ProposalNumbers
+from ..components.sampling.samplers import sampler_for
+from ..components.sampling.spaces import space_of
 from ..components.sampling.thin_lens import through_lens
 from ..components.training.fog import evened
-from ..controls import Control
+from ..components.training.pose_refinement import PoseNumbers, poses_for
+from ..components.training.schedules import held
+from ..datasets.scene import Batch, Frame, Scene
 from ..errors import LumigraphWarning
-from ..method import RayMethod
-from ..ranges import Layers, LearningRate, NonNegative, Positive, Seed, Share, Steps, Width, between
-from ..rays import Look, Rays, Rendering
-from ..scene import Batch, Frame, Scene
+from ..files.ranges import LearningRate, NonNegative, Positive, Seed, Width
+from ..method import FieldMethod
+from ..method.controls import Control
 from ..volume import composite
-from .instant_ngp import Config as NgpConfig
-from .instant_ngp import InstantNGP
 
 
 @dataclass(frozen=True)
-class Config(HashNumbers):
-    """The paper's numbers of the loss, and Instant-NGP's of the field, which are explained there."""
+class Config:
+    """The paper's numbers of the loss, and those of a hash table in place of its network."""
 
+    table: HashNumbers = HashNumbers()
+    occupancy: OccupancyNumbers = OccupancyNumbers()
+    steps: StepNumbers = StepNumbers()
+    proposals: ProposalNumbers = ProposalNumbers()
+    poses: PoseNumbers = PoseNumbers()
     epsilon: Positive = 1e-3  # added to what the error is relative to, eq. 4; 1 is white in the longest exposure
-    variance_weight: NonNegative = 1e-3  # of the variance of weights along a ray, supplement
+    variance_weight: NonNegative = 1e-3  # weight of the variance of weights along a ray, supplement
     exposure_scales: bool = True  # learn a factor per colour of each exposure, section 4.2
-    hidden_width: Width = 64
-    density_layers: Layers = 1
-    colour_layers: Layers = 2
-    geometry_features: Annotated[int, between(1, 256)] = 16
-    sh_bands: Annotated[int, between(1, 4)] = 4
-    samples_per_step: Annotated[int, between(64, 1 << 24)] = 1 << 18
-    steps_per_diagonal: Annotated[int, between(4, 16_384)] = 1024
-    cone_angle: Share = 1 / 256
-    transmittance_threshold: Share = 1e-4
-    occupancy_resolution: Annotated[int, between(4, 512)] = 128
-    occupancy_threshold: NonNegative = 0.05
-    occupancy_interval: Steps = 16
-    occupancy_decay: Share = 0.95
+    hidden_width: Width = 64  # neurons per hidden layer
     learning_rate: LearningRate = 1e-2
-    final_learning_rate: LearningRate = 1e-3
-    hash_weight_decay: NonNegative = 0.0
-    refine_cameras: bool = False  # learn a correction of each photograph's pose
+    final_learning_rate: LearningRate = 1e-3  # at the end of the budget
+    hash_weight_decay: NonNegative = 0.0  # decoupled decay of the table, of objects only
     seed: Seed = 0
 
-    def check(self) -> None:
-        """Raises LumigraphError for numbers that contradict each other."""
-        self.field.check()
 
-    @property
-    def field(self) -> NgpConfig:
-        """The numbers of the field, as Instant-NGP has them."""
-        return NgpConfig(**{name: getattr(self, name) for name in OF_THE_FIELD}, exposure_correction="no")
-
-    @classmethod
-    def around(cls, field: NgpConfig, **own: Any) -> Config:
-        """The numbers of a field, with those of the loss."""
-        return cls(**{name: getattr(field, name) for name in OF_THE_FIELD}, **own)
-
-
-OF_THE_FIELD = {x.name for x in fields(NgpConfig)} & {x.name for x in fields(Config)}
 LENS_PLACES = 24  # through which a picture with a shallow focus is seen
-OPENED = 0.06  # diameter of the lens, as a share of the distance, where a focus is told and no aperture
-WIDEST, FARTHEST = 0.5, 8.0  # aperture in scene units; focus in reaches
-GROSS = 1.0  # relative error from which on the loss is linear
-WHITE = 0.97  # quantile of the light that is shown as white, where nobody said how bright to develop it
-GLANCE = 1 << 14  # pixels that tell how much light there is
+DEFAULT_APERTURE = 0.06  # diameter of the lens, as a share of the distance, where a focus is told and no aperture
+MAX_APERTURE, MAX_FOCUS = 0.5, 8.0  # aperture in scene units; focus in reaches
+HUBER_DELTA = 1.0  # relative error from which on the loss is linear
+DECAY_START = 0.3  # share of the budget before the learning rate falls
+WHITE_QUANTILE = 0.97  # quantile of the light that is shown as white, where nobody said how bright to develop it
+GLANCE_PIXELS = 1 << 14  # pixels that tell how much light there is
 
 
 class LightField(HashField):
-    """Instant-NGP's field with linear radiance instead of encoded colour: an exponential keeps it above zero and
-    spans the range of light (section 4.1).
+    """A hash table with linear radiance in the camera's colours instead of encoded colour, 1 for a full sensor in the
+    longest exposure: an exponential keeps it above zero and spans the range of light (section 4.1).
 
     level: log of the light that the scene has on average, where the network begins
     """
 
     level: Tensor
 
-    def __init__(self, config: NgpConfig, space: Space, reach: float):
-        super().__init__(config, space, reach)
+    def __init__(self, *arguments: Any, **named: Any):
+        super().__init__(*arguments, **named)
         self.register_buffer("level", torch.tensor(-1.0))
 
-    def colour(
-        self,
-        geometry: Float[Tensor, "sample geometry"],
-        directions: Float[Tensor, "sample 3"],
-        *codes: Float[Tensor, "sample code"],
-    ) -> Float[Tensor, "sample 3"]:
-        """Light in the camera's colours, 1 for what fills the sensor in the longest exposure."""
-        harmonics = kernels.spherical_harmonics(directions, self.bands)
-        return truncated_exp(self.colour_network(side_by_side(geometry, harmonics, *codes)) + self.level)
+    def activated(self, raw: Float[Tensor, "point 3"]) -> Float[Tensor, "point 3"]:
+        return truncated_exp(raw + self.level)
 
 
-class RawNeRF(RayMethod):
+class RawNeRF(FieldMethod):
     """Each pixel of a mosaic is compared in the one colour that it measured, noise and all, so that noise averages out
     over all photographs; the picture is developed afterwards."""
 
     Config = Config
+    looks = None  # type: ignore[assignment]  # samples hold light, and a picture is developed from its sum
+    network: LightField
     exposure: Tensor
     group: Tensor
     free: Tensor
@@ -120,14 +102,17 @@ class RawNeRF(RayMethod):
     brightness: Tensor
 
     def __init__(self, frame: Frame, config: Any = None):
-        config = config or Config()
-        super().__init__(frame, config)
-        self.marcher = InstantNGP(frame, config.field)
+        c = config or Config()
+        super().__init__(frame, c)
+        space = space_of(frame)
+        self.poses = poses_for(frame, c.poses)
+        joining = self.poses.weights if self.poses else None
         with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(config.seed)
-            self.marcher.network = LightField(config.field, self.marcher.space, frame.reach)
+            torch.manual_seed(c.seed)
+            self.network = LightField(c.table, c.hidden_width, space, frame.reach, joining=joining)
+        self.sampler = sampler_for(frame, space, c.occupancy, c.proposals, steps=c.steps)
         photographs = frame.image_count
-        self.log_scale = nn.Parameter(torch.zeros(photographs, 3), requires_grad=config.exposure_scales)
+        self.log_scale = nn.Parameter(torch.zeros(photographs, 3), requires_grad=c.exposure_scales)
         self.register_buffer("exposure", torch.ones(photographs))  # of each photograph, of the longest
         self.register_buffer("group", torch.arange(photographs))  # photographs of one exposure share a number
         self.register_buffer("free", torch.ones(photographs))  # 0 for those whose scale is 1, by which others go
@@ -137,27 +122,30 @@ class RawNeRF(RayMethod):
 
     @classmethod
     def preset(cls, device: torch.device) -> Any:
-        """What Instant-NGP takes on this device."""
-        return Config.around(InstantNGP.preset(device))
+        """On a CPU, the table and samples that learn most in a minute."""
+        if device.type == "cuda":
+            return Config()
+        sampling = {"occupancy": CPU_OCCUPANCY, "steps": CPU_STEPS}
+        return Config(table=CPU_TABLE, **sampling, hidden_width=32, learning_rate=2e-2, hash_weight_decay=0.3)
 
     @classmethod
     def smallest(cls) -> Any:
-        """Instant-NGP's, with an error that is less relative: in a few steps its gross beginnings fall, and no more."""
-        return Config.around(InstantNGP.smallest(), epsilon=1.0)
+        """A tiny table with an error that is less relative: in a few steps its gross beginnings fall, and no more."""
+        sampling = {"occupancy": TINY_OCCUPANCY, "steps": TINY_STEPS}
+        poses = PoseNumbers(refine_cameras=True)
+        return Config(table=TINY_TABLE, **sampling, poses=poses, hidden_width=16, learning_rate=2e-2, epsilon=1.0)
 
     @classmethod
     def further_bytes(cls, frame: Frame, config: Any, learning: bool) -> int:
-        return InstantNGP.further_bytes(frame, config.field, learning)
-
-    def rehearse_begin(self) -> None:
-        self.marcher.rehearse_begin()
+        activations = config.table.activation_bytes(config.occupancy.samples_per_step, config.hidden_width)
+        return super().further_bytes(frame, config, learning) + activations * learning
 
     # What there is to learn from
 
-    def begin(self, scene: Scene, seconds: float = math.inf) -> None:
+    def begin(self, data: Scene, seconds: float = math.inf) -> None:
         """Take what the photographs say of exposure and colour, and how much light there is in all."""
-        self.marcher.begin(scene, seconds)
-        train = scene.splits["train"]
+        super().begin(data, seconds)
+        scene, train = data, data.splits["train"]
         if "mosaic" not in scene.layers and "raw" not in scene.layers:
             warnings.warn(
                 f"{scene.source} holds no raw light, so rawnerf learns what its pictures tell of it; give it raw files "
@@ -178,12 +166,10 @@ class RawNeRF(RayMethod):
         if "white_balance" in scene.about:
             self.gains.copy_(scene.about["white_balance"][train].nanmedian(0).values)
             self.srgb_from_camera.copy_(scene.about["srgb_from_camera"][train].nanmedian(0).values)
-        glance = scene.sample_rays(GLANCE, self.random(0), layers=layers_of(scene)).to(self.device)
+        glance = scene.sample_rays(GLANCE_PIXELS, self.random(0), layers=layers_of(scene)).to(self.device)
         light, measured = self.measured(glance)
         taken = self.exposure[glance.rays.image_index]
-        network = self.marcher.network
-        assert isinstance(network, LightField)
-        network.level.copy_((light[measured].mean() / taken.mean()).clamp_min(1e-6).log())
+        self.network.level.copy_((light[measured].mean() / taken.mean()).clamp_min(1e-6).log())
         self.brightness.copy_(self.brightness_of(scene, light[measured[:, 1] & (taken == 1), 1]))
 
     def brightness_of(self, scene: Scene, green: Float[Tensor, " pixel"]) -> Float[Tensor, ""]:
@@ -196,14 +182,11 @@ class RawNeRF(RayMethod):
         if "brightness" in scene.about:
             return (scene.about["brightness"][scene.splits["train"]] * exposure).nanmedian()
         if "mosaic" in scene.layers:
-            return 1 / (green.quantile(WHITE) * self.gains[1]).clamp_min(1e-6)
+            return 1 / (green.quantile(WHITE_QUANTILE) * self.gains[1]).clamp_min(1e-6)
         return exposure.median()
 
     def batch(self, data: Scene, generator: torch.Generator) -> Batch:
-        return data.sample_rays(int(self.marcher.rays_per_step), generator, layers=layers_of(data)).to(self.device)
-
-    def rays_in_a_step(self, data: Scene) -> float:
-        return self.marcher.rays_in_a_step(data)
+        return data.sample_rays(self.sampler.batch_size, generator, layers=layers_of(data)).to(self.device)
 
     def measured(self, batch: Batch) -> tuple[Float[Tensor, "ray 3"], Bool[Tensor, "ray 3"]]:
         """The light of a batch's pixels as it was exposed, and which of its colours were measured."""
@@ -221,14 +204,9 @@ class RawNeRF(RayMethod):
 
     def light(self, rays: Rays) -> Rendering:
         """Linear light along rays in the camera's colours, before nothing."""
-        (look,) = self.marcher.looks(rays)
+        (samples,) = self.sampler.sample(rays, self.network)
+        look = samples.look(self.network)
         return composite(look.samples, look.density, look.rgb)
-
-    def light_and_spread(self, look: Look) -> Rendering:
-        """The light of a look, and how far from one another the weights lie that make each ray's colour: the extra
-        `moments` is the mean and the mean square of their places."""
-        s = evened(look.samples.t)
-        return composite(look.samples, look.density, look.rgb, moments=torch.stack([s, s * s], -1))
 
     def scale(self, rays: Rays) -> Float[Tensor, "ray 3"]:
         """What light is multiplied by in each ray's photograph: its exposure, times alpha, which is learnt for each
@@ -240,34 +218,30 @@ class RawNeRF(RayMethod):
     def loss(self, batch: Batch, step: int) -> dict[str, Tensor]:
         """The squared error relative to what is shown (eq. 4): that of a tone curve with slope 1 / (y + epsilon)."""
         measured, known = self.measured(batch)
-        rays = self.marcher.poses(batch.rays) if self.marcher.poses else batch.rays
-        look, terms = self.marcher.look_to_learn(rays, self.random(step))
-        seen = self.light_and_spread(look)
+        (samples,), terms = self.learn(batch.rays, self.random(step))
+        look = samples.look(self.network)
+        s = evened(look.samples.t)
+        seen = composite(look.samples, look.density, look.rgb, moments=torch.stack([s, s * s], -1))
         shown = seen.rgb * self.scale(batch.rays) + (1 - seen.opacity)[:, None] * decoded(self.background)
         shown = torch.where(measured >= 1, shown.clamp(max=1), shown)  # a full sensor says: at least so much
         error = (shown - measured) / (shown.detach() + self.config.epsilon)
-        self.figures |= self.marcher.figures
         first, second = seen.extra["moments"].unbind(-1)
         variance = (second - first.square() / seen.opacity.clamp_min(1e-3)).mean()
         # Gross errors count linearly: noise is far below, and what is dark by mistake does not outweigh all else.
-        relative = 2 * nn.functional.huber_loss(error[known], torch.zeros_like(error[known]), delta=GROSS)
+        relative = 2 * nn.functional.huber_loss(error[known], torch.zeros_like(error[known]), delta=HUBER_DELTA)
         return {"relative": relative, "variance": self.config.variance_weight * variance, **terms}
 
     def optimizers(self) -> list[torch.optim.Optimizer]:
-        optimizers = self.marcher.optimizers()
-        if self.config.exposure_scales:
+        c = self.config
+        optimizers = self.network.optimizers_at(c.learning_rate, c.hash_weight_decay)
+        if c.exposure_scales:
             group: dict[str, Any] = {"params": [self.log_scale], "scale": 0.05}
-            optimizers.append(torch.optim.Adam([group], lr=self.config.learning_rate, betas=(0.9, 0.99), eps=1e-15))
-        return optimizers
+            optimizers.append(torch.optim.Adam([group], lr=c.learning_rate, betas=(0.9, 0.99), eps=1e-15))
+        return [*optimizers, *super().optimizers()]
 
-    def learning_rate(self, step: int, progress: float) -> dict[str, float]:
-        return self.marcher.learning_rate(step, progress)
-
-    def before_step(self, step: int, progress: float) -> None:
-        self.marcher.before_step(step, progress)
-
-    def after_step(self, step: int) -> None:
-        self.marcher.after_step(step)
+    def learning_rate(self, step: int, progress: float) -> float:
+        c = self.config
+        return held(c.learning_rate, c.final_learning_rate, step, progress, DECAY_START)
 
     # Being seen
 
@@ -278,14 +252,14 @@ class RawNeRF(RayMethod):
             Control(
                 "aperture",
                 0.0,
-                (0.0, WIDEST),
+                (0.0, MAX_APERTURE),
                 unit="scene units",
                 about="Diameter of the lens: the wider, the more blurred is what lies before and behind the focus.",
             ),
             Control(
                 "focus",
                 0.0,
-                (0.0, FARTHEST * self.frame.reach),
+                (0.0, MAX_FOCUS * self.frame.reach),
                 unit="scene units",
                 about="Distance that is sharp; 0: that of the picture's middle. Told alone, it opens the lens.",
             ),
@@ -300,7 +274,7 @@ class RawNeRF(RayMethod):
         width, height = camera.size[0].tolist()
         sharp = self.chunked(camera.rays(camera.pixels()).to(self.device))
         light, opacity = torch.zeros_like(sharp.rgb), torch.zeros_like(sharp.opacity)
-        for rays in through_lens(camera, aperture or OPENED * focus, focus, LENS_PLACES):
+        for rays in through_lens(camera, aperture or DEFAULT_APERTURE * focus, focus, LENS_PLACES):
             seen = self.chunked(rays.to(self.device))
             light, opacity = light + seen.rgb / LENS_PLACES, opacity + seen.opacity / LENS_PLACES
         blurred = Rendering(light, sharp.depth, opacity)
@@ -334,15 +308,8 @@ class RawNeRF(RayMethod):
         self, points: Float[Tensor, "point 3"], directions: Float[Tensor, "point 3"]
     ) -> tuple[Float[Tensor, " point"], Float[Tensor, "point 3"]]:
         """Density per scene unit, and sRGB-encoded colour seen along unit directions."""
-        density, light = self.marcher.field(points, directions)
+        density, light = self.network(points, directions)
         return density, toned(self.linear(light), str(self.control("tone")))
-
-    def density(self, points: Float[Tensor, "sample 3"]) -> Float[Tensor, " sample"]:
-        """Density per scene unit."""
-        return self.marcher.density(points)
-
-    def refined(self, cameras: Camera) -> Camera:
-        return self.marcher.refined(cameras)
 
 
 def layers_of(scene: Scene) -> tuple[str, ...]:

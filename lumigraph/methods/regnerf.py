@@ -15,15 +15,15 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ..camera import Camera
+from ..camera.rays import Look, Rays, Rendering
 from ..components.fields.hash_field import TABLE_ON_A_CPU, HashNumbers, check_levels
 from ..components.training.fog import evened, thickness_before
 from ..components.training.patch_flow import SIDE, PatchFlow
 from ..components.training.photometric import backdrop, residuals
 from ..components.training.unseen_views import patches, roughness, unseen_cameras
+from ..datasets.scene import Batch, Frame, Scene
+from ..files.ranges import LearningRate, NonNegative, PositiveShare, Share, Steps, Width, between
 from ..method import RayMethod
-from ..ranges import LearningRate, NonNegative, PositiveShare, Share, Steps, Width, between
-from ..rays import Look, Rays, Rendering
-from ..scene import Batch, Frame, Scene
 from ..volume import composite
 from .instant_ngp import Config as NgpConfig
 from .instant_ngp import InstantNGP, huber

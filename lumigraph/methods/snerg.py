@@ -12,10 +12,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from ..baked import Atlas
-from ..blending import over
 from ..camera import Camera
-from ..capabilities import HasField, can
+from ..camera.rays import Look, Rays, Rendering, Samples
+from ..color.blending import over
 from ..components.clouds.dense_points import compile_sweep
 from ..components.fields.baked_voxels import BakedVoxels, rounded
 from ..components.fields.deferred import Deferred, HashDeferred, NetworkDeferred, ViewDependence
@@ -35,12 +34,10 @@ from ..components.training.lazy_adam import LazyAdam
 from ..components.training.photometric import backdrop, residuals
 from ..components.training.schedules import falling, held
 from ..components.training.sparsity import cauchy
+from ..datasets.scene import Batch, Frame, Scene
 from ..errors import LumigraphError, LumigraphWarning
-from ..geometry import unit
-from ..kernels.block_march import ALPHA, CHANNELS
-from ..kernels.spherical_harmonics import K00
-from ..method import RayMethod
-from ..ranges import (
+from ..exchange.baked import Atlas
+from ..files.ranges import (
     BatchSize,
     Layers,
     LearningRate,
@@ -53,47 +50,50 @@ from ..ranges import (
     Width,
     between,
 )
-from ..rays import Look, Rays, Rendering, Samples
-from ..scene import Batch, Frame, Scene
+from ..geometry import unit
+from ..kernels.block_march import ALPHA, CHANNELS
+from ..kernels.spherical_harmonics import K00
+from ..method import RayMethod
+from ..method.capabilities import HasField, can
 from ..volume import composite, weights_of
 
 
 @dataclass(frozen=True)
 class Config(HashNumbers, OpenNumbers):
-    """The paper's numbers, with where it gives them; `SNeRG.preset` says what a plain CPU does otherwise."""
+    """The paper's numbers, with where it gives them, but for huber_delta; `SNeRG.preset` has those of a plain CPU."""
 
-    field: Literal["hash", "network"] = "network"  # what is baked: a hash table, or the paper's network
-    view_width: Width = 16  # of the network once a pixel, section 4.2
-    sparsity_weight: NonNegative = 1e-4  # lambda_s, section 4.2
-    deferred_share: Annotated[float, between(0.05, 0.99)] = 0.9  # of the budget, ahead of baking
-    voxel_share: Share = 0.0  # of what is left then, in which voxels learn too; afterwards the network alone does
-    whole: bool = True  # bake all of an open capture, contracted, rather than its box of interest alone
-    resolution: Annotated[int, between(8, 2048)] = 1000  # voxels along the longest side of the grid, section 5.1
-    block_size: Annotated[int, between(4, 66)] = 32  # voxels along a block's side, its apron included, section 5.1
-    visibility_resolution: Annotated[int, between(8, 512)] = 256  # cells per axis in which is told what rays see
-    least_alpha: Share = 0.005  # of a voxel, below which it is empty, section 5.1
-    rays_per_step: BatchSize = 8192  # once it is baked
-    learning_rate: LearningRate = 5e-4  # of the field
-    final_learning_rate: LearningRate = 5e-6
-    decay_start: Annotated[float, between(0, 0.99)] = 0.0  # share of the field's budget before that falls
-    view_learning_rate: LearningRate = 5e-4  # of the network once a pixel
-    voxel_learning_rate: LearningRate = 0.01  # of voxels, at first; in the end a tenth
-    samples_per_step: Annotated[int, between(64, 1 << 24)] = 1 << 18  # of the field
-    hidden_layers: Layers = 8  # of the field's network
-    hidden_width: Width = 256  # section 4.1
-    transmittance_threshold: Share = 1e-3  # at which a ray is spent
-    steps_per_diagonal: Annotated[int, between(4, 16_384)] = 1024  # along a ray through the field
-    cone_angle: Share = 1 / 256  # growth of steps with distance
-    occupancy_resolution: Annotated[int, between(4, 512)] = 128  # cells per axis
-    occupancy_threshold: NonNegative = 0.05  # optical thickness across a cell below which it is empty
-    occupancy_interval: Steps = 16  # steps between updates of the occupancy grid
-    occupancy_decay: Share = 0.95  # of the densities it remembers
+    field: Literal["hash", "network"] = "network"  # field to bake: the paper's network, or a faster hash table
+    view_width: Width = 16  # channels of the view-dependence network, section 4.2; wider is slower in a browser
+    sparsity_weight: NonNegative = 1e-4  # lambda_s of eq. 8, section 4.2; higher gives emptier voxels
+    deferred_share: Annotated[float, between(0.05, 0.99)] = 0.9  # share of the budget ahead of baking
+    voxel_share: Share = 0.0  # share of the rest in which voxels learn too, then the small network alone; 0: none
+    whole: bool = True  # bake an open capture whole, contracted; off: its box alone, for the published viewer
+    resolution: Annotated[int, between(8, 2048)] = 1000  # voxels along the grid's longest side, section 5.1
+    block_size: Annotated[int, between(4, 66)] = 32  # voxels along a block's side with its apron, section 5.1
+    visibility_resolution: Annotated[int, between(8, 512)] = 256  # cells per axis that record visibility
+    least_alpha: Share = 0.005  # alpha of a voxel below which it is empty, section 5.1; higher makes smaller files
+    rays_per_step: BatchSize = 8192  # rays in a step after baking; more reduce noise, and cost time
+    learning_rate: LearningRate = 5e-4  # Adam's learning rate of the field at first; higher: faster, may diverge
+    final_learning_rate: LearningRate = 5e-6  # learning rate of the field at its end, reached exponentially
+    decay_start: Annotated[float, between(0, 0.99)] = 0.0  # share of the field's stage before that rate falls
+    view_learning_rate: LearningRate = 5e-4  # learning rate of the view-dependence network
+    voxel_learning_rate: LearningRate = 0.01  # learning rate of voxels at first; a tenth of it at the end
+    samples_per_step: Annotated[int, between(64, 1 << 24)] = 1 << 18  # samples in a step of the field
+    hidden_layers: Layers = 8  # hidden layers of the field's network; more cost time
+    hidden_width: Width = 256  # channels of the field's hidden layers, section 4.1; wider costs memory and time
+    transmittance_threshold: Share = 1e-3  # transmittance at which a ray terminates; higher is faster, less exact
+    steps_per_diagonal: Annotated[int, between(4, 16_384)] = 1024  # samples across the cube's diagonal, of the field
+    cone_angle: Share = 1 / 256  # growth of the step with distance; higher takes fewer samples far away
+    occupancy_resolution: Annotated[int, between(4, 512)] = 128  # cells per axis of the occupancy grid
+    occupancy_threshold: NonNegative = 0.05  # optical thickness of a cell below which it is empty; higher skips more
+    occupancy_interval: Steps = 16  # steps between updates of the occupancy grid; more are faster, less current
+    occupancy_decay: Share = 0.95  # share of a cell's density kept at each update; higher forgets more slowly
     # Of the paper's network.
-    skip_layer: Layers = 5  # the layer whose activation the input joins again
-    position_frequencies: Octaves = 10
-    hash_weight_decay: NonNegative = 0.0  # of the table, decoupled; of objects only
-    huber_delta: PositiveShare = 0.1  # residual at which the loss turns from square to linear
-    seed: Seed = 0
+    skip_layer: Layers = 5  # layer whose activation the input is concatenated to again
+    position_frequencies: Octaves = 10  # octaves of positions of the network; more give finer detail, and noise
+    hash_weight_decay: NonNegative = 0.0  # decoupled weight decay of an object's table, towards a density of 1
+    huber_delta: PositiveShare = 0.1  # residual at which the loss turns from squared to linear; 1: always squared
+    seed: Seed = 0  # seed of all random numbers; another seed gives another run
 
     def check(self) -> None:
         """Raises LumigraphError for numbers that contradict each other."""

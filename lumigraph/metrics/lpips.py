@@ -63,7 +63,7 @@ class Lpips:
 
     @torch.no_grad()
     def features(self, picture: Float[Tensor, "height width 3"]) -> list[Float[Tensor, "1 channel _ _"]]:
-        """What each of the five layers finds in a picture."""
+        """Features of a picture in each of the five layers."""
         x = (2 * picture.float().cpu() - 1 - torch.tensor(SHIFT)) / torch.tensor(SCALE)
         x = x.movedim(-1, 0)[None]
         found = []

@@ -6,9 +6,9 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Annotated, Any, Literal
 
-from ..ranges import between
+from ..files.ranges import between
 
-# As files have them that were written before scores had names: key, name, unit, better, digits.
+# Of one view, and of views' means: key, name, unit, better, digits.
 KEYS = (
     ("psnr", "PSNR", "dB", "higher", 2),
     ("ssim", "SSIM", "", "higher", 4),
@@ -33,10 +33,6 @@ class Score:
 
     def __str__(self) -> str:
         return f"{self.value:.{self.digits}f} {self.unit}".rstrip()
-
-    def beats(self, other: Score) -> bool:
-        """Whether this is the better one of two of the same name."""
-        return self.value > other.value if self.better == "higher" else self.value < other.value
 
     def to_json(self) -> dict[str, Any]:
         return asdict(self)

@@ -1,4 +1,4 @@
-"""How close a rendering is to a photograph."""
+"""Similarity of a rendering to a photograph."""
 
 from __future__ import annotations
 

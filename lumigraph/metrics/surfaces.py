@@ -1,4 +1,4 @@
-"""How near one shape comes to another (as Mescheder 2019, Occupancy Networks, section 4, measures it)."""
+"""Distances between two shapes (Mescheder 2019, Occupancy Networks, section 4)."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from torch import Tensor
 
 
 def intersection_over_union(a: Bool[Tensor, " point"], b: Bool[Tensor, " point"]) -> float:
-    """Of two volumes: the share of points inside of either that are inside of both. In [0, 1]; 1 where both are empty.
+    """Intersection over union of two volumes, by the points inside of each. In [0, 1]; 1 if both are empty.
 
     The points should lie evenly in a box that holds both.
     """

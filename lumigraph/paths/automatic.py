@@ -18,10 +18,10 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from ..camera import Camera
+from ..camera.lens import Pinhole
+from ..datasets.scene import Frame
 from ..errors import LumigraphError
 from ..geometry import look_at, nearest_to_lines, unit
-from ..lens import Pinhole
-from ..scene import Frame
 
 Poses = Float[Tensor, "frame 3 4"]
 
@@ -72,7 +72,7 @@ def angle_of_view(cameras: Camera) -> float:
 
 @dataclass(frozen=True)
 class Surroundings:
-    """Where the cameras are, seen from what they look at."""
+    """Positions and directions of cameras relative to their common focus."""
 
     cameras: Camera
     frame: Frame
@@ -93,7 +93,7 @@ class Surroundings:
 
     @cached_property
     def cosine(self) -> Float[Tensor, " camera"]:
-        """Of the angle between each camera's gaze and the focus."""
+        """Cosine of the angle between each camera's viewing direction and the focus."""
         return (unit(self.focus - self.position) * self.forward).sum(-1)
 
     @cached_property
@@ -111,13 +111,13 @@ class Surroundings:
 
     @cached_property
     def inward(self) -> bool:
-        """Whether the cameras look at something between them. Some may look elsewhere, as where somebody walked around
-        a courtyard and photographed both its fountain and its walls."""
+        """True if most cameras look at a point between them. Some may look elsewhere: photographs of a courtyard may
+        show both its fountain and its walls."""
         return float((self.cosine > FACING).double().mean()) > ENOUGH
 
     @property
     def alike(self) -> bool:
-        """Whether all cameras look about the same way: at a front, or down from a drone."""
+        """True if all cameras look about the same way: at a front, or down from a drone."""
         return float(self.forward.mean(0).norm()) > ALIKE
 
     @cached_property

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from ..camera import Camera
+from ..datasets.scene import Frame
 from ..errors import LumigraphError
-from ..scene import Frame
 from .automatic import camera_path, film_size
 from .keyframes import CameraPath
 

@@ -20,12 +20,12 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ..camera import Camera
+from ..camera.lens import Lens, Pinhole
+from ..datasets.scene import Frame
 from ..errors import LumigraphError
 from ..files import read_json, write_json
+from ..files.ranges import Coordinate, Row, Side, between, typed
 from ..geometry import RIGID, is_similarity, to_matrix, to_quaternion
-from ..lens import Lens, Pinhole
-from ..ranges import Coordinate, Row, Side, between, typed
-from ..scene import Frame
 
 FORMAT = "lumigraph camera path 1"
 NARROWEST, WIDEST = 1.0, 170.0  # degrees that a flat picture can show
@@ -35,12 +35,12 @@ Fps = Annotated[float, between(1e-3, 1000)]
 
 @dataclass(frozen=True)
 class Keyframe:
-    """Where a camera is at one moment.
+    """Camera pose and field of view at one moment of a path.
 
     pose:    camera-to-world in the source's frame; +x right, +y down, +z forward
     fov:     degrees across the picture's smaller side
-    seconds: when, from the beginning of the film
-    time:    the moment of a moving scene that is seen then; None leaves it to the method
+    seconds: from the beginning of the film
+    time:    rendered moment of a moving scene; `None` leaves it to the method
     """
 
     pose: tuple[Row, Row, Row]
@@ -51,7 +51,7 @@ class Keyframe:
 
 @dataclass(frozen=True)
 class Film:
-    """What the JSON beside a film says of its cameras: see `export.film`."""
+    """Cameras in the JSON beside a film, see `export.film`."""
 
     poses: list[tuple[Row, Row, Row]]
     lens: dict[str, Any]

@@ -1,4 +1,4 @@
-"""How somebody begins to look at a scene, in the viewer as on a page, and what the camera then turns about."""
+"""Initial view of a scene, in the viewer and on pages, and its centre of rotation."""
 
 from __future__ import annotations
 

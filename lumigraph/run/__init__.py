@@ -1,12 +1,13 @@
-"""What opens: runs, the folders that training fills; splat files; compositions of several."""
+"""Everything that opens: runs, the folders that training fills; splat files; compositions of several."""
 
-from .block_run import BlockRun as BlockRun
 from .checkpoint import State as State
 from .folder import Run as Run
 from .folder import build as build
 from .folder import check_new as check_new
+from .folder import is_block_run as is_block_run
 from .folder import processor as processor
 from .needs import check_memory as check_memory
 from .opened import Opened as Opened
+from .opened import Trained as Trained
 from .opening import open_any as open_any
 from .opening import open_run as open_run

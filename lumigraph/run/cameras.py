@@ -9,12 +9,12 @@ from typing import Any
 import torch
 
 from ..camera import Camera
+from ..camera.lens import Lens
+from ..datasets.scene import Scene
 from ..errors import LumigraphError
 from ..files import read_json
+from ..files.ranges import Coordinate, Row, Side
 from ..geometry import RIGID
-from ..lens import Lens
-from ..ranges import Coordinate, Row, Side
-from ..scene import Scene
 
 MOST_PIXELS = 10**9  # of one picture
 

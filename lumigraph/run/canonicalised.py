@@ -26,10 +26,10 @@ import torch
 from .. import files
 from ..camera import Camera
 from ..composition import Placed, compose
+from ..datasets.scene import Frame, Vector
+from ..files.ranges import Name, Point, Share, typed
 from ..geometry import Similarity
 from ..method import Method
-from ..ranges import Name, Point, Share, typed
-from ..scene import Frame, Vector
 from .composition import box_of, place_from_json, place_to_json
 from .folder import Run
 from .opened import Opened
@@ -68,6 +68,10 @@ class Canonicalised(Opened):
     def cameras(self) -> dict[str, Camera]:
         """Those of the run, moved with it."""
         return {split: cameras.transformed(self.place.matrix) for split, cameras in self.run.cameras().items()}
+
+    @property
+    def conversion_fault(self) -> str:
+        return f"is a run at another place; convert {self.run.path}, and align that again"
 
     @property
     def photographed(self) -> bool:

@@ -22,12 +22,13 @@ import safetensors.torch
 import torch
 from torch import Tensor, nn
 
-from .. import files, packing
+from .. import files
 from ..errors import LumigraphError
+from ..exchange import packing
+from ..files.partials import partial
+from ..files.plain import flatten, understood, unflatten
+from ..files.ranges import Lasted, Tally, typed
 from ..method import Method
-from ..partials import partial
-from ..plain import flatten, understood, unflatten
-from ..ranges import Lasted, Tally, typed
 
 FORMAT = "lumigraph checkpoint 1"
 GRID = 4  # axes of a grid of cells, of which the first says which of several grids

@@ -31,12 +31,12 @@ import torch
 
 from .. import files
 from ..camera import Camera
+from ..camera.crop import Box
 from ..composition import Placed, compose, frame_around
-from ..crop import Box
 from ..errors import LumigraphError
+from ..files.ranges import Name, Point, Row, between, typed
 from ..geometry import Similarity, Vector, is_similarity, to_matrix, to_quaternion
 from ..method import Method
-from ..ranges import Name, Point, Row, between, typed
 from .opened import Opened
 
 FORMAT = "lumigraph composition 1"
@@ -99,6 +99,10 @@ class Composition(Opened):
     def cameras(self) -> dict[str, Camera]:
         """Those of the part that leads."""
         return self.opened[self.lead].cameras()
+
+    @property
+    def conversion_fault(self) -> str:
+        return "is a composition of several; convert its parts, and compose what comes of it"
 
     @property
     def photographed(self) -> bool:

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Literal
 
 from .. import files
-from ..ranges import Count, Lasted, Share, Tally
+from ..files.ranges import Count, Lasted, Share, Tally
 
 NAME = "compress.json"
 

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Literal
 
 from .. import files
-from ..ranges import Count, Lasted, Name, Tally, typed
+from ..files.ranges import Count, Lasted, Name, Tally, typed
 from .settings import Settings
 
 NAME = "convert.json"

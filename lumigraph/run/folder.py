@@ -25,18 +25,19 @@ from typing import Any
 
 import torch
 
-from .. import files, marks, methods
+from .. import files, methods
 from ..camera import Camera, ring
-from ..dataset import Dataset
+from ..datasets.dataset import Dataset
+from ..datasets.scene import Frame, Scene
 from ..errors import LumigraphError
-from ..locks import NAME as LOCK
-from ..locks import check_place, held
-from ..marks import NAME as RECORD
+from ..files import marks
+from ..files.locks import NAME as LOCK
+from ..files.locks import check_place, held
+from ..files.marks import NAME as RECORD
+from ..files.partials import FORM
+from ..files.plain import understood
+from ..files.ranges import check
 from ..method import Method
-from ..partials import FORM
-from ..plain import understood
-from ..ranges import check
-from ..scene import Frame, Scene
 from . import cameras
 from .checkpoint import PACKED, Checkpoints, State
 from .measured import read_rows
@@ -54,7 +55,7 @@ class Run(Trained):
     def __init__(self, folder: Path | str):
         self.path = self.folder = Path(folder)
         if not files.is_file(self._config):
-            if files.is_file(self.folder / "blocks.json"):
+            if is_block_run(self.folder):
                 raise LumigraphError(
                     f"{self.folder} is a run in blocks, and this is for one of them at a time: name "
                     f"{self.folder / 'blocks' / '0'}, or another block"
@@ -173,8 +174,12 @@ class Run(Trained):
         return self.kind == Scene.kind
 
     @property
-    def open_scene(self) -> Callable[[], Scene] | None:
+    def open_scene(self) -> Callable[..., Scene] | None:
         return self.scene if self.photographed else None
+
+    @property
+    def conversion_fault(self) -> str | None:
+        return None if self.photographed else f"learnt from {self.kind}, so it has no colours that could be taken over"
 
     def dataset(self, source: str | None = None) -> Dataset:
         """What it learnt from again. source: where that is now, if it has moved.
@@ -302,6 +307,11 @@ def build(
         torch.manual_seed(seed)
         method = kind(frame, config)
     return method.to(device)
+
+
+def is_block_run(folder: Path) -> bool:
+    """Whether a folder holds a run in blocks; see `large`."""
+    return files.is_file(folder / "blocks.json")
 
 
 def check_new(folder: Path) -> None:

@@ -11,10 +11,10 @@ import torch
 from torch import Tensor
 
 from ..camera import Camera
+from ..datasets.scene import Frame, Scene
+from ..files.ranges import Lasted, Name, Seed, Tally, typed
 from ..method import Method
-from ..prior import Prior
-from ..ranges import Lasted, Name, Seed, Tally, typed
-from ..scene import Frame, Scene
+from ..method.prior import Prior
 from .checkpoint import State
 from .folder import Run, check_new
 from .settings import Settings

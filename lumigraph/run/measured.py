@@ -8,13 +8,13 @@ from typing import Any
 
 from .. import files
 from ..errors import LumigraphError
+from ..files.ranges import Lasted, Tally, typed
 from ..metrics import Score
-from ..ranges import Lasted, Tally, typed
 
 
 @dataclass(frozen=True)
 class Line:
-    """A line of metrics.jsonl, as far as anybody relies on it. Not every method has a PSNR; older lines say less."""
+    """A line of metrics.jsonl, as far as anybody relies on it. Not every method has a PSNR or a loss."""
 
     step: Tally
     seconds: Lasted
@@ -68,7 +68,7 @@ class Size:
 
 @dataclass(frozen=True)
 class Evaluation:
-    """Of all that was compared, as far as anybody relies on it. scores: of newer files, where they have names"""
+    """Of all that was compared, as far as anybody relies on it. scores: means of all, by name"""
 
     protocol: Protocol
     steps: Tally

@@ -8,11 +8,11 @@ from typing import Any
 import torch
 
 from .. import methods
+from ..datasets.scene import Frame
 from ..errors import LumigraphError
-from ..memory import ask_for, free_on
+from ..files.ranges import hints, numbers
 from ..method import Method
-from ..ranges import hints, numbers
-from ..scene import Frame
+from ..system.memory import ask_for, free_on
 
 LEARNING = 4  # times a parameter: itself, its gradient, and the two moments that optimizers like Adam keep
 

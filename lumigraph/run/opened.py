@@ -9,12 +9,16 @@ from typing import Any
 
 import torch
 
-from ..camera import Camera
-from ..export.sightings import all_around
+from ..camera import Camera, dome
+from ..datasets.dataset import Dataset
+from ..datasets.scene import Frame, Scene
+from ..exchange import size_of
+from ..gaussians import Gaussians
 from ..method import Method
-from ..scene import Frame, Scene
+from ..method.capabilities import HasGaussians, needs
+from .checkpoint import State
 from .measured import read_evaluation
-from .settings import Source
+from .settings import Settings, Source
 
 
 class Opened(ABC):
@@ -56,9 +60,24 @@ class Opened(ABC):
         return False
 
     @property
-    def open_scene(self) -> Callable[[], Scene] | None:
-        """What opens the photographs again; None where there are none."""
+    def open_scene(self) -> Callable[..., Scene] | None:
+        """Function that opens the photographs again, told where they are now if they have moved; None where there are
+        none."""
         return None
+
+    @property
+    def conversion_fault(self) -> str | None:
+        """Reason why `convert` refuses it, and what to do instead; None for what can be converted."""
+        return None
+
+    @property
+    def model_bytes(self) -> int:
+        """Size of what rendering needs, as it is stored."""
+        return size_of(self.path)
+
+    def source_gaussians(self) -> Gaussians:
+        """Cloud in the source's frame, in the order of the method's. Raises LumigraphError for what is no cloud."""
+        return needs(self.method(), HasGaussians).gaussians().transformed(self.frame.to_source.matrix)
 
     def view_names(self) -> dict[str, list[str]]:
         """What the photographs are called, by split, in the order of `cameras`; nothing where there are none."""
@@ -66,7 +85,7 @@ class Opened(ABC):
 
     def survey(self, cameras: Camera) -> Camera:
         """The cameras that surfaces are looked at with, for meshes and points: its own, or a dome above its ring."""
-        return cameras if self.photographed else all_around(cameras)
+        return cameras if self.photographed else dome(cameras)
 
     def metrics(self) -> list[dict[str, Any]]:
         """What was measured while it was learnt, a row every few steps; none where that is not known."""
@@ -76,15 +95,31 @@ class Opened(ABC):
 class Trained(Opened):
     """A folder in which something was learnt; films, camera paths and what was measured of it lie there too.
 
-    folder: where it lies
+    folder:   where it lies
+    settings: what was trained on what
     """
 
     folder: Path
+    settings: Settings
 
     @property
     @abstractmethod
     def learnt_from(self) -> Source:
         """Where its photographs or shapes came from."""
+
+    @property
+    @abstractmethod
+    def method_name(self) -> str:
+        """The method that learnt, as the user types it."""
+
+    @property
+    @abstractmethod
+    def state(self) -> State:
+        """How far the latest complete state has come. Raises LumigraphError if there is none."""
+
+    @abstractmethod
+    def dataset(self, source: str | None = None) -> Dataset:
+        """What it learnt from again. source: where that is now, if it has moved."""
 
     @property
     def title(self) -> str:

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
+import importlib
 from pathlib import Path
 
 from ..errors import LumigraphError
 from ..exchange import is_splat_file, place_of, snerg
 from ..files import is_file, read_json
-from .block_run import BlockRun, is_block_run
 from .canonicalised import FORMAT, Canonicalised
 from .composition import Composition
-from .folder import Run
-from .opened import Opened
+from .folder import Run, is_block_run
+from .opened import Opened, Trained
 from .snerg_folder import SnergFolder
 from .splat_file import SplatFile
 
@@ -33,11 +33,12 @@ def open_any(path: Path | str, within: tuple[Path, ...] = ()) -> Opened:
         return Composition(path, open_any, within)
     if is_file(path):
         raise LumigraphError(f"{path} is none of the files that open: a splat file, or a composition's JSON")
-    if is_block_run(path):
-        return BlockRun(path)
-    return SnergFolder(path) if snerg.recognises(path) else Run(path)
+    return SnergFolder(path) if snerg.recognises(path) and not is_block_run(path) else open_run(path)
 
 
-def open_run(path: Path | str) -> Run | BlockRun:
+def open_run(path: Path | str) -> Trained:
     """A run, of one field or in blocks. Raises LumigraphError for a folder that is neither."""
-    return BlockRun(path) if is_block_run(Path(path)) else Run(path)
+    if not is_block_run(Path(path)):
+        return Run(path)
+    large = importlib.import_module("..large", __package__)  # by name, for that room stands above this one
+    return large.BlockRun(path)

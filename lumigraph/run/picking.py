@@ -13,14 +13,12 @@ from jaxtyping import Bool
 from torch import Tensor
 
 from .. import files
-from ..capabilities import CanPrune, HasGaussians, needs
 from ..errors import LumigraphError
 from ..exchange import SUFFIXES, claim_splats, names_splats, write_gaussians
-from ..export.splats import export_splats
+from ..method.capabilities import CanPrune, needs
 from .checkpoint import Checkpoints
 from .folder import Run, check_new
 from .opened import Opened
-from .splat_file import SplatFile
 
 
 def check_output(opened: Opened, output: Path, overwrite: bool | None = None, reads: Iterable[Path] = ()) -> None:
@@ -45,10 +43,8 @@ def save_picked(opened: Opened, keep: Bool[Tensor, " gaussian"], output: Path, w
     Raises LumigraphError as `check_output` does, and for a method that cannot learn on with fewer.
     """
     check_output(opened, output)
-    if isinstance(opened, SplatFile):
-        write_gaussians(output, opened.gaussians[keep])
-    elif names_splats(output):
-        export_splats(needs(opened.method(), HasGaussians).gaussians()[keep], opened.frame, output)
+    if names_splats(output):
+        write_gaussians(output, opened.source_gaussians()[keep])
     else:
         assert isinstance(opened, Run)
         write_run(opened, keep, output, why)

@@ -11,13 +11,13 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from .. import methods
-from ..baked import Atlas
 from ..camera import Camera, ring
+from ..datasets.scene import Frame
 from ..errors import LumigraphError
 from ..exchange import snerg
+from ..exchange.baked import Atlas
 from ..geometry import Similarity
 from ..method import Method
-from ..scene import Frame
 from .opened import Opened
 
 SLACK = 0.02  # beyond [-1, 1]^3, that a voxel may reach

@@ -8,13 +8,13 @@ import torch
 
 from .. import methods
 from ..camera import Camera, ring
+from ..datasets.scene import Frame
 from ..errors import LumigraphError
 from ..exchange import read_gaussians
+from ..files.ranges import changed
 from ..gaussians import Gaussians
 from ..geometry import Similarity
 from ..method import Method
-from ..ranges import changed
-from ..scene import Frame
 from .opened import Opened
 
 SHARE = 0.96  # of what is visible that the box of interest holds, along each axis
@@ -40,6 +40,9 @@ class SplatFile(Opened):
         method = kind(self.frame, changed(kind.Config(), sh_degree=cloud.degree, antialiased=cloud.antialiased))
         method.cloud.replace(self._in_scene)
         return method.to(device).eval()
+
+    def source_gaussians(self) -> Gaussians:
+        return self.gaussians
 
     def cameras(self) -> dict[str, Camera]:
         """A ring of cameras around the middle, looking at it."""

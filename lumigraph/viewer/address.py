@@ -90,7 +90,7 @@ def is_wildcard(host: str) -> bool:
 
 
 def is_local(host: str) -> bool:
-    """Whether only this machine can reach a host."""
+    """True if only this machine can reach a host."""
     if is_wildcard(host):
         return False
     places = {entry[4][0] for entry in socket.getaddrinfo(host, None)}

@@ -10,8 +10,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ..camera import Camera
+from ..camera.lens import Pinhole
 from ..geometry import to_matrix
-from ..lens import Pinhole
 
 WIDEST = math.radians(120)  # of a view, and of a photograph that is drawn as a frustum
 

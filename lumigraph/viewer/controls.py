@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable
 from typing import Any
 
-from ..scene import Frame, Vector
+from ..datasets.scene import Frame, Vector
 from .modes import MODES
 from .scenery import CAMERAS, POINTS
 from .serving import PAGE
@@ -63,7 +63,7 @@ class Controls:
 
     @property
     def exact(self) -> bool:
-        """Whether Gaussians are rendered here rather than by the browser."""
+        """True if this process renders Gaussians, False if the browser does."""
         return self._exact.value
 
     @property
@@ -80,7 +80,7 @@ class Controls:
 
     @property
     def surrounded(self) -> bool:
-        """Whether anything is drawn beside the scene itself."""
+        """True if camera frusta or sparse points are drawn in the scene."""
         return bool(self._cameras.value or self._points.value)
 
     def offer_points(self) -> None:

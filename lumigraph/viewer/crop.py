@@ -15,15 +15,15 @@ from jaxtyping import Bool, Shaped
 from torch import Tensor
 
 from ..camera import Camera
-from ..crop import Crop
+from ..camera.crop import Crop
+from ..camera.rays import Rays, Rendering
 from ..method import Method, RayMethod
-from ..rays import Rays, Rendering
 
 TOLERANCE = 0.01  # of the crop's size: an expected depth may lie so far outside
 
 
 def render_inside(method: Method, camera: Camera, crop: Crop) -> Rendering:
-    """What a camera sees inside a crop of a method that has no Gaussians."""
+    """Rendering of the inside of a crop, for a method without Gaussians."""
     frame = method.frame
     rays = camera.rays(camera.pixels())
     if isinstance(method, RayMethod):
@@ -52,7 +52,7 @@ def kept(values: Shaped[Tensor, "*all"], where: Bool[Tensor, "*pixels"]) -> Shap
 
 @torch.no_grad()
 def from_entry(method: RayMethod, rays: Rays, crop: Crop) -> Rendering:
-    """What rays see from the point at which they enter a crop; depth still counts from their origins."""
+    """Rendering along rays from their entry into a crop; depth is measured from their origins."""
     enter, hits = crop.entered(rays)
     asked = hits.clone()
     asked[0] = True  # so that a picture beside the crop has the method's extras too

@@ -10,10 +10,10 @@ from typing import Any, cast
 import numpy as np
 from jaxtyping import Float
 
-from ..crop import Box, Crop, Sphere
+from ..camera.crop import Box, Crop, Sphere
+from ..datasets.scene import Frame, Vector
 from ..errors import LumigraphError
 from ..gaussians.cleaning import ISOLATION, MAX_SCALE, MIN_OPACITY
-from ..scene import Frame, Vector
 from .path_panel import code
 from .subject import NAME, NAMING, Keep
 
@@ -87,7 +87,7 @@ class CropPanel:
 
     @property
     def crop(self) -> Crop | None:
-        """What is shown of the scene, in its frame; None for everything."""
+        """The chosen crop in the scene's frame; `None` for the whole scene."""
         if self._shape.value == BOX:
             a, b = self._lower.value, self._upper.value
             return Box(vector(np.minimum(a, b)), vector(np.maximum(a, b)))
@@ -102,7 +102,7 @@ class CropPanel:
 
     @property
     def drawn(self) -> bool:
-        """Whether the crop is drawn beside the scene."""
+        """True if the handles or the outline of the crop are drawn."""
         return bool(self._nodes)
 
     def _update(self) -> None:
@@ -141,7 +141,7 @@ class CropPanel:
                 self._nodes[name].position = np.array(number.value)
 
     def _follower(self, number: Any) -> Callable[[Any], Any]:
-        """What takes a handle's place over into the numbers, in the order of its moves."""
+        """A callback that copies a handle's position into the panel's numbers, in the order of moves."""
 
         async def follow(event: Any) -> None:
             self._following = True

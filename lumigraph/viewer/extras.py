@@ -6,8 +6,8 @@ import torch
 from jaxtyping import Bool, Float, Int, Shaped
 from torch import Tensor
 
+from ..camera.rays import Rendering
 from ..figures import NOTHING, hex_colour, ramp
-from ..rays import Rendering
 
 # Twenty colours that are told apart easily; labels beyond begin again at the first.
 PALETTE = (

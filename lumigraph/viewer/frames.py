@@ -1,6 +1,6 @@
-"""What a browser may say: the messages that our page sends, with the types and ranges that it sends them in.
+"""Messages accepted from a browser: those of our page, with their types and ranges.
 
-viser sets whatever attribute a message names and prints a traceback for what it cannot use, so nothing else reaches it.
+viser sets every attribute that a message names and prints a traceback for unusable values, so others must not reach it.
 """
 
 from __future__ import annotations
@@ -115,7 +115,7 @@ def is_turn(wxyz: Quaternion) -> bool:
 
 
 def fits(part: Any, value: Any) -> bool:
-    """Whether a part of a panel can have a value: its type, its range, its choices."""
+    """True if a panel's input accepts a value, by its type, range and choices."""
     now = part.value
     if isinstance(now, bool) or now is None:
         return isinstance(value, bool)

@@ -1,10 +1,10 @@
-"""Who may speak to the viewer: its own page, opened at an address of its own, with the token where one is needed.
+"""Access control of the viewer: its own page, opened at its own address, with the token if one is required.
 
-A browser sends requests to any address that any page names, so that a foreign page could look at the scene and press
-buttons; but it says truly which page asks (Origin) and by which name it found the server (Host). A page of another
-site has another Origin; one whose name was turned to this machine after it was loaded (DNS rebinding) has a Host that
-is none of ours. Where other machines can reach the server, an unguessable token in the address is asked for besides;
-the page keeps it as a cookie, so that its websocket has it too.
+A browser sends requests to any address that any page names, so a foreign page could see the scene and press buttons.
+Its headers are reliable: the page that sends the request (Origin) and the name of the server (Host). A page of another
+site has another Origin. A page whose name was redirected to this machine after loading (DNS rebinding) has a foreign
+Host. If other machines can reach the server, an unguessable token in the address is required too; the page keeps it
+as a cookie, so that its websocket has it.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ Answers = Callable[[Any, Request], Response | None | Awaitable[Response | None]]
 
 
 class Guard:
-    """Whether a request may be answered, by its headers; the websocket's handshake is a request like any other."""
+    """Check of requests by their headers, including the websocket's handshake."""
 
     def __init__(self, address: Address):
         self.token = address.token
@@ -58,9 +58,9 @@ class Guard:
         return None
 
     def is_ours(self, host: str) -> bool:
-        """Whether a Host header names this machine. Another port may lead here, through a tunnel.
+        """True if a Host header names this machine. Any port is accepted, because a tunnel may lead here.
 
-        With a token any number will do: what rebinds is a name, and knows no token.
+        With a token any IP address is accepted: DNS rebinding uses a name, and has no token.
         """
         try:
             name = (urlsplit(f"//{host}").hostname or "").rstrip(".")
@@ -110,7 +110,7 @@ def own_names(address: Address) -> set[str]:
 
 
 def is_number(name: str) -> bool:
-    """Whether a host is an IP address rather than a name."""
+    """True if a host is an IP address, not a name."""
     try:
         return bool(ipaddress.ip_address(name))
     except ValueError:

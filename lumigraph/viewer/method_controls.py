@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from ..controls import Control, Value
 from ..method import Method
+from ..method.controls import Control, Value
 
 STEPS = 200  # of a slider
 
@@ -62,5 +62,5 @@ def add(gui: Any, control: Control, value: Value) -> Any:
 
 
 def value_of(control: Control, shown: Any) -> Value:
-    """What a client's slider or list says; sliders round, also beyond the ends of their range."""
+    """The value of a client's slider or list, within the range: sliders round, also beyond its ends."""
     return shown if control.range is None else min(max(float(shown), control.range[0]), control.range[1])

@@ -6,13 +6,13 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from ..blending import before, over
 from ..camera import Camera
+from ..camera.rays import Rendering
+from ..color.blending import before, over
+from ..datasets.scene import Vector
 from ..errors import LumigraphError
 from ..figures import NOTHING, colour_depth, depth_range, hex_colour
 from ..geometry import normals_from_depth
-from ..rays import Rendering
-from ..scene import Vector
 from .extras import draw_extra, drawable
 
 MODES = ("colour", "depth", "opacity", "normals")  # of every method

@@ -14,12 +14,12 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ..camera import Camera
+from ..camera.lens import Pinhole
+from ..datasets.scene import Frame
 from ..errors import LumigraphError
+from ..files.names import natural
 from ..geometry import to_quaternion
-from ..lens import Pinhole
-from ..names import natural
 from ..paths.keyframes import CameraPath, Keyframe
-from ..scene import Frame
 from .cameras import pose_of
 from .flight import Flight
 from .subject import NAME, NAMING, Subject
@@ -87,7 +87,7 @@ class PathPanel:
 
     @property
     def drawn(self) -> bool:
-        """Whether keyframes are drawn beside the scene."""
+        """True if keyframes are drawn in the scene."""
         return bool(self._nodes)
 
     @property

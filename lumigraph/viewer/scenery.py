@@ -11,9 +11,9 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from ..camera import Camera
+from ..datasets.scene import Scene
 from ..errors import LumigraphError
 from ..geometry import to_quaternion
-from ..scene import Scene
 from .cameras import angles
 
 CAMERAS, POINTS = "/cameras", "/points"

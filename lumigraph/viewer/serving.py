@@ -46,7 +46,7 @@ def start_server(address: Address, title: str, page: Callable[[], bytes] | None 
 
 
 class Door:
-    """What stands between the network and viser, which has no place of its own for it."""
+    """The guard between the network and viser, which has no hook for one."""
 
     def __init__(self, address: Address, page: Callable[[], bytes] | None = None):
         self._guard, self._page = Guard(address), page
@@ -102,7 +102,7 @@ class Door:
         return None
 
     def _swallow(self, loop: asyncio.AbstractEventLoop, fault: dict[str, Any]) -> None:
-        """What goes wrong with one client is not printed, unless somebody looks for it."""
+        """Suppress the traceback of a client's fault, unless LUMIGRAPH_DEBUG is set."""
         if os.environ.get("LUMIGRAPH_DEBUG"):
             loop.default_exception_handler(fault)
 

@@ -6,11 +6,11 @@ from dataclasses import dataclass
 from typing import Any
 
 from ..camera import Camera
-from ..capabilities import HasGaussians, needs
+from ..camera.rays import Rendering
 from ..gaussians import Gaussians, splatting
 from ..gaussians.cleaning import cleaned
 from ..method import Method
-from ..rays import Rendering
+from ..method.capabilities import HasGaussians, needs
 from .crop import render_inside
 from .scenery import Scenery
 from .subject import Subject
@@ -52,7 +52,7 @@ class Shared:
         return self._picked[1]
 
     def render(self, camera: Camera, request: ViewRequest) -> Rendering:
-        """What a camera sees of the method as a client told it, on the CPU. Call it inside `turns.turn`."""
+        """Rendering of the method with a client's controls and crop, on the CPU. Call it inside `turns.turn`."""
         method = self._given(request)
         if not request.part:
             return method.render(camera).cpu()
@@ -65,5 +65,5 @@ class Shared:
         return self.method.given(**dict(request.told)) if request.told else self.method
 
     def knows(self, client: Any) -> bool:
-        """Whether a client is still connected."""
+        """True if a client is still connected."""
         return not self.stopped and client.client_id in self.server.get_clients()

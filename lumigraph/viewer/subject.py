@@ -10,9 +10,9 @@ from pathlib import Path
 from typing import Any
 
 from ..camera import Camera
-from ..crop import Crop
+from ..camera.crop import Crop
+from ..datasets.scene import Frame, Scene
 from ..paths import Surroundings, best_centred, pivot
-from ..scene import Frame, Scene
 
 NAME = re.compile(r"\w[\w .-]{0,80}")  # of what somebody saves
 NAMING = "A name is made of letters, digits, spaces, dots and dashes"
@@ -46,7 +46,7 @@ class Subject:
 
     @cached_property
     def around(self) -> Surroundings:
-        """Where all the cameras stand and look."""
+        """Positions and directions of all cameras."""
         return Surroundings(Camera.cat(list(self.cameras.values())).to("cpu"), self.frame)
 
     @cached_property

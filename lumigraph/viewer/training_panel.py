@@ -8,7 +8,7 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Float
 
-from ..progress import clock, short
+from ..system.progress import clock, short
 from .turns import Turns
 
 EVERY = 1.0  # seconds between updates
@@ -72,7 +72,7 @@ class TrainingPanel:
 
 
 def measure_of(rows: list[dict[str, Any]]) -> Measure:
-    """What the curve shows: the PSNR, or of methods that have none the loss."""
+    """Name of the plotted measure: the PSNR, or the loss for methods without one."""
     return "psnr" if not rows or any("psnr" in row for row in rows) else "loss"
 
 

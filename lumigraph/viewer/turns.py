@@ -65,7 +65,7 @@ class Turns:
 
     @property
     def asked(self) -> bool:
-        """Whether training should give way now: someone waits and training had its own share, or it is paused."""
+        """True if training must give way: a rendering waits and training had its share, or it is paused."""
         return self.paused or bool(self._waiting) and time.perf_counter() >= self._own_until
 
     def give_way(self, stopping: Callable[[], object] = lambda: False) -> None:
@@ -89,7 +89,7 @@ class Turns:
             self._condition.notify_all()
 
     def claim_refresh(self) -> bool:
-        """Whether a client at rest may render anew after training; other clients then wait until `refreshed`."""
+        """True if a client at rest may render again after training steps; other clients then wait until `refreshed`."""
         with self._condition:
             if self.training and not self.paused and time.perf_counter() < self._idle_until:
                 return False

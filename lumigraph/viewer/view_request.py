@@ -8,10 +8,10 @@ from dataclasses import dataclass
 import torch
 
 from ..camera import Camera
-from ..controls import Value
-from ..crop import Crop
-from ..lens import Pinhole
-from ..scene import Vector
+from ..camera.crop import Crop
+from ..camera.lens import Pinhole
+from ..datasets.scene import Vector
+from ..method.controls import Value
 
 
 @dataclass(frozen=True)
@@ -45,7 +45,7 @@ class ViewRequest:
 
     @property
     def part(self) -> bool:
-        """Whether less than the whole scene is shown."""
+        """True if a part of the scene is hidden by a crop or as floaters."""
         return self.crop is not None or bool(self.floaters)
 
     @property

@@ -8,8 +8,8 @@ from collections.abc import Callable
 from typing import Any
 
 from ..camera import Camera
-from ..capabilities import HasGaussians, can
 from ..method import Method
+from ..method.capabilities import HasGaussians, can
 from . import window
 from .address import Address
 from .cameras import angles
@@ -70,7 +70,7 @@ class Viewer:
 
     @property
     def asked(self) -> bool:
-        """Whether training should give way now."""
+        """True if training must give way to a rendering."""
         return self.turns.asked
 
     def give_way(self, stopping: Callable[[], object]) -> None:

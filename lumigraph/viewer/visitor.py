@@ -14,11 +14,11 @@ import torch
 from jaxtyping import UInt8
 
 from ..camera import Camera
-from ..crop import Crop
+from ..camera.crop import Crop
+from ..camera.rays import Rendering
+from ..datasets.scene import Vector
 from ..errors import LumigraphError
 from ..figures import to_bytes
-from ..rays import Rendering
-from ..scene import Vector
 from .cameras import angle_for, angles, pose_of, rows
 from .controls import Controls
 from .crop_panel import CropPanel

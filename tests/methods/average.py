@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import torch
 
+from lumigraph.camera.rays import Look, Samples
+from lumigraph.files.ranges import Cells, NonNegative, RaySamples, Share
 from lumigraph.method import RayMethod
-from lumigraph.ranges import Cells, NonNegative, RaySamples, Share
-from lumigraph.rays import Look, Samples
 
 NEAR, FAR = 1.0, 5.0  # scene units from a camera, between which the cube lies
 

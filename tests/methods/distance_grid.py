@@ -7,10 +7,10 @@ from dataclasses import dataclass
 import torch
 from torch import nn
 
+from lumigraph.camera.rays import Look, Samples
+from lumigraph.datasets.shapes import Shapes
+from lumigraph.files.ranges import BatchSize, Cells, LearningRate, NonNegative, RaySamples
 from lumigraph.method import RayMethod
-from lumigraph.ranges import BatchSize, Cells, LearningRate, NonNegative, RaySamples
-from lumigraph.rays import Look, Samples
-from lumigraph.shapes import Shapes
 
 
 @dataclass(frozen=True)

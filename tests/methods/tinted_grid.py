@@ -7,11 +7,11 @@ from dataclasses import dataclass
 import torch
 from torch import nn
 
-from lumigraph.collection import Collection
+from lumigraph.camera.rays import Look, Samples
+from lumigraph.datasets.collection import Collection
+from lumigraph.datasets.scene import Scene
+from lumigraph.files.ranges import BatchSize, Cells, LearningRate, RaySamples
 from lumigraph.method import RayMethod
-from lumigraph.ranges import BatchSize, Cells, LearningRate, RaySamples
-from lumigraph.rays import Look, Samples
-from lumigraph.scene import Scene
 from lumigraph.volume import composite
 
 

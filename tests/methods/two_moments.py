@@ -7,10 +7,10 @@ from dataclasses import dataclass
 import torch
 from torch import nn
 
-from lumigraph.controls import Control, moment
+from lumigraph.camera.rays import Look, Samples
+from lumigraph.files.ranges import BatchSize, Cells, LearningRate, RaySamples
 from lumigraph.method import RayMethod
-from lumigraph.ranges import BatchSize, Cells, LearningRate, RaySamples
-from lumigraph.rays import Look, Samples
+from lumigraph.method.controls import Control, moment
 from lumigraph.volume import composite
 
 

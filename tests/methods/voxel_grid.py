@@ -8,9 +8,9 @@ from typing import Annotated
 import torch
 from torch import nn
 
+from lumigraph.camera.rays import Look, Rendering, Samples
+from lumigraph.files.ranges import BatchSize, Layers, LearningRate, RaySamples, between
 from lumigraph.method import RayMethod
-from lumigraph.ranges import BatchSize, Layers, LearningRate, RaySamples, between
-from lumigraph.rays import Look, Rendering, Samples
 from lumigraph.volume import composite
 
 

@@ -1,4 +1,4 @@
-"""How many rows a table of COLMAP's database has, written to standard output every now and then.
+"""Write the number of rows of a table in COLMAP's database to standard output, at intervals.
 
 A process of its own, until its standard input ends. Python and COLMAP each bring an SQLite; two of them in one process
 break each other's locks on one file, and its shared memory is then cut off under whoever still reads it.

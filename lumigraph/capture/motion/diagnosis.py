@@ -1,4 +1,4 @@
-"""What became of each photograph, and how far the result is to be trusted, in words that people act on."""
+"""Report the outcome for each photograph and the reliability of the result, with what to do next."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial import ConvexHull, QhullError
 
-from ...library import pycolmap
-from ...names import counted, natural
+from ...files.names import counted, natural
+from ...system.library import pycolmap
 from ..folds import in_steps, jumps
 from ..normalise import where_axes_meet
 from ..photos import Intake, Photo
@@ -32,7 +32,7 @@ NAMED = 8  # photographs that a warning lists
 
 @dataclass(frozen=True)
 class Matches:
-    """Which photographs share details: for each pair of names how many one motion explains, and COLMAP's verdict."""
+    """Matches of photographs: for each pair of names the number of inliers of one motion, and COLMAP's verdict."""
 
     features: dict[str, int]
     shared: dict[tuple[str, str], int]
@@ -93,7 +93,7 @@ class Gap:
 
 @dataclass(frozen=True)
 class Coverage:
-    """How far around their subject photographs were taken; gaps only where they go more than half around."""
+    """Angle of the subject that photographs cover; gaps only if they cover more than half of the circle."""
 
     degrees: float
     gaps: list[Gap] = field(default_factory=list)

@@ -11,8 +11,8 @@ from jaxtyping import Float, UInt8
 from PIL import Image, ImageDraw, ImageFont
 
 from ...figures import RAMP, fit_into, save_picture
-from ...library import pycolmap
-from ...names import natural
+from ...files.names import natural
+from ...system.library import pycolmap
 from ..photos import Intake
 from .diagnosis import Diagnosis
 
@@ -30,7 +30,7 @@ FRUSTUM = 0.05  # depth of a camera's pyramid, as a share of what is shown
 
 @dataclass(frozen=True)
 class Sketch:
-    """What is drawn, in a frame with +z up: corners are each camera's eye and the four of its picture."""
+    """Geometry to draw, in a frame with +z up: corners are each camera's eye and the four corners of its picture."""
 
     eyes: Float[np.ndarray, "photo 3"]
     corners: Float[np.ndarray, "photo 4 3"]
@@ -199,7 +199,7 @@ def draw_photographs(path: Path, intake: Intake, diagnosis: Diagnosis) -> None:
 
 
 def remark(name: str, diagnosis: Diagnosis) -> tuple[str, str | None]:
-    """What to say of a photograph, and in which colour."""
+    """Remark on a photograph, and its colour."""
     if name in diagnosis.left_out:
         return diagnosis.left_out[name], LEFT_OUT
     if name in diagnosis.duplicates:

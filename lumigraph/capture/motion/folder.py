@@ -15,8 +15,8 @@ from PIL import Image
 from ...errors import LumigraphError
 from ...files import claim as claim_file
 from ...files import claim_folder, read_json, remove, replacing, replacing_folder, write_json
-from ...library import pycolmap
-from ...marks import is_ours
+from ...files.marks import is_ours
+from ...system.library import pycolmap
 from ..masks import MASKS as MASKS
 from ..photos import Photo
 from ..photos.track import Track
@@ -118,7 +118,7 @@ def copy_masks(photos: Sequence[Photo], masks: Path, track: Track) -> Path | Non
 
 
 def stamp(path: Path) -> tuple[int, int]:
-    """What changes when a file does: nanoseconds and bytes."""
+    """Modification time of a file in nanoseconds, and its size in bytes."""
     about = path.stat()
     return about.st_mtime_ns, about.st_size
 
@@ -139,7 +139,7 @@ def write_model(folder: Path, model: pycolmap.Reconstruction, photos: Sequence[P
 
 
 def transforms(model: pycolmap.Reconstruction, images: Sequence[pycolmap.Image]) -> dict[str, Any]:
-    """What transforms.json says: the lens once if all share it, otherwise with each frame."""
+    """Contents of transforms.json: the lens once if all frames share it, otherwise with each frame."""
     shared = len({image.camera_id for image in images}) == 1
     frames = []
     for image in images:

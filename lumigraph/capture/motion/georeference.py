@@ -1,4 +1,4 @@
-"""Which way is up, how long a metre is, and where on Earth: from GPS, or only up from how cameras are held."""
+"""Up direction, metric scale and position on Earth from GPS; without it, only up, from how cameras are held."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ import torch
 from jaxtyping import Float
 
 from ...camera import Camera
-from ...lens import Pinhole
-from ...library import pycolmap
+from ...camera.lens import Pinhole
+from ...system.library import pycolmap
 from ..photos import Photo
 from ..up import common_up, turn_onto_z
 
@@ -23,7 +23,7 @@ CONSENSUS = 0.5  # share of the positions that must agree
 
 @dataclass(frozen=True)
 class Georeference:
-    """What GPS tells of a model.
+    """Georeference of a model by GPS.
 
     new_from_old: the similarity that turns the model to metres east, north and up of the origin; None where GPS cannot
     say:          what was done, or why not, in a sentence

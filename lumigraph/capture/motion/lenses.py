@@ -1,4 +1,4 @@
-"""Which photographs share a lens, and COLMAP's database with what is known of each before anything is measured."""
+"""Group photographs by lens, and write COLMAP's database with the known parameters of each before matching."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Literal
 
 from ...errors import LumigraphError
-from ...library import pycolmap
+from ...system.library import pycolmap
 from ..photos import Photo
 
 Sharing = Literal["auto", "single", "per-device", "per-image"]

@@ -1,4 +1,4 @@
-"""Which photographs to compare with which: all, neighbours in time, or those that look alike."""
+"""Pairs of photographs to match: all, neighbours in time, or those that look alike."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from jaxtyping import Float
 from scipy.cluster.vq import kmeans2, vq
 from scipy.spatial import cKDTree
 
-from ...choice import evenly
-from ...library import pycolmap
+from ...geometry.choice import evenly
+from ...system.library import pycolmap
 
 Matching = Literal["auto", "exhaustive", "sequential", "retrieval"]
 Pair = tuple[int, int]

@@ -16,11 +16,11 @@ import numpy as np
 from ...errors import LumigraphError
 from ...files import claim as claim_file
 from ...files import read_json, remove, replacing, replacing_folder, write_bytes, write_json
-from ...library import pycolmap
-from ...locks import held
-from ...names import counted, natural
-from ...progress import counting
-from ...ranges import typed
+from ...files.locks import held
+from ...files.names import counted, natural
+from ...files.ranges import typed
+from ...system.library import pycolmap
+from ...system.progress import counting
 from ..photos import Intake, Photo, gather
 from ..photos.track import Track, untracked
 from ..raw import REMEMBERED, Remembered
@@ -92,7 +92,7 @@ def reconstruct(
 
 
 def taken_in(sources: Sequence[Path], work: Path, options: Options, track: Track) -> tuple[Intake, list[Photo]]:
-    """What there is, and of that what is not there twice. Raises LumigraphError where it is too little."""
+    """Gather photographs, and list those that are no duplicates. Raises LumigraphError if there are too few."""
     intake = with_safe_names(gather(sources, work, options.frames, track))
     photos = [photo for photo in intake.photos if photo.name not in intake.duplicates]
     if len(photos) < FEWEST:
@@ -135,7 +135,7 @@ def intake_identity(intake: Intake) -> list[Any]:
 
 
 def finished(folder: Path, key: str) -> dict[str, Any] | None:
-    """What an earlier call found, if it came to its end for the same things."""
+    """Result of an earlier call that finished with the same inputs; None if there is none."""
     needed = ("transforms.json", "sparse/0/images.bin", "images", RESULT)
     if not all((folder / name).exists() for name in needed):
         return None
@@ -389,7 +389,7 @@ def read_models(folder: Path) -> list[pycolmap.Reconstruction]:
 
 
 def largest(folder: Path) -> int:
-    """How many photographs the largest of COLMAP's models in a folder places; 0 if there is none."""
+    """Number of photographs in the largest of COLMAP's models in a folder; 0 if there is none."""
     return max((model.num_reg_images() for model in read_models(folder)), default=0)
 
 
@@ -417,7 +417,7 @@ def keep_near(path: Path, names: Sequence[str], reach: int) -> None:
 
 
 def also_unreadable(intake: Intake) -> str:
-    """What to add where photographs are too few: that there were others, which nobody could read, and why."""
+    """Addition to the error for too few photographs: an unreadable one, why, and how many more."""
     if not intake.unreadable:
         return ""
     name, why = next(iter(intake.unreadable.items()))

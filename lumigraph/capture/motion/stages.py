@@ -1,4 +1,4 @@
-"""What is done stays done: stages of work in a folder, each known by everything that it was made from."""
+"""Stages of work in a folder, each identified by all of its inputs; finished stages are not repeated."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from typing import Any
 
 from ...errors import LumigraphError
 from ...files import read_json, write_json
-from ...processes import start
-from ...ranges import Lasted
+from ...files.ranges import Lasted
+from ...system.processes import start
 
 WORKER = Path(__file__).with_name("worker.py")
 
@@ -29,7 +29,7 @@ def key_of(*parts: Any) -> str:
 
 @dataclass(frozen=True)
 class Mark:
-    """Of a stage: what it was made from, whether it is done, and how long it took."""
+    """Record of a stage: its inputs, whether it is done, and its duration."""
 
     key: str
     done: bool
@@ -48,11 +48,11 @@ class Stages:
         return self.was_begun(stage, key) and self.marks[stage].done
 
     def was_begun(self, stage: str, key: str) -> bool:
-        """Whether work that is not done may go on: it was begun with the same things."""
+        """True if an unfinished stage may continue: it was begun with the same inputs."""
         return stage in self.marks and self.marks[stage].key == key
 
     def seconds(self) -> dict[str, float]:
-        """How long each stage took, interruptions left out."""
+        """Seconds that each stage took, without interruptions."""
         return {stage: mark.seconds for stage, mark in self.marks.items()}
 
     @contextmanager

@@ -1,4 +1,4 @@
-"""Which colours an object has and which its surroundings: two mixtures of Gaussians (Rother 2004, section 3.1)."""
+"""Colour models of an object and of its surroundings: two mixtures of Gaussians (Rother 2004, section 3.1)."""
 
 from __future__ import annotations
 

@@ -15,7 +15,7 @@ HOLD = 30.0  # the largest of these costs
 
 
 def cut(view: View, costs: Float[np.ndarray, " patch"]) -> Bool[np.ndarray, " patch"]:
-    """Which superpixels belong to the object.
+    """Mask of the superpixels that belong to the object.
 
     costs: of taking each into it, in logarithms of likelihood; negative ones speak for it. They count by the width of a
            superpixel rather than its area, for the pixels of one are no independent witnesses

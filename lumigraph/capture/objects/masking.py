@@ -12,11 +12,11 @@ import torch
 from jaxtyping import Float
 from PIL import Image
 
-from ...choice import evenly
+from ...datasets.scene import Scene
 from ...errors import LumigraphError
 from ...figures import Row, contact_sheet, fit_into, save_picture
 from ...files import claim, replacing_folder
-from ...scene import Scene
+from ...geometry.choice import evenly
 from ..assemble import assemble
 from ..capture import Capture
 from ..masks import OBJECT_MASKS, inner_names
@@ -37,7 +37,7 @@ Track = Callable[[Sequence[Any], str, int], Iterable[Any]]
 
 @dataclass(frozen=True)
 class Masked:
-    """What was written, and what to doubt: a sentence each."""
+    """Result of masking: number of photographs, contact sheet, and doubts: a sentence each."""
 
     photographs: int
     sheet: Path
@@ -89,7 +89,7 @@ def refined(
 
 
 def doubts(found: Segmentation) -> list[str]:
-    """What a user should look at before training on the masks."""
+    """Doubts that a user should check before training on the masks."""
     told = []
     if found.region.table is None:
         told.append("no table or floor was found below the object, so shadows at its foot may belong to it")

@@ -1,4 +1,4 @@
-"""Where an object must be: what nearly all cameras look at, above the plane that it stands on."""
+"""Region of an object: seen by nearly all cameras, above its ground plane."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class Table:
     height: float
 
     def above(self, points: Float[Tensor, "point 3"]) -> Float[Tensor, " point"]:
-        """How far points are above the plane, scene units."""
+        """Height of points above the plane, scene units."""
         return points @ self.normal - self.height
 
 
@@ -47,7 +47,7 @@ class Region:
     table: Table | None
 
     def holds(self, points: Float[Tensor, "point 3"]) -> Bool[Tensor, " point"]:
-        """Which points lie in one of the cells."""
+        """Mask of the points that lie in one of the cells."""
         if not len(points):
             return torch.zeros(0, dtype=torch.bool)
         low = self.cells.amin(0) - 0.5 * self.size

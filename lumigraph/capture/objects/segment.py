@@ -38,7 +38,7 @@ Patches = np.ndarray  # bool: which superpixels of one picture; each picture has
 
 @dataclass(frozen=True)
 class Segmentation:
-    """What was found.
+    """Result of a segmentation.
 
     views:    the photographs, small
     inside:   which superpixels of each belong to the object

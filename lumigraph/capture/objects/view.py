@@ -73,14 +73,11 @@ class View:
         self, points: Float[torch.Tensor, "point 3"]
     ) -> tuple[Int[np.ndarray, "point 2"], Bool[np.ndarray, " point"]]:
         """The (row, column) at which points are seen, clamped to the picture, and whether they are in it."""
-        pixels, valid = self.camera.project(points)
-        height, width = self.lab.shape[:2]
-        places = pixels.nan_to_num(-1, -1, -1).clamp(-1, 1e6).floor().long().numpy()[:, ::-1]
-        inside = valid.numpy() & (places >= 0).all(-1) & (places < (height, width)).all(-1)
-        return places.clip(0, (height - 1, width - 1)), inside
+        places, inside = self.camera.locate(points)
+        return places.numpy(), inside.numpy()
 
     def shadow(self, points: Float[torch.Tensor, "point 3"], size: float) -> Float[np.ndarray, "height width"]:
-        """How much of each pixel cubes cover that are `size` large and stand at points: about 1 inside, 0 outside."""
+        """Coverage of each pixel by cubes of side `size` at points: about 1 inside, 0 outside."""
         places, inside = self.at(points)
         hit = np.zeros(self.lab.shape[:2])
         hit[tuple(places[inside].T)] = 1.0
@@ -90,7 +87,7 @@ class View:
         return ndimage.gaussian_filter(closed, 0.5 * radius)
 
     def pixels(self, points: Float[torch.Tensor, "point 3"], size: float) -> float:
-        """How large a length appears in the middle of points, in pixels."""
+        """Size of a length at the mean of points, in pixels."""
         middle = points.mean(0)
         ends, _ = self.camera.project(torch.stack([middle, middle + size * self.camera.pose[0, :, 0]]))
         return max(1.0, float((ends[1] - ends[0]).norm()))

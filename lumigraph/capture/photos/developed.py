@@ -10,9 +10,9 @@ from pathlib import Path
 
 from PIL import Image
 
-from ...choice import evenly
 from ...errors import LumigraphError
 from ...files import read_json, replacing, write_json
+from ...geometry.choice import evenly
 from ..raw import REMEMBERED, Developed, RawPhoto, Remembered, exif_of, open_raw
 from .track import Track
 from .upright import QUALITY, is_current
@@ -72,7 +72,7 @@ def reason(path: Path, fault: LumigraphError) -> str:
 
 
 def brightness_of_all(photos: list[RawPhoto]) -> float | None:
-    """What each photograph's light is to be multiplied by, times its exposure; None where some do not say theirs."""
+    """Factor on each photograph's light, times its exposure; None if some exposures are unknown."""
     found = []
     for photo in evenly(photos, PROBES):
         if photo.exposure is None:

@@ -1,4 +1,4 @@
-"""What a photograph's file says of how it was taken: lens, place and time."""
+"""Lens, place and time of a photograph from its file."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ CROPPED = 0.02  # ratio of sides that may differ from the one at exposure, by ro
 
 @dataclass(frozen=True)
 class Facts:
-    """What is known of one exposure; None where the file does not say, or says nonsense.
+    """Facts of one exposure; None where the file has none, or an invalid one.
 
     device, focal, time: as in Photo
     gps: latitude and longitude in degrees, altitude in metres, NaN where that alone is missing
@@ -79,7 +79,7 @@ def focal_length(tags: dict[int, Any], size: tuple[int, int]) -> float | None:
 
 
 def exposure(exif: Image.Exif) -> float | None:
-    """How much light a photograph took of the same scene, up to a factor: seconds at f/1 and ISO 100, t S / (100 N^2).
+    """Exposure of a photograph up to a factor: seconds at f/1 and ISO 100, t S / (100 N^2).
 
     Where the aperture or the sensitivity is not said, both are taken for constant.
     """

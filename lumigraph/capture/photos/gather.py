@@ -14,7 +14,7 @@ from PIL import Image, UnidentifiedImageError
 
 from ...errors import LumigraphError
 from ...files import explained
-from ...names import counted, natural
+from ...files.names import counted, natural
 from ..masks import MASKS, OBJECT_MASKS, find_mask
 from ..pictures import describe, reductions
 from ..raw import Developed, is_raw
@@ -70,7 +70,7 @@ def gather(sources: Sequence[Path], work: Path, frames: int | None = None, track
 
 
 def all_raw(files: Mapping[str, Path], source: str) -> bool:
-    """Whether photographs are raw files. Raises LumigraphError where some are and others are not."""
+    """True if photographs are raw files. Raises LumigraphError if some are and others are not."""
     raw = [name for name, path in files.items() if is_raw(path)]
     if raw and len(raw) < len(files):
         other = next(name for name in files if name not in raw)
@@ -127,7 +127,7 @@ def nothing(source: str, unreadable: Mapping[str, str]) -> str:
 
 
 def is_bare(path: Path) -> bool:
-    """Whether this is a video, or a folder with photographs but without poses that a reader knows."""
+    """True for a video, or a folder with photographs but without poses that a reader knows."""
     from .. import READERS  # that package may import this one
 
     if not path.is_dir():
@@ -223,7 +223,7 @@ def unread(path: Path, fault: Exception) -> str:
 
 
 def with_altitudes(photos: list[Photo]) -> list[Photo]:
-    """Where altitudes alone are missing, the others' median stands in."""
+    """Replace missing altitudes by the median of the others."""
     known = [p.gps[2] for p in photos if p.gps and not math.isnan(p.gps[2])]
     usual = statistics.median(known) if known else 0.0
     return [replace(p, gps=(p.gps[0], p.gps[1], usual)) if p.gps and math.isnan(p.gps[2]) else p for p in photos]

@@ -1,4 +1,4 @@
-"""How good a picture is, from its pixels: sharp or blurred, bright or dark, new or like an earlier one.
+"""Quality of a picture from its pixels: sharp or blurred, bright or dark, new or a duplicate.
 
 All is judged on the luminance at 640 pixels along the longer side, where a picture from a phone has no noise to speak
 of, and blur that can only be seen by enlarging does no harm.
@@ -24,7 +24,7 @@ from jaxtyping import Float
 from PIL import Image
 from scipy.ndimage import gaussian_filter
 
-from ...srgb import linear_from_srgb
+from ...color.srgb import linear_from_srgb
 from ..pictures import eight_bits, same_shape
 
 WORKING = 640  # pixels, the longer side of what is judged
@@ -44,7 +44,7 @@ SAME = 0.95  # correlation of signatures; neighbours of a walk around a subject 
 
 @dataclass(frozen=True)
 class Judgement:
-    """How good one picture is, from its pixels.
+    """Quality of one picture, from its pixels.
 
     sharpness: see above, 1 to 16
     brightness: mean log2 of the linear luminance
@@ -105,7 +105,7 @@ def signature(grey: Image.Image) -> Float[np.ndarray, " cell"]:
 
 
 def blurred(sharpness: Mapping[str, float]) -> dict[str, str]:
-    """Which pictures are too blurred to trust, by name, and why in a few words.
+    """Names of pictures that are too blurred to use, and why in a few words.
 
     Muddy ones in any case. Otherwise those that are noticeably less sharp than the others, and either soft or unusual
     as well, unless they are crisp. The others' spread is taken from the median absolute deviation of log s, so that the
@@ -131,7 +131,7 @@ def blurred(sharpness: Mapping[str, float]) -> dict[str, str]:
 def duplicates(
     signatures: Mapping[str, Float[np.ndarray, " cell"]], sizes: Mapping[str, tuple[int, int]]
 ) -> dict[str, str]:
-    """Which pictures show what an earlier one shows, pixel for pixel or nearly, by name, and that one's name.
+    """Names of duplicates, exact or nearly, with the name of the earlier picture.
 
     signatures: the one to keep comes first
     Two are the same if their signatures correlate by more than SAME and their sides have the same ratio.

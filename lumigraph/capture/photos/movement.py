@@ -1,4 +1,4 @@
-"""How far the picture of a moving camera has moved."""
+"""Displacement of a moving camera's picture."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How work that takes long tells of its progress, to whoever wants to show it."""
+"""Interface for reporting the progress of long work."""
 
 from __future__ import annotations
 

@@ -24,7 +24,7 @@ def learn_formats() -> None:
 
 
 def is_plain(image: Image.Image, path: Path) -> bool:
-    """Whether OpenCV and COLMAP read this file as it is meant: JPEG or PNG, upright, 8 bits of grey or colour."""
+    """True if OpenCV and COLMAP read this file correctly: JPEG or PNG, upright, 8 bits of grey or colour."""
     if image.getexif().get(EXIF_ORIENTATION) not in EXIF_UPRIGHT:
         return False
     if image.format in ("JPEG", "MPO"):
@@ -65,5 +65,5 @@ def save(image: Image.Image, path: Path, suffix: str, profile: bytes | None = No
 
 
 def is_current(path: Path, source: Path) -> bool:
-    """Whether a copy of this source lies there already."""
+    """True if a copy of this source exists there already."""
     return path.is_file() and path.stat().st_mtime_ns == source.stat().st_mtime_ns

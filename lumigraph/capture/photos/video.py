@@ -25,7 +25,7 @@ from PIL import Image
 
 from ...errors import LumigraphError, LumigraphWarning
 from ...files import is_file, read_json, replacing_folder, write_json
-from ...ranges import Lasted
+from ...files.ranges import Lasted
 from .judge import SAME, WORKING, sharpness, signature
 from .movement import Odometer
 from .track import Track, untracked
@@ -55,7 +55,7 @@ class Index:
 
 
 def is_video(path: Path) -> bool:
-    """Whether a file is a film, by its suffix."""
+    """True if a file is a video, by its suffix."""
     return path.suffix.lower() in VIDEOS and path.is_file()
 
 

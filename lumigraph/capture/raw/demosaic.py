@@ -37,6 +37,6 @@ def demosaiced(light: Float[np.ndarray, "height width"], pattern: Pattern) -> Fl
 
 
 def repeated(pattern: Pattern, size: tuple[int, int]) -> np.ndarray:
-    """Which filter lies over every pixel of a picture of a size (width, height): int8 (height, width)."""
+    """Filter over every pixel of a picture of a size (width, height): int8 (height, width)."""
     width, height = size
     return np.tile(np.array(pattern, np.int8), (-(-height // 2), -(-width // 2)))[:height, :width]

@@ -142,8 +142,8 @@ def opened(path: Path) -> Iterator[Any]:
 
 
 def exif_of(path: Path) -> Image.Exif:
-    """What a raw file says of how it was taken, for the picture that is developed from it: empty where LibRaw's formats
-    are not TIFF within."""
+    """EXIF of a raw file, for the picture that is developed from it: empty for those of LibRaw's formats that are not
+    TIFF inside."""
     told, found = Image.Exif(), Image.Exif()
     with open(path, "rb") as file, contextlib.suppress(Exception):  # Pillow raises anything for odd tags
         if file.read(4) in TIFF:

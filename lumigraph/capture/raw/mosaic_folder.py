@@ -15,7 +15,7 @@ import numpy as np
 
 from ...errors import LumigraphError
 from ...files import read_json
-from ...ranges import Coordinate, Name, Side, between
+from ...files.ranges import Coordinate, Name, Side, between
 from ..numbers import check_pixels, kind_of, read_numbers
 from ..pictures import readable
 from .photo import RawPhoto, srgb_from_camera
@@ -28,7 +28,7 @@ Vector = tuple[Coordinate, Coordinate, Coordinate]
 
 @dataclass(frozen=True)
 class About:
-    """What is said of one mosaic, or of all of a folder.
+    """Description of one mosaic, or of all in a folder.
 
     pattern:  colours of the filters over the first two pixels of the first row, then of the second
     black, white: numbers that stand for no light, and for as much as the sensor can tell
@@ -57,7 +57,7 @@ class Listing:
 
 
 def is_listed(path: Path) -> bool:
-    """Whether the folder of a file calls it a mosaic."""
+    """True if the folder of a file lists it as a mosaic."""
     listing = path.parent / LISTING
     return listing.is_file() and path.name in listed(listing, listing.stat().st_mtime_ns).photographs
 
@@ -97,7 +97,7 @@ def x_of(own: About, common: About, name: str):
 
 
 def needed(about: About, name: str, path: Path):
-    """What has to be said of a mosaic."""
+    """Fields that a mosaic's description must have."""
     value = getattr(about, name)
     if value is None:
         raise LumigraphError(

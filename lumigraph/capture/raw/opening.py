@@ -1,4 +1,4 @@
-"""Whatever is a raw photograph, by its file."""
+"""Open raw photographs by their file."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from .photo import RawPhoto
 
 
 def is_raw(path: Path) -> bool:
-    """Whether a file is a camera's raw file by its name, or listed as a mosaic in its folder."""
+    """True if a file is a camera's raw file by its name, or listed as a mosaic in its folder."""
     return path.suffix.lower() in library.SUFFIXES or mosaic_folder.is_listed(path)
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from ...srgb import srgb_from_linear
+from ...color.srgb import srgb_from_linear
 from .demosaic import GREEN, Pattern, demosaiced, repeated
 
 XYZ_FROM_SRGB = np.array(
@@ -41,7 +41,7 @@ class RawPhoto:
 
     @property
     def filters(self) -> np.ndarray:
-        """Which filter lies over every pixel, int8 (height, width)."""
+        """Filter over every pixel, int8 (height, width)."""
         return repeated(self.pattern, self.size)
 
     def linear(self) -> Float[np.ndarray, "height width 3"]:

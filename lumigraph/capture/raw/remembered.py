@@ -1,4 +1,4 @@
-"""Which raw file each photograph of a scene was developed from, and what it adds to the scene: layers and facts.
+"""Raw file of each photograph of a scene, and the layers and facts that it adds to the scene.
 
 raw.json in a scene's folder names the files, as `lumigraph capture` writes it. Without it, a folder `raw` beside the
 photographs may hold them, each called as its photograph is (RawNeRF's published captures have it so).
@@ -16,7 +16,7 @@ import numpy as np
 
 from ...errors import LumigraphError
 from ...files import exists, read_json
-from ...ranges import Name, between
+from ...files.ranges import Name, between
 from ..capture import Capture, Plane, Shot
 from ..masks import inner_names
 from ..pictures import same_shape, stat
@@ -110,7 +110,7 @@ def planes(photo: RawPhoto, identity: str | None = None) -> dict[str, Plane]:
 
 
 def facts(photo: RawPhoto, brightness: float | None) -> dict[str, Any]:
-    """What a raw photograph says of itself, for `Scene.about`."""
+    """Facts of a raw photograph, for `Scene.about`."""
     said = {
         "exposure": photo.exposure,
         "white_balance": np.array(photo.gains),

@@ -1,1 +1,1 @@
-"""What can be measured: a file each."""
+"""Benchmarks, one file each."""

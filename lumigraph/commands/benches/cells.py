@@ -1,4 +1,4 @@
-"""What benchmarks that train have in common."""
+"""Common options of benchmarks that train methods."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 from ... import methods
-from ...budget import Budget
 from ...errors import LumigraphError
-from ...ranges import Count, Downscale, Scales, Seed
+from ...files.ranges import Count, Downscale, Scales, Seed
+from ...run.budget import Budget
 from ..capture import posed
 from ..common import ReaderOption, choose_device, needed, option, say, show
 from ..train import DEFAULT_SECONDS
@@ -24,29 +24,29 @@ class Cells:
     """Options of benchmarks that train methods and compare them."""
 
     methods: Annotated[tuple[str, ...], needed("METHOD ...")]
-    """What to train, for example instant-ngp gaussian-splatting."""
+    """Methods to train, for example instant-ngp gaussian-splatting."""
     scenes: Annotated[tuple[str, ...], needed("SCENE ...")]
-    """What to train it on, as for `lumigraph train`."""
+    """Scenes to train on, as for `lumigraph train`."""
     output: Annotated[Path, needed("OUTPUT")]
     """Folder for runs, table and charts."""
     seeds: Annotated[tuple[Seed, ...], option("N")] = (0,)
-    """Of all random choices; several make means with deviations."""
+    """Seeds of all random choices; several give means with deviations."""
     eval_views: Annotated[Count | None, option("N", "all")] = None
-    """Compare so many held-out views only, evenly spread."""
+    """Compare only this number of held-out views, evenly spread."""
     lpips: Annotated[tuple[Path, ...], option("FILE", "those in LUMIGRAPH_LPIPS, if any")] = ()
     """Files with the weights of LPIPS, as for `lumigraph eval`."""
-    downscale: Annotated[Downscale | None, option("N", "none, or what suits the photographs")] = None
-    """Shrink photographs by a whole number."""
+    downscale: Annotated[Downscale | None, option("N", "to at most about 1000 pixels")] = None
+    """Reduce photographs by this whole number; a larger one trains faster and loses detail."""
     reader: ReaderOption = None
     scales: Annotated[Scales, option("N")] = 1
-    """Have every photograph so many times, each half as large as the one before; the figures count them all."""
+    """Number of resolutions of every photograph, each half of the one before; scores average over all."""
     device: Annotated[str, option("NAME")] = "auto"
-    """auto, cpu, cuda, cuda:1."""
+    """Device to compute on: auto (a GPU if there is one), cpu, cuda, cuda:1."""
     preset: Literal["auto", "laptop", "paper"] = "auto"
-    """The methods' own defaults: their papers', or what learns most on a plain CPU; auto looks at --device."""
+    """Defaults of the methods' options: the papers', or those tuned for a CPU; auto decides by --device."""
 
     def checked(self) -> Settings:
-        """What all cells share. Raises LumigraphError for what cannot be, before anything is opened or trained."""
+        """Settings of all cells. Raises LumigraphError for impossible ones, before anything is opened or trained."""
         from ...benchmark.cell import Settings
         from ...metrics.lpips import load_lpips, named_files
 
@@ -71,18 +71,18 @@ class Cells:
 
 
 def budgets(seconds: Sequence[float], steps: Sequence[int]) -> list[Budget]:
-    """How long to train: seconds or steps, DEFAULT_SECONDS where neither is said. Raises LumigraphError for both."""
+    """Budgets in seconds or steps, DEFAULT_SECONDS without either. Raises LumigraphError for both."""
     if seconds and steps:
         raise LumigraphError("--steps and --seconds are two ways to say how long; give one of them")
     return [Budget(n, None) for n in steps] or [Budget(None, s) for s in seconds or (DEFAULT_SECONDS,)]
 
 
 def place_of(scene: str) -> str:
-    """Where what a user names lies, with poses, in words that mean the same in every folder."""
+    """Source with poses for a scene that a user names, independent of the current folder."""
     return located(posed(scene))
 
 
 def located(source: str) -> str:
-    """A source that means the same in every folder."""
+    """A source independent of the current folder: paths become absolute."""
     path = Path(source).expanduser()
     return str(path.resolve()) if path.exists() else source

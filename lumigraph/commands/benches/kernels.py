@@ -1,4 +1,4 @@
-"""`lumigraph bench kernels`: how fast the kernels are on this machine."""
+"""`lumigraph bench kernels`: time the kernels on this machine."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from ..common import Overwrite, choose_device, option
 class BenchKernels:
     """Measure every kernel's throughput on every engine, and its ratio to the reference in the same run."""
 
-    output: Annotated[Path | None, option("FILE.json", "the table alone")] = None
-    """Also write the figures there."""
+    output: Annotated[Path | None, option("FILE.json", "print the table only")] = None
+    """File for the figures, in addition to the table."""
     overwrite: Overwrite = False
     device: Annotated[str, option("NAME")] = "auto"
-    """auto, cpu, cuda, cuda:1."""
+    """Device to compute on: auto (a GPU if there is one), cpu, cuda, cuda:1."""
 
     def run(self) -> int:
         from ...kernels.bench import bench_kernels

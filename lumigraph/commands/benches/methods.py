@@ -1,4 +1,4 @@
-"""`lumigraph bench methods`: methods side by side on the same scenes."""
+"""`lumigraph bench methods`: compare methods on the same scenes."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Annotated
 
 from ... import methods
-from ...ranges import Seconds, Steps
+from ...files.ranges import Seconds, Steps
 from ..common import option, scene_name
 from .cells import Cells, budgets, place_of
 
@@ -15,15 +15,15 @@ from .cells import Cells, budgets, place_of
 class BenchMethods(Cells):
     """Train methods on scenes, for several durations and from several seeds, and compare held-out views.
 
-    Every cell is a run of its own in OUTPUT/runs, trained by `lumigraph train` and compared by `lumigraph eval` in
-    processes of their own. OUTPUT/results.md has the table, results.json all figures; charts show PSNR over time.
-    Ctrl-C stops; the same command goes on.
+    Every cell is a separate run in OUTPUT/runs, trained by `lumigraph train` and compared by `lumigraph eval` in
+    separate processes. OUTPUT/results.md has the table, results.json all figures; charts show PSNR over time. Ctrl-C
+    stops; the same command continues.
     """
 
     seconds: Annotated[tuple[Seconds, ...], option("S", "60")] = ()
-    """Train for so long; several make a chart."""
+    """Training time in seconds; several give a chart."""
     steps: Annotated[tuple[Steps, ...], option("N", "as long as --seconds")] = ()
-    """Train for so many steps instead."""
+    """Train for these numbers of steps instead."""
 
     def run(self) -> int:
         from ...benchmark.cell import Cell

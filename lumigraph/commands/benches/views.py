@@ -1,4 +1,4 @@
-"""`lumigraph bench views`: how many photographs methods need."""
+"""`lumigraph bench views`: PSNR against the number of training photographs."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 from ... import methods
-from ...budget import Budget
 from ...errors import LumigraphError
-from ...ranges import Count, Seconds, Steps
+from ...files.ranges import Count, Seconds, Steps
+from ...run.budget import Budget
 from ..common import needed, option, say, scene_name
 from .cells import Cells, budgets, place_of
 
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Place:
-    """A scene: where it is, its short name, and that of the collection whose member it is, if it is one."""
+    """A scene: its source, its short name, and the name of its collection, if any."""
 
     source: str
     scene: str
@@ -31,10 +31,10 @@ class Place:
 class BenchViews(Cells):
     """Train methods on fewer and fewer photographs of a scene, and compare the same held-out views.
 
-    The photographs are spread evenly over the cameras, and fewer are always among more. Otherwise as `lumigraph bench
-    methods`; a table and a chart show PSNR over the number of photographs. Of a collection, held-out members are
-    scenes, whose mean is shown. Methods that learn from collections, as pixelnerf does, are told the photographs
-    instead of trained on them: by a run of --priors, or one that is trained first, on the first collection of --scenes.
+    The photographs are spread evenly over the cameras, and each subset contains the smaller ones. A table and a chart
+    show PSNR over the number of photographs; the rest is as in `lumigraph bench methods`. For a collection, held-out
+    members are scenes, and the mean is shown. Priors, such as pixelnerf, take the photographs as input. The prior is a
+    run of --priors, or one that is trained first, on the first collection of --scenes.
     """
 
     methods: Annotated[tuple[str, ...], needed("METHOD ...")] = (
@@ -45,21 +45,21 @@ class BenchViews(Cells):
         "regnerf",
         "pixelnerf",
     )
-    """What to train (default: nerf mip-nerf instant-ngp gaussian-splatting regnerf pixelnerf)."""
+    """Methods to train (default: nerf mip-nerf instant-ngp gaussian-splatting regnerf pixelnerf)."""
     views: Annotated[tuple[Count | Literal["all"], ...], option("N")] = (2, 3, 4, 6, 9, 15, 25, 50, "all")
-    """How many photographs to learn from; numbers that a scene does not have are left out."""
+    """Numbers of training photographs; those that a scene does not have are left out."""
     seconds: Annotated[Seconds | None, option("S", "60")] = None
-    """Train for so long."""
+    """Training time in seconds."""
     steps: Annotated[Steps | None, option("N", "as long as --seconds")] = None
-    """Train for so many steps instead."""
+    """Train for this number of steps instead."""
     members: Annotated[Count, option("N")] = 4
-    """Of a collection, so many held-out members, evenly spread."""
+    """Number of held-out members of a collection, evenly spread."""
     priors: Annotated[tuple[Path, ...], option("RUN ...", "trained first, on the first collection of --scenes")] = ()
-    """Runs that have learnt from a collection."""
+    """Runs trained on a collection."""
     prior_seconds: Annotated[Seconds | None, option("S", "as long as the others")] = None
-    """Train priors for so long."""
+    """Training time of priors in seconds."""
     prior_steps: Annotated[Steps | None, option("N", "as long as --prior-seconds")] = None
-    """Train priors for so many steps instead."""
+    """Train priors for this number of steps instead."""
 
     def run(self) -> int:
         (budget,) = budgets(said(self.seconds), said(self.steps))
@@ -83,7 +83,7 @@ class BenchViews(Cells):
         are not there."""
         from ...benchmark.cell import Cell
         from ...capture import kind_of
-        from ...collection import Collection
+        from ...datasets.collection import Collection
         from ...run import Run
 
         there = {Run(path).method_name: path.resolve() for path in self.priors}
@@ -107,8 +107,8 @@ class BenchViews(Cells):
         """The source itself, or held-out members of the collection that it is."""
         from ...benchmark.cell import MEMBERS
         from ...capture import kind_of, open_dataset, sources_of
-        from ...choice import evenly
-        from ...collection import Collection
+        from ...datasets.collection import Collection
+        from ...geometry.choice import evenly
 
         if kind_of(source) is not Collection:
             yield Place(source, scene_name(source))
@@ -135,7 +135,7 @@ class BenchViews(Cells):
                     yield cell
 
     def there(self, source: str) -> int:
-        """How many photographs a scene has to learn from."""
+        """Number of a scene's training photographs."""
         from ...benchmark.cell import reduced
         from ...capture import open_scene
 
@@ -143,7 +143,7 @@ class BenchViews(Cells):
         return len(open_scene(source, downscale=downscale, reader=self.reader).splits["train"])
 
     def possible(self, source: str, there: int) -> list[int | None]:
-        """Those of the numbers that a scene has photographs for; None is all."""
+        """The numbers of views that a scene has photographs for; `None` is all."""
         left_out = [views for views in self.views if views != "all" and views > there]
         if left_out:
             say(f"{source} has {there} photographs to learn from; leaving out {', '.join(map(str, left_out))}")
@@ -151,8 +151,8 @@ class BenchViews(Cells):
 
 
 def learns_across(name: str) -> bool:
-    """Whether a method learns from collections, and is told a scene."""
-    from ...collection import Collection
+    """True if a method learns from collections and takes a scene as input."""
+    from ...datasets.collection import Collection
 
     return methods.find(name).learns_from is Collection
 

@@ -1,1 +1,1 @@
-"""What `lumigraph explain` can draw: one thing, one file, each a dataclass of options and a thin run()."""
+"""Explanations of `lumigraph explain`: one file each, a dataclass of options and a thin run()."""

@@ -6,29 +6,29 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
-from ...ranges import Steps, between
+from ...files.ranges import Steps, between
 from ..common import Overwrite, option, show
 
 
 @dataclass(frozen=True)
 class ExplainActivation:
-    """Learn a sharp edge with a coarse grid in three orders: activation before, within and after interpolation.
+    """Fit a sharp edge with a coarse grid in three orders: activation before, within and after interpolation.
 
-    One picture shows what each makes of it, with its PSNR.
+    One picture shows the result of each, with its PSNR.
     """
 
     output: Annotated[Path, option("FILE.png")] = Path("explained/activation.png")
-    """Where the picture goes."""
+    """File of the picture."""
     overwrite: Overwrite = False
     cells: Annotated[int, between(2, 128), option("N")] = 10
-    """Of the grid, along each axis."""
+    """Cells of the grid along each axis; more reduce the differences."""
     steps: Annotated[Steps, option("N")] = 1500
-    """Of learning, for each order."""
+    """Training steps for each order."""
 
     def run(self) -> int:
         from ...explain.activation import draw, fits
         from ...files import claim
-        from ...progress import counting
+        from ...system.progress import counting
 
         claim(self.output, "figure", self.overwrite)
         with counting("Learning an edge in three orders"):

@@ -1,4 +1,4 @@
-"""`lumigraph explain encodings`: what Fourier features do for a network that learns a picture."""
+"""`lumigraph explain encodings`: the effect of Fourier features on a network that fits a picture."""
 
 from __future__ import annotations
 
@@ -9,25 +9,25 @@ from typing import Annotated
 from tyro.conf import Positional
 
 from ...errors import LumigraphError
-from ...ranges import Downscale, Seed, Steps, between
+from ...files.ranges import Downscale, Seed, Steps, between
 from ..common import Overwrite, choose_device, needed, option, scene_name, show
 
 
 @dataclass(frozen=True)
 class ExplainEncodings:
-    """Fit a network to a picture behind each encoding of its pixels, and over a range of scales.
+    """Fit a network to a picture with each encoding of its pixels, over a range of scales.
 
     Half of the pixels are held out. One page, index.html, shows their PSNR against scale, the spectrum of the neural
-    tangent kernel, and the pictures that the networks draw.
+    tangent kernel, and the networks' pictures.
     """
 
     picture: Annotated[Positional[Path], needed("PICTURE")]
     """An image file."""
     output: Annotated[Path | None, option("FOLDER", "explained/PICTURE-encodings")] = None
-    """Where the page goes."""
+    """Folder of the page."""
     overwrite: Overwrite = False
     steps: Annotated[Steps, option("N")] = 500
-    """Of training, for each network."""
+    """Training steps for each network."""
     scales: Annotated[tuple[Annotated[float, between(1e-6, 1e6)], ...], option("S S ...")] = (
         1.0,
         2.0,
@@ -38,13 +38,13 @@ class ExplainEncodings:
         64.0,
         128.0,
     )
-    """Frequencies in cycles across the picture: the deviation of Gaussian ones, the highest of positional ones."""
+    """Scales to compare, in cycles across the picture: deviation of Gaussian, highest of positional frequencies."""
     downscale: Annotated[Downscale | None, option("N", "to about 512 pixels")] = None
-    """Shrink the picture by a whole number."""
+    """Reduce the picture by this whole number; a larger one is faster."""
     seed: Annotated[Seed, option("N")] = 0
-    """Of all random choices."""
+    """Seed of all random choices."""
     device: Annotated[str, option("NAME")] = "auto"
-    """auto, cpu, cuda, cuda:1."""
+    """Device to compute on: auto (a GPU if there is one), cpu, cuda, cuda:1."""
 
     def run(self) -> int:
         if len(set(self.scales)) < 2:
@@ -55,7 +55,7 @@ class ExplainEncodings:
         from ...explain.encodings import compare
         from ...explain.encodings_page import claim_page, write_page
         from ...methods.fourier_features import FourierFeatures
-        from ...progress import counting
+        from ...system.progress import counting
 
         if not single_image.recognises(self.picture.expanduser()):
             raise LumigraphError(f"{self.picture} is no image file; name one picture, as in photograph.png")

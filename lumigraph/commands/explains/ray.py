@@ -1,4 +1,4 @@
-"""`lumigraph explain ray`: what a method finds along one ray."""
+"""`lumigraph explain ray`: density and weights of a method along one ray."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal
 from tyro.conf import Positional
 
 from ...errors import LumigraphError
-from ...ranges import between
+from ...files.ranges import between
 from ..common import Overwrite, choose_device, needed, option, say, show
 from ..controls import Set, tell
 
@@ -18,39 +18,39 @@ Place = Annotated[int, between(0, 1_000_000)]  # along one side of a picture
 
 @dataclass(frozen=True)
 class ExplainRay:
-    """Draw density, transmittance, weights and samples along the ray of a pixel, and the colour that they build up.
+    """Draw density, transmittance, weights, samples and accumulated colour along the ray of a pixel.
 
-    One figure, which opens in a browser; its numbers lie beside it as JSON. The photograph's own colour is drawn where
-    the photographs are at hand.
+    One figure, which opens in a browser; its numbers are beside it as JSON. It includes the photograph's own colour if
+    the photographs are available.
     """
 
     run_folder: Annotated[Positional[Path], needed("RUN")]
     """Folder of the run."""
     pixel: Annotated[tuple[Place, Place] | None, option("X Y", "the middle of the picture")] = None
-    """Column and row, from 0 0 at the upper left."""
+    """Column and row of the pixel, from 0 0 at the upper left."""
     view: Annotated[str, option("NAME_OR_NUMBER")] = "0"
-    """Which photograph of the split: its name, or its number from 0."""
+    """Photograph of the split: its name, or its number from 0."""
     split: Literal["test", "val", "train"] = "test"
-    """Which photographs."""
+    """Split of the photograph."""
     output: Annotated[Path | None, option("FILE.svg", "RUN/rays/VIEW-X-Y.svg")] = None
-    """The figure."""
+    """File of the figure."""
     overwrite: Overwrite = False
-    scene: Annotated[str | None, option("SCENE", "where they were")] = None
-    """Where the photographs are now, if they have moved."""
+    scene: Annotated[str | None, option("SCENE", "the path used in training")] = None
+    """Path of the photographs, if they were moved since training."""
     told: Set = ()
     device: Annotated[str, option("NAME")] = "auto"
-    """auto, cpu, cuda, cuda:1."""
+    """Device to compute on: auto (a GPU if there is one), cpu, cuda, cuda:1."""
 
     def run(self) -> int:
         if self.output and self.output.suffix != ".svg":
             raise LumigraphError(f"{self.output} does not say that it is a figure; give --output a name ending in .svg")
-        from ...evaluate import file_name
+        from ...evaluation import file_name
         from ...explain.ray import along_ray
         from ...explain.ray_figure import ray_figure
         from ...figures.charts import standalone
         from ...files import claim, write_bytes, write_json
-        from ...progress import counting
         from ...run import Run
+        from ...system.progress import counting
 
         run = Run(self.run_folder)
         name, camera = find_view(run, self.split, self.view)

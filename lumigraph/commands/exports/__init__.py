@@ -1,1 +1,1 @@
-"""What `lumigraph export` can write: one thing, one file, each a dataclass of options and a thin run()."""
+"""Exports of `lumigraph export`: one file each, a dataclass of options and a thin run()."""

@@ -1,4 +1,4 @@
-"""`lumigraph export mesh`: the surfaces of a trained scene, for modellers, printers and game engines."""
+"""`lumigraph export mesh`: a mesh of a trained scene, for modellers, printers and game engines."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from ...errors import LumigraphError
 from ...files import claim
-from ...ranges import Count, Pixels, Positive, Share, between
+from ...files.ranges import Count, Pixels, Positive, Share, between
 from ..common import Overwrite, needed, option, show
 from ..controls import Set, open_method
 from ..keeping import Keeping
@@ -20,50 +20,50 @@ FOR_PHONES = 100_000  # triangles that a phone shows with ease
 
 @dataclass(frozen=True)
 class ExportMesh:
-    """Triangles with colours at their corners, in the frame of the photographs or upright.
+    """Export a triangle mesh with vertex colours, in the frame of the photographs or upright.
 
-    The ending says which format: .ply and .obj, in that frame; .glb, upright; .usdz, upright and for phones. Marching
-    cubes on the density of methods that have one, fusion of the depth that others render. Only the middle of a scene is
-    meshed. What no camera sees is closed up (objects) or left out (rooms and the open).
+    The ending chooses the format: .ply and .obj, in that frame; .glb, upright; .usdz, upright and for phones. Methods
+    with density use marching cubes on it; others use fusion of rendered depth. Only the middle of a scene is meshed.
+    Unseen surface is closed (objects) or left out (rooms and open scenes).
     """
 
     source: Annotated[Positional[Path], needed("RUN_OR_FILE")]
-    """Folder of a run, a splat file, or a composition."""
+    """Folder of a run, a splat file (.ply, .spz ...), or a composition (.json)."""
     output: Annotated[Positional[Path], needed("FILE")]
     """The new file."""
     extent: Annotated[
         Annotated[float, between(0.001, 1000)] | None, option("TIMES", "1 for objects, 1.5 for the rest")
     ] = None
-    """Size of what is meshed, times the box of interest that `lumigraph info` tells; or give --box or --sphere."""
+    """Size of the meshed region, times the box of interest in `lumigraph info`; or give --box or --sphere."""
     cell_size: Annotated[Positive | None, option("LENGTH", "1/256 of the box")] = None
-    """Side of the cubes marched through, in the units of the photographs' frame: details are twice as large."""
+    """Side of the marching cubes, in units of the photographs' frame; smaller gives finer detail and more triangles."""
     way: Annotated[
         Literal["auto", "density", "depth"],
         arg(name="from", help_behavior_hint="(default: density where the method has one)"),
     ] = "auto"
-    """What the surface is found in."""
-    level: Annotated[Positive | None, option("DENSITY", "where rays begin to end")] = None
-    """Density of the surface, per unit of the scene's own frame."""
+    """Source of the surface: the density field, or rendered depth."""
+    level: Annotated[Positive | None, option("DENSITY", "estimated at the rendered depth")] = None
+    """Density of the surface, per unit of the scene's own frame; higher shrinks the mesh."""
     smooth: Annotated[int, between(0, 1000), option("N")] = 10
-    """Rounds of smoothing; 0 for none."""
+    """Rounds of smoothing; more round off detail, 0 is none."""
     faces: Annotated[
         Annotated[int, between(4, 1_000_000_000)] | None,
-        option("N", f"as many as there are, for phones {FOR_PHONES:,}"),
+        option("N", f"all, for phones {FOR_PHONES:,}"),
     ] = None
-    """Triangles to come down to."""
+    """Number of triangles after simplification; fewer make a smaller file."""
     keep: Annotated[Share, option("SHARE")] = 0.01
-    """Pieces smaller than this share of the largest one are dropped."""
+    """Smallest piece to keep, as a share of the largest one's area; larger removes more fragments."""
     unseen: Annotated[Literal["close", "cut"] | None, option("{close,cut}", "close objects, cut the rest")] = None
-    """What becomes of the surface where no camera looks."""
+    """Unseen surface: close it for a watertight mesh, or cut it."""
     size: Annotated[Pixels, option("PIXELS")] = 400
-    """Longer side of the pictures that tell colours, and depth where it is fused; at most that of the photographs."""
+    """Longer side of the pictures for colours and depth, at most that of the photographs; larger is finer, slower."""
     views: Annotated[Count, option("N")] = 64
-    """Number of these pictures at most."""
+    """Largest number of these pictures."""
     overwrite: Overwrite = False
     part: OmitArgPrefixes[Keeping] = Keeping()
     told: Set = ()
     device: Annotated[str, option("NAME")] = "auto"
-    """auto, cpu, cuda, cuda:1."""
+    """Device to compute on: auto (a GPU if there is one), cpu, cuda, cuda:1."""
 
     def run(self) -> int:
         from ...export.mesh import extract_mesh

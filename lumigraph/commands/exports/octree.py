@@ -10,17 +10,17 @@ from tyro.conf import Positional
 
 from ...errors import LumigraphError
 from ...files import claim
-from ...ranges import between
+from ...files.ranges import between
 from ..common import Overwrite, needed, option, show
 from ..controls import Set, tell
 
 
 @dataclass(frozen=True)
 class ExportOctree:
-    """The octree of a run of plenoctrees as one .npz, which volrend and svox read.
+    """Export the octree of a plenoctrees run as one .npz, for volrend and svox.
 
-    It lies in the frame of the photographs, or where that is turned against the scene's, in the scene's: the format
-    knows no rotation.
+    It is in the frame of the photographs. If that is rotated against the scene's, it is in the scene's frame, because
+    the format has no rotation.
     """
 
     source: Annotated[Positional[Path], needed("RUN")]
@@ -28,7 +28,7 @@ class ExportOctree:
     output: Annotated[Positional[Path], needed("FILE.npz")]
     """The new file."""
     depth: Annotated[Annotated[int, between(1, 10)] | None, option("N", "all there are")] = None
-    """Levels of the octree at most; what lies deeper is averaged, for a smaller file."""
+    """Largest depth of the octree; deeper levels are averaged, for a smaller file."""
     overwrite: Overwrite = False
     told: Set = ()
 
@@ -36,8 +36,8 @@ class ExportOctree:
         if self.output.suffix.lower() != ".npz":
             raise LumigraphError(f"{self.output} should end in .npz, as viewers of octrees expect; rename it")
         claim(self.output, "octree", self.overwrite, [self.source])
-        from ...capabilities import HasOctree, needs
         from ...export.octree import write_octree
+        from ...method.capabilities import HasOctree, needs
         from ...run import open_any
 
         opened = open_any(self.source)

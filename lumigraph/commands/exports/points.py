@@ -1,4 +1,4 @@
-"""`lumigraph export points`: where a trained scene is solid, as coloured points."""
+"""`lumigraph export points`: coloured points on the surfaces of a trained scene."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from tyro.conf import OmitArgPrefixes, Positional
 
 from ...errors import LumigraphError
 from ...files import claim
-from ...ranges import CloudSize, Count, Pixels
+from ...files.ranges import CloudSize, Count, Pixels
 from ..common import Overwrite, needed, option, show
 from ..controls import Set, open_method
 from ..keeping import Keeping
@@ -18,26 +18,26 @@ from ..keeping import Keeping
 
 @dataclass(frozen=True)
 class ExportPoints:
-    """A cloud of coloured points with normals, spread evenly over the surfaces that the photographs show.
+    """Export coloured points with normals, spread evenly over the surfaces that the photographs show.
 
-    They lie in the frame of the photographs. Floaters are left out: several cameras must see each point.
+    They are in the frame of the photographs. Floaters are left out: several cameras must see each point.
     """
 
     source: Annotated[Positional[Path], needed("RUN_OR_FILE")]
-    """Folder of a run, a splat file, or a composition."""
+    """Folder of a run, a splat file (.ply, .spz ...), or a composition (.json)."""
     output: Annotated[Positional[Path], needed("FILE.ply")]
     """The new file."""
     count: Annotated[CloudSize, option("N")] = 200_000
-    """Points at most."""
+    """Largest number of points."""
     size: Annotated[Pixels, option("PIXELS")] = 400
-    """Longer side of the pictures that the points come from; at most that of the photographs."""
+    """Longer side of the pictures that points are taken from, at most that of the photographs."""
     views: Annotated[Count, option("N")] = 64
-    """Number of these pictures at most."""
+    """Largest number of these pictures."""
     overwrite: Overwrite = False
     part: OmitArgPrefixes[Keeping] = Keeping()
     told: Set = ()
     device: Annotated[str, option("NAME")] = "auto"
-    """auto, cpu, cuda, cuda:1."""
+    """Device to compute on: auto (a GPU if there is one), cpu, cuda, cuda:1."""
 
     def run(self) -> int:
         if self.output.suffix.lower() != ".ply":

@@ -20,21 +20,21 @@ CONTRACTED = (
 
 @dataclass(frozen=True)
 class ExportSnerg:
-    """A baked run as the folder that SNeRG's own viewer opens: scene_params.json and slices of its atlas as PNG.
+    """Export a baked run as the folder of SNeRG's own viewer: scene_params.json and slices of its atlas as PNG.
 
-    It lies in the scene's frame with +y up. A folder of that kind opens like a run, too. One of an open
-    capture is contracted (docs/methods/snerg.md), which other viewers do not undo, unless trained with --no-whole.
+    It is in the scene's frame with +y up. Such a folder also opens like a run. A folder of an open capture is
+    contracted (docs/methods/snerg.md), which other viewers do not undo, unless trained with --no-whole.
     """
 
     source: Annotated[Positional[Path], needed("RUN_OR_FOLDER")]
-    """Folder of a baked run, or of such a scene."""
+    """Folder of a baked run, or one that SNeRG's viewer opens."""
     output: Annotated[Positional[Path], needed("FOLDER")]
     """The new folder."""
 
     def run(self) -> int:
-        from ...capabilities import HasAtlas, needs
         from ...exchange import size_of, snerg
         from ...files import claim_folder
+        from ...method.capabilities import HasAtlas, needs
         from ...run import open_any
 
         claim_folder(self.output, "atlas")

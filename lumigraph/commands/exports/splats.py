@@ -9,7 +9,7 @@ from typing import Annotated, Any
 from tyro.conf import OmitArgPrefixes, Positional
 
 from ...errors import LumigraphError
-from ...ranges import between
+from ...files.ranges import between
 from ..common import Overwrite, needed, option, show
 from ..controls import Set, tell
 from ..keeping import Keeping
@@ -17,19 +17,19 @@ from ..keeping import Keeping
 
 @dataclass(frozen=True)
 class Levels:
-    """Levels of detail: large scenes for viewers that fetch what a camera needs."""
+    """Levels of detail for viewers that stream large scenes."""
 
     lod: bool = False
-    """Write a folder of streamed SOG, FILE/lod-meta.json with chunks at several levels of detail beside it."""
+    """Write a folder of streamed SOG: FILE/lod-meta.json, and chunks at several levels of detail."""
     levels: Annotated[Annotated[int, between(1, 10)] | None, option("N", "4")] = None
-    """With --lod: levels of detail, the finest among them."""
+    """With --lod: number of levels of detail, including the finest."""
     ratio: Annotated[Annotated[float, between(1.5, 16)] | None, option("TIMES", "4")] = None
-    """With --lod: Gaussians of a level to one of the next."""
+    """With --lod: Gaussians of a level per Gaussian of the next; larger makes coarser levels."""
     chunk: Annotated[Annotated[int, between(1024, 1 << 20)] | None, option("N", "65,536")] = None
-    """With --lod: Gaussians in a chunk at most."""
+    """With --lod: largest number of Gaussians in a chunk; smaller makes more files."""
 
     def output(self, path: Path) -> Path:
-        """Where lod-meta.json goes, or the path itself. Raises LumigraphError for options that need --lod."""
+        """Path of lod-meta.json, or the path itself. Raises LumigraphError for options that need --lod."""
         if path.name == "lod-meta.json":
             return path
         if self.lod and path.suffix:
@@ -46,15 +46,15 @@ class Levels:
 
 @dataclass(frozen=True)
 class ExportSplats:
-    """A trained cloud of Gaussians for splat viewers, or one splat format turned into another.
+    """Export a trained cloud of Gaussians for splat viewers, or convert a splat file to another format.
 
-    The ending says which format: .ply (all there is), .glb (glTF), .sog, .spz, .compressed.ply, .splat (no
-    view-dependent colour); NEW/meta.json is a folder of SOG, NEW/lod-meta.json (or NEW with --lod) one of streamed SOG.
-    What a run exports lies in the frame of the photographs it was trained on.
+    The ending chooses the format: .ply (lossless), .glb (glTF), .sog, .spz, .compressed.ply, .splat (no view-dependent
+    colour); NEW/meta.json is a folder of SOG, NEW/lod-meta.json (or NEW with --lod) one of streamed SOG. The export of
+    a run is in the frame of its photographs.
     """
 
     source: Annotated[Positional[Path], needed("RUN_OR_FILE")]
-    """Folder of a run, a splat file, or a composition."""
+    """Folder of a run, a splat file (.ply, .spz ...), or a composition (.json)."""
     output: Annotated[Positional[Path], needed("FILE")]
     """The new file."""
     detail: OmitArgPrefixes[Levels] = Levels()
@@ -63,10 +63,10 @@ class ExportSplats:
     told: Set = ()
 
     def run(self) -> int:
-        from ...capabilities import HasGaussians, needs
         from ...exchange import check_ending, claim_splats, is_splat_file, read_gaussians, size_of, write_gaussians
         from ...exchange.streamed_sog import Detail
         from ...export.splats import export_splats
+        from ...method.capabilities import HasGaussians, needs
         from ...run import open_any
         from ...run.splat_file import frame_of
 

@@ -3,55 +3,31 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Annotated
 
-from tyro.conf import OmitArgPrefixes, Positional
-
 from ...errors import LumigraphError
-from ...files import claim
-from ...ranges import Positive, SphereSize
-from ..common import Overwrite, needed, option, show
-from ..controls import Set, open_method
-from ..keeping import Keeping
-from .panorama import Place
+from ...files.ranges import Positive
+from ..common import option, show
+from .panorama import SphereExport
 
 
 @dataclass(frozen=True)
-class ExportStereo:
+class ExportStereo(SphereExport):
     """An omnidirectional stereo pair on one square picture, the left eye on top.
 
-    The horizon is level, the photographs' main direction in the middle. The ending says which format: .png or .jpg.
-    Photographs seldom tell how large a scene is; where yours do (GPS, a measured model), give --interpupillary 0.064 in
-    metres, and sizes will feel real.
+    The horizon is level, the photographs' main direction in the middle. The ending chooses the format: .png or .jpg.
+    Photographs seldom determine the scale of a scene. If yours is in metres (GPS, a measured model), real sizes need
+    the option --interpupillary 0.064.
     """
 
-    source: Annotated[Positional[Path], needed("RUN_OR_FILE")]
-    """Folder of a run, a splat file, or a composition."""
-    output: Annotated[Positional[Path], needed("FILE")]
-    """The new picture."""
-    place: Place = None
-    """Where the middle between the eyes is, in the frame of the photographs."""
     interpupillary: Annotated[Positive | None, option("LENGTH", "1/50 of the median distance to what is around")] = None
-    """Distance between the eyes, in the units of the photographs' frame."""
-    size: Annotated[SphereSize, option("PIXELS")] = 2048
-    """Width, and height of both halves together."""
-    overwrite: Overwrite = False
-    part: OmitArgPrefixes[Keeping] = Keeping()
-    told: Set = ()
-    device: Annotated[str, option("NAME")] = "auto"
-    """auto, cpu, cuda, cuda:1."""
+    """Distance between the eyes, in units of the photographs' frame; larger makes the scene look smaller and deeper."""
 
     def run(self) -> int:
-        from ...export.panorama import picture_format, save_sphere, sphere_size, standpoint
+        from ...export.panorama import save_sphere
         from ...export.stereo import SHARE, stereo_pair, surrounding_distances, top_bottom
 
-        picture_format(self.output)
-        sphere_size(self.size)
-        claim(self.output, "panorama", self.overwrite, [self.source])
-        opened, method, cameras = open_method(self.source, self.device, self.told)
-        method = self.part.of_method(method)
-        place, heading, where = standpoint(cameras["train"], opened.frame, self.place)
+        opened, method, place, heading, where = self.stand()
         unit = opened.frame.to_source.scale
         near, middle = surrounding_distances(method, place, heading)
         apart = SHARE * middle if self.interpupillary is None else self.interpupillary / unit

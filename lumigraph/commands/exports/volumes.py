@@ -1,4 +1,4 @@
-"""What a page of a volume holds: an octree or an atlas, or a field that becomes an octree first."""
+"""Volumes of web pages: an octree or an atlas, or a field converted to an octree first."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ INTO = "plenoctrees"
 
 
 def is_baked(method: Any) -> bool:
-    from ...capabilities import HasAtlas, HasOctree, can
+    from ...method.capabilities import HasAtlas, HasOctree, can
 
     return can(method, HasOctree) or can(method, HasAtlas)
 
 
 def browsable(method: Any, degree: int = 3) -> tuple[Any, str]:
-    """A baked method's volume for browsers, and in words what it holds. degree: of an octree's harmonics, at most"""
-    from ...baked.browser import atlas_for_browser, octree_for_browser
-    from ...capabilities import HasAtlas, HasOctree, can, needs
+    """A baked method's volume for browsers, and its description. degree: largest degree of an octree's harmonics"""
+    from ...exchange.baked.browser import atlas_for_browser, octree_for_browser
+    from ...method.capabilities import HasAtlas, HasOctree, can, needs
 
     if can(method, HasOctree):
         volume = octree_for_browser(method.octree(), degree)
@@ -31,8 +31,8 @@ def browsable(method: Any, degree: int = 3) -> tuple[Any, str]:
 
 
 def can_be_baked(opened: Any, method: Any) -> bool:
-    """Whether a method's field can become an octree, which holds objects only."""
-    from ...conversion.ways import check, way
+    """True if a method's field can be converted to an octree, which supports objects only."""
+    from ...derive.conversion.ways import check, way
     from ...methods import find
 
     try:
@@ -43,8 +43,8 @@ def can_be_baked(opened: Any, method: Any) -> bool:
 
 
 def converted(opened: Any, seconds: float, device: Any) -> tuple[Any, str]:
-    """An octree's method made of what was opened, and in words what that took. seconds: of learning on"""
-    from ...conversion import Aim, convert
+    """The opened method converted to an octree, and the cost as text. seconds: training time after initialisation"""
+    from ...derive.conversion import Aim, convert
     from ...run import open_any
 
     begin = time.monotonic()

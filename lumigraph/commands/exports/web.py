@@ -1,4 +1,4 @@
-"""`lumigraph export web`: a trained scene as one page to share."""
+"""`lumigraph export web`: a trained scene as one HTML page."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from ...errors import LumigraphError
 from ...files import claim
-from ...ranges import Seconds, between
+from ...files.ranges import Seconds, between
 from ..common import Overwrite, choose_device, needed, option, show
 from ..controls import Set, open_method
 from ..keeping import Keeping
@@ -23,15 +23,15 @@ Kind = Literal["auto", "splats", "volume", "mesh", "views"]
 
 @dataclass(frozen=True)
 class ExportWeb:
-    """One HTML file that opens from disk, in any browser, without a server or a network.
+    """Export one HTML file that opens from disk, in any browser, without a server or a network.
 
-    Gaussians are drawn as splats, octrees and atlases ray by ray. Other fields of objects are converted to an octree
-    first; `lumigraph convert` keeps one. --as views and --as mesh need no conversion: pictures rendered here from all
-    around, which dragging turns over, or a coloured mesh.
+    Gaussians are drawn as splats, octrees and atlases by ray marching. Other fields of objects are converted to an
+    octree first; `lumigraph convert` keeps one. --as views and --as mesh need no conversion: pictures rendered from all
+    around, or a coloured mesh.
     """
 
     source: Annotated[Positional[Path], needed("RUN_OR_FILE")]
-    """Folder of a run, a splat file, or a composition."""
+    """Folder of a run, a splat file (.ply, .spz ...), or a composition (.json)."""
     output: Annotated[Positional[Path], needed("FILE.html")]
     """The page."""
     kind: Annotated[
@@ -41,26 +41,26 @@ class ExportWeb:
             help_behavior_hint="(default: splats for Gaussians, volume for fields of objects, views for the rest)",
         ),
     ] = "auto"
-    """What the page holds."""
+    """Representation in the page: splats and volume render the scene itself, mesh is coarser, views are pictures."""
     title: Annotated[str | None, option("TEXT", "the scene's name")] = None
-    """What the page is called."""
+    """Title of the page."""
     background: Annotated[
-        str | None, option("#RRGGBB", "the one it was trained with; outdoors the colours of its sky and ground")
+        str | None, option("#RRGGBB", "the training background; for open scenes the colours of sky and ground")
     ] = None
     """Colour behind splats, a volume or the mesh."""
     views: Annotated[int, between(2, 1000), option("N")] = 72
-    """Pictures in a page of views."""
+    """Number of pictures in a page of views; more turn more smoothly and take more bytes."""
     size: Annotated[int, between(16, 4096), option("PIXELS")] = 640
-    """Longer side of these pictures."""
+    """Longer side of these pictures in pixels."""
     degree: Annotated[int, between(0, 3), option("N")] = 3
     """Highest degree of an octree's harmonics; a lower one makes a smaller page, with weaker reflections."""
     seconds: Annotated[Seconds, option("S")] = 30.0
-    """How long an octree learns on that a field is converted to first."""
+    """Training time of the octree that a field is converted to, in seconds."""
     overwrite: Overwrite = False
     part: OmitArgPrefixes[Keeping] = Keeping()
     told: Set = ()
     device: Annotated[str, option("NAME")] = "auto"
-    """auto, cpu, cuda, cuda:1."""
+    """Device to compute on: auto (a GPU if there is one), cpu, cuda, cuda:1."""
 
     def run(self) -> int:
         from ...export.backdrop import backdrop
@@ -85,9 +85,9 @@ class ExportWeb:
 
     def _write(self, kind: str, method: Any, cameras: Any, opening: Any) -> str:
         """Write the page, and say what it holds."""
-        from ...capabilities import HasGaussians, needs
         from ...export.mesh import extract_mesh
         from ...export.page import mesh_page, splats_page, views_page, volume_page
+        from ...method.capabilities import HasGaussians, needs
 
         if kind == "splats":
             gaussians = self.part.of_gaussians(needs(method, HasGaussians).gaussians(), self.part.crop(method.frame))
@@ -105,7 +105,7 @@ class ExportWeb:
         return f"{len(mesh.faces):,} triangles"
 
     def _kind(self, opened: Any, method: Any) -> str:
-        from ...capabilities import HasGaussians, can
+        from ...method.capabilities import HasGaussians, can
 
         if self.kind != "auto":
             return self.kind
@@ -116,7 +116,7 @@ class ExportWeb:
         return "volume" if is_baked(method) or (not self.told and can_be_baked(opened, method)) else "views"
 
     def _baked(self, opened: Any, method: Any) -> tuple[Any, dict[str, str]]:
-        """What can be shown as a volume, and what it took to make."""
+        """A volume for the page, and the cost of its conversion."""
         if self.part.crops:
             raise LumigraphError("A volume is shown as a whole; leave out --box and --sphere, or give --as views")
         if is_baked(method):

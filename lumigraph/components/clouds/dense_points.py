@@ -16,9 +16,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ... import kernels
-from ...choice import evenly
-from ...progress import track
-from ...scene import Scene
+from ...datasets.scene import Scene
+from ...geometry.choice import evenly
+from ...system.progress import track
 from .flat_view import FlatView, flat_view
 
 VIEWS, FEWEST_VIEWS = 48, 8  # photographs asked at most, and however short the time

@@ -11,8 +11,8 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import grid_sample
 
-from ...lens import Pinhole
-from ...scene import Photograph
+from ...camera.lens import Pinhole
+from ...datasets.scene import Photograph
 
 WIDEST = math.radians(50.0)  # from the axis to the left and right border, where a lens sees further
 GREY = (0.299, 0.587, 0.114)

@@ -12,8 +12,8 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
-from ...controls import Control, blend
-from ...scene import Batch, Photograph
+from ...datasets.scene import Batch, Photograph
+from ...method.controls import Control, blend
 from .code_space import axes_of, fitted
 
 AVERAGE = "average"  # the choice of the mean of all learnt codes

@@ -9,10 +9,10 @@ from jaxtyping import Float, Int, UInt8
 from torch import Tensor, nn
 
 from ... import kernels
-from ...baked import Atlas
+from ...camera.rays import Rays, Samples
+from ...exchange.baked import Atlas
 from ...kernels.block_march import ALPHA, CHANNELS
 from ...kernels.block_march.reference import contracted, steps
-from ...rays import Rays, Samples
 from ...volume import packed
 from ..sampling.spaces import Contraction
 from .deferred import ViewDependence

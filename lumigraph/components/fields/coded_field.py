@@ -10,8 +10,8 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 from torch.nn.functional import embedding
 
-from ...rays import Rays, Samples
-from ...scene import Scene
+from ...camera.rays import Rays, Samples
+from ...datasets.scene import Scene
 
 
 @dataclass(frozen=True)

@@ -9,8 +9,8 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn.functional import pad, softplus
 
-from ...rays import Rays
-from ...scene import Frame
+from ...camera.rays import Rays
+from ...datasets.scene import Frame
 from ...volume import weights_of
 from ..sampling.frustums import blurred, frustums_between
 from ..sampling.sampling import inverse_transform, stratified

@@ -10,8 +10,8 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from ... import kernels
-from ...rays import Rays
-from ...scene import Frame, Scene
+from ...camera.rays import Rays
+from ...datasets.scene import Frame, Scene
 from ..sampling.coarse_to_fine import first_grid, keep_looking, lattice, stage
 from ..sampling.marching import FIRST_RAYS, rays_for, reached
 from ..sampling.proposal import Proposed

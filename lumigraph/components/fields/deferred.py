@@ -12,7 +12,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from ... import kernels
-from ...baked import ViewNetwork
+from ...exchange.baked import ViewNetwork
 from ..sampling.spaces import Box, Space
 from .activations import truncated_exp
 from .dense import Dense, in_chunks

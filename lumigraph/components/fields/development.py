@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from ...controls import Control
+from ...method.controls import Control
 
 STOPS = 8.0  # that exposure can be turned up or down
 DAYLIGHT = 6500.0  # kelvin, of the white that sRGB has

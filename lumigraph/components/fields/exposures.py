@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
-from ...controls import Control
+from ...method.controls import Control
 from .encodings import FrequencyEncoding
 
 FULL = 8.0  # stops that count as 1, so that the longest wave rises all the way from four below the usual to four above

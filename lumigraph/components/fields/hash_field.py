@@ -12,15 +12,17 @@ from torch import Tensor, nn
 
 from ... import kernels
 from ...errors import LumigraphError
+from ...exchange.packing import Stored
+from ...files.ranges import Layers, between
 from ...method import Field
-from ...packing import Stored
-from ...ranges import Layers, between
 from ..sampling.spaces import Space
 from ..training.lazy_adam import LazyAdam
 from .activations import truncated_exp
 from .mlp import MLP
 
-OPEN_RATE = 0.5  # of the table's learning rate, that of networks in the open: at all of it one seed in three never learns a hue
+OPEN_RATE = (
+    0.5  # of the table's learning rate, that of networks in the open: at all of it one seed in three never learns a hue
+)
 OPEN_RESOLUTION = 2  # factor on max_resolution where coordinates are contracted: the box of interest is half as wide
 
 Joining = Callable[[int], Tensor | None]  # weights of so many levels or octaves; None where all count fully
@@ -90,9 +92,7 @@ class HashField(Field):
         self.space, self.bands, self.joining = space, n.sh_bands, joining
         self.extent, finer = (1.0, OPEN_RESOLUTION) if space.is_open else (reach, reach)
         finest = int(n.max_resolution * finer)
-        self.levels = kernels.HashLevels(
-            n.levels, n.features_per_level, n.log2_hashmap_size, n.base_resolution, finest
-        )
+        self.levels = kernels.HashLevels(n.levels, n.features_per_level, n.log2_hashmap_size, n.base_resolution, finest)
         self.table = nn.Parameter(torch.empty(self.levels.offsets[-1], n.features_per_level).uniform_(-1e-4, 1e-4))
         encoded = n.levels * n.features_per_level
         self.density_network = MLP(encoded, *[hidden_width] * n.density_layers, n.geometry_features)
@@ -142,6 +142,7 @@ class HashField(Field):
         """The table as whole numbers, the networks as halves."""
         networks = [name for name, _ in self.named_parameters() if name != "table"]
         return {"table": Stored("scaled"), **dict.fromkeys(networks, Stored("half"))}
+
 
 def side_by_side(*features: Float[Tensor, "sample _"]) -> Float[Tensor, "sample width"]:
     """Features of samples joined as `kernels.perceptron` reads them quickest, all samples' first one, then the next."""

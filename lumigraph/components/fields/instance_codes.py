@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
-from ...controls import blend
+from ...method.controls import blend
 from .code_space import axes_of
 
 AVERAGE = "average"

@@ -11,11 +11,11 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from ...camera import Camera
+from ...camera.lens import Lens
+from ...datasets.scene import Photograph, Vector
 from ...errors import LumigraphError
 from ...files import from_json
-from ...lens import Lens
-from ...ranges import Row, Side, typed
-from ...scene import Photograph, Vector
+from ...files.ranges import Row, Side, typed
 
 WHERE = "what a checkpoint says of its photographs"
 

@@ -10,12 +10,12 @@ from torch import Tensor, nn
 from torch.nn.functional import embedding
 
 from ... import kernels
-from ...baked import Octree
+from ...camera.rays import Rays, Rendering
 from ...errors import LumigraphError
+from ...exchange.baked import Octree
 from ...kernels.octree_cells import Crossed, Tree, code_of, levels_of
 from ...kernels.octree_cells.reference import leaves
-from ...memory import free_on, gigabytes
-from ...rays import Rays, Rendering
+from ...system.memory import free_on, gigabytes
 from .harmonic_field import colour
 
 

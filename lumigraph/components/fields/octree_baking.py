@@ -16,11 +16,11 @@ from torch import Tensor, nn
 from torch.nn.functional import max_pool3d
 
 from ...camera import Camera
-from ...capabilities import HasDensity, can
+from ...camera.rays import Rays
 from ...errors import LumigraphError
 from ...kernels import composite
-from ...memory import free_on, gigabytes
-from ...rays import Rays
+from ...method.capabilities import HasDensity, can
+from ...system.memory import free_on, gigabytes
 from ...volume import weights_of
 from .leaves import Leaves, codes_of
 

@@ -1,7 +1,7 @@
 """What a method takes over from another one: density and colour at points, as far as cameras see them.
 
-A teacher that has a `field` is asked for it. One without, such as a cloud of Gaussians, shows pictures with depth, and
-these are fused into a shell of density around its surfaces (Curless and Levoy 1996). Of either nothing is taken where
+A teacher that has a `field` is asked for it. One without, such as a cloud of Gaussians, is rendered into depth maps,
+which are fused into a shell of density around its surfaces (Curless and Levoy 1996). Of either nothing is taken where
 cameras see past it: a field may say anything of space that its own pictures never ask about.
 """
 
@@ -17,20 +17,20 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from ...camera import Camera
-from ...capabilities import HasDensity, HasField, can
-from ...choice import evenly
-from ...errors import LumigraphError
+from ...depth_maps import DEPTH_EDGE, TSDF, DepthMap, SurfacePoints, Tolerance, free, render_depth_maps, surface_points
 from ...geometry import unit
+from ...geometry.choice import evenly
 from ...kernels import spherical_harmonics
-from ...progress import track
+from ...method.capabilities import HasDensity, HasField, can
+from ...system.progress import track
 from ..sampling.spaces import Space
-from ..sampling.surveyed import Sight, Surface, empty, surface, survey
 
 AT_ONCE = 1 << 17  # points
+VIEWS, SIZE = 24, 128  # depth maps of a teacher at most, and pixels of their longer side
 ASKED = 12  # views whose directions tell how a colour depends on them
 UNSEEN = 0.02  # weight of a view that does not see a point, which then has some colour at least
 STIFFNESS = 0.1  # views that hold harmonics beyond the first at zero
-TRUNCATION = 0.015  # of the distance from a camera: half the thickness of a shell
+TRUNCATION = Tolerance(per_distance=0.015)  # half the thickness of a shell
 SPENT = 8.0  # optical thickness of half a shell, where it is solid
 COARSE, PROBES = 64, 8  # cells per axis that are looked at first, and places in each
 SPREAD = 0.01  # of its distance, by which places near a surface are scattered
@@ -40,40 +40,38 @@ EDGE = 2e-3  # coordinates by which a place may miss its own and still be one
 def taken_over(teacher: Any, cameras: Camera) -> TakenOver:
     """A teacher, looked at by cameras around it, ready to be taken over. Raises LumigraphError where they see nothing
     solid."""
-    sights = survey(teacher, cameras)
-    if not any(sight.solid.any() for sight in sights):
-        raise LumigraphError("No camera sees anything solid, so there is nothing to take over; train for longer first")
-    return OfField(sights, teacher) if can(teacher, HasField) else OfSights(sights)
+    depth_maps = render_depth_maps(teacher.render, cameras, teacher.frame.background, VIEWS, SIZE)
+    return OfField(depth_maps, teacher) if can(teacher, HasField) else OfDepthMaps(depth_maps)
 
 
 class TakenOver(ABC):
     """Density and colour of a teacher at points of the scene, on the CPU.
 
-    sights: what cameras see of it
+    depth_maps: of cameras around it
     """
 
-    def __init__(self, sights: Sequence[Sight]):
-        self.sights = sights
+    def __init__(self, depth_maps: Sequence[DepthMap]):
+        self.depth_maps = depth_maps
 
     @abstractmethod
     def _density(self, points: Float[Tensor, "point 3"]) -> Float[Tensor, " point"]:
         """Density per scene unit, wherever it is."""
 
     @abstractmethod
-    def glance(self, points: Float[Tensor, "point 3"], sight: Sight) -> Float[Tensor, "point 3"]:
+    def glance(self, points: Float[Tensor, "point 3"], depth_map: DepthMap) -> Float[Tensor, "point 3"]:
         """The colours that points have, sRGB-encoded, seen from where one camera is."""
 
     @cached_property
-    def surface(self) -> Surface:
-        """Places on what cameras see."""
-        return surface(self.sights)
+    def surface(self) -> SurfacePoints:
+        """Points of the surfaces that cameras see."""
+        return surface_points(self.depth_maps)
 
     @torch.no_grad()
     def density(self, points: Float[Tensor, "point 3"]) -> Float[Tensor, " point"]:
         """Density per scene unit; none where cameras see past."""
         found = []
         for part in points.split(AT_ONCE):
-            there = (~empty(part, self.sights)).nonzero()[:, 0]
+            there = (~free(part, self.depth_maps)).nonzero()[:, 0]
             found.append(part.new_zeros(len(part)).index_copy(0, there, self._density(part[there])))
         return torch.cat(found) if found else points.new_zeros(0)
 
@@ -95,18 +93,18 @@ class TakenOver(ABC):
     ) -> Float[Tensor, "point coefficient 3"]:
         """Spherical harmonics of a function of each point's colour, by least squares over the directions of cameras
         that see it; those beyond the first are held small where few do."""
-        chosen, width = evenly(self.sights, ASKED), bands**2
+        chosen, width = evenly(self.depth_maps, ASKED), bands**2
         held = torch.cat([torch.tensor([1e-4]), torch.full((width - 1,), STIFFNESS)]).diag()
         found = []
         parts = points.split(AT_ONCE)
         for part in track(parts, "Taking over colour", len(parts)):
             squares, products = held.repeat(len(part), 1, 1), part.new_zeros(len(part), width, 3)
-            seen = torch.stack([sight.sees(part) for sight in chosen])
-            for i, sight in enumerate(chosen):
+            seen = torch.stack([depth_map.sees(part) for depth_map in chosen])
+            for i, depth_map in enumerate(chosen):
                 asked = (seen[i] | ~seen.any(0)).nonzero()[:, 0]  # what nobody sees is asked for all the same
-                basis = spherical_harmonics(unit(part[asked] - sight.camera.position), bands)
+                basis = spherical_harmonics(unit(part[asked] - depth_map.camera.position), bands)
                 weight = torch.where(seen[i][asked], 1.0, UNSEEN)[:, None]
-                colour = of(self.glance(part[asked], sight))
+                colour = of(self.glance(part[asked], depth_map))
                 squares.index_add_(0, asked, (weight * basis)[:, :, None] * basis[:, None])
                 products.index_add_(0, asked, (weight * basis)[:, :, None] * colour[:, None])
             found.append(torch.linalg.solve(squares, products))
@@ -161,8 +159,8 @@ class TakenOver(ABC):
 class OfField(TakenOver):
     """Of a teacher with a field."""
 
-    def __init__(self, sights: Sequence[Sight], teacher: Any):
-        super().__init__(sights)
+    def __init__(self, depth_maps: Sequence[DepthMap], teacher: Any):
+        super().__init__(depth_maps)
         self.teacher = teacher
 
     def _density(self, points):
@@ -171,16 +169,16 @@ class OfField(TakenOver):
             return self.teacher.density(there).cpu().float()
         return self.teacher.field(there, torch.nn.functional.normalize(there + 1e-6, dim=-1))[0].cpu().float()
 
-    def glance(self, points, sight):
-        there, directions = points, unit(points - sight.camera.position)
+    def glance(self, points, depth_map):
+        there, directions = points, unit(points - depth_map.camera.position)
         parts = zip(there.split(AT_ONCE), directions.split(AT_ONCE), strict=True)
         device = self.teacher.device
         found = [self.teacher.field(x.to(device), d.to(device))[1].cpu().float() for x, d in parts]
         return torch.cat(found) if found else points
 
 
-class OfSights(TakenOver):
-    """Of pictures with depth: a shell around the surfaces that they show, solid from half its thickness on.
+class OfDepthMaps(TakenOver):
+    """Of depth maps: a shell around the surfaces that they show, solid from half its thickness on.
 
     It has a `field` itself, so it can stand for its teacher wherever one is needed that has.
     """
@@ -188,19 +186,8 @@ class OfSights(TakenOver):
     device = torch.device("cpu")
 
     def _density(self, points):
-        total, weight, thickness = (points.new_zeros(len(points)) for _ in range(3))
-        for sight in self.sights:
-            pixel, inside, away = sight.pixels(points)
-            depth, opacity = sight.depth.view(-1)[pixel], sight.opacity.view(-1)[pixel]
-            half = TRUNCATION * away
-            ahead = torch.where(opacity > 0.5, (depth - away) / half, 1.0)
-            share = torch.where(inside & (ahead > -1), 1 / away.square(), 0.0)
-            total += share * ahead.nan_to_num(1.0, 1.0, -1.0).clamp(-1, 1)
-            weight += share
-            thickness += share * half
-        known = weight > 0
-        inwards = (0.5 - total / weight.clamp_min(1e-12)).clamp(0, 1) * known
-        return inwards * SPENT * weight / thickness.clamp_min(1e-12)
+        distance, truncation, _ = TSDF(self.depth_maps, TRUNCATION, DEPTH_EDGE)(points)
+        return ((0.5 - distance).clamp(0, 1) * SPENT / truncation).nan_to_num(0.0)
 
     @torch.no_grad()
     def field(
@@ -208,15 +195,16 @@ class OfSights(TakenOver):
     ) -> tuple[Float[Tensor, " point"], Float[Tensor, "point 3"]]:
         """Density per scene unit, and the colour in that picture which sees the point most nearly along a direction."""
         best, rgb = torch.full((len(points),), -2.0), torch.full_like(points, 0.5)
-        for sight in self.sights:
-            along = (unit(points - sight.camera.position) * directions).sum(-1)
-            nearer = ((along > best) & sight.sees(points)).nonzero()[:, 0]
-            best[nearer], rgb[nearer] = along[nearer], self.glance(points[nearer], sight)
+        for depth_map in self.depth_maps:
+            along = (unit(points - depth_map.camera.position) * directions).sum(-1)
+            nearer = ((along > best) & depth_map.sees(points)).nonzero()[:, 0]
+            best[nearer], rgb[nearer] = along[nearer], self.glance(points[nearer], depth_map)
         return self.density(points), rgb
 
-    def glance(self, points, sight):
-        pixel, inside, _ = sight.pixels(points)
-        return torch.where(inside[:, None], sight.rgb.view(-1, 3)[pixel], 0.5)
+    def glance(self, points, depth_map):
+        pixels, valid, _ = depth_map.project(points)
+        inside = depth_map.inside(pixels, valid)[:, None]
+        return torch.where(inside, depth_map.at_pixels(depth_map.rgb, pixels), 0.5)
 
 
 def logit(rgb: Float[Tensor, "point 3"]) -> Float[Tensor, "point 3"]:

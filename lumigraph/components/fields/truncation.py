@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from ...packing import most_important
+from ...exchange.packing import most_important
 from .factorised import FactorGrid
 
 

@@ -7,7 +7,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from ... import kernels
-from ...rays import Rays, Samples
+from ...camera.rays import Rays, Samples
 from ..sampling.spaces import Space
 from ..training.fog import evened
 from .encodings import FrequencyEncoding

@@ -13,7 +13,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ... import kernels
-from ...rays import Rendering
+from ...camera.rays import Rendering
 from ...volume import composite
 from .coded_field import CodedField, Places
 

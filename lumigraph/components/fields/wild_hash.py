@@ -8,7 +8,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import softplus
 
-from ...scene import Frame
+from ...datasets.scene import Frame
 from .activations import truncated_exp
 from .coded_field import Places
 from .coded_hash import CodedHash

@@ -9,8 +9,8 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn.functional import softplus
 
-from ...rays import Rays, Samples
-from ...scene import Frame
+from ...camera.rays import Rays, Samples
+from ...datasets.scene import Frame
 from ...volume import weights_of
 from ..sampling.sampling import inverse_transform, midpoints, stratified
 from ..sampling.spaces import space_of

@@ -10,8 +10,8 @@ from torch import Tensor
 from torch.nn.functional import max_pool2d
 
 from ...camera import PIXEL_RADIUS, Camera
-from ...choice import evenly
-from ...scene import Scene
+from ...datasets.scene import Scene
+from ...geometry.choice import evenly
 
 VIEWS = 24  # photographs asked at most: more cut little further
 
@@ -56,7 +56,5 @@ def _seen_through(
     around = alpha[None]
     for size in ((2 * reach + 1, 1), (1, 2 * reach + 1)):
         around = max_pool2d(around, size, 1, (size[0] // 2, size[1] // 2))
-    pixels, valid = camera.project(centres)
-    x, y = pixels.floor().long().unbind(-1)
-    inside = valid & (x >= 0) & (y >= 0) & (x < width) & (y < height)
-    return inside & (around[0][y.clamp(0, height - 1), x.clamp(0, width - 1)] == 0)
+    places, inside = camera.locate(centres)
+    return inside & (around[0][places.unbind(-1)] == 0)

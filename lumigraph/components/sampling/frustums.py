@@ -7,7 +7,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import max_pool1d, pad
 
-from ...rays import Rays, Samples
+from ...camera.rays import Rays, Samples
 from .spaces import Space
 
 

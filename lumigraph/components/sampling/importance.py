@@ -9,7 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ...camera import Camera
-from ...capabilities import HasLooks
+from ...method.capabilities import HasLooks
 from ...volume import weights_of
 
 RAYS = 8192  # at once

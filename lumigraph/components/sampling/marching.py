@@ -8,8 +8,8 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from ...camera.rays import Rays, Samples
 from ...kernels import composite
-from ...rays import Rays, Samples
 from ...volume import visible
 
 FIRST_RAYS = 256  # of a step, before anybody knows how many samples a ray needs

@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
 from ... import kernels
-from ...rays import Rays, Samples
+from ...camera.rays import Rays, Samples
 
 
 class OccupancyGrid(nn.Module):

@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 from torch.nn.functional import max_pool3d
 
-from ...scene import Scene
+from ...datasets.scene import Scene
 from .carving import visual_hull
 from .occupancy import OccupancyGrid
 

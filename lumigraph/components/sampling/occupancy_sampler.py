@@ -10,12 +10,12 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from ...camera.rays import Rays, Samples
+from ...datasets.scene import Frame, Scene
+from ...exchange.packing import Stored
+from ...files.ranges import NonNegative, Share, Steps, between
 from ...method import Features, Field, Pass, Sampler
 from ...method.sampler import Density, codes_at
-from ...packing import Stored
-from ...ranges import NonNegative, Share, Steps, between
-from ...rays import Rays, Samples
-from ...scene import Frame, Scene
 from ...volume import visible, weights_of
 from .carving import visual_hull
 from .occupancy import OccupancyGrid
@@ -51,6 +51,13 @@ class StepNumbers:
 
     steps_per_diagonal: Annotated[int, between(4, 16_384)] = 1024  # steps across the diagonal of the unit cascade
     cone_angle: Share = 1 / 256  # growth of steps with distance, in scenes without bounds
+
+
+# Numbers for a plain CPU, which learn most in a minute (docs/methods/instant_ngp.md), and for tests.
+CPU_OCCUPANCY = OccupancyNumbers(samples_per_step=1 << 15, transmittance_threshold=1e-3, occupancy_threshold=0.15)
+CPU_STEPS = StepNumbers(steps_per_diagonal=384, cone_angle=1 / 96)
+TINY_OCCUPANCY = OccupancyNumbers(samples_per_step=2048, occupancy_resolution=16)
+TINY_STEPS = StepNumbers(steps_per_diagonal=128)
 
 
 class Stage(NamedTuple):
@@ -127,7 +134,9 @@ class OccupancySampler(Sampler):
 
     @property
     def expected_rays(self) -> float:
-        return min(self.max_rays, self.numbers.samples_per_step / self.samples_per_ray) if self.adapts else self.max_rays
+        return (
+            min(self.max_rays, self.numbers.samples_per_step / self.samples_per_ray) if self.adapts else self.max_rays
+        )
 
     def sample(
         self,
@@ -146,7 +155,7 @@ class OccupancySampler(Sampler):
         of_samples = None if code_of is None else codes_at(samples.ray_index, code_of)
         if generator is not None:
             self.evaluated = evaluated
-        if field.joint and generator is not None:
+        if field.joint:
             density, rgb = field(points, directions, of_samples)
             return [Pass("samples", samples, density, (), directions, rgb=rgb, evaluated=evaluated)]
         density, features = field.geometry(points, of_samples)

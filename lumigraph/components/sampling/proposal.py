@@ -4,25 +4,23 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from ... import loops
-from ...rays import Rays, Samples
+from ... import kernels
+from ...camera.rays import Rays, Samples
 from ...volume import weights_of
 from ..fields.activations import LIMIT, truncated_exp
 from ..fields.voxels import VoxelGrid
 from .sampling import FAINT, inverse_transform
-from .spaces import NDC, Contraction, Space, looped
+from .spaces import NDC, Contraction, Space, fits_kernels
 
 FLAT = (1.5, 1.5, 0.5)  # a forward-facing capture has few depths and many pixels
 LITTLE = 1e-5  # weight that counts as none in the loss
 SLOPE = 10.0  # of annealing (Barron 2022, appendix)
 SHARP = 0.3  # share of the budget after which samples lie where the grid says
 DENSE, THIN = 3.0, -3.0  # log density per unit of the coordinates, where places on surfaces are known and elsewhere
-BLOCK = 64  # rays that a thread goes through at a time
 SPARE = 0.01  # share of samples that lie anywhere, however little was found there
 
 
@@ -84,17 +82,15 @@ class Proposal(nn.Module):
     @torch.no_grad()
     def places(self, rays: Rays) -> Samples:
         """The intervals of `sample` for a field, without jitter."""
-        if not (isinstance(self.space, Contraction | NDC) and looped(rays.origins)):
+        if not (isinstance(self.space, Contraction | NDC) and fits_kernels(rays.origins)):
             return self.sample(rays).samples
-        ends, numbers = self.space.interval(rays), list[float]()
-        lines = rays.origins, rays.directions
+        origins, directions, frustum = rays.origins, rays.directions, None
         if isinstance(self.space, NDC):
-            lines, numbers = self.space.in_device(rays)
-        tensors = [x.detach().contiguous().numpy() for x in (*lines, *ends, self.grid.values[:, 0])]
-        t = rays.origins.new_empty(len(rays), self.count + 1)
-        limits = np.array((2 * LIMIT, self.sharpness, SPARE, FAINT), np.float32)
-        size, device = self.grid.size.numpy(), np.array(numbers, np.float32)
-        loops.propose(BLOCK, self.bins, *tensors, size, device, limits, t.numpy())
+            (origins, directions), frustum = self.space.camera_rays(rays), self.space.frustum
+        near, far = self.space.interval(rays)
+        grid = self.grid.values.view(self.grid.shape)
+        resampling = kernels.Resampling(self.bins, self.count, self.sharpness, SPARE, FAINT, 2 * LIMIT)
+        t = kernels.sample_proposals(origins, directions, near, far, grid, resampling, frustum)
         return Samples.rows(t[:, :-1], t[:, -1])
 
     @torch.no_grad()

@@ -16,12 +16,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from ...camera.rays import Rays
+from ...datasets.scene import Frame, Scene
+from ...exchange.packing import Stored
+from ...files.ranges import NonNegative, between
 from ...method import Field, Pass, Sampler
 from ...method.sampler import Density, codes_at
-from ...packing import Stored
-from ...ranges import NonNegative, between
-from ...rays import Rays
-from ...scene import Frame, Scene
 from ...volume import weights_of
 from ..clouds.dense_points import Points, compile_sweep, seen_points
 from ..training.fog import elsewhere, scaled_by_distance, spread

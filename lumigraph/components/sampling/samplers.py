@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
+from ...datasets.scene import Frame
 from ...method import Sampler
-from ...scene import Frame
 from .occupancy_sampler import NGP_SCHEDULE, GridSchedule, OccupancyNumbers, OccupancySampler
 from .proposal_sampler import ProposalNumbers, ProposalSampler
 from .spaces import Space

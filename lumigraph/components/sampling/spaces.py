@@ -12,17 +12,15 @@ from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import ClassVar
 
-import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from ... import loops
-from ...rays import Rays, Samples
-from ...scene import Forward, Frame, Vector
+from ... import kernels
+from ...camera.rays import Rays, Samples
+from ...datasets.scene import Forward, Frame, Vector
 
 INFINITY = 1000.0  # times the near plane's distance: rays in normalised device coordinates end at 0.998 instead of 1
-NOTHING = np.empty(0, np.float32)  # asked of a loop
 SIDEWAYS = 1e-3  # sine of the angle to the near plane, below which a ray is said not to reach it
 
 
@@ -190,11 +188,15 @@ class NDC(Space):
         scale_x, scale_y = self.forward.scale
         return (2 * scale_x * scale_y * self.forward.near) ** (1 / 3) * z ** (-4 / 3)
 
-    def in_device(self, rays: Rays) -> tuple[tuple[Tensor, Tensor], list[float]]:
-        """Origins and directions in the mean camera, and the four numbers of its device that `loops.propose` takes."""
-        pose, (scale_x, scale_y), near = self._pose(rays.origins), self.forward.scale, self.forward.near
-        lines = (rays.origins - pose[:, 3]) @ pose[:, :3], rays.directions @ pose[:, :3]
-        return lines, [scale_x, scale_y, near, (2 * scale_x * scale_y * near) ** (1 / 3)]
+    def camera_rays(self, rays: Rays) -> tuple[Float[Tensor, "ray 3"], Float[Tensor, "ray 3"]]:
+        """Origins and directions of rays in the mean camera's frame."""
+        pose = self._pose(rays.origins)
+        return (rays.origins - pose[:, 3]) @ pose[:, :3], rays.directions @ pose[:, :3]
+
+    @property
+    def frustum(self) -> tuple[float, float, float]:
+        """Scale of x, scale of y and the near plane."""
+        return *self.forward.scale, self.forward.near
 
     def _pose(self, like: Tensor) -> Float[Tensor, "3 4"]:
         return like.new_tensor(self.forward.pose)
@@ -229,11 +231,8 @@ class Contraction(Space):
         return torch.lerp(near[:, None], far[:, None], even_in_inverse(share, near[:, None], far[:, None]))
 
     def warp(self, points):
-        if looped(points):
-            coordinates = points.new_empty(points.shape)
-            rows = (x.view(-1, 3).numpy() for x in (points.detach().contiguous(), coordinates))
-            loops.contract(*rows, NOTHING)
-            return coordinates
+        if fits_kernels(points):
+            return kernels.contract(points.reshape(-1, 3))[0].view(points.shape)
         return points * self._across(points)[..., None]
 
     def unwarp(self, coordinates):
@@ -248,9 +247,9 @@ class Contraction(Space):
         return across[:, None, None] * identity + (radial - across)[:, None, None] * out[:, :, None] * out[:, None]
 
     def stretch(self, points):
-        if looped(points):
-            coordinates, stretch = points.new_empty(points.shape), points.new_empty(len(points))
-            loops.contract(*(x.numpy() for x in (points.detach().contiguous(), coordinates, stretch)))
+        if fits_kernels(points):
+            stretch = kernels.contract(points, True)[1]
+            assert stretch is not None
             return stretch
         return (self._radial(points) * self._across(points).square()) ** (1 / 3)
 
@@ -267,13 +266,9 @@ class Contraction(Space):
         return 0.5 / self._radius(points).square()
 
 
-def looped(points: Tensor) -> bool:
-    """Whether a loop of `loops.py` may do: float32 on a CPU, where no gradient is asked for."""
-    return (
-        points.device.type == "cpu"
-        and points.dtype == torch.float32
-        and not (torch.is_grad_enabled() and points.requires_grad)
-    )
+def fits_kernels(points: Tensor) -> bool:
+    """Whether kernels that are not differentiable take these points: float32, and no gradient is asked for."""
+    return points.dtype == torch.float32 and not (torch.is_grad_enabled() and points.requires_grad)
 
 
 def even_in_inverse(share: Tensor, first: Tensor, last: Tensor) -> Tensor:

@@ -11,7 +11,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ...camera import Camera
-from ...rays import Rays
+from ...camera.rays import Rays
 
 GOLDEN_ANGLE = math.pi * (3 - math.sqrt(5))
 NARROWEST = 0.2  # cosine with the axis below which a ray is taken to be no flatter

@@ -16,10 +16,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from ...packing import Stored
-from ...ranges import NonNegative, between
-from ...rays import Look, Rays
-from ...scene import Frame, Scene
+from ...camera.rays import Look, Rays
+from ...datasets.scene import Frame, Scene
+from ...exchange.packing import Stored
+from ...files.ranges import NonNegative, between
 from ...volume import weights_of
 from ..clouds.dense_points import Points, seen_points
 from ..training.fog import elsewhere, scaled_by_distance, spread

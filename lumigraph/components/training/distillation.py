@@ -10,7 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ...geometry import unit
-from ...progress import track
+from ...system.progress import track
 from ..fields.taken_over import TakenOver
 from ..sampling.spaces import Space
 from .schedules import held
@@ -80,10 +80,10 @@ def glances(
 ) -> tuple[Float[Tensor, "point 3"], Float[Tensor, "point 3"], Float[Tensor, " point"]]:
     """For each place the direction from a random camera, the colour from there, and whether (0 or 1) it is seen."""
     directions, rgb, seen = torch.zeros_like(places), torch.full_like(places, 0.5), torch.zeros(len(places))
-    camera = torch.randint(len(held_by.sights), (len(places),), generator=chance)
-    for i, sight in enumerate(track(held_by.sights, "Asking the teacher", len(held_by.sights))):
+    camera = torch.randint(len(held_by.depth_maps), (len(places),), generator=chance)
+    for i, depth_map in enumerate(track(held_by.depth_maps, "Asking the teacher", len(held_by.depth_maps))):
         own = (camera == i).nonzero()[:, 0]
-        directions[own] = unit(places[own] - sight.camera.position)
-        own = own[sight.sees(places[own])]
-        seen[own], rgb[own] = 1.0, held_by.glance(places[own], sight)
+        directions[own] = unit(places[own] - depth_map.camera.position)
+        own = own[depth_map.sees(places[own])]
+        seen[own], rgb[own] = 1.0, held_by.glance(places[own], depth_map)
     return directions, rgb, seen

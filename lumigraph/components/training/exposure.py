@@ -10,10 +10,10 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
-from ...controls import Control, Value
+from ...datasets.scene import Photograph, Scene
 from ...errors import LumigraphWarning
 from ...method import Part
-from ...scene import Photograph, Scene
+from ...method.controls import Control, Value
 from ..fields.appearance import AVERAGE, drawn
 from .lights import BRIGHTEST, DARKEST, spread_of_exposure
 
@@ -71,8 +71,8 @@ class Exposure(Part):
 
     @property
     def controls(self) -> tuple[Control, ...]:
-        """Brightness in stops, and the photograph whose exposure they count from: by default that of the scene as it was
-        learnt, which is arbitrary, for a gain that all photographs share is as well the scene's own."""
+        """Brightness in stops, and the photograph whose exposure they count from. By default they count from the scene as
+        it was learnt, which is arbitrary: a gain that all photographs share can be the scene's own."""
         if not bool(self.differ):
             return ()
         photographs = tuple(str(i) for i in range(len(self.log_gain)))
@@ -80,9 +80,7 @@ class Exposure(Part):
         about = "The photograph, by number or name, whose brightness and tint are shown; or the average of all."
         return (
             Control("exposure", 0.0, stops, unit="stops", about="Each stop doubles the scene's colours."),
-            Control(
-                "exposed_as", SCENE, choices=(SCENE, AVERAGE, *photographs), about=about, of_photographs=True
-            ),
+            Control("exposed_as", SCENE, choices=(SCENE, AVERAGE, *photographs), about=about, of_photographs=True),
         )
 
     @property

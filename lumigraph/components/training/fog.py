@@ -6,8 +6,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from ...camera.rays import Samples
 from ...kernels import distortion
-from ...rays import Samples
 
 
 def evened(t: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 import torch
 from numba import njit, prange
 
+from .row_optimizer import RowOptimizer, adam_moments, adam_rate
+
 BLOCK = 64  # elements that are passed over together where no gradient has a bit set
 
 
-class LazyAdam(torch.optim.Optimizer):
+class LazyAdam(RowOptimizer):
     """Adam (Kingma and Ba 2015) that leaves an element alone, moments and all, where its gradient is exactly zero.
 
     So a hash table's entries that no sample touched do not drift (Müller 2022, section 4). Defaults are that paper's.
@@ -29,25 +29,14 @@ class LazyAdam(torch.optim.Optimizer):
     ):
         super().__init__(params, {"lr": lr, "betas": betas, "eps": eps, "weight_decay": weight_decay, "rates": None})
 
-    @torch.no_grad()
-    def step(self, closure=None) -> None:  # type: ignore[override]  # nobody asks for a closure
-        """Take one step with all parameters that have a gradient."""
-        for group in self.param_groups:
-            for p in group["params"]:
-                if p.grad is not None:
-                    self._update(p, group)
+    def moments(self, p):
+        return adam_moments(p)
 
-    def _update(self, p, group):
-        state = self.state[p]
-        if not state:
-            state["step"] = torch.zeros(())
-            state["mean"], state["square"] = torch.zeros_like(p), torch.zeros_like(p)
+    def update(self, p, grad, state, group):
         state["step"] += 1
-        (b1, b2), t = group["betas"], float(state["step"])
-        # Both bias corrections in the step size; epsilon is far below anything that they could change.
-        rate = group["lr"] * math.sqrt(1 - b2**t) / (1 - b1**t)
+        (b1, b2), rate = group["betas"], adam_rate(group, float(state["step"]))
         keep = 1 - group["lr"] * group["weight_decay"]
-        tensors, rates = (p, p.grad, state["mean"], state["square"]), group["rates"]
+        tensors, rates = (p, grad, state["mean"], state["square"]), group["rates"]
         if rates is not None and len(rates) != len(p):
             raise ValueError(f"{len(rates)} rates are given for {len(p)} rows")
         if p.is_cuda:

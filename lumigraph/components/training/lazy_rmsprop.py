@@ -6,8 +6,10 @@ import numpy as np
 import torch
 from numba import njit, prange
 
+from .row_optimizer import RowOptimizer
 
-class LazyRMSprop(torch.optim.Optimizer):
+
+class LazyRMSprop(RowOptimizer):
     """RMSprop (Hinton 2012) that looks at no row but those that a sparse gradient names:
 
         s = beta s + (1 - beta) g^2,    p = p - lr g / (sqrt(s) + eps)
@@ -20,23 +22,15 @@ class LazyRMSprop(torch.optim.Optimizer):
     def __init__(self, params, lr: float = 1e-2, beta: float = 0.95, eps: float = 1e-8):
         super().__init__(params, {"lr": lr, "beta": beta, "eps": eps})
 
-    @torch.no_grad()
-    def step(self, closure=None) -> None:  # type: ignore[override]  # nobody asks for a closure
-        """Take one step with all parameters that have a gradient."""
-        for group in self.param_groups:
-            for p in group["params"]:
-                if p.grad is not None:
-                    self._update(p, group)
+    def moments(self, p):
+        return {"square": torch.zeros_like(p)}
 
-    def _update(self, p, group):
-        state = self.state[p]
-        if not state:
-            state["square"] = torch.zeros_like(p)
+    def update(self, p, grad, state, group):
         numbers = group["lr"], group["beta"], group["eps"]
-        if p.grad.is_sparse:
-            rows, grad = p.grad._indices()[0], p.grad._values().contiguous()
+        if grad.is_sparse:
+            rows, grad = grad._indices()[0], grad._values().contiguous()
         else:
-            rows, grad = torch.arange(len(p), device=p.device), p.grad.contiguous()
+            rows, grad = torch.arange(len(p), device=p.device), grad.contiguous()
         if p.is_cuda:
             _rows(p, rows, grad, state["square"], *numbers)
         else:

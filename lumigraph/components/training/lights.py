@@ -7,8 +7,8 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from ...camera import Camera
-from ...choice import evenly
-from ...scene import Scene
+from ...datasets.scene import Scene
+from ...geometry.choice import evenly
 from ..clouds.flat_view import FlatView, flat_view
 
 LOOKED_AT = 32  # photographs, each beside its neighbour

@@ -8,10 +8,10 @@ import torch
 from jaxtyping import Int
 from torch import Tensor
 
-from ...dataset import Dataset
+from ...camera.rays import Rays
+from ...datasets.dataset import Dataset
+from ...datasets.scene import Batch, Photograph, Scene
 from ...errors import LumigraphError
-from ...rays import Rays
-from ...scene import Batch, Photograph, Scene
 
 
 def photographed(member: Dataset, method: str) -> Scene:

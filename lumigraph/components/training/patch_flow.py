@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from ...scene import Scene
+from ...datasets.scene import Scene
 
 SIDE = 8  # pixels along a patch's side (section 3.4)
 COUPLINGS, WIDTH = 4, 96  # steps of the flow, and neurons of the two layers in each

@@ -6,8 +6,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from ...rays import Rendering
-from ...scene import Batch
+from ...camera.rays import Rendering
+from ...datasets.scene import Batch
 from .exposure import Exposure
 
 

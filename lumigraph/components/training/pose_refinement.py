@@ -10,11 +10,11 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from ...camera import Camera
+from ...camera.rays import Rays
+from ...datasets.scene import Frame, Scene
+from ...files.ranges import LearningRate
 from ...geometry import rotated
 from ...method import Part
-from ...ranges import LearningRate
-from ...rays import Rays
-from ...scene import Frame, Scene
 from .bundle_adjustment import adjusted, pixel_angle, rotation_vector
 from .coarse_to_fine import ENDS, band_weights
 from .pose_adam import PoseAdam

@@ -19,9 +19,9 @@ from torch import Tensor
 from torch.nn.functional import interpolate, normalize
 
 from ...camera import Camera
-from ...library import pycolmap
-from ...progress import track
-from ...scene import Photograph, Scene
+from ...datasets.scene import Photograph, Scene
+from ...system.library import pycolmap
+from ...system.progress import track
 
 LONGEST = 800  # pixels of the longer side, to which larger photographs are reduced
 SHORTEST = 400  # to which smaller ones are enlarged: features have a size that pictures of 100 pixels lack

@@ -10,8 +10,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ...camera import Camera
+from ...camera.rays import Rays
 from ...geometry import look_at, nearest_to_lines
-from ...rays import Rays
 
 ASTRAY = 0.125  # deviation of the point that an unseen camera looks at, of the distance to it (section 3.3)
 

@@ -22,7 +22,7 @@ EMPTIEST = 64  # of an empty block's
 
 @dataclass(frozen=True)
 class Blocks:
-    """Which row of a table belongs to each voxel of a grid, most of which is empty; made by `of`.
+    """Table row of each voxel of a mostly empty grid; made by `of`.
 
     Voxel (x, y, z) has its centre there. Block (a, b, c) holds voxels from (a, b, c) * block on, and one more on each
     side, its apron, so that all that is blended at a place lies within one block.

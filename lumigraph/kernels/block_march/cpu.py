@@ -5,7 +5,7 @@ import numpy as np
 import torch
 from numba import njit, prange
 
-from .._dispatch import empty
+from .._dispatch import differentiable, empty
 from ..sparse_grid.cpu import slabs_of
 from .reference import LEAST
 
@@ -257,36 +257,31 @@ def _spread(owed, points, index, rows, order, starts, out):
                         out[row, c] += weight * owed[s, c]
 
 
-class _BlockMarch(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx, origins, directions, enter, leave, blocks, values, stop):
-        ctx.blocks, ctx.stop = blocks, np.float32(stop)
-        totals, distance = empty(len(origins), C), empty(len(origins))
-        lengths = torch.zeros(len(origins), dtype=torch.int64)
-        given = (x.detach().numpy() for x in (origins, directions, enter, leave, blocks.index, blocks.rows, values))
-        _forward(*given, np.float32(blocks.ball), ctx.stop, totals.numpy(), distance.numpy(), lengths.numpy())
-        ctx.save_for_backward(origins, directions, enter, leave, values, lengths)
-        return totals, distance
-
-    @staticmethod
-    @torch.autograd.function.once_differentiable
-    def backward(ctx, g_totals, g_distance):
-        origins, directions, enter, leave, values, lengths = (x.detach().numpy() for x in ctx.saved_tensors)
-        index, rows = ctx.blocks.index.numpy(), ctx.blocks.rows.numpy()
-        starts = np.concatenate([np.zeros(1, np.int64), lengths.cumsum()])
-        total, block = int(starts[-1]), ctx.blocks.block
-        ball, first = np.float32(ctx.blocks.ball), np.empty(total, np.int32)
-        steps, lights, points, owed = (empty(total, *width).numpy() for width in ((), (), (3,), (C,)))
-        _steps(origins, directions, enter, leave, index, rows, values, ball, ctx.stop, starts, steps, lights)
-        grads = g_totals.contiguous().numpy(), g_distance.contiguous().numpy()
-        _owed(*grads, origins, directions, index, rows, values, ball, starts, steps, lights, points, first, owed)
-        # Places of one slab of cells touch its voxels and the next one's first: see `sparse_grid`.
-        order, slabs = slabs_of(first, block * index.shape[0] + 1)
-        to_values = torch.zeros(values.shape)
-        _spread(owed, points, index, rows, order, slabs, to_values.numpy())
-        return None, None, None, None, None, to_values, None
+def forward(ctx, origins, directions, enter, leave, blocks, values, stop):
+    ctx.blocks, ctx.stop = blocks, np.float32(stop)
+    totals, distance = empty(len(origins), C), empty(len(origins))
+    lengths = torch.zeros(len(origins), dtype=torch.int64)
+    given = (x.detach().numpy() for x in (origins, directions, enter, leave, blocks.index, blocks.rows, values))
+    _forward(*given, np.float32(blocks.ball), ctx.stop, totals.numpy(), distance.numpy(), lengths.numpy())
+    ctx.save_for_backward(origins, directions, enter, leave, values, lengths)
+    return totals, distance
 
 
-def run(origins, directions, enter, leave, blocks, values, stop):
-    given = (x.contiguous() for x in (origins, directions, enter, leave))
-    return _BlockMarch.apply(*given, blocks, values.contiguous(), stop)
+def backward(ctx, g_totals, g_distance):
+    origins, directions, enter, leave, values, lengths = (x.detach().numpy() for x in ctx.saved_tensors)
+    index, rows = ctx.blocks.index.numpy(), ctx.blocks.rows.numpy()
+    starts = np.concatenate([np.zeros(1, np.int64), lengths.cumsum()])
+    total, block = int(starts[-1]), ctx.blocks.block
+    ball, first = np.float32(ctx.blocks.ball), np.empty(total, np.int32)
+    steps, lights, points, owed = (empty(total, *width).numpy() for width in ((), (), (3,), (C,)))
+    _steps(origins, directions, enter, leave, index, rows, values, ball, ctx.stop, starts, steps, lights)
+    grads = g_totals.contiguous().numpy(), g_distance.contiguous().numpy()
+    _owed(*grads, origins, directions, index, rows, values, ball, starts, steps, lights, points, first, owed)
+    # Places of one slab of cells touch its voxels and the next one's first: see `sparse_grid`.
+    order, slabs = slabs_of(first, block * index.shape[0] + 1)
+    to_values = torch.zeros(values.shape)
+    _spread(owed, points, index, rows, order, slabs, to_values.numpy())
+    return None, None, None, None, None, to_values, None
+
+
+run = differentiable(forward, backward)

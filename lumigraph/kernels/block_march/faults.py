@@ -1,7 +1,4 @@
-"""Faults that the tests write into a copy of an engine, one at a time, to see their comparison turn red.
-
-By name: the engine, the function, what stands there, and what is put in its place.
-"""
+"""Seeded faults by name: the engine, the function, a piece of it, and what is put in its place."""
 
 FAULTS = {
     "a leap too far": ("cpu", "onward", "np.int64(-1 - row)", "np.int64(-row)"),

@@ -5,9 +5,10 @@ from __future__ import annotations
 import torch
 import triton
 import triton.language as tl
-from torch import Tensor
 
-from .._dispatch import empty
+from .._dispatch import differentiable, empty
+from .._rows_gpu import load_row
+from ..sparse_grid.gpu import corner_of, weight_of
 from . import ALPHA, CHANNELS, Blocks
 from .reference import LEAST
 
@@ -90,24 +91,27 @@ def _cell_of(x, b, B: tl.constexpr):
 
 
 @triton.jit
-def _row_of(rows, number, x, y, z, there, B: tl.constexpr):
-    return tl.load(rows + ((number.to(tl.int64) * (B + 2) + x) * (B + 2) + y) * (B + 2) + z, mask=there, other=-1)
+def _voxel_of(x, y, z, bx, by, bz, B: tl.constexpr):
+    """The first of the eight voxels around each place, counted in its block, and the place beyond it."""
+    (cx, fx), (cy, fy), (cz, fz) = _cell_of(x, bx, B), _cell_of(y, by, B), _cell_of(z, bz, B)
+    return (cx, cy, cz), (fx, fy, fz)
 
 
 @triton.jit
-def _share(fraction, side: tl.constexpr):
-    return fraction if side == 1 else 1 - fraction
+def _row_of(rows, number, voxel, there, B: tl.constexpr):
+    at = ((number.to(tl.int64) * (B + 2) + voxel[0]) * (B + 2) + voxel[1]) * (B + 2) + voxel[2]
+    return tl.load(rows + at, mask=there, other=-1)
 
 
 @triton.jit
-def _blended(rows, values, number, cx, fx, cy, fy, cz, fz, there, BLOCK: tl.constexpr, B: tl.constexpr):
+def _blended(rows, values, number, voxel, f, there, BLOCK: tl.constexpr, B: tl.constexpr):
     """What is at each place, and whether any of the eight voxels around it has a row."""
     c = tl.arange(0, C)
     seen = tl.zeros([BLOCK, C], tl.float32)
     some = tl.zeros([BLOCK], tl.int32)
-    for corner in tl.static_range(8):
-        weight = _share(fx, corner % 2) * _share(fy, corner // 2 % 2) * _share(fz, corner // 4)
-        row = _row_of(rows, number, cx + corner % 2, cy + corner // 2 % 2, cz + corner // 4, there, B).to(tl.int64)
+    for k in tl.static_range(8):
+        weight = weight_of(k, f)
+        row = _row_of(rows, number, corner_of(k, voxel), there, B).to(tl.int64)
         full = row >= 0
         some |= full.to(tl.int32)
         seen += weight[:, None] * tl.load(values + row[:, None] * C + c[None, :], mask=full[:, None], other=0.0)
@@ -149,12 +153,8 @@ def _march(
     r = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
     c = tl.arange(0, C)
     here = r < R
-    ox = tl.load(origins + 3 * r, mask=here, other=0.0)
-    oy = tl.load(origins + 3 * r + 1, mask=here, other=0.0)
-    oz = tl.load(origins + 3 * r + 2, mask=here, other=0.0)
-    dx = tl.load(directions + 3 * r, mask=here, other=1.0)
-    dy = tl.load(directions + 3 * r + 1, mask=here, other=0.0)
-    dz = tl.load(directions + 3 * r + 2, mask=here, other=0.0)
+    ox, oy, oz = load_row(origins, r, here)
+    dx, dy, dz = load_row(directions, r, here, 1.0)
     t = tl.load(enter + r, mask=here, other=0.0)
     end = tl.load(leave + r, mask=here, other=0.0)
     if NOTE:
@@ -170,15 +170,13 @@ def _march(
         x, y, z = _placed(ox, oy, oz, dx, dy, dz, t, ball, CURVED)
         bx, by, bz, number = _block_of(x, y, z, index, alive, X, Y, Z, B)
         there = number >= 0
-        cx, fx = _cell_of(x, bx, B)
-        cy, fy = _cell_of(y, by, B)
-        cz, fz = _cell_of(z, bz, B)
-        nearest = _row_of(rows, number, cx, cy, cz, there, B)
+        voxel, f = _voxel_of(x, y, z, bx, by, bz, B)
+        nearest = _row_of(rows, number, voxel, there, B)
         leap = tl.where(nearest < -1, -1 - nearest, 0)
         if CURVED:  # a step may be longer than a voxel
             leap = tl.maximum(leap - 1, 0)
         there &= leap == 0
-        seen, some = _blended(rows, values, number, cx, fx, cy, fy, cz, fz, there, BLOCK, B)
+        seen, some = _blended(rows, values, number, voxel, f, there, BLOCK, B)
         alpha = _alpha(seen)
         if NOTE:
             place = first + met
@@ -229,12 +227,8 @@ def _backward(
     r = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
     c = tl.arange(0, C)
     here = r < R
-    ox = tl.load(origins + 3 * r, mask=here, other=0.0)
-    oy = tl.load(origins + 3 * r + 1, mask=here, other=0.0)
-    oz = tl.load(origins + 3 * r + 2, mask=here, other=0.0)
-    dx = tl.load(directions + 3 * r, mask=here, other=1.0)
-    dy = tl.load(directions + 3 * r + 1, mask=here, other=0.0)
-    dz = tl.load(directions + 3 * r + 2, mask=here, other=0.0)
+    ox, oy, oz = load_row(origins, r, here)
+    dx, dy, dz = load_row(directions, r, here, 1.0)
     g = tl.load(g_totals + r[:, None] * C + c[None, :], mask=here[:, None], other=0.0)
     g_along = tl.load(g_distance + r, mask=here, other=0.0)
     first = tl.load(starts + r, mask=here, other=0)
@@ -247,15 +241,13 @@ def _backward(
         x, y, z = _placed(ox, oy, oz, dx, dy, dz, t, ball, CURVED)
         bx, by, bz, number = _block_of(x, y, z, index, alive, X, Y, Z, B)
         there = number >= 0
-        cx, fx = _cell_of(x, bx, B)
-        cy, fy = _cell_of(y, by, B)
-        cz, fz = _cell_of(z, bz, B)
-        seen, _ = _blended(rows, values, number, cx, fx, cy, fy, cz, fz, there, BLOCK, B)
+        voxel, f = _voxel_of(x, y, z, bx, by, bz, B)
+        seen, _ = _blended(rows, values, number, voxel, f, there, BLOCK, B)
         alpha = _alpha(seen)
         owed = light[:, None] * (g + tl.where(c[None, :] == A, (g_along * t - hidden)[:, None], 0.0))
-        for corner in tl.static_range(8):
-            weight = _share(fx, corner % 2) * _share(fy, corner // 2 % 2) * _share(fz, corner // 4)
-            row = _row_of(rows, number, cx + corner % 2, cy + corner // 2 % 2, cz + corner // 4, there, B).to(tl.int64)
+        for k in tl.static_range(8):
+            weight = weight_of(k, f)
+            row = _row_of(rows, number, corner_of(k, voxel), there, B).to(tl.int64)
             to = to_values + row[:, None] * C + c[None, :]
             tl.atomic_add(to, weight[:, None] * owed, mask=(row >= 0)[:, None], sem="relaxed")
         own = tl.sum(g * seen, 1) + g_along * alpha * t
@@ -264,45 +256,40 @@ def _backward(
         alive &= s >= first
 
 
-class _BlockMarch(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx, origins, directions, enter, leave, blocks: Blocks, values, stop: float):
-        device, rays = origins.device, len(origins)
-        ctx.given = blocks.index.contiguous(), blocks.rows.contiguous()
-        ctx.sizes = rays, *blocks.index.shape, float(blocks.ball)
-        ctx.options = {"CURVED": blocks.ball > 0, "BLOCK": BLOCK, "B": blocks.block}
-        ctx.options |= {"num_warps": 1, "enable_fp_fusion": False}
-        ctx.stop = float(stop)
-        totals, distance = empty(rays, CHANNELS, device=device), empty(rays, device=device)
-        lengths = torch.zeros(rays, dtype=torch.int32, device=device)
-        if rays:
-            out = totals, distance, lengths, lengths, distance, distance  # the last three are only noted into
-            rest = *out, *ctx.sizes, ctx.stop
-            _march[(triton.cdiv(rays, BLOCK),)](
-                origins, directions, enter, leave, *ctx.given, values, *rest, NOTE=False, **ctx.options
-            )
-        ctx.save_for_backward(origins, directions, enter, leave, values, totals, distance, lengths)
-        return totals, distance
-
-    @staticmethod
-    @torch.autograd.function.once_differentiable
-    def backward(ctx, g_totals, g_distance):
-        origins, directions, enter, leave, values, totals, distance, lengths = ctx.saved_tensors
-        starts = torch.nn.functional.pad(lengths.long().cumsum(0), (1, 0))
-        steps = torch.zeros(int(starts[-1]), device=values.device)
-        lights, to_values = empty(len(steps), device=values.device), torch.zeros_like(values)
-        if len(origins):
-            grid = (triton.cdiv(len(origins), BLOCK),)
-            out = totals, distance, lengths, starts, steps, lights
-            rest = *out, *ctx.sizes, ctx.stop
-            _march[grid](origins, directions, enter, leave, *ctx.given, values, *rest, NOTE=True, **ctx.options)
-            grads = g_totals.contiguous(), g_distance.contiguous()
-            noted = starts, steps, lights, to_values
-            given = origins, directions, *ctx.given, values
-            _backward[grid](*grads, *given, *noted, *ctx.sizes, **ctx.options)
-        return None, None, None, None, None, to_values, None
+def forward(ctx, origins, directions, enter, leave, blocks: Blocks, values, stop: float):
+    device, rays = origins.device, len(origins)
+    ctx.given = blocks.index.contiguous(), blocks.rows.contiguous()
+    ctx.sizes = rays, *blocks.index.shape, float(blocks.ball)
+    ctx.options = {"CURVED": blocks.ball > 0, "BLOCK": BLOCK, "B": blocks.block}
+    ctx.options |= {"num_warps": 1, "enable_fp_fusion": False}
+    ctx.stop = float(stop)
+    totals, distance = empty(rays, CHANNELS, device=device), empty(rays, device=device)
+    lengths = torch.zeros(rays, dtype=torch.int32, device=device)
+    if rays:
+        out = totals, distance, lengths, lengths, distance, distance  # the last three are only noted into
+        rest = *out, *ctx.sizes, ctx.stop
+        _march[(triton.cdiv(rays, BLOCK),)](
+            origins, directions, enter, leave, *ctx.given, values, *rest, NOTE=False, **ctx.options
+        )
+    ctx.save_for_backward(origins, directions, enter, leave, values, totals, distance, lengths)
+    return totals, distance
 
 
-def run(origins, directions, enter, leave, blocks: Blocks, values: Tensor, stop: float):
-    given = (x.contiguous() for x in (origins, directions, enter, leave))
-    return _BlockMarch.apply(*given, blocks, values.contiguous(), stop)
+def backward(ctx, g_totals, g_distance):
+    origins, directions, enter, leave, values, totals, distance, lengths = ctx.saved_tensors
+    starts = torch.nn.functional.pad(lengths.long().cumsum(0), (1, 0))
+    steps = torch.zeros(int(starts[-1]), device=values.device)
+    lights, to_values = empty(len(steps), device=values.device), torch.zeros_like(values)
+    if len(origins):
+        grid = (triton.cdiv(len(origins), BLOCK),)
+        out = totals, distance, lengths, starts, steps, lights
+        rest = *out, *ctx.sizes, ctx.stop
+        _march[grid](origins, directions, enter, leave, *ctx.given, values, *rest, NOTE=True, **ctx.options)
+        grads = g_totals.contiguous(), g_distance.contiguous()
+        noted = starts, steps, lights, to_values
+        given = origins, directions, *ctx.given, values
+        _backward[grid](*grads, *given, *noted, *ctx.sizes, **ctx.options)
+    return None, None, None, None, None, to_values, None
+
+
+run = differentiable(forward, backward)

@@ -1,10 +1,9 @@
 """Numba: one thread takes a run of rays."""
 
 import numpy as np
-import torch
 from numba import njit, prange
 
-from .._dispatch import empty
+from .._dispatch import differentiable, empty
 
 ONE = np.float32(1)
 
@@ -53,25 +52,22 @@ def _backward(to_total, to_opacity, to_weights, tau, values, weights, starts, st
             to_tau[i] = worth * through - behind
 
 
-class _Composite(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx, tau, values, starts, stop):
-        rays = len(starts) - 1
-        total, opacity, weights = empty(rays, values.shape[1]), empty(rays), empty(len(tau))
-        arrays = (x.detach().numpy() for x in (tau, values, starts))
-        _forward(*arrays, np.float32(stop), total.numpy(), opacity.numpy(), weights.numpy())
-        ctx.save_for_backward(tau, values, weights, starts)
-        ctx.stop = stop
-        return total, opacity, weights
-
-    @staticmethod
-    def backward(ctx, *grads):
-        saved = [x.detach().numpy() for x in ctx.saved_tensors]
-        to_tau, to_values = (empty(*x.shape) for x in ctx.saved_tensors[:2])
-        arrays = (g.contiguous().numpy() for g in grads)
-        _backward(*arrays, *saved, np.float32(ctx.stop), to_tau.numpy(), to_values.numpy())
-        return to_tau, to_values, None, None
+def forward(ctx, tau, values, starts, stop):
+    rays = len(starts) - 1
+    total, opacity, weights = empty(rays, values.shape[1]), empty(rays), empty(len(tau))
+    arrays = (x.detach().numpy() for x in (tau, values, starts))
+    _forward(*arrays, np.float32(stop), total.numpy(), opacity.numpy(), weights.numpy())
+    ctx.save_for_backward(tau, values, weights, starts)
+    ctx.stop = stop
+    return total, opacity, weights
 
 
-def run(tau, values, ray_starts, stop):
-    return _Composite.apply(tau.contiguous(), values.contiguous(), ray_starts.contiguous(), stop)
+def backward(ctx, *grads):
+    saved = [x.detach().numpy() for x in ctx.saved_tensors]
+    to_tau, to_values = (empty(*x.shape) for x in ctx.saved_tensors[:2])
+    arrays = (g.contiguous().numpy() for g in grads)
+    _backward(*arrays, *saved, np.float32(ctx.stop), to_tau.numpy(), to_values.numpy())
+    return to_tau, to_values, None, None
+
+
+run = differentiable(forward, backward)

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import torch
 import triton
 import triton.language as tl
-from torch import Tensor
 
-from .._dispatch import empty
+from .._dispatch import differentiable, empty
 
 BLOCK = 32  # samples; most rays of a trained scene need one or two blocks
 
@@ -97,30 +95,26 @@ def _backward(
         behind -= tl.sum(g * w, 0)
 
 
-class _Composite(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx, tau, values, ray_starts, stop):
-        rays, channels = len(ray_starts) - 1, values.shape[1]
-        shapes = (rays, channels), (rays,), (len(tau),)
-        total, opacity, weights = (empty(*shape, device=tau.device) for shape in shapes)
-        ctx.sizes = {"C": channels, "CHANNELS": max(triton.next_power_of_2(channels), 1), "BLOCK": BLOCK}
-        ctx.stop = stop
-        if rays:
-            _forward[(rays,)](tau, values, ray_starts, total, opacity, weights, stop, **ctx.sizes, num_warps=1)
-        ctx.save_for_backward(tau, values, ray_starts, total, opacity, weights)
-        return total, opacity, weights
-
-    @staticmethod
-    @torch.autograd.function.once_differentiable
-    def backward(ctx, *grads):
-        tau, values, ray_starts, *outputs = ctx.saved_tensors
-        d_tau, d_values = (empty(*x.shape, device=x.device) for x in (tau, values))
-        if len(ray_starts) > 1:
-            given = *(g.contiguous() for g in grads), tau, values, ray_starts, *outputs
-            grid = (len(ray_starts) - 1,)
-            _backward[grid](*given, d_tau, d_values, ctx.stop, **ctx.sizes, num_warps=1)
-        return d_tau, d_values, None, None
+def forward(ctx, tau, values, ray_starts, stop):
+    rays, channels = len(ray_starts) - 1, values.shape[1]
+    shapes = (rays, channels), (rays,), (len(tau),)
+    total, opacity, weights = (empty(*shape, device=tau.device) for shape in shapes)
+    ctx.sizes = {"C": channels, "CHANNELS": max(triton.next_power_of_2(channels), 1), "BLOCK": BLOCK}
+    ctx.stop = stop
+    if rays:
+        _forward[(rays,)](tau, values, ray_starts, total, opacity, weights, stop, **ctx.sizes, num_warps=1)
+    ctx.save_for_backward(tau, values, ray_starts, total, opacity, weights)
+    return total, opacity, weights
 
 
-def run(tau: Tensor, values: Tensor, ray_starts: Tensor, stop: float) -> tuple[Tensor, Tensor, Tensor]:
-    return _Composite.apply(tau.contiguous(), values.contiguous(), ray_starts.contiguous(), stop)
+def backward(ctx, *grads):
+    tau, values, ray_starts, *outputs = ctx.saved_tensors
+    d_tau, d_values = (empty(*x.shape, device=x.device) for x in (tau, values))
+    if len(ray_starts) > 1:
+        given = *(g.contiguous() for g in grads), tau, values, ray_starts, *outputs
+        grid = (len(ray_starts) - 1,)
+        _backward[grid](*given, d_tau, d_values, ctx.stop, **ctx.sizes, num_warps=1)
+    return d_tau, d_values, None, None
+
+
+run = differentiable(forward, backward)

@@ -6,8 +6,8 @@ import numpy as np
 import torch
 from numba import get_num_threads, njit, prange
 
-from .._dispatch import empty
-from .lanes import BLOCK, blend, spread
+from .._dispatch import differentiable, empty
+from ..hash_encode.cpu import BLOCK, blend, spread
 
 FAST = {"fastmath": True, "cache": True, "error_model": "numpy"}
 ZERO, ONE = np.float32(0), np.float32(1)
@@ -121,33 +121,31 @@ def _slabs(points, box, planes, parts):
     return starts
 
 
-class _Lookup(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx, points, grid, box):
-        ctx.save_for_backward(points, grid)
-        ctx.box = _scaled(box, grid).numpy()
-        out = empty(grid.shape[3], len(points))
-        lanes = (ONE,) * grid.shape[3]
-        given = points.detach().numpy(), grid.detach().numpy().reshape(-1), ctx.box
-        _look_up(*given, np.array(grid.shape), lanes, out.numpy().reshape(-1))
-        return out.t()
+def forward(ctx, points, grid, box):
+    ctx.save_for_backward(points, grid)
+    ctx.box = _scaled(box, grid).numpy()
+    out = empty(grid.shape[3], len(points))
+    lanes = (ONE,) * grid.shape[3]
+    given = points.detach().numpy(), grid.detach().numpy().reshape(-1), ctx.box
+    _look_up(*given, np.array(grid.shape), lanes, out.numpy().reshape(-1))
+    return out.t()
 
-    @staticmethod
-    def backward(ctx, grad):
-        points, grid = (x.detach() for x in ctx.saved_tensors)
-        grad = grad.t().contiguous().numpy()
-        to_points = to_grid = None
-        if ctx.needs_input_grad[0]:
-            to_points = empty(*points.shape)
-            _point_gradient(grad, points.numpy(), grid.numpy(), ctx.box, to_points.numpy())
-        if ctx.needs_input_grad[1]:
-            # Zeros that the system gives as they are touched: a step's samples touch a small part of a large grid.
-            to_grid = torch.from_numpy(np.zeros(grid.shape, np.float32))
-            slabs = _slabs(points.numpy(), ctx.box, len(grid), max(2, get_num_threads()))
-            lanes = (ONE,) * grid.shape[3]
-            flat = to_grid.numpy().reshape(-1)
-            _grid_gradient(grad.reshape(-1), points.numpy(), slabs, ctx.box, np.array(grid.shape), lanes, flat)
-        return to_points, to_grid, None
+
+def backward(ctx, grad):
+    points, grid = (x.detach() for x in ctx.saved_tensors)
+    grad = grad.t().contiguous().numpy()
+    to_points = to_grid = None
+    if ctx.needs_input_grad[0]:
+        to_points = empty(*points.shape)
+        _point_gradient(grad, points.numpy(), grid.numpy(), ctx.box, to_points.numpy())
+    if ctx.needs_input_grad[1]:
+        # Zeros that the system gives as they are touched: a step's samples touch a small part of a large grid.
+        to_grid = torch.from_numpy(np.zeros(grid.shape, np.float32))
+        slabs = _slabs(points.numpy(), ctx.box, len(grid), max(2, get_num_threads()))
+        lanes = (ONE,) * grid.shape[3]
+        flat = to_grid.numpy().reshape(-1)
+        _grid_gradient(grad.reshape(-1), points.numpy(), slabs, ctx.box, np.array(grid.shape), lanes, flat)
+    return to_points, to_grid, None
 
 
 def _scaled(box, grid):
@@ -155,5 +153,4 @@ def _scaled(box, grid):
     return torch.stack([box[0], (torch.tensor(grid.shape[:3]) - 1) / (box[1] - box[0])])
 
 
-def run(points, grid, box):
-    return _Lookup.apply(points.contiguous(), grid.contiguous(), box)
+run = differentiable(forward, backward)

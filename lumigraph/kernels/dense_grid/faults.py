@@ -1,13 +1,10 @@
-"""Faults that the tests write into a copy of an engine, one at a time, to see their comparison turn red.
-
-By name: the engine, the function, what stands there, and what is put in its place.
-"""
+"""Seeded faults by name: the engine, the function, a piece of it, and what is put in its place."""
 
 FAULTS = {
     "corner forgotten": ("gpu", "_backward_grid", "tl.static_range(8)", "tl.static_range(7)"),
     "weight forgotten": ("gpu", "_backward_grid", "weight[:, None] * g", "g"),
-    "slope's sign": ("gpu", "_backward_points", "(corner % 2 * 2 - 1)", "(1 - corner % 2 * 2)"),
-    "clamped, yet with gradient": ("gpu", "_backward_points", "where(inside_y", "where(here"),
+    "slope's sign": ("gpu", "_backward_points", "dx + slope[0]", "dx - slope[0]"),
+    "clamped, yet with gradient": ("gpu", "_backward_points", "where(inside[1]", "where(here"),
     "sides mistaken": ("cpu", "_sides", "fy * (ONE - fz), (ONE - fy) * fz", "(ONE - fy) * fz, fy * (ONE - fz)"),
     "gradient of the first sample": ("cpu", "_grid_gradient", "spread(grad, i, n", "spread(grad, 0, n"),
     "plane of another thread, with weight": ("cpu", "_grid_gradient", "if above else ZERO", "if n else ZERO"),

@@ -5,17 +5,17 @@ from __future__ import annotations
 import torch
 import triton
 import triton.language as tl
-from torch import Tensor
 
-from .._dispatch import empty
+from .._dispatch import differentiable, empty
+from .._rows_gpu import load_row, store_row
+from ..sparse_grid.gpu import corner_of, slope_of, weight_of
 
 BLOCK = 64
 
 
 @triton.jit
-def _axis(points, box, i, axis: tl.constexpr, here, size):
+def _along(x, box, axis: tl.constexpr, size):
     """Along one axis: the corner at or below each point, the place between it and the next, whether it lies inside."""
-    x = tl.load(points + 3 * i + axis, mask=here, other=0.0)
     x = (x - tl.load(box + axis)) * tl.load(box + 3 + axis)
     inside = (x > 0.0) & (x < size - 1)
     x = tl.minimum(tl.maximum(x, 0.0), (size - 1).to(tl.float32))
@@ -24,46 +24,47 @@ def _axis(points, box, i, axis: tl.constexpr, here, size):
 
 
 @triton.jit
-def _weight(fraction, side: tl.constexpr):
-    return fraction if side == 1 else 1 - fraction
+def _cell_of(points, box, i, here, X, Y, Z):
+    """As `cell_of` of sparse grids, of a grid of X Y Z corners in a box."""
+    x, y, z = load_row(points, i, here)
+    cx, fx, inside_x = _along(x, box, 0, X)
+    cy, fy, inside_y = _along(y, box, 1, Y)
+    cz, fz, inside_z = _along(z, box, 2, Z)
+    return (cx, cy, cz), (fx, fy, fz), (inside_x, inside_y, inside_z)
 
 
 @triton.jit
-def _entry(cx, cy, cz, Y, Z):
-    return (cx.to(tl.int64) * Y + cy) * Z + cz
+def _entry(corner, Y, Z):
+    return (corner[0].to(tl.int64) * Y + corner[1]) * Z + corner[2]
 
 
 @triton.jit(do_not_specialize=["S", "X", "Y", "Z"])
 def _forward(points, grid, box, out, S, X, Y, Z, C: tl.constexpr, CHANNELS: tl.constexpr, BLOCK: tl.constexpr):
     i = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
-    f = tl.arange(0, CHANNELS)
+    c = tl.arange(0, CHANNELS)
     here = i < S
-    there = here[:, None] & (f < C)[None, :]
-    cx, fx, _ = _axis(points, box, i, 0, here, X)
-    cy, fy, _ = _axis(points, box, i, 1, here, Y)
-    cz, fz, _ = _axis(points, box, i, 2, here, Z)
+    there = here[:, None] & (c < C)[None, :]
+    cell, f, _ = _cell_of(points, box, i, here, X, Y, Z)
     total = tl.zeros([BLOCK, CHANNELS], tl.float32)
-    for corner in tl.static_range(8):
-        weight = _weight(fx, corner % 2) * _weight(fy, corner // 2 % 2) * _weight(fz, corner // 4)
-        entry = _entry(cx + corner % 2, cy + corner // 2 % 2, cz + corner // 4, Y, Z)
-        total += weight[:, None] * tl.load(grid + entry[:, None] * C + f[None, :], mask=there, other=0.0)
-    tl.store(out + i[:, None] * C + f[None, :], total, mask=there)
+    for k in tl.static_range(8):
+        weight = weight_of(k, f)
+        entry = _entry(corner_of(k, cell), Y, Z)
+        total += weight[:, None] * tl.load(grid + entry[:, None] * C + c[None, :], mask=there, other=0.0)
+    tl.store(out + i[:, None] * C + c[None, :], total, mask=there)
 
 
 @triton.jit(do_not_specialize=["S", "X", "Y", "Z"])
 def _backward_grid(grad, points, box, d_grid, S, X, Y, Z, C: tl.constexpr, CHANNELS: tl.constexpr, BLOCK: tl.constexpr):
     i = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
-    f = tl.arange(0, CHANNELS)
+    c = tl.arange(0, CHANNELS)
     here = i < S
-    there = here[:, None] & (f < C)[None, :]
-    cx, fx, _ = _axis(points, box, i, 0, here, X)
-    cy, fy, _ = _axis(points, box, i, 1, here, Y)
-    cz, fz, _ = _axis(points, box, i, 2, here, Z)
-    g = tl.load(grad + i[:, None] * C + f[None, :], mask=there, other=0.0)
-    for corner in tl.static_range(8):
-        weight = _weight(fx, corner % 2) * _weight(fy, corner // 2 % 2) * _weight(fz, corner // 4)
-        entry = _entry(cx + corner % 2, cy + corner // 2 % 2, cz + corner // 4, Y, Z)
-        tl.atomic_add(d_grid + entry[:, None] * C + f[None, :], weight[:, None] * g, mask=there, sem="relaxed")
+    there = here[:, None] & (c < C)[None, :]
+    cell, f, _ = _cell_of(points, box, i, here, X, Y, Z)
+    g = tl.load(grad + i[:, None] * C + c[None, :], mask=there, other=0.0)
+    for k in tl.static_range(8):
+        weight = weight_of(k, f)
+        entry = _entry(corner_of(k, cell), Y, Z)
+        tl.atomic_add(d_grid + entry[:, None] * C + c[None, :], weight[:, None] * g, mask=there, sem="relaxed")
 
 
 @triton.jit(do_not_specialize=["S", "X", "Y", "Z"])
@@ -71,56 +72,49 @@ def _backward_points(
     grad, points, grid, box, d_points, S, X, Y, Z, C: tl.constexpr, CHANNELS: tl.constexpr, BLOCK: tl.constexpr
 ):
     i = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
-    f = tl.arange(0, CHANNELS)
+    c = tl.arange(0, CHANNELS)
     here = i < S
-    there = here[:, None] & (f < C)[None, :]
-    cx, fx, inside_x = _axis(points, box, i, 0, here, X)
-    cy, fy, inside_y = _axis(points, box, i, 1, here, Y)
-    cz, fz, inside_z = _axis(points, box, i, 2, here, Z)
-    g = tl.load(grad + i[:, None] * C + f[None, :], mask=there, other=0.0)
+    there = here[:, None] & (c < C)[None, :]
+    cell, f, inside = _cell_of(points, box, i, here, X, Y, Z)
+    g = tl.load(grad + i[:, None] * C + c[None, :], mask=there, other=0.0)
     dx = tl.zeros([BLOCK], tl.float32)
     dy = tl.zeros([BLOCK], tl.float32)
     dz = tl.zeros([BLOCK], tl.float32)
-    for corner in tl.static_range(8):
-        wx, wy, wz = _weight(fx, corner % 2), _weight(fy, corner // 2 % 2), _weight(fz, corner // 4)
-        entry = _entry(cx + corner % 2, cy + corner // 2 % 2, cz + corner // 4, Y, Z)
-        value = tl.sum(g * tl.load(grid + entry[:, None] * C + f[None, :], mask=there, other=0.0), 1)
-        dx += (corner % 2 * 2 - 1) * wy * wz * value
-        dy += (corner // 2 % 2 * 2 - 1) * wx * wz * value
-        dz += (corner // 4 * 2 - 1) * wx * wy * value
-    tl.store(d_points + 3 * i, tl.where(inside_x, dx * tl.load(box + 3), 0.0), mask=here)
-    tl.store(d_points + 3 * i + 1, tl.where(inside_y, dy * tl.load(box + 4), 0.0), mask=here)
-    tl.store(d_points + 3 * i + 2, tl.where(inside_z, dz * tl.load(box + 5), 0.0), mask=here)
+    for k in tl.static_range(8):
+        entry = _entry(corner_of(k, cell), Y, Z)
+        value = tl.sum(g * tl.load(grid + entry[:, None] * C + c[None, :], mask=there, other=0.0), 1)
+        slope = slope_of(k, f)
+        dx, dy, dz = dx + slope[0] * value, dy + slope[1] * value, dz + slope[2] * value
+    dx = tl.where(inside[0], dx * tl.load(box + 3), 0.0)
+    dy = tl.where(inside[1], dy * tl.load(box + 4), 0.0)
+    dz = tl.where(inside[2], dz * tl.load(box + 5), 0.0)
+    store_row(d_points, i, (dx, dy, dz), here)
 
 
-class _Lookup(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx, points, grid, box):
-        (X, Y, Z, C), S = grid.shape, len(points)
-        ctx.sizes = {"S": S, "X": X, "Y": Y, "Z": Z, "C": C, "CHANNELS": triton.next_power_of_2(C), "BLOCK": BLOCK}
-        ctx.box = torch.stack([box[0], (torch.tensor([X, Y, Z], device=box.device) - 1) / (box[1] - box[0])])
-        out = empty(S, C, device=points.device)
-        if S:
-            _forward[(triton.cdiv(S, BLOCK),)](points, grid, ctx.box, out, **ctx.sizes)
-        ctx.save_for_backward(points, grid)
-        return out
-
-    @staticmethod
-    @torch.autograd.function.once_differentiable
-    def backward(ctx, grad):
-        points, grid = ctx.saved_tensors
-        grad, blocks = grad.contiguous(), triton.cdiv(len(points), BLOCK)
-        d_points = d_grid = None
-        if ctx.needs_input_grad[0]:
-            d_points = empty(*points.shape, device=points.device)
-            if blocks:
-                _backward_points[(blocks,)](grad, points, grid, ctx.box, d_points, **ctx.sizes)
-        if ctx.needs_input_grad[1]:
-            d_grid = torch.zeros_like(grid)
-            if blocks:
-                _backward_grid[(blocks,)](grad, points, ctx.box, d_grid, **ctx.sizes)
-        return d_points, d_grid, None
+def forward(ctx, points, grid, box):
+    (X, Y, Z, C), S = grid.shape, len(points)
+    ctx.sizes = {"S": S, "X": X, "Y": Y, "Z": Z, "C": C, "CHANNELS": triton.next_power_of_2(C), "BLOCK": BLOCK}
+    ctx.box = torch.stack([box[0], (torch.tensor([X, Y, Z], device=box.device) - 1) / (box[1] - box[0])])
+    out = empty(S, C, device=points.device)
+    if S:
+        _forward[(triton.cdiv(S, BLOCK),)](points, grid, ctx.box, out, **ctx.sizes)
+    ctx.save_for_backward(points, grid)
+    return out
 
 
-def run(points: Tensor, grid: Tensor, box: Tensor) -> Tensor:
-    return _Lookup.apply(points.contiguous(), grid.contiguous(), box)
+def backward(ctx, grad):
+    points, grid = ctx.saved_tensors
+    grad, blocks = grad.contiguous(), triton.cdiv(len(points), BLOCK)
+    d_points = d_grid = None
+    if ctx.needs_input_grad[0]:
+        d_points = empty(*points.shape, device=points.device)
+        if blocks:
+            _backward_points[(blocks,)](grad, points, grid, ctx.box, d_points, **ctx.sizes)
+    if ctx.needs_input_grad[1]:
+        d_grid = torch.zeros_like(grid)
+        if blocks:
+            _backward_grid[(blocks,)](grad, points, ctx.box, d_grid, **ctx.sizes)
+    return d_points, d_grid, None
+
+
+run = differentiable(forward, backward)

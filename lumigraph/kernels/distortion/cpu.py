@@ -1,10 +1,9 @@
 """Numba: one thread takes a run of rays."""
 
 import numpy as np
-import torch
 from numba import njit, prange
 
-from .._dispatch import empty
+from .._dispatch import differentiable, empty
 
 THIRD = np.float32(1 / 3)
 
@@ -38,21 +37,18 @@ def _backward(to_total, weights, middles, lengths, starts, to_weights):
             moment += w * m
 
 
-class _Distortion(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx, weights, middles, lengths, starts):
-        total = empty(len(starts) - 1)
-        _forward(*(x.detach().numpy() for x in (weights, middles, lengths, starts)), total.numpy())
-        ctx.save_for_backward(weights, middles, lengths, starts)
-        return total
-
-    @staticmethod
-    def backward(ctx, to_total):
-        saved = [x.detach().numpy() for x in ctx.saved_tensors]
-        to_weights = empty(len(saved[0]))
-        _backward(to_total.contiguous().numpy(), *saved, to_weights.numpy())
-        return to_weights, None, None, None
+def forward(ctx, weights, middles, lengths, starts):
+    total = empty(len(starts) - 1)
+    _forward(*(x.detach().numpy() for x in (weights, middles, lengths, starts)), total.numpy())
+    ctx.save_for_backward(weights, middles, lengths, starts)
+    return total
 
 
-def run(weights, middles, lengths, ray_starts):
-    return _Distortion.apply(*(x.contiguous() for x in (weights, middles, lengths, ray_starts)))
+def backward(ctx, to_total):
+    saved = [x.detach().numpy() for x in ctx.saved_tensors]
+    to_weights = empty(len(saved[0]))
+    _backward(to_total.contiguous().numpy(), *saved, to_weights.numpy())
+    return to_weights, None, None, None
+
+
+run = differentiable(forward, backward)

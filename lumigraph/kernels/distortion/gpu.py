@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import torch
 import triton
 import triton.language as tl
-from torch import Tensor
 
-from .._dispatch import empty
+from .._dispatch import differentiable, empty
 
 BLOCK = 32  # samples; most rays of a trained scene need one or two blocks
 
@@ -54,25 +52,21 @@ def _backward(d_total, weights, middles, lengths, ray_starts, d_weights, BLOCK: 
         moment += 2 * tl.sum(w * m, 0)
 
 
-class _Distortion(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx, weights, middles, lengths, ray_starts):
-        total = empty(len(ray_starts) - 1, device=weights.device)
-        if len(total):
-            _forward[(len(total),)](weights, middles, lengths, ray_starts, total, BLOCK=BLOCK, num_warps=1)
-        ctx.save_for_backward(weights, middles, lengths, ray_starts)
-        return total
-
-    @staticmethod
-    @torch.autograd.function.once_differentiable
-    def backward(ctx, d_total):
-        weights, *rest = ctx.saved_tensors
-        d_weights = empty(*weights.shape, device=weights.device)
-        if len(d_total):
-            grid = (len(d_total),)
-            _backward[grid](d_total.contiguous(), weights, *rest, d_weights, BLOCK=BLOCK, num_warps=1)
-        return d_weights, None, None, None
+def forward(ctx, weights, middles, lengths, ray_starts):
+    total = empty(len(ray_starts) - 1, device=weights.device)
+    if len(total):
+        _forward[(len(total),)](weights, middles, lengths, ray_starts, total, BLOCK=BLOCK, num_warps=1)
+    ctx.save_for_backward(weights, middles, lengths, ray_starts)
+    return total
 
 
-def run(weights: Tensor, middles: Tensor, lengths: Tensor, ray_starts: Tensor) -> Tensor:
-    return _Distortion.apply(*(x.contiguous() for x in (weights, middles, lengths, ray_starts)))
+def backward(ctx, d_total):
+    weights, *rest = ctx.saved_tensors
+    d_weights = empty(*weights.shape, device=weights.device)
+    if len(d_total):
+        grid = (len(d_total),)
+        _backward[grid](d_total.contiguous(), weights, *rest, d_weights, BLOCK=BLOCK, num_warps=1)
+    return d_weights, None, None, None
+
+
+run = differentiable(forward, backward)

@@ -23,7 +23,7 @@ LARGEST = 1 << 14  # nodes along an axis, so that the rows of a table are counte
 
 @dataclass(frozen=True)
 class Factors:
-    """How a table's rows make up a grid of nodes (x, y, z): one component of all factors in each column.
+    """Layout of a table as a factorised grid of nodes (x, y, z): one component of all factors in each column.
 
     vm: planes over (y, z), (x, z), (x, y), then lines along x, y, z (vector-matrix, Chen 2022, eq. 3)
     cp: lines along x, y, z (eq. 2)

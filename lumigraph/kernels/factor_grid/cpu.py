@@ -9,12 +9,12 @@ import numpy as np
 import torch
 from numba import njit, prange
 
-from .._dispatch import empty
-from .._lanes import fetch, put
-from .._vectors import LANES
+from .._dispatch import differentiable, empty
+from .._lanes import LANES, fetch, put, totals
 from . import MODES
 
-FAST = {"parallel": True, "fastmath": True, "cache": True}
+# All but "reassoc": sums over corners stay in their order.
+FAST = {"parallel": True, "fastmath": {"nnan", "ninf", "nsz", "arcp", "contract", "afn"}, "cache": True}
 ZERO, ONE = np.float32(0), np.float32(1)
 NONE = np.zeros(LANES, np.float32)
 SHARE = 1 << 10  # samples that a thread takes at a time
@@ -44,15 +44,6 @@ def _on_plane(table, at, down, width, f, g):
 @njit(inline="always")
 def _add(table, at, x):
     put(table, at, fetch(table, at) + x)
-
-
-@njit(inline="always")
-def _total(x, scratch):
-    put(scratch, 0, x)
-    total = ZERO
-    for k in range(LANES):
-        total += scratch[k]
-    return total
 
 
 @njit(**FAST)
@@ -86,7 +77,8 @@ def _look_up(points, table, nodes, starts, vm, width, summed, out):
                 else:
                     put(out, i * width + c, a * b * d)
             if summed:
-                out[i] = _total(total, scratch)
+                put(scratch, 0, totals((total,)))
+                out[i] = scratch[0]
 
 
 @njit(**FAST)
@@ -164,36 +156,36 @@ def _spread_lines(grad, cells, fractions, table, starts, width, summed, sums):
                 _add(sums, mine + at_z + c + width, to_z * fz)
 
 
-class _FactorGrid(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx, points, table, factors, summed):
-        width = table.shape[1]
-        starts = np.cumsum([0, *factors.sizes[:-1]]) * width
-        found = empty(len(points), 1 if summed else factors.products * width)
-        vm = factors.kind == "vm"
-        _look_up(_flat(points, 2), _flat(table), np.array(factors.nodes), starts, vm, width, summed, _flat(found))
-        ctx.save_for_backward(points, table)
-        ctx.about = factors, starts, summed
-        return found
+def forward(ctx, points, table, factors, summed):
+    width = table.shape[1]
+    starts = np.cumsum([0, *factors.sizes[:-1]]) * width
+    found = empty(len(points), 1 if summed else factors.products * width)
+    vm = factors.kind == "vm"
+    _look_up(_flat(points, 2), _flat(table), np.array(factors.nodes), starts, vm, width, summed, _flat(found))
+    ctx.save_for_backward(points, table)
+    ctx.about = factors, starts, summed
+    return found
 
-    @staticmethod
-    @torch.autograd.function.once_differentiable
-    def backward(ctx, grad):
-        points, table = ctx.saved_tensors
-        factors, starts, summed = ctx.about
-        nodes, width = np.array(factors.nodes), table.shape[1]
-        cells, fractions = np.empty((3, len(points)), np.int64), np.empty((3, len(points)), np.float32)
-        _places(_flat(points, 2), nodes, cells, fractions)
-        found, lines = empty(*table.shape), sum(factors.sizes[-3:])
-        sums = torch.zeros(BANDS, lines, width)
-        given = _flat(grad.contiguous()), cells, fractions, _flat(table)
-        if factors.kind == "vm":
-            edges = np.stack([_bands(cells[axes[0]], nodes[axes[0]]) for axes in MODES])
-            _spread_planes(*given, nodes, starts, AXES, edges, width, summed, _flat(found), _flat(sums))
-        else:
-            _spread_lines(*given, starts, width, summed, _flat(sums))
-        torch.sum(sums, 0, out=found[-lines:])
-        return None, found, None, None
+
+def backward(ctx, grad):
+    points, table = ctx.saved_tensors
+    factors, starts, summed = ctx.about
+    nodes, width = np.array(factors.nodes), table.shape[1]
+    cells, fractions = np.empty((3, len(points)), np.int64), np.empty((3, len(points)), np.float32)
+    _places(_flat(points, 2), nodes, cells, fractions)
+    found, lines = empty(*table.shape), sum(factors.sizes[-3:])
+    sums = torch.zeros(BANDS, lines, width)
+    given = _flat(grad.contiguous()), cells, fractions, _flat(table)
+    if factors.kind == "vm":
+        edges = np.stack([_bands(cells[axes[0]], nodes[axes[0]]) for axes in MODES])
+        _spread_planes(*given, nodes, starts, AXES, edges, width, summed, _flat(found), _flat(sums))
+    else:
+        _spread_lines(*given, starts, width, summed, _flat(sums))
+    torch.sum(sums, 0, out=found[-lines:])
+    return None, found, None, None
+
+
+_factor_grid = differentiable(forward, backward)
 
 
 def _bands(rows, count):
@@ -211,8 +203,8 @@ def _flat(x, axes=1):
 def run(points, table, factors, summed):
     """Whole vectors of components: a table whose width they do not divide is widened by zeros."""
     width = table.shape[1]
-    table = torch.nn.functional.pad(table, (0, -width % LANES)) if width % LANES else table.contiguous()
-    found = _FactorGrid.apply(points.contiguous(), table, factors, summed)
+    table = torch.nn.functional.pad(table, (0, -width % LANES)) if width % LANES else table
+    found = _factor_grid(points, table, factors, summed)
     if summed or width == table.shape[1]:
         return found
     return found.view(len(points), factors.products, table.shape[1])[:, :, :width].flatten(1)

@@ -5,10 +5,8 @@ from __future__ import annotations
 import torch
 import triton
 import triton.language as tl
-from torch import Tensor
 
-from .._dispatch import empty
-from . import Factors
+from .._dispatch import differentiable, empty
 
 BLOCK = 64  # samples
 WIDEST = 32  # components taken together
@@ -155,28 +153,24 @@ def _backward(
             _add_line(d_table, on_z, fz, c, there, slope * a * b, R)
 
 
-class _FactorGrid(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx, points, table, factors, summed):
-        width, vm = table.shape[1], factors.kind == "vm"
-        out = empty(len(points), 1 if summed else factors.products * width, device=points.device)
-        ctx.numbers = len(points), *factors.nodes
-        ctx.shape = {"VM": vm, "SUMMED": summed, "R": width, "BLOCK": BLOCK}
-        ctx.shape["C"] = min(WIDEST, triton.next_power_of_2(width))
-        if len(points):
-            _forward[(triton.cdiv(len(points), BLOCK),)](points, table, out, *ctx.numbers, **ctx.shape)
-        ctx.save_for_backward(points, table)
-        return out
-
-    @staticmethod
-    @torch.autograd.function.once_differentiable
-    def backward(ctx, grad):
-        points, table = ctx.saved_tensors
-        d_table = torch.zeros_like(table)
-        if blocks := triton.cdiv(len(points), BLOCK):
-            _backward[(blocks,)](grad.contiguous(), points, table, d_table, *ctx.numbers, **ctx.shape)
-        return None, d_table, None, None
+def forward(ctx, points, table, factors, summed):
+    width, vm = table.shape[1], factors.kind == "vm"
+    out = empty(len(points), 1 if summed else factors.products * width, device=points.device)
+    ctx.numbers = len(points), *factors.nodes
+    ctx.shape = {"VM": vm, "SUMMED": summed, "R": width, "BLOCK": BLOCK}
+    ctx.shape["C"] = min(WIDEST, triton.next_power_of_2(width))
+    if len(points):
+        _forward[(triton.cdiv(len(points), BLOCK),)](points, table, out, *ctx.numbers, **ctx.shape)
+    ctx.save_for_backward(points, table)
+    return out
 
 
-def run(points: Tensor, table: Tensor, factors: Factors, summed: bool) -> Tensor:
-    return _FactorGrid.apply(points.contiguous(), table.contiguous(), factors, summed)
+def backward(ctx, grad):
+    points, table = ctx.saved_tensors
+    d_table = torch.zeros_like(table)
+    if blocks := triton.cdiv(len(points), BLOCK):
+        _backward[(blocks,)](grad.contiguous(), points, table, d_table, *ctx.numbers, **ctx.shape)
+    return None, d_table, None, None
+
+
+run = differentiable(forward, backward)

@@ -5,7 +5,7 @@ import numpy as np
 import torch
 from numba import njit, prange
 
-from .._dispatch import empty
+from .._dispatch import differentiable, empty
 from .._lanes import fetch, put, put_where, totals
 from ..sparse_grid.cpu import CHUNK, corners, in_slabs
 from ..spherical_harmonics import K00, K1, K20, K21, K22
@@ -102,30 +102,25 @@ def _gradient(d_density, d_rgb, points, directions, index, rows, order, starts, 
                     put_where(own, to_harmonics, second, v1)
 
 
-class _HarmonicGrid(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx, points, directions, nodes, density, harmonics):
-        ctx.nodes, ctx.shapes = nodes, (density.shape, harmonics.shape)
-        ctx.save_for_backward(points, directions)
-        to_density, to_rgb = empty(len(points)), empty(len(points), 3)
-        tables = density.detach().numpy(), harmonics.detach().view(-1).numpy()
-        given = points.detach().numpy(), directions.detach().numpy(), nodes.index.numpy(), nodes.rows.numpy()
-        _look_up(*given, *tables, LANES_OF, to_density.numpy(), to_rgb.numpy())
-        return to_density, to_rgb
-
-    @staticmethod
-    @torch.autograd.function.once_differentiable
-    def backward(ctx, d_density, d_rgb):
-        points, directions = (x.detach().numpy() for x in ctx.saved_tensors)
-        to_density, to_harmonics = (torch.zeros(shape) for shape in ctx.shapes)
-        index, rows = ctx.nodes.index.numpy(), ctx.nodes.rows.numpy()
-        grads = d_density.contiguous().numpy(), d_rgb.contiguous().numpy()
-        order, starts = in_slabs(points, index)
-        out = to_density.numpy(), to_harmonics.view(-1).numpy()
-        _gradient(*grads, points, directions, index, rows, order, starts, LANES_OF, *out)
-        return None, None, None, to_density, to_harmonics
+def forward(ctx, points, directions, nodes, density, harmonics):
+    ctx.nodes, ctx.shapes = nodes, (density.shape, harmonics.shape)
+    ctx.save_for_backward(points, directions)
+    to_density, to_rgb = empty(len(points)), empty(len(points), 3)
+    tables = density.detach().numpy(), harmonics.detach().view(-1).numpy()
+    given = points.detach().numpy(), directions.detach().numpy(), nodes.index.numpy(), nodes.rows.numpy()
+    _look_up(*given, *tables, LANES_OF, to_density.numpy(), to_rgb.numpy())
+    return to_density, to_rgb
 
 
-def run(points, directions, nodes, density, harmonics):
-    given = points.contiguous(), directions.contiguous(), nodes, density.contiguous(), harmonics.contiguous()
-    return _HarmonicGrid.apply(*given)
+def backward(ctx, d_density, d_rgb):
+    points, directions = (x.detach().numpy() for x in ctx.saved_tensors)
+    to_density, to_harmonics = (torch.zeros(shape) for shape in ctx.shapes)
+    index, rows = ctx.nodes.index.numpy(), ctx.nodes.rows.numpy()
+    grads = d_density.contiguous().numpy(), d_rgb.contiguous().numpy()
+    order, starts = in_slabs(points, index)
+    out = to_density.numpy(), to_harmonics.view(-1).numpy()
+    _gradient(*grads, points, directions, index, rows, order, starts, LANES_OF, *out)
+    return None, None, None, to_density, to_harmonics
+
+
+run = differentiable(forward, backward)

@@ -5,14 +5,12 @@ from __future__ import annotations
 import torch
 import triton
 import triton.language as tl
-from torch import Tensor
 
-from .._dispatch import empty
-from ..sparse_grid import Nodes
-from ..sparse_grid.gpu import cell_of, row_of, share
-from ..spherical_harmonics import K00, K1, K20, K21, K22
+from .._dispatch import differentiable, empty
+from .._rows_gpu import load_row
+from ..sparse_grid.gpu import cell_of, corner_of, row_of, weight_of
+from ..spherical_harmonics.gpu import harmonic
 
-Y0, Y1, Y20, Y21, Y22 = (tl.constexpr(k) for k in (K00, K1, K20, K21, K22))
 BLOCK = 64
 WIDTH = tl.constexpr(27)  # coefficients of a row, colours next to each other
 
@@ -20,14 +18,11 @@ WIDTH = tl.constexpr(27)  # coefficients of a row, colours next to each other
 @triton.jit
 def _basis(directions, i, here, c):
     """The nine harmonics of each direction, each three times."""
-    x = tl.load(directions + 3 * i, mask=here, other=0.0)[:, None]
-    y = tl.load(directions + 3 * i + 1, mask=here, other=0.0)[:, None]
-    z = tl.load(directions + 3 * i + 2, mask=here, other=0.0)[:, None]
-    k = c[None, :] // 3
-    first = tl.where(k == 0, Y0, tl.where(k == 1, -Y1 * y, tl.where(k == 2, Y1 * z, -Y1 * x)))
-    second = tl.where(k == 4, Y21 * x * y, tl.where(k == 5, -Y21 * y * z, Y20 * (3 * z * z - 1)))
-    third = tl.where(k == 7, -Y21 * x * z, Y22 * (x * x - y * y))
-    return tl.where(k < 4, first, tl.where(k < 7, second, third))
+    x, y, z = load_row(directions, i[:, None], here[:, None])
+    basis = tl.zeros_like(x)
+    for k in tl.static_range(9):
+        basis = tl.where(c[None, :] // 3 == k, harmonic(k, x, y, z), basis)
+    return basis
 
 
 @triton.jit(do_not_specialize=["S"])
@@ -35,14 +30,12 @@ def _forward(points, directions, index, rows, density, harmonics, to_density, to
     i = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
     c = tl.arange(0, 32)
     here = i < S
-    cx, fx, _ = cell_of(points, i, 0, here, X - 1)
-    cy, fy, _ = cell_of(points, i, 1, here, Y - 1)
-    cz, fz, _ = cell_of(points, i, 2, here, Z - 1)
+    cell, f, _ = cell_of(points, i, here, X - 1, Y - 1, Z - 1)
     sigma = tl.zeros([BLOCK], tl.float32)
     total = tl.zeros([BLOCK, 32], tl.float32)
-    for corner in tl.static_range(8):
-        weight = share(fx, corner % 2) * share(fy, corner // 2 % 2) * share(fz, corner // 4)
-        row = row_of(index, rows, cx + corner % 2, cy + corner // 2 % 2, cz + corner // 4, here, Y, Z)
+    for k in tl.static_range(8):
+        weight = weight_of(k, f)
+        row = row_of(index, rows, corner_of(k, cell), here, Y, Z)
         there = (row >= 0)[:, None] & (c < WIDTH)[None, :]
         sigma += weight * tl.load(density + row, mask=row >= 0, other=0.0)
         total += weight[:, None] * tl.load(harmonics + row[:, None] * WIDTH + c[None, :], mask=there, other=0.0)
@@ -58,43 +51,36 @@ def _backward(d_sigma, d_rgb, points, directions, index, rows, d_density, d_harm
     i = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
     c = tl.arange(0, 32)
     here = i < S
-    cx, fx, _ = cell_of(points, i, 0, here, X - 1)
-    cy, fy, _ = cell_of(points, i, 1, here, Y - 1)
-    cz, fz, _ = cell_of(points, i, 2, here, Z - 1)
+    cell, f, _ = cell_of(points, i, here, X - 1, Y - 1, Z - 1)
     g_sigma = tl.load(d_sigma + i, mask=here, other=0.0)
     g = tl.load(d_rgb + 3 * i[:, None] + c[None, :] % 3, mask=here[:, None], other=0.0)
     g *= _basis(directions, i, here, c)
-    for corner in tl.static_range(8):
-        weight = share(fx, corner % 2) * share(fy, corner // 2 % 2) * share(fz, corner // 4)
-        row = row_of(index, rows, cx + corner % 2, cy + corner // 2 % 2, cz + corner // 4, here, Y, Z)
+    for k in tl.static_range(8):
+        weight = weight_of(k, f)
+        row = row_of(index, rows, corner_of(k, cell), here, Y, Z)
         there = (row >= 0)[:, None] & (c < WIDTH)[None, :]
         tl.atomic_add(d_density + row, weight * g_sigma, mask=row >= 0, sem="relaxed")
         tl.atomic_add(d_harmonics + row[:, None] * WIDTH + c[None, :], weight[:, None] * g, mask=there, sem="relaxed")
 
 
-class _HarmonicGrid(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx, points, directions, nodes, density, harmonics):
-        ctx.index, ctx.shapes = (nodes.index.contiguous(), nodes.named), (density.shape, harmonics.shape)
-        ctx.sizes = (len(points), *nodes.index.shape)
-        ctx.save_for_backward(points, directions)
-        out = empty(len(points), device=points.device), empty(len(points), 3, device=points.device)
-        if len(points):
-            blocks = (triton.cdiv(len(points), BLOCK),)
-            _forward[blocks](points, directions, *ctx.index, density, harmonics, *out, *ctx.sizes, BLOCK=BLOCK)
-        return out
-
-    @staticmethod
-    @torch.autograd.function.once_differentiable
-    def backward(ctx, d_sigma, d_rgb):
-        points, directions = ctx.saved_tensors
-        out = [torch.zeros(shape, device=points.device) for shape in ctx.shapes]
-        if len(points):
-            blocks, grads = (triton.cdiv(len(points), BLOCK),), (d_sigma.contiguous(), d_rgb.contiguous())
-            _backward[blocks](*grads, points, directions, *ctx.index, *out, *ctx.sizes, BLOCK=BLOCK)
-        return None, None, None, *out
+def forward(ctx, points, directions, nodes, density, harmonics):
+    ctx.index, ctx.shapes = (nodes.index.contiguous(), nodes.named), (density.shape, harmonics.shape)
+    ctx.sizes = (len(points), *nodes.index.shape)
+    ctx.save_for_backward(points, directions)
+    out = empty(len(points), device=points.device), empty(len(points), 3, device=points.device)
+    if len(points):
+        blocks = (triton.cdiv(len(points), BLOCK),)
+        _forward[blocks](points, directions, *ctx.index, density, harmonics, *out, *ctx.sizes, BLOCK=BLOCK)
+    return out
 
 
-def run(points: Tensor, directions: Tensor, nodes: Nodes, density: Tensor, harmonics: Tensor) -> tuple[Tensor, Tensor]:
-    given = points.contiguous(), directions.contiguous(), nodes, density.contiguous(), harmonics.contiguous()
-    return _HarmonicGrid.apply(*given)
+def backward(ctx, d_sigma, d_rgb):
+    points, directions = ctx.saved_tensors
+    out = [torch.zeros(shape, device=points.device) for shape in ctx.shapes]
+    if len(points):
+        blocks, grads = (triton.cdiv(len(points), BLOCK),), (d_sigma.contiguous(), d_rgb.contiguous())
+        _backward[blocks](*grads, points, directions, *ctx.index, *out, *ctx.sizes, BLOCK=BLOCK)
+    return None, None, None, *out
+
+
+run = differentiable(forward, backward)

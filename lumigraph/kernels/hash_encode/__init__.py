@@ -57,7 +57,7 @@ class HashLevels:
 
     @property
     def offsets(self) -> list[int]:
-        """Where each level begins in the table; one longer than there are levels."""
+        """First entry of each level in the table; one longer than there are levels."""
         offsets = [0]
         for size in self.sizes:
             offsets.append(offsets[-1] + size)

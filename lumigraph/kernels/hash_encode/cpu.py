@@ -9,65 +9,121 @@ import torch
 from numba import get_num_threads, njit, prange
 
 from .._dispatch import empty
-from .._vectors import LANES
+from .._lanes import LANES, fetch, fetch_like, gather, highest, lowest, put, real, scatter, whole
+from ..sparse_grid.cpu import cell_of
 from . import PRIMES
-from .lanes import BLOCK, blend, place_dense, place_hashed, spread
 
 P1, P2 = np.uint32(PRIMES[1]), np.uint32(PRIMES[2])
 ZERO, ONE = np.float32(0), np.float32(1)
+BLOCK = 64  # points whose corners are worked out together; entries and weights are laid out corner by corner
 CHUNK = 1 << 16  # points a thread takes at most at a time: many, so that a level's table is fetched once
 
 
 @njit(inline="always")
-def _cell(x, resolution):
-    """Cell and place within it along one axis; what lies outside is clamped onto the border."""
-    s = min(max(x, ZERO), ONE) * np.float32(resolution)
-    cell = min(np.int32(s), np.int32(resolution - 1))
-    cell = max(cell, np.int32(0))  # also where x is no number
-    return cell, s - np.float32(cell)
+def _along(points, at, resolution):
+    """Along one axis: the cells of sixteen points, and the weights of their two sides."""
+    x = lowest(highest(fetch(points, at), ZERO), ONE) * np.float32(resolution)
+    cell = lowest(whole(x), np.uint32(resolution - 1))
+    share = x - real(cell)
+    return cell, ONE - share, share
 
 
 @njit(inline="always")
-def _place(points, axes, first, count, resolution, mask, base, lanes, entries, weights):
-    """The eight corners around each of `count` points: where their features lie, and trilinear weights."""
+def _added(x, y, z, mask):
+    return x + y + z
+
+
+@njit(inline="always")
+def _hashed(x, y, z, mask):
+    return (x ^ y ^ z) & mask
+
+
+@njit(inline="always")
+def _corners(points, n, at, resolution, step_y, step_z, join, mask, base, features, entries, weights, i):
+    """Number of the first feature, and trilinear weight, of the corners around sixteen points, from point `at` on.
+
+    step_y, step_z: what a step along y and z adds to an entry's number (multiplies, where hashed)
+    Written to [corner BLOCK + i] and on. Lanes beyond the last point get what happens to lie there.
+    """
+    x, u0, u1 = _along(points, at, resolution)
+    y, v0, v1 = _along(points, n + at, resolution)
+    z, w0, w1 = _along(points, 2 * n + at, resolution)
+    y, z = y * step_y, z * step_z
+    for corner in range(8):
+        entry = join(
+            x + np.uint32(1) if corner & 1 else x,
+            y + step_y if corner & 2 else y,
+            z + step_z if corner & 4 else z,
+            mask,
+        )
+        put(entries, corner * BLOCK + i, (entry + np.uint32(base)) * np.uint32(len(features)))
+        weight = (u1 if corner & 1 else u0) * ((v1 if corner & 2 else v0) * (w1 if corner & 4 else w0))
+        put(weights, corner * BLOCK + i, weight)
+
+
+@njit(inline="always")
+def _place(points, n, first, count, resolution, mask, base, features, entries, weights):
+    """The eight corners around each of `count` points."""
     row = np.uint32(resolution + 1)
     for i in range(0, count, LANES):
         if mask:
-            place_hashed(points, first + i, axes, resolution, P1, P2, mask, base, lanes, entries, weights, i)
+            _corners(points, n, first + i, resolution, P1, P2, _hashed, mask, base, features, entries, weights, i)
         else:
-            place_dense(points, first + i, axes, resolution, row, row * row, mask, base, lanes, entries, weights, i)
+            _corners(
+                points, n, first + i, resolution, row, row * row, _added, mask, base, features, entries, weights, i
+            )
+
+
+@njit(inline="always")
+def blend(table, entries, weights, i, features, out, at, stride):
+    """Point i's sum over corners of weight times entry; its features go to numbers `at`, `at` + `stride`, ... of out.
+
+    All features of an entry are one register, so that there are eight loads and eight multiply-adds however many.
+    """
+    total = weights[i] * fetch_like(table, entries[i], features)
+    for corner in range(1, 8):
+        k = corner * BLOCK + i
+        total = total + weights[k] * fetch_like(table, entries[k], features)
+    scatter(out, at, stride, total)
+
+
+@njit(inline="always")
+def spread(grad, at, stride, entries, weights, i, features, table):
+    """The way back: add to each corner's entry its weight times the gradient that `blend` would have written."""
+    g = gather(grad, at, stride, features)
+    for corner in range(8):
+        k = corner * BLOCK + i
+        put(table, entries[k], fetch_like(table, entries[k], features) + weights[k] * g)
 
 
 @njit(parallel=True, fastmath=True, cache=True)
-def _look_up(points, table, resolutions, offsets, masks, lanes, out, share):
-    n, features = points.shape[1], len(lanes)
-    axes = points.strides[0] // 4
+def _look_up(points, n, table, resolutions, offsets, masks, features, out, share):
+    width = len(features)
     for chunk in prange((n + share - 1) // share):
         entries, weights = np.empty(8 * BLOCK, np.uint32), np.empty(8 * BLOCK, np.float32)
         last = min(n, (chunk + 1) * share)
         for level in range(len(resolutions)):
-            base, plane = offsets[level], level * features * n
+            base, plane = offsets[level], level * width * n
             for first in range(chunk * share, last, BLOCK):
                 count = min(BLOCK, last - first)
-                _place(points, axes, first, count, resolutions[level], masks[level], base, lanes, entries, weights)
+                _place(points, n, first, count, resolutions[level], masks[level], base, features, entries, weights)
                 for i in range(count):
-                    blend(table, entries, weights, i, lanes, out, plane + first + i, n)
+                    blend(table, entries, weights, i, features, out, plane + first + i, n)
 
 
 @njit(parallel=True, fastmath=True, cache=True)
-def _table_gradient(grad, points, resolutions, offsets, masks, order, lanes, out):
-    n, features = points.shape[1], len(lanes)
-    axes = points.strides[0] // 4
+def _table_gradient(grad, points, n, resolutions, offsets, masks, order, features, out):
+    width = len(features)
     for slot in prange(len(order)):
         level = order[slot]
         entries, weights = np.empty(8 * BLOCK, np.uint32), np.empty(8 * BLOCK, np.float32)
-        base, plane = offsets[level], level * features * n
-        out[base : offsets[level + 1]] = 0
+        base, plane = offsets[level], level * width * n
+        out[base * width : offsets[level + 1] * width] = 0
         for first in range(0, n, BLOCK):
             count = min(BLOCK, n - first)
-            _place(points, axes, first, count, resolutions[level], masks[level], base, lanes, entries, weights)
+            _place(points, n, first, count, resolutions[level], masks[level], base, features, entries, weights)
             for i in range(count):
-                spread(grad, plane + first + i, n, entries, weights, i, lanes, out)
+                spread(grad, plane + first + i, n, entries, weights, i, features, out)
 
 
 @njit(parallel=True, fastmath=True, cache=True)
@@ -81,9 +137,9 @@ def _point_gradient(grad, points, table, resolutions, offsets, masks, out):
             row = np.uint32(resolution + 1)
             step_y = P1 if mask else row
             step_z = P2 if mask else np.uint32(row * row)
-            cx, fx = _cell(points[0, i], resolution)
-            cy, fy = _cell(points[1, i], resolution)
-            cz, fz = _cell(points[2, i], resolution)
+            cx, fx = cell_of(points[0, i], resolution)
+            cy, fy = cell_of(points[1, i], resolution)
+            cz, fz = cell_of(points[2, i], resolution)
             for corner in range(8):
                 bx, by, bz = corner & 1, corner >> 1 & 1, corner >> 2
                 x, y = np.uint32(cx + bx), np.uint32(np.uint32(cy + by) * step_y)
@@ -113,40 +169,40 @@ def _grid(levels):
 class _Encode(torch.autograd.Function):
     @staticmethod
     def forward(ctx, points, table, levels):
-        planes = _planes(points.detach())
+        n, flat = len(points), _planes(points.detach())
         ctx.levels = levels
-        ctx.save_for_backward(planes, table)
-        out = empty(levels.levels * levels.features, len(points))
-        *grid, lanes = _grid(levels)
-        share = max(BLOCK, min(CHUNK, -(-len(points) // get_num_threads())))
-        _look_up(planes.numpy(), table.detach().numpy(), *grid, lanes, out.numpy().reshape(-1), share)
+        ctx.save_for_backward(flat, table)
+        out = empty(levels.levels * levels.features, n)
+        share = max(BLOCK, min(CHUNK, -(-n // get_num_threads())))
+        _look_up(flat.numpy(), n, table.detach().numpy().reshape(-1), *_grid(levels), out.numpy().reshape(-1), share)
         return out.t()
 
     @staticmethod
     def backward(ctx, grad):
-        points, table = ctx.saved_tensors
-        resolutions, offsets, masks, lanes = _grid(ctx.levels)
-        grad = grad.t().contiguous().numpy()
+        flat, table = ctx.saved_tensors
+        *grid, features = _grid(ctx.levels)
+        grad, n = grad.t().contiguous().numpy(), len(grad)
         to_points = to_table = None
         if ctx.needs_input_grad[0]:
-            to_points = empty(*points.shape)
-            table_ = table.detach().numpy()
-            _point_gradient(grad, points.numpy(), table_, resolutions, offsets, masks, to_points.numpy())
+            to_points = empty(3, n)
+            points = flat[: 3 * n].view(3, n).numpy()
+            _point_gradient(grad, points, table.detach().numpy(), *grid, to_points.numpy())
             to_points = to_points.t()
         if ctx.needs_input_grad[1]:
             to_table = empty(*table.shape)
-            order = _shared_out(len(resolutions), get_num_threads())
-            _table_gradient(
-                grad.reshape(-1), points.numpy(), resolutions, offsets, masks, order, lanes, to_table.numpy()
-            )
+            order = _shared_out(ctx.levels.levels, get_num_threads())
+            given = grad.reshape(-1), flat.numpy(), n, *grid, order, features
+            _table_gradient(*given, to_table.numpy().reshape(-1))
         return to_points, to_table, None
 
 
 def _planes(points):
-    """One axis after another, and as much memory after the last as a vector may reach over the end."""
+    """One axis after another, and as much memory after the last as lanes may reach over the end."""
     n = len(points)
-    planes = empty(3 * n + LANES)[: 3 * n].view(3, n)
-    return planes.copy_(points.t())
+    flat = empty(3 * n + LANES)
+    flat[: 3 * n].view(3, n).copy_(points.t())
+    flat[3 * n :] = 0
+    return flat
 
 
 @cache

@@ -1,18 +1,18 @@
-"""Faults that the tests write into a copy of an engine, one at a time, to see their comparison turn red.
-
-By name: the engine, the function, what stands there, and what is put in its place.
-"""
+"""Seeded faults by name: the engine, the function, a piece of it, and what is put in its place."""
 
 FAULTS = {
     "corner forgotten": ("gpu", "_backward_table", "tl.static_range(8)", "tl.static_range(7)"),
     "weight forgotten": ("gpu", "_backward_table", "weight[:, None] * g", "g"),
-    "slope's sign": ("gpu", "_backward_points", "(corner % 2 * 2 - 1)", "(1 - corner % 2 * 2)"),
-    "clamped, yet with gradient": ("gpu", "_backward_points", "where(inside_y", "where(here"),
+    "slope's sign": ("gpu", "_backward_points", "dx += ", "dx -= "),
+    "clamped, yet with gradient": ("gpu", "_backward_points", "where(inside[1]", "where(here"),
     "gradient of another sample": ("cpu", "_table_gradient", "plane + first + i", "plane + first"),
+    "corner forgotten on the cpu": ("cpu", "blend", "range(1, 8)", "range(1, 7)"),
+    "sides mistaken": ("cpu", "_along", "ONE - share, share", "share, ONE - share"),
     "slope's sign on the cpu": ("cpu", "_point_gradient", "(2 * by - 1)", "(1 - 2 * by)"),
 }
 
 # These let an index leave its array.
 ASTRAY = {
-    "the point 1.0, a cell too far": ("cpu", "_cell", "np.int32(resolution - 1))\n", "np.int32(resolution))\n"),
+    "the entry after the last": ("cpu", "_corners", "(entry + np.uint32(base))", "(entry + np.uint32(base + 1))"),
+    "the point 1.0, a cell too far": ("cpu", "_along", "np.uint32(resolution - 1)", "np.uint32(resolution)"),
 }

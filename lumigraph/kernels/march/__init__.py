@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from ...rays import Samples
+from ...camera.rays import Samples
 from .._dispatch import implementation
 from .._doors import door, require
 from .._facts import Facts

@@ -10,6 +10,7 @@ import triton.language as tl
 from torch import Tensor
 
 from .._dispatch import empty
+from .._rows_gpu import load_row
 
 BLOCK = 32  # rays; they march together, so a program is as slow as its slowest
 
@@ -85,12 +86,8 @@ def _march(
 ):
     r = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
     here = r < R
-    ox = tl.load(origins + 3 * r, mask=here, other=0.0)
-    oy = tl.load(origins + 3 * r + 1, mask=here, other=0.0)
-    oz = tl.load(origins + 3 * r + 2, mask=here, other=0.0)
-    dx = tl.load(directions + 3 * r, mask=here, other=1.0)
-    dy = tl.load(directions + 3 * r + 1, mask=here, other=0.0)
-    dz = tl.load(directions + 3 * r + 2, mask=here, other=0.0)
+    ox, oy, oz = load_row(origins, r, here)
+    dx, dy, dz = load_row(directions, r, here, 1.0)
     t_near = tl.load(t_nears + r, mask=here, other=0.0)
     t_far = tl.load(t_fars + r, mask=here, other=0.0)
     ix, iy, iz = _inverse(dx), _inverse(dy), _inverse(dz)

@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float, Int, Int32
 from torch import Tensor
 
-from ...rays import Samples
+from ...camera.rays import Samples
 from .._dispatch import implementation, using
 from .._doors import door, require
 from .._facts import Facts
@@ -21,7 +21,7 @@ SLOW = 1e-9  # of a direction along an axis, below which a ray is said to go for
 
 @dataclass(frozen=True)
 class Tree:
-    """Which row of a table belongs to each cell of an octree over the unit cube; made by `of` or `part`.
+    """Table row of each cell of an octree over the unit cube; made by `of` or `part`.
 
     The cube is divided in eight, and each cell again where something smaller lies in it. A cell's code begins with a 1
     and has three bits for each level, the half along x, y and z that it lies in (1 is the upper one).
@@ -129,7 +129,7 @@ def check(tree: Tree, density: Tensor, near: float, stop: float) -> None:
 
 
 def levels_of(codes: Int[Tensor, " row"]) -> Int[Tensor, " row"]:
-    """How many levels below the cube cells of these codes lie."""
+    """Number of levels below the cube of cells with these codes."""
     level = torch.zeros_like(codes)
     for k in range(1, DEEPEST + 1):
         level += (codes >= 8**k).to(level.dtype)

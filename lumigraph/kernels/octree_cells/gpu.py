@@ -11,26 +11,12 @@ import triton.language as tl
 from torch import Tensor
 
 from .._dispatch import empty
+from .._rows_gpu import load_row
 from . import SLOW as _SLOW
 from . import Tree
 
 SLOW = tl.constexpr(_SLOW)
 BLOCK = 32  # rays; they go together, so a program is as slow as its slowest
-
-
-@triton.jit
-def ray_of(origins, directions, r, here):
-    """Origins, directions and one over these, of a block of rays."""
-    ox = tl.load(origins + 3 * r, mask=here, other=0.0)
-    oy = tl.load(origins + 3 * r + 1, mask=here, other=0.0)
-    oz = tl.load(origins + 3 * r + 2, mask=here, other=0.0)
-    dx = tl.load(directions + 3 * r, mask=here, other=1.0)
-    dy = tl.load(directions + 3 * r + 1, mask=here, other=0.0)
-    dz = tl.load(directions + 3 * r + 2, mask=here, other=0.0)
-    ix = 1.0 / tl.where(tl.abs(dx) < SLOW, SLOW, dx)
-    iy = 1.0 / tl.where(tl.abs(dy) < SLOW, SLOW, dy)
-    iz = 1.0 / tl.where(tl.abs(dz) < SLOW, SLOW, dz)
-    return ox, oy, oz, dx, dy, dz, ix, iy, iz
 
 
 @triton.jit
@@ -47,6 +33,21 @@ def cell_at(x, low, high, side):
     """The whole number of the smallest cell at a coordinate, from low to below high."""
     inside = tl.minimum(tl.maximum(x * side, -1.0), side + 1.0)
     return tl.minimum(tl.maximum(tl.floor(inside).to(tl.int32), low), high - 1)
+
+
+@triton.jit
+def enter(origins, directions, r, here, near, DEPTH: tl.constexpr):
+    """Rays (origins, directions, one over these), where they enter the cube, which do, and their cells there."""
+    ox, oy, oz = load_row(origins, r, here)
+    dx, dy, dz = load_row(directions, r, here, 1.0)
+    ix = 1.0 / tl.where(tl.abs(dx) < SLOW, SLOW, dx)
+    iy = 1.0 / tl.where(tl.abs(dy) < SLOW, SLOW, dy)
+    iz = 1.0 / tl.where(tl.abs(dz) < SLOW, SLOW, dz)
+    t, far = through_cube(ox, oy, oz, ix, iy, iz, near)
+    x = cell_at(ox + t * dx, 0, 1 << DEPTH, 2.0**DEPTH)
+    y = cell_at(oy + t * dy, 0, 1 << DEPTH, 2.0**DEPTH)
+    z = cell_at(oz + t * dz, 0, 1 << DEPTH, 2.0**DEPTH)
+    return ((ox, oy, oz), (dx, dy, dz), (ix, iy, iz)), t, here & (t < far), (x, y, z)
 
 
 @triton.jit
@@ -67,8 +68,11 @@ def leaf(cells, x, y, z, going, DEPTH: tl.constexpr):
 
 
 @triton.jit
-def leave(x, y, z, shift, ox, oy, oz, dx, dy, dz, ix, iy, iz, t, DEPTH: tl.constexpr):
+def leave(x, y, z, shift, ray, t, DEPTH: tl.constexpr):
     """Where rays leave the cells of side 2^shift at their places, and the places beyond."""
+    ox, oy, oz = ray[0]
+    dx, dy, dz = ray[1]
+    ix, iy, iz = ray[2]
     side = 2.0**DEPTH
     size = 1 << shift
     lx, ly, lz = (x >> shift) << shift, (y >> shift) << shift, (z >> shift) << shift
@@ -109,20 +113,15 @@ def _walk(
 ):  # fmt: skip
     r = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
     here = r < R
-    ox, oy, oz, dx, dy, dz, ix, iy, iz = ray_of(origins, directions, r, here)
-    t, far = through_cube(ox, oy, oz, ix, iy, iz, near)
-    going = here & (t < far)
-    side = 2.0**DEPTH
-    x = cell_at(ox + t * dx, 0, 1 << DEPTH, side)
-    y = cell_at(oy + t * dy, 0, 1 << DEPTH, side)
-    z = cell_at(oz + t * dz, 0, 1 << DEPTH, side)
+    ray, t, going, cell = enter(origins, directions, r, here, near, DEPTH)
+    x, y, z = cell
     count = tl.zeros([BLOCK], tl.int32)
     thickness = tl.zeros([BLOCK], tl.float32)
     if WRITE:
         first = tl.load(ray_starts + r, mask=here, other=0)
     while tl.max(going.to(tl.int32), 0) > 0:
         value, shift = leaf(cells, x, y, z, going, DEPTH)
-        end, u, v, w = leave(x, y, z, shift, ox, oy, oz, dx, dy, dz, ix, iy, iz, t, DEPTH)
+        end, u, v, w = leave(x, y, z, shift, ray, t, DEPTH)
         row = row_in(named, value, going)
         held = row >= 0
         if WRITE:

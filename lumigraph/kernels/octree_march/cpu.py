@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from numba import get_num_threads, njit, prange
 
-from .._dispatch import empty
+from .._dispatch import differentiable, empty
 from ..octree_cells.cpu import CHUNK, FAST, ONE, ZERO, cell_at, inverse_of, leaf, leave, row_of, shared, through_cube
 from ..spherical_harmonics.cpu import basis
 
@@ -187,38 +187,33 @@ def _sum(firsts, order, rays, shares, bases, to_density, to_harmonics):
                     to_harmonics[row, k, c] += bases[r, k] * shares[i, 1 + c]
 
 
-class _OctreeMarch(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx, origins, directions, tree, density, harmonics, near, stop):
-        n = len(origins)
-        rgb, distance, opacity = empty(n, 3), empty(n), empty(n)
-        starts = torch.zeros(n + 1, dtype=torch.int64)
-        ctx.numbers = math.isqrt(harmonics.shape[1]), tree.depth, np.float32(near)
-        ctx.tree = tree.cells.numpy(), tree.rows.numpy()
-        rays = origins.detach().numpy(), directions.detach().numpy()
-        tables = density.detach().numpy(), harmonics.detach().numpy()
-        out = rgb.numpy(), distance.numpy(), opacity.numpy(), starts.numpy()[1:]
-        _forward(spread(n), *rays, *ctx.tree, *tables, *ctx.numbers, np.float32(stop), *out)
-        ctx.save_for_backward(origins, directions, density, harmonics, rgb, distance, opacity, starts.cumsum_(0))
-        return rgb, distance, opacity
-
-    @staticmethod
-    @torch.autograd.function.once_differentiable
-    def backward(ctx, *grads):
-        origins, directions, density, harmonics, *outputs = (x.detach().numpy() for x in ctx.saved_tensors)
-        starts = outputs[-1]
-        bases = np.zeros((len(origins), 16), np.float32)
-        rows, rays, order = (np.empty(starts[-1], np.int32) for _ in range(3))
-        shares = empty(int(starts[-1]), 4).numpy()
-        given = origins, directions, *ctx.tree, density, harmonics, *ctx.numbers, *outputs
-        _share(spread(len(origins)), *(g.contiguous().numpy() for g in grads), *given, bases, rows, rays, shares)
-        firsts = np.zeros(len(density) + 1, np.int64)
-        _sorted(rows, firsts, order)
-        to_density, to_harmonics = torch.zeros(density.shape), torch.zeros(harmonics.shape)
-        _sum(firsts, order, rays, shares, bases, to_density.numpy(), to_harmonics.numpy())
-        return None, None, None, to_density, to_harmonics, None, None
+def forward(ctx, origins, directions, tree, density, harmonics, near, stop):
+    n = len(origins)
+    rgb, distance, opacity = empty(n, 3), empty(n), empty(n)
+    starts = torch.zeros(n + 1, dtype=torch.int64)
+    ctx.numbers = math.isqrt(harmonics.shape[1]), tree.depth, np.float32(near)
+    ctx.tree = tree.cells.numpy(), tree.rows.numpy()
+    rays = origins.detach().numpy(), directions.detach().numpy()
+    tables = density.detach().numpy(), harmonics.detach().numpy()
+    out = rgb.numpy(), distance.numpy(), opacity.numpy(), starts.numpy()[1:]
+    _forward(spread(n), *rays, *ctx.tree, *tables, *ctx.numbers, np.float32(stop), *out)
+    ctx.save_for_backward(origins, directions, density, harmonics, rgb, distance, opacity, starts.cumsum_(0))
+    return rgb, distance, opacity
 
 
-def run(origins, directions, tree, density, harmonics, near, stop):
-    given = origins.contiguous(), directions.contiguous(), tree, density.contiguous(), harmonics.contiguous()
-    return _OctreeMarch.apply(*given, near, stop)
+def backward(ctx, *grads):
+    origins, directions, density, harmonics, *outputs = (x.detach().numpy() for x in ctx.saved_tensors)
+    starts = outputs[-1]
+    bases = np.zeros((len(origins), 16), np.float32)
+    rows, rays, order = (np.empty(starts[-1], np.int32) for _ in range(3))
+    shares = empty(int(starts[-1]), 4).numpy()
+    given = origins, directions, *ctx.tree, density, harmonics, *ctx.numbers, *outputs
+    _share(spread(len(origins)), *(g.contiguous().numpy() for g in grads), *given, bases, rows, rays, shares)
+    firsts = np.zeros(len(density) + 1, np.int64)
+    _sorted(rows, firsts, order)
+    to_density, to_harmonics = torch.zeros(density.shape), torch.zeros(harmonics.shape)
+    _sum(firsts, order, rays, shares, bases, to_density.numpy(), to_harmonics.numpy())
+    return None, None, None, to_density, to_harmonics, None, None
+
+
+run = differentiable(forward, backward)

@@ -5,64 +5,22 @@ from __future__ import annotations
 import torch
 import triton
 import triton.language as tl
-from torch import Tensor
 
-from .._dispatch import empty
-from ..octree_cells import Tree
-from ..octree_cells.gpu import cell_at, inside, leaf, leave, ray_of, row_in, through_cube
-from ..spherical_harmonics import K00, K1, K20, K21, K22, K30, K31, K32, K33
+from .._dispatch import differentiable, empty
+from .._rows_gpu import load_row, store_row
+from ..octree_cells.gpu import enter, inside, leaf, leave, row_in
+from ..spherical_harmonics.gpu import harmonic
 
-Y00, Y1, Y20, Y21, Y22 = (tl.constexpr(k) for k in (K00, K1, K20, K21, K22))
-Y30, Y31, Y32, Y33 = (tl.constexpr(k) for k in (K30, K31, K32, K33))
 BLOCK = 32  # rays
 
 
 @triton.jit
-def _harmonic(k: tl.constexpr, x, y, z):
-    """One of the sixteen harmonics of directions."""
-    if k == 0:
-        found = tl.zeros_like(x) + Y00
-    elif k == 1:
-        found = y * -Y1
-    elif k == 2:
-        found = z * Y1
-    elif k == 3:
-        found = x * -Y1
-    elif k == 4:
-        found = x * y * Y21
-    elif k == 5:
-        found = y * z * -Y21
-    elif k == 6:
-        found = (3 * z * z - 1) * Y20
-    elif k == 7:
-        found = x * z * -Y21
-    elif k == 8:
-        found = (x * x - y * y) * Y22
-    elif k == 9:
-        found = y * (3 * x * x - y * y) * -Y33
-    elif k == 10:
-        found = x * y * z * (2 * Y32)
-    elif k == 11:
-        found = y * (5 * z * z - 1) * -Y31
-    elif k == 12:
-        found = z * (5 * z * z - 3) * Y30
-    elif k == 13:
-        found = x * (5 * z * z - 1) * -Y31
-    elif k == 14:
-        found = z * (x * x - y * y) * Y32
-    else:
-        found = x * (x * x - 3 * y * y) * -Y33
-    return found
-
-
-@triton.jit
-def _colour(harmonics, row, held, x, y, z, BASIS: tl.constexpr):
+def _colour(harmonics, row, held, direction, BASIS: tl.constexpr):
     """What cells show along directions."""
-    red = tl.zeros_like(x)
-    green = tl.zeros_like(x)
-    blue = tl.zeros_like(x)
+    x, y, z = direction
+    red, green, blue = tl.zeros_like(x), tl.zeros_like(x), tl.zeros_like(x)
     for k in tl.static_range(BASIS):
-        basis = _harmonic(k, x, y, z)
+        basis = harmonic(k, x, y, z)
         at = harmonics + row * (3 * BASIS) + 3 * k
         red += basis * tl.load(at, mask=held, other=0.0)
         green += basis * tl.load(at + 1, mask=held, other=0.0)
@@ -77,12 +35,8 @@ def _forward(
 ):  # fmt: skip
     r = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
     here = r < R
-    ox, oy, oz, dx, dy, dz, ix, iy, iz = ray_of(origins, directions, r, here)
-    t, far = through_cube(ox, oy, oz, ix, iy, iz, near)
-    going = here & (t < far)
-    x = cell_at(ox + t * dx, 0, 1 << DEPTH, 2.0**DEPTH)
-    y = cell_at(oy + t * dy, 0, 1 << DEPTH, 2.0**DEPTH)
-    z = cell_at(oz + t * dz, 0, 1 << DEPTH, 2.0**DEPTH)
+    ray, t, going, cell = enter(origins, directions, r, here, near, DEPTH)
+    x, y, z = cell
     red = tl.zeros([BLOCK], tl.float32)
     green = tl.zeros([BLOCK], tl.float32)
     blue = tl.zeros([BLOCK], tl.float32)
@@ -91,13 +45,13 @@ def _forward(
     through = tl.zeros([BLOCK], tl.float32) + 1.0
     while tl.max(going.to(tl.int32), 0) > 0:
         value, shift = leaf(cells, x, y, z, going, DEPTH)
-        end, u, v, w = leave(x, y, z, shift, ox, oy, oz, dx, dy, dz, ix, iy, iz, t, DEPTH)
+        end, u, v, w = leave(x, y, z, shift, ray, t, DEPTH)
         row = row_in(named, value, going).to(tl.int64)
         held = row >= 0
         keep = tl.exp(-tl.load(density + row, mask=held, other=0.0) * tl.where(held, end - t, 0.0))
         weight = through * (1 - keep)
         through *= keep
-        r_, g_, b_ = _colour(harmonics, row, held, dx, dy, dz, BASIS)
+        r_, g_, b_ = _colour(harmonics, row, held, ray[1], BASIS)
         red += weight * r_
         green += weight * g_
         blue += weight * b_
@@ -105,9 +59,7 @@ def _forward(
         spent += weight
         going = going & inside(u, v, w, DEPTH) & (through >= stop)
         x, y, z, t = tl.where(going, u, 0), tl.where(going, v, 0), tl.where(going, w, 0), end
-    tl.store(rgb + 3 * r, red, mask=here)
-    tl.store(rgb + 3 * r + 1, green, mask=here)
-    tl.store(rgb + 3 * r + 2, blue, mask=here)
+    store_row(rgb, r, (red, green, blue), here)
     tl.store(distance + r, way, mask=here)
     tl.store(opacity + r, spent, mask=here)
 
@@ -121,15 +73,10 @@ def _backward(
     """dL/dtau_i = g_i T_{i+1} - sum_{j>i} g_j w_j, where g_i is what one unit of weight i is worth to the loss."""
     r = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
     here = r < R
-    ox, oy, oz, dx, dy, dz, ix, iy, iz = ray_of(origins, directions, r, here)
-    t, far = through_cube(ox, oy, oz, ix, iy, iz, near)
-    going = here & (t < far)
-    x = cell_at(ox + t * dx, 0, 1 << DEPTH, 2.0**DEPTH)
-    y = cell_at(oy + t * dy, 0, 1 << DEPTH, 2.0**DEPTH)
-    z = cell_at(oz + t * dz, 0, 1 << DEPTH, 2.0**DEPTH)
-    g_red = tl.load(d_rgb + 3 * r, mask=here, other=0.0)
-    g_green = tl.load(d_rgb + 3 * r + 1, mask=here, other=0.0)
-    g_blue = tl.load(d_rgb + 3 * r + 2, mask=here, other=0.0)
+    ray, t, going, cell = enter(origins, directions, r, here, near, DEPTH)
+    x, y, z = cell
+    dx, dy, dz = ray[1]
+    g_red, g_green, g_blue = load_row(d_rgb, r, here)
     g_distance = tl.load(d_distance + r, mask=here, other=0.0)
     g_opacity = tl.load(d_opacity + r, mask=here, other=0.0)
     behind = g_distance * tl.load(distance + r, mask=here, other=0.0)
@@ -140,14 +87,14 @@ def _backward(
     through = tl.zeros([BLOCK], tl.float32) + 1.0
     while tl.max(going.to(tl.int32), 0) > 0:
         value, shift = leaf(cells, x, y, z, going, DEPTH)
-        end, u, v, w = leave(x, y, z, shift, ox, oy, oz, dx, dy, dz, ix, iy, iz, t, DEPTH)
+        end, u, v, w = leave(x, y, z, shift, ray, t, DEPTH)
         row = row_in(named, value, going).to(tl.int64)
         held = row >= 0
         length = tl.where(held, end - t, 0.0)
         keep = tl.exp(-tl.load(density + row, mask=held, other=0.0) * length)
         weight = through * (1 - keep)
         through *= keep
-        red, green, blue = _colour(harmonics, row, held, dx, dy, dz, BASIS)
+        red, green, blue = _colour(harmonics, row, held, ray[1], BASIS)
         worth = g_opacity + g_distance * (0.5 * (t + end)) + g_red * red + g_green * green + g_blue * blue
         behind -= tl.where(held, worth * weight, 0.0)
         slope = (worth * through - behind) * length
@@ -156,7 +103,7 @@ def _backward(
         g_g = weight * g_green * green * (1 - green)
         g_b = weight * g_blue * blue * (1 - blue)
         for k in tl.static_range(BASIS):
-            basis = _harmonic(k, dx, dy, dz)
+            basis = harmonic(k, dx, dy, dz)
             at = to_harmonics + row * (3 * BASIS) + 3 * k
             tl.atomic_add(at, basis * g_r, mask=held, sem="relaxed")
             tl.atomic_add(at + 1, basis * g_g, mask=held, sem="relaxed")
@@ -165,34 +112,27 @@ def _backward(
         x, y, z, t = tl.where(going, u, 0), tl.where(going, v, 0), tl.where(going, w, 0), end
 
 
-class _OctreeMarch(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx, origins, directions, tree, density, harmonics, near, stop):
-        rays, device = len(origins), origins.device
-        out = empty(rays, 3, device=device), empty(rays, device=device), empty(rays, device=device)
-        ctx.numbers = rays, float(near), float(stop)
-        ctx.sizes = {"DEPTH": tree.depth, "BASIS": harmonics.shape[1], "BLOCK": BLOCK, "num_warps": 1}
-        ctx.tree = tree.cells.contiguous(), tree.named
-        if rays:
-            grid = (triton.cdiv(rays, BLOCK),)
-            _forward[grid](origins, directions, *ctx.tree, density, harmonics, *out, *ctx.numbers, **ctx.sizes)
-        ctx.save_for_backward(origins, directions, density, harmonics, *out)
-        return out
-
-    @staticmethod
-    @torch.autograd.function.once_differentiable
-    def backward(ctx, *grads):
-        origins, directions, density, harmonics, *out = ctx.saved_tensors
-        to_density, to_harmonics = torch.zeros_like(density), torch.zeros_like(harmonics)
-        if rays := len(origins):
-            given = origins, directions, *ctx.tree, density, harmonics, *out, to_density, to_harmonics
-            grid, slopes = (triton.cdiv(rays, BLOCK),), [g.contiguous() for g in grads]
-            _backward[grid](*slopes, *given, *ctx.numbers, **ctx.sizes)
-        return None, None, None, to_density, to_harmonics, None, None
+def forward(ctx, origins, directions, tree, density, harmonics, near, stop):
+    rays, device = len(origins), origins.device
+    out = empty(rays, 3, device=device), empty(rays, device=device), empty(rays, device=device)
+    ctx.numbers = rays, float(near), float(stop)
+    ctx.sizes = {"DEPTH": tree.depth, "BASIS": harmonics.shape[1], "BLOCK": BLOCK, "num_warps": 1}
+    ctx.tree = tree.cells.contiguous(), tree.named
+    if rays:
+        grid = (triton.cdiv(rays, BLOCK),)
+        _forward[grid](origins, directions, *ctx.tree, density, harmonics, *out, *ctx.numbers, **ctx.sizes)
+    ctx.save_for_backward(origins, directions, density, harmonics, *out)
+    return out
 
 
-def run(
-    origins: Tensor, directions: Tensor, tree: Tree, density: Tensor, harmonics: Tensor, near: float, stop: float
-) -> tuple[Tensor, Tensor, Tensor]:
-    given = origins.contiguous(), directions.contiguous(), tree, density.contiguous(), harmonics.contiguous()
-    return _OctreeMarch.apply(*given, near, stop)
+def backward(ctx, *grads):
+    origins, directions, density, harmonics, *out = ctx.saved_tensors
+    to_density, to_harmonics = torch.zeros_like(density), torch.zeros_like(harmonics)
+    if rays := len(origins):
+        given = origins, directions, *ctx.tree, density, harmonics, *out, to_density, to_harmonics
+        grid, slopes = (triton.cdiv(rays, BLOCK),), [g.contiguous() for g in grads]
+        _backward[grid](*slopes, *given, *ctx.numbers, **ctx.sizes)
+    return None, None, None, to_density, to_harmonics, None, None
+
+
+run = differentiable(forward, backward)

@@ -8,32 +8,101 @@ import torch
 from numba import get_num_threads, njit, prange
 
 from .._dispatch import empty
-from .lanes import BLOCK, TILE, added, gated, move, product, rectified, transpose
+from .._lanes import LANES, fetch_like, filled, highest, put, turn, where
 
 FAST = {"cache": True, "fastmath": True, "error_model": "numpy"}
-WIDE, NARROW = (0,) * TILE, (0,)  # their lengths tell the compiler how many outputs go together
+BLOCK = 32  # samples, whose values of one feature are lanes; a buffer has feature f of sample s at [f BLOCK + s]
+TILE = 8  # outputs that are summed up together: each weight that is read serves BLOCK products
+ROW = (0,) * BLOCK
+ZERO = np.float32(0)
 
 
 @njit(inline="always")
-def _fetch(planes, features, first, count, block, row):
+def _row(block, f):
+    return fetch_like(block, f * BLOCK, ROW)
+
+
+@njit(inline="always")
+def _as_it_is(total, block, gate):
+    return total
+
+
+@njit(inline="always")
+def _rectified(total, block, gate):
+    return highest(total, ZERO)
+
+
+@njit(inline="always")
+def _gated(total, block, gate):
+    return where(_row(block, gate) > ZERO, total, ZERO)
+
+
+@njit(inline="always")
+def _added(total, block, gate):
+    return total + _row(block, gate)
+
+
+@njit(inline="always")
+def _eight(values, x, depth, weights, w, down, across, out, y, gate, finish):
+    """`_product` of eight outputs, whose sums stay in registers."""
+    a = b = c = d = e = f = g = h = filled(ZERO, ROW)
+    for i in range(depth):
+        value, k = _row(values, x + i), w + down * i
+        a = a + weights[np.uint64(k)] * value
+        b = b + weights[np.uint64(k + across)] * value
+        c = c + weights[np.uint64(k + 2 * across)] * value
+        d = d + weights[np.uint64(k + 3 * across)] * value
+        e = e + weights[np.uint64(k + 4 * across)] * value
+        f = f + weights[np.uint64(k + 5 * across)] * value
+        g = g + weights[np.uint64(k + 6 * across)] * value
+        h = h + weights[np.uint64(k + 7 * across)] * value
+    put(out, y * BLOCK, finish(a, out, gate))
+    put(out, (y + 1) * BLOCK, finish(b, out, gate + 1))
+    put(out, (y + 2) * BLOCK, finish(c, out, gate + 2))
+    put(out, (y + 3) * BLOCK, finish(d, out, gate + 3))
+    put(out, (y + 4) * BLOCK, finish(e, out, gate + 4))
+    put(out, (y + 5) * BLOCK, finish(f, out, gate + 5))
+    put(out, (y + 6) * BLOCK, finish(g, out, gate + 6))
+    put(out, (y + 7) * BLOCK, finish(h, out, gate + 7))
+
+
+@njit(inline="always")
+def _product(values, x, depth, weights, w, down, across, count, out, y, gate, finish):
+    """y_o = finish(sum_i w_io x_i, gate_o) for `count` outputs o.
+
+    x_i is row x + i of `values`, y_o row y + o and gate_o row gate + o of `out`;
+    w_io is number w + down i + across o of `weights`.
+    """
+    whole = count - count % TILE
+    for o in range(0, whole, TILE):
+        _eight(values, x, depth, weights, w + across * o, down, across, out, y + o, gate + o, finish)
+    for o in range(whole, count):
+        total = filled(ZERO, ROW)
+        for i in range(depth):
+            total = total + weights[np.uint64(w + down * i + across * o)] * _row(values, x + i)
+        put(out, (y + o) * BLOCK, finish(total, out, gate + o))
+
+
+@njit(inline="always")
+def _fetch(planes, n, features, first, count, block, row):
     """Samples first to first + count of all features, into a block's rows; zeros after them."""
     for f in range(features):
         if count == BLOCK:
-            move(planes, f * planes.shape[1] + first, block, (row + f) * BLOCK)
+            put(block, (row + f) * BLOCK, fetch_like(planes, f * n + first, ROW))
         else:
             block[(row + f) * BLOCK : (row + f + 1) * BLOCK] = 0
             for s in range(count):
-                block[(row + f) * BLOCK + s] = planes[f, first + s]
+                block[(row + f) * BLOCK + s] = planes[f * n + first + s]
 
 
 @njit(inline="always")
-def _deliver(block, row, features, planes, first, count):
+def _deliver(block, row, features, planes, n, first, count):
     for f in range(features):
         if count == BLOCK:
-            move(block, (row + f) * BLOCK, planes, f * planes.shape[1] + first)
+            put(planes, f * n + first, _row(block, row + f))
         else:
             for s in range(count):
-                planes[f, first + s] = block[(row + f) * BLOCK + s]
+                planes[f * n + first + s] = block[(row + f) * BLOCK + s]
 
 
 @njit(inline="always")
@@ -41,79 +110,64 @@ def _upwards(block, weights, widths, rows, last):
     """All layers of one block; the last of the network has no ReLU."""
     begin = 0
     for layer in range(last):
-        depth, across = widths[layer], widths[layer + 1]
-        x, y, whole = rows[layer], rows[layer + 1], across - across % TILE
+        depth, across, x, y = widths[layer], widths[layer + 1], rows[layer], rows[layer + 1]
         if layer < len(widths) - 2:
-            for o in range(0, whole, TILE):
-                rectified(block, x, depth, weights, begin + o * depth, 1, depth, block, y + o, y + o, WIDE)
-            for o in range(whole, across):
-                rectified(block, x, depth, weights, begin + o * depth, 1, depth, block, y + o, y + o, NARROW)
+            _product(block, x, depth, weights, begin, 1, depth, across, block, y, y, _rectified)
         else:
-            for o in range(0, whole, TILE):
-                product(block, x, depth, weights, begin + o * depth, 1, depth, block, y + o, y + o, WIDE)
-            for o in range(whole, across):
-                product(block, x, depth, weights, begin + o * depth, 1, depth, block, y + o, y + o, NARROW)
+            _product(block, x, depth, weights, begin, 1, depth, across, block, y, y, _as_it_is)
         begin += depth * across
 
 
 @njit(inline="always")
 def _downwards(block, weights, begin, depth, across, slope, target, gate, ungated):
     """The gradient of one layer's inputs from that of its outputs."""
-    whole = across - across % TILE
     if ungated:
-        for i in range(0, whole, TILE):
-            product(block, slope, depth, weights, begin + i, across, 1, block, target + i, target + i, WIDE)
-        for i in range(whole, across):
-            product(block, slope, depth, weights, begin + i, across, 1, block, target + i, target + i, NARROW)
+        _product(block, slope, depth, weights, begin, across, 1, across, block, target, target, _as_it_is)
     else:
-        for i in range(0, whole, TILE):
-            gated(block, slope, depth, weights, begin + i, across, 1, block, target + i, gate + i, WIDE)
-        for i in range(whole, across):
-            gated(block, slope, depth, weights, begin + i, across, 1, block, target + i, gate + i, NARROW)
+        _product(block, slope, depth, weights, begin, across, 1, across, block, target, gate, _gated)
 
 
 @njit(inline="always")
 def _correlate(block, x, depth, slope, across, spare, sums, row):
     """Add one layer's weight gradient: sum_s slope_os x_is. `sums` holds BLOCK inputs i of output o in a row."""
-    whole = across - across % TILE
     for i in range(0, depth, BLOCK):
-        transpose(block, x + i, spare)
-        for o in range(0, whole, TILE):
-            added(block, spare, BLOCK, block, (slope + o) * BLOCK, 1, BLOCK, sums, row + o, row + o, WIDE)
-        for o in range(whole, across):
-            added(block, spare, BLOCK, block, (slope + o) * BLOCK, 1, BLOCK, sums, row + o, row + o, NARROW)
+        for down in range(0, BLOCK, LANES):
+            for right in range(0, BLOCK, LANES):
+                turn(block, (x + i + down) * BLOCK + right, (spare + right) * BLOCK + down, BLOCK)
+        _product(block, spare, BLOCK, block, slope * BLOCK, 1, BLOCK, across, sums, row, row, _added)
         row += across
 
 
 @njit(parallel=True, **FAST)
-def _forward(x, weights, widths, rows, share, out):
-    n, layers = x.shape[1], len(widths) - 1
+def _forward(x, n, weights, widths, rows, share, out):
+    layers = len(widths) - 1
     for part in prange((n + share - 1) // share):
         block = np.empty(rows[-1] * BLOCK, np.float32)
         stop = min(n, (part + 1) * share)
         for first in range(part * share, stop, BLOCK):
             count = min(BLOCK, stop - first)
-            _fetch(x, widths[0], first, count, block, 0)
+            _fetch(x, n, widths[0], first, count, block, 0)
             _upwards(block, weights, widths, rows, layers)
-            _deliver(block, rows[layers], widths[layers], out, first, count)
+            _deliver(block, rows[layers], widths[layers], out, n, first, count)
 
 
 @njit(parallel=True, **FAST)
-def _backward(grad, x, weights, widths, rows, share, to_x, sums):
+def _backward(grad, x, n, weights, widths, rows, share, inputs, to_x, sums):
     """A block holds each layer's values, then each layer's gradients, then what `_correlate` turns over.
 
+    inputs: how many of the network's have a gradient, all or none
     sums: one for each part; those of a layer's weights for BLOCK inputs follow those of all layers before it
     """
-    n, layers, total = x.shape[1], len(widths) - 1, rows[-1]
+    layers, total = len(widths) - 1, rows[-1]
     for part in prange((n + share - 1) // share):
         block = np.zeros((2 * total + 3 * BLOCK) * BLOCK, np.float32)
         mine = np.zeros(sums.shape[1], np.float32)
         stop = min(n, (part + 1) * share)
         for first in range(part * share, stop, BLOCK):
             count = min(BLOCK, stop - first)
-            _fetch(x, widths[0], first, count, block, 0)
+            _fetch(x, n, widths[0], first, count, block, 0)
             _upwards(block, weights, widths, rows, layers - 1)
-            _fetch(grad, widths[layers], first, count, block, total + rows[layers])
+            _fetch(grad, n, widths[layers], first, count, block, total + rows[layers])
             begin, row = len(weights), len(mine) // BLOCK
             for layer in range(layers - 1, -1, -1):
                 depth, across = widths[layer], widths[layer + 1]
@@ -121,9 +175,9 @@ def _backward(grad, x, weights, widths, rows, share, to_x, sums):
                 begin -= depth * across
                 row -= (depth + BLOCK - 1) // BLOCK * across
                 _correlate(block, rows[layer], depth, slope, across, 2 * total + BLOCK, mine, row)
-                if layer or len(to_x):
+                if layer or inputs:
                     _downwards(block, weights, begin, across, depth, slope, target, rows[layer], layer == 0)
-            _deliver(block, total, len(to_x), to_x, first, count)
+            _deliver(block, total, inputs, to_x, n, first, count)
         sums[part] = mine
 
 
@@ -133,7 +187,7 @@ class _Perceptron(torch.autograd.Function):
         planes = x.detach().t().contiguous()
         shape = _shape(weights)
         out = empty(len(weights[-1]), len(x))
-        _forward(planes.numpy(), *shape, _share(len(x)), out.numpy())
+        _forward(planes.numpy().reshape(-1), len(x), *shape, _share(len(x)), out.numpy().reshape(-1))
         ctx.save_for_backward(planes, *weights)
         return out.t()
 
@@ -145,7 +199,17 @@ class _Perceptron(torch.autograd.Function):
         to_x = empty(len(x) if ctx.needs_input_grad[0] else 0, n)
         heights = [-(-w.shape[1] // BLOCK) * len(w) for w in weights]
         sums = torch.zeros(max(1, -(-n // share)), sum(heights) * BLOCK)
-        _backward(grad.t().contiguous().numpy(), x.numpy(), flat, widths, rows, share, to_x.numpy(), sums.numpy())
+        given = (
+            grad.t().contiguous().numpy().reshape(-1),
+            x.numpy().reshape(-1),
+            n,
+            flat,
+            widths,
+            rows,
+            share,
+            len(to_x),
+        )
+        _backward(*given, to_x.numpy().reshape(-1), sums.numpy())
         parts = sums.sum(0).view(-1, BLOCK).split(heights)
         to_weights = [
             part.view(-1, len(w), BLOCK).transpose(0, 1).reshape(len(w), -1)[:, : w.shape[1]]

@@ -1,11 +1,8 @@
-"""Faults that the tests write into a copy of an engine, one at a time, to see their comparison turn red.
-
-By name: the engine, the function, what stands there, and what is put in its place.
-"""
+"""Seeded faults by name: the engine, the function, a piece of it, and what is put in its place."""
 
 FAULTS = {
     "a layer that no gate closes": ("cpu", "_backward", "layer == 0)", "True)"),
-    "the wrong gate": ("cpu", "_downwards", "gate + i", "target + i"),
+    "the wrong gate": ("cpu", "_downwards", "target, gate, _gated", "target, target, _gated"),
     "the last block's rest counted twice": (
         "cpu",
         "_fetch",
@@ -16,5 +13,5 @@ FAULTS = {
 
 # These let an index leave its array.
 ASTRAY = {
-    "a tile too many": ("cpu", "_downwards", "whole = across - across % TILE\n", "whole = across\n"),
+    "a tile too many": ("cpu", "_product", "whole = count - count % TILE\n", "whole = count\n"),
 }

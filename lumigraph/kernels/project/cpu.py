@@ -3,10 +3,9 @@
 import math
 
 import numpy as np
-import torch
 from numba import njit, prange
 
-from .._dispatch import empty
+from .._dispatch import differentiable, empty
 from ..spherical_harmonics.cpu import basis, slope
 from . import FAINTEST
 
@@ -285,26 +284,21 @@ def _backward(
             to_means[i, 2] = to_mean[2] + (tz - dz * inward) / distance
 
 
-class _Project(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx, means, quaternions, scales, opacities, harmonics, view, bands, blur, compensate):
-        n, inputs = len(means), (means, quaternions, scales, opacities, harmonics)
-        ctx.numbers = view.numbers().float().numpy(), bands, np.float32(blur), compensate
-        results = empty(n, 2), empty(n, 3), empty(n), empty(n, 3), empty(n)
-        _forward(*(x.detach().numpy() for x in inputs), *ctx.numbers, *(x.numpy() for x in results))
-        ctx.save_for_backward(*inputs, results[3], results[4])
-        return results
-
-    @staticmethod
-    @torch.autograd.function.once_differentiable
-    def backward(ctx, *grads):
-        *inputs, colours, seen = (x.detach().numpy() for x in ctx.saved_tensors)
-        results = [empty(*x.shape) for x in inputs]
-        given = (x.contiguous().numpy() for x in grads)
-        _backward(*given, *inputs, *ctx.numbers, colours, seen, *(x.numpy() for x in results))
-        return *results, None, None, None, None
+def forward(ctx, means, quaternions, scales, opacities, harmonics, view, bands, blur, compensate):
+    n, inputs = len(means), (means, quaternions, scales, opacities, harmonics)
+    ctx.numbers = view.numbers().float().numpy(), bands, np.float32(blur), compensate
+    results = empty(n, 2), empty(n, 3), empty(n), empty(n, 3), empty(n)
+    _forward(*(x.detach().numpy() for x in inputs), *ctx.numbers, *(x.numpy() for x in results))
+    ctx.save_for_backward(*inputs, results[3], results[4])
+    return results
 
 
-def run(means, quaternions, scales, opacities, harmonics, view, bands, blur, compensate):
-    tensors = (x.contiguous() for x in (means, quaternions, scales, opacities, harmonics))
-    return _Project.apply(*tensors, view, bands, blur, compensate)
+def backward(ctx, *grads):
+    *inputs, colours, seen = (x.detach().numpy() for x in ctx.saved_tensors)
+    results = [empty(*x.shape) for x in inputs]
+    given = (x.contiguous().numpy() for x in grads)
+    _backward(*given, *inputs, *ctx.numbers, colours, seen, *(x.numpy() for x in results))
+    return *results, None, None, None, None
+
+
+run = differentiable(forward, backward)

@@ -18,27 +18,14 @@ C = T T^T + blur I = (a b; b c), K = C^-1 the conic; T_0 and T_1 are a matrix's 
 
 from __future__ import annotations
 
-import torch
 import triton
 import triton.language as tl
-from torch import Tensor
 
-from .._dispatch import empty
-from ..spherical_harmonics import K00 as _K00
-from ..spherical_harmonics import K1 as _K1
-from ..spherical_harmonics import K20 as _K20
-from ..spherical_harmonics import K21 as _K21
-from ..spherical_harmonics import K22 as _K22
-from ..spherical_harmonics import K30 as _K30
-from ..spherical_harmonics import K31 as _K31
-from ..spherical_harmonics import K32 as _K32
-from ..spherical_harmonics import K33 as _K33
+from .._dispatch import differentiable, empty
+from .._rows_gpu import load_row, store_row
+from ..spherical_harmonics.gpu import harmonic, harmonic_slope
 from . import FAINTEST as _FAINTEST
-from . import View
 
-K00, K1 = tl.constexpr(_K00), tl.constexpr(_K1)
-K20, K21, K22 = tl.constexpr(_K20), tl.constexpr(_K21), tl.constexpr(_K22)
-K30, K31, K32, K33 = tl.constexpr(_K30), tl.constexpr(_K31), tl.constexpr(_K32), tl.constexpr(_K33)
 FAINTEST, LEAST_SHARE = tl.constexpr(_FAINTEST), tl.constexpr(1e-8)
 # Where the parts of a view begin in View.numbers()
 EYE, FOCAL, CENTRE, DISTORTION = tl.constexpr(9), tl.constexpr(12), tl.constexpr(14), tl.constexpr(16)
@@ -49,19 +36,9 @@ BLOCK = 128
 
 
 @triton.jit
-def _load(pointer, i, here):
-    x = tl.load(pointer + 3 * i, mask=here, other=0.0)
-    y = tl.load(pointer + 3 * i + 1, mask=here, other=0.0)
-    z = tl.load(pointer + 3 * i + 2, mask=here, other=0.0)
-    return x, y, z
-
-
-@triton.jit
 def _store(pointer, i, v, seen, here):
     """A row of three, zero where not seen."""
-    tl.store(pointer + 3 * i, tl.where(seen, v[0], 0.0), mask=here)
-    tl.store(pointer + 3 * i + 1, tl.where(seen, v[1], 0.0), mask=here)
-    tl.store(pointer + 3 * i + 2, tl.where(seen, v[2], 0.0), mask=here)
+    store_row(pointer, i, (tl.where(seen, v[0], 0.0), tl.where(seen, v[1], 0.0), tl.where(seen, v[2], 0.0)), here)
 
 
 @triton.jit
@@ -97,14 +74,14 @@ def _across(v, M):
 
 @triton.jit
 def _rotation(view):
-    return _load(view, 0, True), _load(view, 1, True), _load(view, 2, True)
+    return load_row(view, 0, True), load_row(view, 1, True), load_row(view, 2, True)
 
 
 @triton.jit
 def _unit(quaternions, i, here):
     """A unit quaternion (w, x, y, z), and 1 over the length that it had."""
     w = tl.load(quaternions + 4 * i, mask=here, other=1.0)
-    x, y, z = _load(quaternions + i + 1, i, here)
+    x, y, z = load_row(quaternions + i + 1, i, here)
     inverse = 1 / tl.maximum(tl.sqrt(w * w + x * x + y * y + z * z), 1e-12)
     return (w * inverse, x * inverse, y * inverse, z * inverse), inverse
 
@@ -240,89 +217,12 @@ def _covariance_backward(T, d_conic, d_share, blur):
 
 
 @triton.jit
-def _harmonic(k: tl.constexpr, x, y, z):
-    """Y_k, as `spherical_harmonics`."""
-    if k == 0:
-        Y = K00 + 0 * x
-    elif k == 1:
-        Y = y * -K1
-    elif k == 2:
-        Y = z * K1
-    elif k == 3:
-        Y = x * -K1
-    elif k == 4:
-        Y = x * y * K21
-    elif k == 5:
-        Y = y * z * -K21
-    elif k == 6:
-        Y = (3 * z * z - 1) * K20
-    elif k == 7:
-        Y = x * z * -K21
-    elif k == 8:
-        Y = (x * x - y * y) * K22
-    elif k == 9:
-        Y = y * (3 * x * x - y * y) * -K33
-    elif k == 10:
-        Y = x * y * z * (2 * K32)
-    elif k == 11:
-        Y = y * (5 * z * z - 1) * -K31
-    elif k == 12:
-        Y = z * (5 * z * z - 3) * K30
-    elif k == 13:
-        Y = x * (5 * z * z - 1) * -K31
-    elif k == 14:
-        Y = z * (x * x - y * y) * K32
-    else:
-        Y = x * (x * x - 3 * y * y) * -K33
-    return Y
-
-
-@triton.jit
-def _slope(k: tl.constexpr, x, y, z):
-    """The gradient of Y_k in x, y and z."""
-    zero = 0 * x
-    if k == 0:
-        slope = zero, zero, zero
-    elif k == 1:
-        slope = zero, zero - K1, zero
-    elif k == 2:
-        slope = zero, zero, zero + K1
-    elif k == 3:
-        slope = zero - K1, zero, zero
-    elif k == 4:
-        slope = y * K21, x * K21, zero
-    elif k == 5:
-        slope = zero, z * -K21, y * -K21
-    elif k == 6:
-        slope = zero, zero, z * (6 * K20)
-    elif k == 7:
-        slope = z * -K21, zero, x * -K21
-    elif k == 8:
-        slope = x * (2 * K22), y * (-2 * K22), zero
-    elif k == 9:
-        slope = x * y * (-6 * K33), (x * x - y * y) * (-3 * K33), zero
-    elif k == 10:
-        slope = y * z * (2 * K32), x * z * (2 * K32), x * y * (2 * K32)
-    elif k == 11:
-        slope = zero, (5 * z * z - 1) * -K31, y * z * (-10 * K31)
-    elif k == 12:
-        slope = zero, zero, (5 * z * z - 1) * (3 * K30)
-    elif k == 13:
-        slope = (5 * z * z - 1) * -K31, zero, x * z * (-10 * K31)
-    elif k == 14:
-        slope = x * z * (2 * K32), y * z * (-2 * K32), (x * x - y * y) * K32
-    else:
-        slope = (x * x - y * y) * (-3 * K33), x * y * (6 * K33), zero
-    return slope
-
-
-@triton.jit
 def _colour(harmonics, i, d, seen, K: tl.constexpr, BANDS: tl.constexpr):
     """1/2 + sum_k Y_k(d) h_k, before what is negative is cut off."""
     half = 0.5 + 0 * d[0]
     colour = half, half, half
     for k in tl.static_range(BANDS * BANDS):
-        colour = _mix(1.0, colour, _harmonic(k, d[0], d[1], d[2]), _load(harmonics, K * i + k, seen))
+        colour = _mix(1.0, colour, harmonic(k, d[0], d[1], d[2]), load_row(harmonics, K * i + k, seen))
     return colour
 
 
@@ -361,13 +261,13 @@ def _forward(
     i = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
     here = i < N
     R = _rotation(view)
-    v = _mix(1.0, _load(means, i, here), -1.0, _load(view + EYE, 0, True))
+    v = _mix(1.0, load_row(means, i, here), -1.0, load_row(view + EYE, 0, True))
     p = _apply(R, v)
     seen = here & (p[2] > tl.load(view + NEAR))
     z = tl.where(seen, p[2], 1.0)
     u, _, J = _lens(p[0] / z, p[1] / z, z, view)
     q, _ = _unit(quaternions, i, here)
-    L = _stretched(_matrix(q), _load(scales, i, here))
+    L = _stretched(_matrix(q), load_row(scales, i, here))
     T = _across(_across(J[0], R), L), _across(_across(J[1], R), L)
     a, b, c, det, n = _covariance(T, blur)
     opacity = tl.load(opacities + i, mask=here, other=0.0)
@@ -419,13 +319,13 @@ def _backward(
     here = i < N
     seen = tl.load(depths + i, mask=here, other=0.0) > 0  # what is not seen has depth zero, and all gradients zero
     R = _rotation(view)
-    v = _mix(1.0, _load(means, i, seen), -1.0, _load(view + EYE, 0, True))
+    v = _mix(1.0, load_row(means, i, seen), -1.0, load_row(view + EYE, 0, True))
     p = _apply(R, v)
     z = tl.where(seen, p[2], 1.0)
     X, Y = p[0] / z, p[1] / z
     _, S, J = _lens(X, Y, z, view)
     q, inverse = _unit(quaternions, i, seen)
-    Q, s = _matrix(q), _load(scales, i, seen)
+    Q, s = _matrix(q), load_row(scales, i, seen)
     L = _stretched(Q, s)
     N0, N1 = _across(J[0], R), _across(J[1], R)
     T = _across(N0, L), _across(N1, L)
@@ -439,7 +339,7 @@ def _backward(
         opacity = tl.load(opacities + i, mask=seen, other=0.0)
         d_share = tl.where(share > LEAST_SHARE, 0.5 * d_opacity * opacity / root, 0.0)
         d_opacity *= root
-    d_T = _covariance_backward(T, _load(d_conics, i, seen), d_share, blur)
+    d_T = _covariance_backward(T, load_row(d_conics, i, seen), d_share, blur)
     d_L0 = _mix(N0[0], d_T[0], N1[0], d_T[1])
     d_L1 = _mix(N0[1], d_T[0], N1[1], d_T[1])
     d_L2 = _mix(N0[2], d_T[0], N1[2], d_T[1])
@@ -450,14 +350,14 @@ def _backward(
     d_v = _across((d_p[0], d_p[1], d_p[2] + tl.load(d_depths + i, mask=seen, other=0.0)), R)
 
     d, shrink = _direction(v)
-    colour, g = _load(colours, i, seen), _load(d_colours, i, seen)
+    colour, g = load_row(colours, i, seen), load_row(d_colours, i, seen)
     g = tl.where(colour[0] > 0, g[0], 0.0), tl.where(colour[1] > 0, g[1], 0.0), tl.where(colour[2] > 0, g[2], 0.0)
     d_d = 0 * z, 0 * z, 0 * z
     for k in tl.static_range(K):
         if k < BANDS * BANDS:
-            worth = _dot(g, _load(harmonics, K * i + k, seen))
-            d_d = _mix(1.0, d_d, worth, _slope(k, d[0], d[1], d[2]))
-            Y_k = _harmonic(k, d[0], d[1], d[2])
+            worth = _dot(g, load_row(harmonics, K * i + k, seen))
+            d_d = _mix(1.0, d_d, worth, harmonic_slope(k, d[0], d[1], d[2]))
+            Y_k = harmonic(k, d[0], d[1], d[2])
             _store(d_harmonics, K * i + k, (Y_k * g[0], Y_k * g[1], Y_k * g[2]), seen, here)
         else:
             _store(d_harmonics, K * i + k, g, False, here)
@@ -474,39 +374,24 @@ def _backward(
     tl.store(d_opacities + i, tl.where(seen, d_opacity, 0.0), mask=here)
 
 
-class _Project(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx, means, quaternions, scales, opacities, harmonics, camera, bands, blur, compensate):
-        inputs = means, quaternions, scales, opacities, harmonics, camera
-        count, device = len(means), means.device
-        outputs = [empty(*shape, device=device) for shape in ((count, 2), (count, 3), (count,), (count, 3), (count,))]
-        options = {"K": harmonics.shape[1], "BANDS": bands, "COMPENSATE": compensate, "BLOCK": BLOCK}
-        ctx.grid, ctx.rest, ctx.options = (triton.cdiv(count, BLOCK),), (count, float(blur)), options
-        if count:
-            _forward[ctx.grid](*inputs, *outputs, *ctx.rest, **options)
-        ctx.save_for_backward(*inputs, outputs[2], outputs[3])
-        return tuple(outputs)
-
-    @staticmethod
-    @torch.autograd.function.once_differentiable
-    def backward(ctx, *grads):
-        saved = ctx.saved_tensors
-        found = [empty(*x.shape, device=x.device) for x in saved[:5]]
-        if len(saved[0]):
-            _backward[ctx.grid](*(g.contiguous() for g in grads), *saved, *found, *ctx.rest, **ctx.options)
-        return *found, None, None, None, None
+def forward(ctx, means, quaternions, scales, opacities, harmonics, view, bands, blur, compensate):
+    inputs = means, quaternions, scales, opacities, harmonics, view.numbers().to(means)
+    count, device = len(means), means.device
+    outputs = [empty(*shape, device=device) for shape in ((count, 2), (count, 3), (count,), (count, 3), (count,))]
+    options = {"K": harmonics.shape[1], "BANDS": bands, "COMPENSATE": compensate, "BLOCK": BLOCK}
+    ctx.grid, ctx.rest, ctx.options = (triton.cdiv(count, BLOCK),), (count, float(blur)), options
+    if count:
+        _forward[ctx.grid](*inputs, *outputs, *ctx.rest, **options)
+    ctx.save_for_backward(*inputs, outputs[2], outputs[3])
+    return tuple(outputs)
 
 
-def run(
-    means: Tensor,
-    quaternions: Tensor,
-    scales: Tensor,
-    opacities: Tensor,
-    harmonics: Tensor,
-    view: View,
-    bands: int,
-    blur: float,
-    compensate: bool,
-) -> tuple[Tensor, ...]:
-    tensors = (x.contiguous() for x in (means, quaternions, scales, opacities, harmonics))
-    return _Project.apply(*tensors, view.numbers().to(means), bands, blur, compensate)
+def backward(ctx, *grads):
+    saved = ctx.saved_tensors
+    found = [empty(*x.shape, device=x.device) for x in saved[:5]]
+    if len(saved[0]):
+        _backward[ctx.grid](*(g.contiguous() for g in grads), *saved, *found, *ctx.rest, **ctx.options)
+    return *found, None, None, None, None
+
+
+run = differentiable(forward, backward)

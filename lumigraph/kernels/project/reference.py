@@ -5,8 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from ...camera.lens import bend
 from ...geometry import to_matrix
-from ...lens import bend
 from ..spherical_harmonics.reference import run as harmonics_of
 from . import FAINTEST, View
 

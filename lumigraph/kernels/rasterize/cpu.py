@@ -8,10 +8,9 @@ the order of tiles, so that no two threads add to one place and the result is th
 import math
 
 import numpy as np
-import torch
 from numba import get_num_threads, njit, prange
 
-from .._dispatch import empty
+from .._dispatch import differentiable, empty
 from .._lanes import bytes_between, exp2, fetch, first_bit, highest, inverse, lowest, put, root, some, totals, where
 from ..project import FAINTEST as FAINTEST_
 from ..project import OPAQUEST as OPAQUEST_
@@ -252,35 +251,30 @@ def _shares(work):
     return np.concatenate([[0], cuts, [len(work)]])
 
 
-class _Rasterize(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx, centres, conics, opacities, colours, depths, tiles, stop):
-        width, height = tiles.size
-        order, starts = tiles.order.numpy(), tiles.starts.numpy()
-        rows = np.empty(len(centres) * LANES, np.float32)
-        _pack(*(x.detach().numpy() for x in (centres, conics, opacities, colours, depths)), rows)
-        rgb, depth, opacity = empty(height, width, 3), empty(height, width), empty(height, width)
-        work = np.diff(starts) + TILE
-        masks, visits = np.empty(len(order), np.uint64), np.empty(len(work), np.int64)
-        ctx.numbers = tiles.size, tiles.side, np.float32(stop), TABLE
-        pictures = (x.numpy() for x in (rgb, depth, opacity))
-        _forward(rows, order, starts, _shares(work), *ctx.numbers, *pictures, masks, visits)
-        ctx.kept = rows, order, starts, masks, _shares(visits + PAIR * work)
-        ctx.save_for_backward(rgb, depth, opacity, conics, opacities)
-        return rgb, depth, opacity
-
-    @staticmethod
-    @torch.autograd.function.once_differentiable
-    def backward(ctx, *grads):
-        (rows, order, starts, masks, shares), saved = ctx.kept, [x.detach().numpy() for x in ctx.saved_tensors]
-        n, sums = len(saved[3]), np.empty(len(order) * LANES, np.float32)
-        given = (x.contiguous().numpy() for x in grads)
-        _backward(*given, *saved[:3], rows, order, starts, shares, *ctx.numbers, masks, sums)
-        results = empty(n, 2), empty(n, 3), empty(n), empty(n, 3), empty(n)
-        _gather(sums, masks, order, *saved[3:], get_num_threads(), *(x.numpy() for x in results))
-        return *results, None, None
+def forward(ctx, centres, conics, opacities, colours, depths, tiles, stop):
+    width, height = tiles.size
+    order, starts = tiles.order.numpy(), tiles.starts.numpy()
+    rows = np.empty(len(centres) * LANES, np.float32)
+    _pack(*(x.detach().numpy() for x in (centres, conics, opacities, colours, depths)), rows)
+    rgb, depth, opacity = empty(height, width, 3), empty(height, width), empty(height, width)
+    work = np.diff(starts) + TILE
+    masks, visits = np.empty(len(order), np.uint64), np.empty(len(work), np.int64)
+    ctx.numbers = tiles.size, tiles.side, np.float32(stop), TABLE
+    pictures = (x.numpy() for x in (rgb, depth, opacity))
+    _forward(rows, order, starts, _shares(work), *ctx.numbers, *pictures, masks, visits)
+    ctx.kept = rows, order, starts, masks, _shares(visits + PAIR * work)
+    ctx.save_for_backward(rgb, depth, opacity, conics, opacities)
+    return rgb, depth, opacity
 
 
-def run(centres, conics, opacities, colours, depths, tiles, stop):
-    tensors = (x.contiguous() for x in (centres, conics, opacities, colours, depths))
-    return _Rasterize.apply(*tensors, tiles, stop)
+def backward(ctx, *grads):
+    (rows, order, starts, masks, shares), saved = ctx.kept, [x.detach().numpy() for x in ctx.saved_tensors]
+    n, sums = len(saved[3]), np.empty(len(order) * LANES, np.float32)
+    given = (x.contiguous().numpy() for x in grads)
+    _backward(*given, *saved[:3], rows, order, starts, shares, *ctx.numbers, masks, sums)
+    results = empty(n, 2), empty(n, 3), empty(n), empty(n, 3), empty(n)
+    _gather(sums, masks, order, *saved[3:], get_num_threads(), *(x.numpy() for x in results))
+    return *results, None, None
+
+
+run = differentiable(forward, backward)

@@ -9,12 +9,11 @@ from __future__ import annotations
 import torch
 import triton
 import triton.language as tl
-from torch import Tensor
 
-from .._dispatch import empty
+from .._dispatch import differentiable, empty
+from .._rows_gpu import load_row, store_row
 from ..project import FAINTEST as _FAINTEST
 from ..project import OPAQUEST as _OPAQUEST
-from ..tile import Tiles
 
 FAINTEST, OPAQUEST = tl.constexpr(_FAINTEST), tl.constexpr(_OPAQUEST)
 SQUARE = 16  # pixels along a program's share of a tile, at most
@@ -39,12 +38,8 @@ def _gaussians(i, here, order, centres, conics, opacities, colours, depths):
     """Numbers, centres, conics, opacities and values of the tile's Gaussians at i; opacity 0 after the last."""
     n = tl.load(order + i, mask=here, other=0).to(tl.int64)
     cx, cy = tl.load(centres + 2 * n, mask=here, other=0.0), tl.load(centres + 2 * n + 1, mask=here, other=0.0)
-    a = tl.load(conics + 3 * n, mask=here, other=0.0)
-    b = tl.load(conics + 3 * n + 1, mask=here, other=0.0)
-    c = tl.load(conics + 3 * n + 2, mask=here, other=0.0)
-    red = tl.load(colours + 3 * n, mask=here, other=0.0)
-    green = tl.load(colours + 3 * n + 1, mask=here, other=0.0)
-    blue = tl.load(colours + 3 * n + 2, mask=here, other=0.0)
+    a, b, c = load_row(conics, n, here)
+    red, green, blue = load_row(colours, n, here)
     opacity, depth = tl.load(opacities + n, mask=here, other=0.0), tl.load(depths + n, mask=here, other=0.0)
     return n, (cx, cy), (a, b, c), opacity, (red, green, blue, depth)
 
@@ -74,9 +69,7 @@ def _light(dx, dy, conic, opacity, through, stop):
 @triton.jit
 def _of_pixel(picture, depth, weight, at, inside):
     """What the outputs, or their gradients, hold for each pixel."""
-    red = tl.load(picture + 3 * at, mask=inside, other=0.0)
-    green = tl.load(picture + 3 * at + 1, mask=inside, other=0.0)
-    blue = tl.load(picture + 3 * at + 2, mask=inside, other=0.0)
+    red, green, blue = load_row(picture, at, inside)
     return red, green, blue, tl.load(depth + at, mask=inside, other=0.0), tl.load(weight + at, mask=inside, other=0.0)
 
 
@@ -116,9 +109,7 @@ def _forward(
         sum_w += tl.sum(w, 0)
         through = tl.min(behind, 0)  # it only ever grows darker
         first += GAUSSIANS
-    tl.store(picture + 3 * at, red, mask=inside)
-    tl.store(picture + 3 * at + 1, green, mask=inside)
-    tl.store(picture + 3 * at + 2, blue, mask=inside)
+    store_row(picture, at, (red, green, blue), inside)
     tl.store(depth + at, sum_depth, mask=inside)
     tl.store(weight + at, sum_w, mask=inside)
 
@@ -189,31 +180,24 @@ def _backward(
         first += GAUSSIANS
 
 
-class _Rasterize(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx, centres, conics, opacities, colours, depths, tiles, stop):
-        (width, height), device = tiles.size, centres.device
-        inputs = centres, conics, opacities, colours, depths, tiles.order, tiles.starts
-        outputs = [empty(*shape, device=device) for shape in ((height, width, 3), (height, width), (height, width))]
-        square = min(tiles.side, SQUARE)
-        ctx.grid = (tiles.across * tiles.down * (tiles.side // square) ** 2,)
-        ctx.rest = width, height, max(float(stop), DARK)
-        ctx.options = {"SIDE": tiles.side, "SQUARE": square, "GAUSSIANS": GAUSSIANS}
-        _forward[ctx.grid](*inputs, *outputs, *ctx.rest, **ctx.options)
-        ctx.save_for_backward(*inputs, *outputs)
-        return tuple(outputs)
-
-    @staticmethod
-    @torch.autograd.function.once_differentiable
-    def backward(ctx, *grads):
-        saved = ctx.saved_tensors
-        found = [torch.zeros_like(x) for x in saved[:5]]
-        _backward[ctx.grid](*(g.contiguous() for g in grads), *saved, *found, *ctx.rest, **ctx.options)
-        return *found, None, None
+def forward(ctx, centres, conics, opacities, colours, depths, tiles, stop):
+    (width, height), device = tiles.size, centres.device
+    inputs = centres, conics, opacities, colours, depths, tiles.order, tiles.starts
+    outputs = [empty(*shape, device=device) for shape in ((height, width, 3), (height, width), (height, width))]
+    square = min(tiles.side, SQUARE)
+    ctx.grid = (tiles.across * tiles.down * (tiles.side // square) ** 2,)
+    ctx.rest = width, height, max(float(stop), DARK)
+    ctx.options = {"SIDE": tiles.side, "SQUARE": square, "GAUSSIANS": GAUSSIANS}
+    _forward[ctx.grid](*inputs, *outputs, *ctx.rest, **ctx.options)
+    ctx.save_for_backward(*inputs, *outputs)
+    return tuple(outputs)
 
 
-def run(
-    centres: Tensor, conics: Tensor, opacities: Tensor, colours: Tensor, depths: Tensor, tiles: Tiles, stop: float
-) -> tuple[Tensor, Tensor, Tensor]:
-    tensors = (x.contiguous() for x in (centres, conics, opacities, colours, depths))
-    return _Rasterize.apply(*tensors, tiles, stop)
+def backward(ctx, *grads):
+    saved = ctx.saved_tensors
+    found = [torch.zeros_like(x) for x in saved[:5]]
+    _backward[ctx.grid](*(g.contiguous() for g in grads), *saved, *found, *ctx.rest, **ctx.options)
+    return *found, None, None
+
+
+run = differentiable(forward, backward)

@@ -17,7 +17,7 @@ FACTS = Facts(unit="samples", outputs=1, differentiable=(0, 2), typical=2, compi
 
 @dataclass(frozen=True)
 class Nodes:
-    """Which row of a table belongs to each node of a grid over the unit cube; made by `of`, `all` or `part`.
+    """Table row of each node of a grid over the unit cube; made by `of`, `all` or `part`.
 
     The nodes (x, y, z) of a grid of X Y Z of them stand at (x / (X - 1), y / (Y - 1), z / (Z - 1)), the first and the
     last on the cube's faces. A node's number is (x Y + y) Z + z.
@@ -114,7 +114,7 @@ def some_nodes(shape: tuple[int, int, int], share: float, generator: torch.Gener
 
 
 def shell(n: int) -> Nodes:
-    """Those of n^3 nodes that are at distances from 0.3 to 0.36 from the cube's middle."""
+    """Nodes of n^3 at distances from 0.3 to 0.36 from the cube's middle."""
     place = torch.linspace(-0.5, 0.5, n)
     radius = (place[:, None, None] ** 2 + place[:, None] ** 2 + place**2).sqrt()
     return Nodes.of(((radius > 0.3) & (radius < 0.36)).flatten().nonzero()[:, 0], (n, n, n))

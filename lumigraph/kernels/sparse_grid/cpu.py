@@ -5,7 +5,7 @@ import numpy as np
 import torch
 from numba import njit, prange
 
-from .._dispatch import empty
+from .._dispatch import differentiable, empty
 
 ZERO, ONE = np.float32(0), np.float32(1)
 SLABS = 32  # that a grid is cut into at most, however many threads there are
@@ -162,32 +162,28 @@ def _point_gradient(grad, points, index, rows, values, out):
         out[i, 2] = sz * cells[2] if ZERO <= points[i, 2] <= ONE else ZERO
 
 
-class _SparseGrid(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx, points, nodes, values):
-        ctx.nodes = nodes
-        ctx.save_for_backward(points, values)
-        out = empty(len(points), values.shape[1])
-        run = _look_up_one if values.shape[1] == 1 else _look_up
-        run(points.detach().numpy(), nodes.index.numpy(), nodes.rows.numpy(), values.detach().numpy(), out.numpy())
-        return out
-
-    @staticmethod
-    @torch.autograd.function.once_differentiable
-    def backward(ctx, grad):
-        points, values = (x.detach() for x in ctx.saved_tensors)
-        index, rows = ctx.nodes.index.numpy(), ctx.nodes.rows.numpy()
-        grad = grad.contiguous().numpy()
-        to_points = to_values = None
-        if ctx.needs_input_grad[0]:
-            to_points = empty(*points.shape)
-            _point_gradient(grad, points.numpy(), index, rows, values.numpy(), to_points.numpy())
-        if ctx.needs_input_grad[2]:
-            to_values = torch.zeros_like(values)
-            order, starts = in_slabs(points.numpy(), index)
-            _value_gradient(grad, points.numpy(), index, rows, order, starts, to_values.numpy())
-        return to_points, None, to_values
+def forward(ctx, points, nodes, values):
+    ctx.nodes = nodes
+    ctx.save_for_backward(points, values)
+    out = empty(len(points), values.shape[1])
+    run = _look_up_one if values.shape[1] == 1 else _look_up
+    run(points.detach().numpy(), nodes.index.numpy(), nodes.rows.numpy(), values.detach().numpy(), out.numpy())
+    return out
 
 
-def run(points, nodes, values):
-    return _SparseGrid.apply(points.contiguous(), nodes, values.contiguous())
+def backward(ctx, grad):
+    points, values = (x.detach() for x in ctx.saved_tensors)
+    index, rows = ctx.nodes.index.numpy(), ctx.nodes.rows.numpy()
+    grad = grad.contiguous().numpy()
+    to_points = to_values = None
+    if ctx.needs_input_grad[0]:
+        to_points = empty(*points.shape)
+        _point_gradient(grad, points.numpy(), index, rows, values.numpy(), to_points.numpy())
+    if ctx.needs_input_grad[2]:
+        to_values = torch.zeros_like(values)
+        order, starts = in_slabs(points.numpy(), index)
+        _value_gradient(grad, points.numpy(), index, rows, order, starts, to_values.numpy())
+    return to_points, None, to_values
+
+
+run = differentiable(forward, backward)

@@ -1,13 +1,10 @@
-"""Faults that the tests write into a copy of an engine, one at a time, to see their comparison turn red.
-
-By name: the engine, the function, what stands there, and what is put in its place.
-"""
+"""Seeded faults by name: the engine, the function, a piece of it, and what is put in its place."""
 
 FAULTS = {
     "corner forgotten": ("gpu", "_backward_values", "tl.static_range(8)", "tl.static_range(7)"),
     "weight forgotten": ("gpu", "_backward_values", "weight[:, None] * g", "g"),
-    "slope's sign": ("gpu", "_backward_points", "(corner % 2 * 2 - 1)", "(1 - corner % 2 * 2)"),
-    "clamped, yet with gradient": ("gpu", "_backward_points", "where(inside_y", "where(here"),
+    "slope's sign": ("gpu", "slope_of", "(k % 2 * 2 - 1)", "(1 - k % 2 * 2)"),
+    "clamped, yet with gradient": ("gpu", "_backward_points", "where(inside[1]", "where(here"),
     "gradient of another sample": ("cpu", "_value_gradient", "grad[i, c]", "grad[j, c]"),
     "slope's sign on the cpu": ("cpu", "_point_gradient", "(2 * y - 1)", "(1 - 2 * y)"),
     "empty nodes as the first row": ("cpu", "corners", "count += row >= 0", "count += 1"),

@@ -5,35 +5,64 @@ from __future__ import annotations
 import torch
 import triton
 import triton.language as tl
-from torch import Tensor
 
-from .._dispatch import empty
-from . import Nodes
+from .._dispatch import differentiable, empty
+from .._rows_gpu import load_row, store_row
 
 BLOCK = 64
 
 
 @triton.jit
-def cell_of(points, i, axis: tl.constexpr, here, cells):
-    """Along one axis: the cell that holds each point, its place in the cell, whether it lies inside the cube."""
-    x = tl.load(points + 3 * i + axis, mask=here, other=0.0)
-    inside = (x >= 0.0) & (x <= 1.0)
+def _along(x, cells):
+    """Along one axis: the cell that holds each point, and its place in the cell."""
     x = tl.minimum(tl.maximum(x, 0.0), 1.0) * cells
     cell = tl.minimum(x.to(tl.int32), cells - 1)
-    return cell, x - cell.to(tl.float32), inside
+    return cell, x - cell.to(tl.float32)
 
 
 @triton.jit
-def row_of(index, rows, x, y, z, here, Y, Z):
+def cell_of(points, i, here, X, Y, Z):
+    """Of X Y Z cells the one that holds each point, its place in the cell, along which axes it lies inside the cube."""
+    x, y, z = load_row(points, i, here)
+    (cx, fx), (cy, fy), (cz, fz) = _along(x, X), _along(y, Y), _along(z, Z)
+    inside = (x >= 0.0) & (x <= 1.0), (y >= 0.0) & (y <= 1.0), (z >= 0.0) & (z <= 1.0)
+    return (cx, cy, cz), (fx, fy, fz), inside
+
+
+@triton.jit
+def corner_of(k: tl.constexpr, cell):
+    """Corner k of a cell; the bits of k are its sides along x, y and z."""
+    return cell[0] + k % 2, cell[1] + k // 2 % 2, cell[2] + k // 4
+
+
+@triton.jit
+def _shares(k: tl.constexpr, f):
+    x = f[0] if k % 2 == 1 else 1 - f[0]
+    y = f[1] if k // 2 % 2 == 1 else 1 - f[1]
+    z = f[2] if k // 4 == 1 else 1 - f[2]
+    return x, y, z
+
+
+@triton.jit
+def weight_of(k: tl.constexpr, f):
+    """Trilinear weight of corner k at a place f in the cell."""
+    x, y, z = _shares(k, f)
+    return x * y * z
+
+
+@triton.jit
+def slope_of(k: tl.constexpr, f):
+    """The slope of `weight_of` along each axis."""
+    x, y, z = _shares(k, f)
+    return (k % 2 * 2 - 1) * y * z, (k // 2 % 2 * 2 - 1) * x * z, (k // 4 * 2 - 1) * x * y
+
+
+@triton.jit
+def row_of(index, rows, node, here, Y, Z):
     """The row of a node, -1 where it has none."""
-    number = (x.to(tl.int64) * Y + y) * Z + z
+    number = (node[0].to(tl.int64) * Y + node[1]) * Z + node[2]
     row = tl.load(index + number, mask=here, other=-1)
     return tl.load(rows + row, mask=row >= 0, other=-1).to(tl.int64)
-
-
-@triton.jit
-def share(fraction, side: tl.constexpr):
-    return fraction if side == 1 else 1 - fraction
 
 
 @triton.jit(do_not_specialize=["S"])
@@ -41,13 +70,11 @@ def _forward(points, index, rows, values, out, S, X, Y, Z, C: tl.constexpr, WIDT
     i = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
     c = tl.arange(0, WIDTH)
     here = i < S
-    cx, fx, _ = cell_of(points, i, 0, here, X - 1)
-    cy, fy, _ = cell_of(points, i, 1, here, Y - 1)
-    cz, fz, _ = cell_of(points, i, 2, here, Z - 1)
+    cell, f, _ = cell_of(points, i, here, X - 1, Y - 1, Z - 1)
     total = tl.zeros([BLOCK, WIDTH], tl.float32)
-    for corner in tl.static_range(8):
-        weight = share(fx, corner % 2) * share(fy, corner // 2 % 2) * share(fz, corner // 4)
-        row = row_of(index, rows, cx + corner % 2, cy + corner // 2 % 2, cz + corner // 4, here, Y, Z)
+    for k in tl.static_range(8):
+        weight = weight_of(k, f)
+        row = row_of(index, rows, corner_of(k, cell), here, Y, Z)
         there = (row >= 0)[:, None] & (c < C)[None, :]
         total += weight[:, None] * tl.load(values + row[:, None] * C + c[None, :], mask=there, other=0.0)
     tl.store(out + i[:, None] * C + c[None, :], total, mask=here[:, None] & (c < C)[None, :])
@@ -60,13 +87,11 @@ def _backward_values(
     i = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
     c = tl.arange(0, WIDTH)
     here = i < S
-    cx, fx, _ = cell_of(points, i, 0, here, X - 1)
-    cy, fy, _ = cell_of(points, i, 1, here, Y - 1)
-    cz, fz, _ = cell_of(points, i, 2, here, Z - 1)
+    cell, f, _ = cell_of(points, i, here, X - 1, Y - 1, Z - 1)
     g = tl.load(grad + i[:, None] * C + c[None, :], mask=here[:, None] & (c < C)[None, :], other=0.0)
-    for corner in tl.static_range(8):
-        weight = share(fx, corner % 2) * share(fy, corner // 2 % 2) * share(fz, corner // 4)
-        row = row_of(index, rows, cx + corner % 2, cy + corner // 2 % 2, cz + corner // 4, here, Y, Z)
+    for k in tl.static_range(8):
+        weight = weight_of(k, f)
+        row = row_of(index, rows, corner_of(k, cell), here, Y, Z)
         there = (row >= 0)[:, None] & (c < C)[None, :]
         tl.atomic_add(d_values + row[:, None] * C + c[None, :], weight[:, None] * g, mask=there, sem="relaxed")
 
@@ -78,55 +103,48 @@ def _backward_points(
     i = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
     c = tl.arange(0, WIDTH)
     here = i < S
-    cx, fx, inside_x = cell_of(points, i, 0, here, X - 1)
-    cy, fy, inside_y = cell_of(points, i, 1, here, Y - 1)
-    cz, fz, inside_z = cell_of(points, i, 2, here, Z - 1)
+    cell, f, inside = cell_of(points, i, here, X - 1, Y - 1, Z - 1)
     g = tl.load(grad + i[:, None] * C + c[None, :], mask=here[:, None] & (c < C)[None, :], other=0.0)
     dx = tl.zeros([BLOCK], tl.float32)
     dy = tl.zeros([BLOCK], tl.float32)
     dz = tl.zeros([BLOCK], tl.float32)
-    for corner in tl.static_range(8):
-        wx, wy, wz = share(fx, corner % 2), share(fy, corner // 2 % 2), share(fz, corner // 4)
-        row = row_of(index, rows, cx + corner % 2, cy + corner // 2 % 2, cz + corner // 4, here, Y, Z)
+    for k in tl.static_range(8):
+        row = row_of(index, rows, corner_of(k, cell), here, Y, Z)
         there = (row >= 0)[:, None] & (c < C)[None, :]
         along = tl.sum(g * tl.load(values + row[:, None] * C + c[None, :], mask=there, other=0.0), 1)
-        dx += (corner % 2 * 2 - 1) * wy * wz * along
-        dy += (corner // 2 % 2 * 2 - 1) * wx * wz * along
-        dz += (corner // 4 * 2 - 1) * wx * wy * along
-    tl.store(d_points + 3 * i, tl.where(inside_x, dx * (X - 1), 0.0), mask=here)
-    tl.store(d_points + 3 * i + 1, tl.where(inside_y, dy * (Y - 1), 0.0), mask=here)
-    tl.store(d_points + 3 * i + 2, tl.where(inside_z, dz * (Z - 1), 0.0), mask=here)
+        slope = slope_of(k, f)
+        dx, dy, dz = dx + slope[0] * along, dy + slope[1] * along, dz + slope[2] * along
+    dx = tl.where(inside[0], dx * (X - 1), 0.0)
+    dy = tl.where(inside[1], dy * (Y - 1), 0.0)
+    dz = tl.where(inside[2], dz * (Z - 1), 0.0)
+    store_row(d_points, i, (dx, dy, dz), here)
 
 
-class _SparseGrid(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx, points, nodes, values):
-        channels = values.shape[1]
-        ctx.index = nodes.index.contiguous(), nodes.named
-        ctx.sizes = (len(points), *nodes.index.shape)
-        ctx.meta = {"C": channels, "WIDTH": triton.next_power_of_2(max(channels, 1)), "BLOCK": BLOCK}
-        ctx.save_for_backward(points, values)
-        out = empty(len(points), channels, device=points.device)
+def forward(ctx, points, nodes, values):
+    channels = values.shape[1]
+    ctx.index = nodes.index.contiguous(), nodes.named
+    ctx.sizes = (len(points), *nodes.index.shape)
+    ctx.meta = {"C": channels, "WIDTH": triton.next_power_of_2(max(channels, 1)), "BLOCK": BLOCK}
+    ctx.save_for_backward(points, values)
+    out = empty(len(points), channels, device=points.device)
+    if len(points):
+        _forward[(triton.cdiv(len(points), BLOCK),)](points, *ctx.index, values, out, *ctx.sizes, **ctx.meta)
+    return out
+
+
+def backward(ctx, grad):
+    points, values = ctx.saved_tensors
+    grad, blocks = grad.contiguous(), (triton.cdiv(len(points), BLOCK),)
+    d_points = d_values = None
+    if ctx.needs_input_grad[0]:
+        d_points = empty(*points.shape, device=points.device)
         if len(points):
-            _forward[(triton.cdiv(len(points), BLOCK),)](points, *ctx.index, values, out, *ctx.sizes, **ctx.meta)
-        return out
-
-    @staticmethod
-    @torch.autograd.function.once_differentiable
-    def backward(ctx, grad):
-        points, values = ctx.saved_tensors
-        grad, blocks = grad.contiguous(), (triton.cdiv(len(points), BLOCK),)
-        d_points = d_values = None
-        if ctx.needs_input_grad[0]:
-            d_points = empty(*points.shape, device=points.device)
-            if len(points):
-                _backward_points[blocks](grad, points, *ctx.index, values, d_points, *ctx.sizes, **ctx.meta)
-        if ctx.needs_input_grad[2]:
-            d_values = torch.zeros_like(values)
-            if len(points):
-                _backward_values[blocks](grad, points, *ctx.index, d_values, *ctx.sizes, **ctx.meta)
-        return d_points, None, d_values
+            _backward_points[blocks](grad, points, *ctx.index, values, d_points, *ctx.sizes, **ctx.meta)
+    if ctx.needs_input_grad[2]:
+        d_values = torch.zeros_like(values)
+        if len(points):
+            _backward_values[blocks](grad, points, *ctx.index, d_values, *ctx.sizes, **ctx.meta)
+    return d_points, None, d_values
 
 
-def run(points: Tensor, nodes: Nodes, values: Tensor) -> Tensor:
-    return _SparseGrid.apply(points.contiguous(), nodes, values.contiguous())
+run = differentiable(forward, backward)

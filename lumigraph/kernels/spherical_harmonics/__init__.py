@@ -43,7 +43,7 @@ def cases(generator: torch.Generator):
 
 
 def benchmark_case(generator: torch.Generator, size: int = 2**18):
-    """As many directions as a training step has samples, for the four bands that Instant-NGP uses."""
+    """Directions of a training step's samples, for the four bands that Instant-NGP uses."""
     return _directions(size, generator).requires_grad_(), 4
 
 

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-import torch
 from numba import njit, prange
-from torch import Tensor
 
-from .._dispatch import empty
+from .._dispatch import differentiable, empty
 from . import K00, K1, K20, K21, K22, K30, K31, K32, K33
 
 MOST = 16  # coefficients
@@ -78,23 +76,19 @@ def _backward(grad, directions, bands, d_directions):
         d_directions[r, 0], d_directions[r, 1], d_directions[r, 2] = x, y, z
 
 
-class _SphericalHarmonics(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx, directions, bands):
-        ctx.save_for_backward(directions)
-        ctx.bands = bands
-        out = empty(bands**2, len(directions))
-        _forward(directions.numpy(), bands, out.numpy())
-        return out.t()
-
-    @staticmethod
-    @torch.autograd.function.once_differentiable
-    def backward(ctx, grad):
-        (directions,) = ctx.saved_tensors
-        d_directions = empty(*directions.shape)
-        _backward(grad.contiguous().numpy(), directions.numpy(), ctx.bands, d_directions.numpy())
-        return d_directions, None
+def forward(ctx, directions, bands):
+    ctx.save_for_backward(directions)
+    ctx.bands = bands
+    out = empty(bands**2, len(directions))
+    _forward(directions.numpy(), bands, out.numpy())
+    return out.t()
 
 
-def run(directions: Tensor, bands: int) -> Tensor:
-    return _SphericalHarmonics.apply(directions.contiguous(), bands)
+def backward(ctx, grad):
+    (directions,) = ctx.saved_tensors
+    d_directions = empty(*directions.shape)
+    _backward(grad.contiguous().numpy(), directions.numpy(), ctx.bands, d_directions.numpy())
+    return d_directions, None
+
+
+run = differentiable(forward, backward)

@@ -1,11 +1,14 @@
-"""Faults that the tests write into a copy of an engine, one at a time, to see their comparison turn red.
-
-By name: the engine, the function, what stands there, and what is put in its place.
-"""
+"""Seeded faults by name: the engine, the function, a piece of it, and what is put in its place."""
 
 FAULTS = {
-    "sign in band 3": ("gpu", "_backward", "- sectoral * g15", "+ sectoral * g15"),
-    "never written": ("gpu", "_backward", "d_directions + 3 * r + 2", "d_directions + 3 * r"),
+    "sign in band 3": ("gpu", "harmonic", "z * z - 3", "z * z + 3"),
+    "sign of a slope in band 3": (
+        "gpu",
+        "harmonic_slope",
+        "(-3 * Y33), x * y * (6 * Y33)",
+        "(3 * Y33), x * y * (6 * Y33)",
+    ),
+    "never written": ("gpu", "_backward", "(dx, dy, dz), here", "(dx, dy, dz), r < R - 1"),
     "term forgotten": ("cpu", "slope", " - zonal * g[13]", ""),
 }
 

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from numba import get_num_threads, njit, prange
 
-from .._dispatch import empty
+from .._dispatch import differentiable, empty
 from . import C1, C2, WINDOW, weights
 
 REACH = WINDOW // 2
@@ -172,37 +172,33 @@ def _backward(own, other, maps, mean, scale, pixel, bands, out):
                 )
 
 
-class _SSIM(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx, a, b):
-        height, width, channels = a.shape
-        lines = [x.detach().reshape(height, -1).numpy() for x in (a, b)]
-        wanted = ctx.needs_input_grad
-        if wanted == (False, True):  # S is symmetric
-            lines.reverse()
-        strips = -(-width * channels // STRIP)
-        maps = empty(height, 3 + all(wanted) if any(wanted) else 0, strips * STRIP + 2 * REACH * channels)
-        ctx.pixel = (0,) * channels  # its length is known to the compiler, and how far apart pixels are
-        ctx.bands = min(get_num_threads(), -(-height // HEIGHT))
-        sums = np.empty((strips, height))
-        _forward(*lines, ctx.pixel, ctx.bands, sums, maps.numpy())
-        ctx.save_for_backward(a, b, maps)
-        return torch.tensor(sums.sum() / a.numel(), dtype=torch.float32)
-
-    @staticmethod
-    @torch.autograd.function.once_differentiable
-    def backward(ctx, grad):
-        a, b, maps = ctx.saved_tensors
-        scale = np.float32(grad.item() / a.numel())
-        gradients: list[torch.Tensor | None] = [None, None]
-        for i, (own, other) in enumerate([(a, b), (b, a)]):
-            if ctx.needs_input_grad[i]:
-                found = gradients[i] = empty(*a.shape)
-                lines = [x.detach().reshape(len(a), -1).numpy() for x in (own, other, found)]
-                mean = MEAN_B if i and maps.shape[1] > MEAN_B else MEAN_A
-                _backward(*lines[:2], maps.numpy(), mean, scale, ctx.pixel, ctx.bands, lines[2])
-        return (*gradients,)
+def forward(ctx, a, b):
+    height, width, channels = a.shape
+    lines = [x.detach().reshape(height, -1).numpy() for x in (a, b)]
+    wanted = ctx.needs_input_grad
+    if wanted == (False, True):  # S is symmetric
+        lines.reverse()
+    strips = -(-width * channels // STRIP)
+    maps = empty(height, 3 + all(wanted) if any(wanted) else 0, strips * STRIP + 2 * REACH * channels)
+    ctx.pixel = (0,) * channels  # its length is known to the compiler, and how far apart pixels are
+    ctx.bands = min(get_num_threads(), -(-height // HEIGHT))
+    sums = np.empty((strips, height))
+    _forward(*lines, ctx.pixel, ctx.bands, sums, maps.numpy())
+    ctx.save_for_backward(a, b, maps)
+    return torch.tensor(sums.sum() / a.numel(), dtype=torch.float32)
 
 
-def run(a, b):
-    return _SSIM.apply(a.contiguous(), b.contiguous())
+def backward(ctx, grad):
+    a, b, maps = ctx.saved_tensors
+    scale = np.float32(grad.item() / a.numel())
+    gradients: list[torch.Tensor | None] = [None, None]
+    for i, (own, other) in enumerate([(a, b), (b, a)]):
+        if ctx.needs_input_grad[i]:
+            found = gradients[i] = empty(*a.shape)
+            lines = [x.detach().reshape(len(a), -1).numpy() for x in (own, other, found)]
+            mean = MEAN_B if i and maps.shape[1] > MEAN_B else MEAN_A
+            _backward(*lines[:2], maps.numpy(), mean, scale, ctx.pixel, ctx.bands, lines[2])
+    return (*gradients,)
+
+
+run = differentiable(forward, backward)

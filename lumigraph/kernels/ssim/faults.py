@@ -1,7 +1,4 @@
-"""Faults that the tests write into a copy of an engine, one at a time, to see their comparison turn red.
-
-By name: the engine, the function, what stands there, and what is put in its place.
-"""
+"""Seeded faults by name: the engine, the function, a piece of it, and what is put in its place."""
 
 FAULTS = {
     "the wrong image": ("cpu", "_gradient", "other[x] * products", "own[x] * products"),

@@ -9,7 +9,7 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from .._dispatch import empty
+from .._dispatch import differentiable, empty
 from . import C1, C2, WINDOW, weights
 
 TAPS, REACH = tl.constexpr(WINDOW), tl.constexpr(WINDOW // 2)
@@ -115,37 +115,33 @@ def _window(device: torch.device) -> Tensor:
     return torch.tensor(weights(), dtype=torch.float32, device=device)
 
 
-class _SSIM(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx, a, b):
-        height, width, channels = a.shape
-        length = width * channels
-        ctx.grid, ctx.window = (height, triton.cdiv(length, BLOCK)), _window(a.device)
-        wanted = ctx.needs_input_grad
-        first, second = (b, a) if wanted == (False, True) else (a, b)  # S is symmetric
-        count = 3 + all(wanted) if any(wanted) else 0
-        rows, out, maps = (empty(n, height, length, device=a.device) for n in (4, 1, count))
-        _moments[ctx.grid](first, second, ctx.window, rows, height, length, C=channels, BLOCK=BLOCK)
-        _likeness[ctx.grid](rows, ctx.window, out, maps, height, length, MAPS=count, BLOCK=BLOCK)
-        ctx.save_for_backward(a, b, maps)
-        return out.mean()
-
-    @staticmethod
-    @torch.autograd.function.once_differentiable
-    def backward(ctx, grad):
-        a, b, maps = ctx.saved_tensors
-        count, height, length = maps.shape
-        rows = empty(*maps.shape, device=a.device)
-        _along[(*ctx.grid, count)](maps, ctx.window, rows, height, length, C=a.shape[2], BLOCK=BLOCK)
-        gradients: list[Tensor | None] = [None, None]
-        for i, (own, other) in enumerate([(a, b), (b, a)]):
-            if ctx.needs_input_grad[i]:
-                mean = MEAN_B if i and count > MEAN_B else MEAN_A
-                found = gradients[i] = empty(*a.shape, device=a.device)
-                given = rows, ctx.window, own, other, grad.contiguous(), found
-                _gradient[ctx.grid](*given, height, length, mean, 1 / a.numel(), BLOCK=BLOCK)
-        return (*gradients,)
+def forward(ctx, a, b):
+    height, width, channels = a.shape
+    length = width * channels
+    ctx.grid, ctx.window = (height, triton.cdiv(length, BLOCK)), _window(a.device)
+    wanted = ctx.needs_input_grad
+    first, second = (b, a) if wanted == (False, True) else (a, b)  # S is symmetric
+    count = 3 + all(wanted) if any(wanted) else 0
+    rows, out, maps = (empty(n, height, length, device=a.device) for n in (4, 1, count))
+    _moments[ctx.grid](first, second, ctx.window, rows, height, length, C=channels, BLOCK=BLOCK)
+    _likeness[ctx.grid](rows, ctx.window, out, maps, height, length, MAPS=count, BLOCK=BLOCK)
+    ctx.save_for_backward(a, b, maps)
+    return out.mean()
 
 
-def run(a: Tensor, b: Tensor) -> Tensor:
-    return _SSIM.apply(a.contiguous(), b.contiguous())
+def backward(ctx, grad):
+    a, b, maps = ctx.saved_tensors
+    count, height, length = maps.shape
+    rows = empty(*maps.shape, device=a.device)
+    _along[(*ctx.grid, count)](maps, ctx.window, rows, height, length, C=a.shape[2], BLOCK=BLOCK)
+    gradients: list[Tensor | None] = [None, None]
+    for i, (own, other) in enumerate([(a, b), (b, a)]):
+        if ctx.needs_input_grad[i]:
+            mean = MEAN_B if i and count > MEAN_B else MEAN_A
+            found = gradients[i] = empty(*a.shape, device=a.device)
+            given = rows, ctx.window, own, other, grad.contiguous(), found
+            _gradient[ctx.grid](*given, height, length, mean, 1 / a.numel(), BLOCK=BLOCK)
+    return (*gradients,)
+
+
+run = differentiable(forward, backward)

@@ -5,6 +5,7 @@ import numpy as np
 import torch
 from numba import njit, prange
 
+from .._dispatch import differentiable
 from ..sparse_grid.cpu import row_of, slabs_of
 from . import FLAT
 
@@ -52,24 +53,20 @@ def _vary(chosen, index, rows, values, order, starts, sloped, sums, out):
             sums[slab] = total
 
 
-class _TotalVariation(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx, chosen, nodes, values):
-        index, rows = nodes.index.numpy(), nodes.rows.numpy()
-        first = (chosen // (index.shape[1] * index.shape[2])).to(torch.int32)
-        order, starts = slabs_of(first.numpy(), index.shape[0])
-        sloped, ctx.count = ctx.needs_input_grad[2], max(len(chosen), 1)
-        slope, sums = torch.zeros(values.shape if sloped else (0, 0)), np.zeros(len(starts) - 1)
-        _vary(chosen.numpy(), index, rows, values.detach().numpy(), order, starts, sloped, sums, slope.numpy())
-        ctx.save_for_backward(slope)
-        return torch.tensor(sums.sum() / ctx.count, dtype=torch.float32)
-
-    @staticmethod
-    @torch.autograd.function.once_differentiable
-    def backward(ctx, grad):
-        (slope,) = ctx.saved_tensors
-        return None, None, slope * (grad / ctx.count)
+def forward(ctx, chosen, nodes, values):
+    index, rows = nodes.index.numpy(), nodes.rows.numpy()
+    first = (chosen // (index.shape[1] * index.shape[2])).to(torch.int32)
+    order, starts = slabs_of(first.numpy(), index.shape[0])
+    sloped, ctx.count = ctx.needs_input_grad[2], max(len(chosen), 1)
+    slope, sums = torch.zeros(values.shape if sloped else (0, 0)), np.zeros(len(starts) - 1)
+    _vary(chosen.numpy(), index, rows, values.detach().numpy(), order, starts, sloped, sums, slope.numpy())
+    ctx.save_for_backward(slope)
+    return torch.tensor(sums.sum() / ctx.count, dtype=torch.float32)
 
 
-def run(chosen, nodes, values):
-    return _TotalVariation.apply(chosen.contiguous(), nodes, values.contiguous())
+def backward(ctx, grad):
+    (slope,) = ctx.saved_tensors
+    return None, None, slope * (grad / ctx.count)
+
+
+run = differentiable(forward, backward)

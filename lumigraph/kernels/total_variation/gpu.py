@@ -5,9 +5,8 @@ from __future__ import annotations
 import torch
 import triton
 import triton.language as tl
-from torch import Tensor
 
-from ..sparse_grid import Nodes
+from .._dispatch import differentiable
 from ..sparse_grid.gpu import row_of
 from . import FLAT
 
@@ -19,7 +18,7 @@ BLOCK = 64
 def _after(index, rows, x, y, z, row, X, Y, Z):
     """Rows of the nodes at (x, y, z), or each node's own `row` where there is none, from which nothing differs then."""
     inside = (row >= 0) & (x < X) & (y < Y) & (z < Z)
-    after = row_of(index, rows, x, y, z, inside, Y, Z)
+    after = row_of(index, rows, (x, y, z), inside, Y, Z)
     return tl.where(after >= 0, after, row)
 
 
@@ -44,7 +43,7 @@ def _vary(
     c = tl.arange(0, WIDTH)[None, :]
     number = tl.load(chosen + i, mask=i < K, other=0)
     x, y, z = number // (Y * Z), number // Z % Y, number % Z
-    row = row_of(index, rows, x, y, z, i < K, Y, Z)
+    row = row_of(index, rows, (x, y, z), i < K, Y, Z)
     right = _after(index, rows, x + 1, y, z, row, X, Y, Z)
     down = _after(index, rows, x, y + 1, z, row, X, Y, Z)
     ahead = _after(index, rows, x, y, z + 1, row, X, Y, Z)
@@ -62,27 +61,23 @@ def _vary(
         tl.atomic_add(out + ahead[:, None] * C + c, dz / length, mask=there, sem="relaxed")
 
 
-class _TotalVariation(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx, chosen, nodes, values):
-        channels, sloped = values.shape[1], ctx.needs_input_grad[2]
-        ctx.count = max(len(chosen), 1)
-        total = torch.zeros((), device=values.device)
-        slope = torch.zeros_like(values) if sloped else total
-        if len(chosen):
-            sizes = len(chosen), *nodes.index.shape
-            meta = {"C": channels, "WIDTH": triton.next_power_of_2(channels), "SLOPED": sloped, "BLOCK": BLOCK}
-            index = nodes.index.contiguous(), nodes.named
-            _vary[(triton.cdiv(len(chosen), BLOCK),)](chosen, *index, values, total, slope, *sizes, **meta)
-        ctx.save_for_backward(slope)
-        return total / ctx.count
-
-    @staticmethod
-    @torch.autograd.function.once_differentiable
-    def backward(ctx, grad):
-        (slope,) = ctx.saved_tensors
-        return None, None, slope * (grad / ctx.count)
+def forward(ctx, chosen, nodes, values):
+    channels, sloped = values.shape[1], ctx.needs_input_grad[2]
+    ctx.count = max(len(chosen), 1)
+    total = torch.zeros((), device=values.device)
+    slope = torch.zeros_like(values) if sloped else total
+    if len(chosen):
+        sizes = len(chosen), *nodes.index.shape
+        meta = {"C": channels, "WIDTH": triton.next_power_of_2(channels), "SLOPED": sloped, "BLOCK": BLOCK}
+        index = nodes.index.contiguous(), nodes.named
+        _vary[(triton.cdiv(len(chosen), BLOCK),)](chosen, *index, values, total, slope, *sizes, **meta)
+    ctx.save_for_backward(slope)
+    return total / ctx.count
 
 
-def run(chosen: Tensor, nodes: Nodes, values: Tensor) -> Tensor:
-    return _TotalVariation.apply(chosen.contiguous(), nodes, values.contiguous())
+def backward(ctx, grad):
+    (slope,) = ctx.saved_tensors
+    return None, None, slope * (grad / ctx.count)
+
+
+run = differentiable(forward, backward)

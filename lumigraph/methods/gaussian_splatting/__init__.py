@@ -11,17 +11,17 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from ... import kernels
-from ...blending import over
 from ...camera import Camera
+from ...camera.rays import Rendering
+from ...color.blending import over
 from ...components.clouds.dense_points import compile_sweep
 from ...components.fields.taken_over import taken_over
 from ...components.training.pose_refinement import PoseNumbers, poses_for
+from ...datasets.scene import Frame, Photograph, Scene
+from ...files.ranges import CloudSize, PositiveShare, Seed, Share, Steps, between
 from ...gaussians import Gaussians
 from ...gaussians.splatting import render, splat, view_of
 from ...method import Method
-from ...ranges import CloudSize, PositiveShare, Seed, Share, Steps, between
-from ...rays import Rendering
-from ...scene import Frame, Photograph, Scene
 from .adaptive import AdaptiveDensity, AdaptiveNumbers
 from .addition import Addition, Step
 from .appearance import AppearanceNumbers, SplatAppearance

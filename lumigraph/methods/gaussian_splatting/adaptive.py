@@ -9,9 +9,9 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from ...exchange.packing import Stored
+from ...files.ranges import NonNegative, Steps
 from ...geometry import to_matrix
-from ...packing import Stored
-from ...ranges import NonNegative, Steps
 from .cloud import Cloud
 from .density_control import PRUNE_OPACITY, DensityControl, RefineNumbers
 

@@ -10,11 +10,11 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from ...camera import Camera
+from ...camera.rays import Rendering
+from ...datasets.scene import Photograph
 from ...gaussians import Gaussians
 from ...gaussians.splatting import Splatted
 from ...method import Part
-from ...rays import Rendering
-from ...scene import Photograph
 
 
 @dataclass

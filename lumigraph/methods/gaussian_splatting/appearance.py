@@ -12,15 +12,15 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ...camera import Camera
+from ...camera.rays import Rendering
 from ...components.fields.appearance import PhotographCodes
 from ...components.training.lights import spread_of_light
 from ...components.training.schedules import falling
-from ...controls import Control
+from ...datasets.scene import Frame, Photograph, Scene
 from ...errors import LumigraphWarning
+from ...files.ranges import LearningRate, NonNegative
 from ...gaussians import Gaussians
-from ...ranges import LearningRate, NonNegative
-from ...rays import Rendering
-from ...scene import Frame, Photograph, Scene
+from ...method.controls import Control
 from .addition import Addition, Step
 from .affine_colours import COLOUR_NUMBERS, fit_colours, recoloured, recoloured_harmonics
 from .cloud import CloudAdam

@@ -15,11 +15,12 @@ from torch import Tensor, nn
 
 from ...camera import Camera
 from ...components.training.exchange import exchange
+from ...components.training.row_optimizer import RowOptimizer, adam_moments, adam_rate
 from ...components.training.schedules import falling
+from ...exchange.packing import Stored
+from ...files.ranges import LearningRate, between
 from ...gaussians import Gaussians
 from ...method import Part
-from ...packing import Stored
-from ...ranges import LearningRate, between
 from .interval_schedule import short_schedule_lr_scale
 from .view_count import view_count, with_view
 
@@ -147,7 +148,7 @@ class Cloud(Part):
         return {"means": Stored("scaled", 16), **scaled, "harmonics": harmonics, "view_bits": Stored("nothing")}
 
 
-class CloudAdam(torch.optim.Optimizer):
+class CloudAdam(RowOptimizer):
     """Adam (Kingma and Ba 2015) that passes over a row while its whole gradient is exactly zero, and catches up later.
 
     Most Gaussians are not on most pictures. Adam would still move them, by what is left of their momentum, for steps
@@ -160,26 +161,15 @@ class CloudAdam(torch.optim.Optimizer):
     def __init__(self, groups, betas: tuple[float, float] = (0.9, 0.999), eps: float = 1e-15):
         super().__init__(groups, {"lr": 0.0, "betas": betas, "eps": eps, "columns": None})
 
-    @torch.no_grad()
-    def step(self, closure=None) -> None:  # type: ignore[override]  # nobody asks for a closure
-        """Take one step with all parameters that have a gradient."""
-        for group in self.param_groups:
-            for p in group["params"]:
-                if p.grad is not None:
-                    self._update(p, group)
+    def moments(self, p):
+        return adam_moments(p) | {"last": torch.zeros(len(p), device=p.device)}  # step at which each row was moved
 
-    def _update(self, p, group):
-        state = self.state[p]
-        if not state:
-            state["step"] = torch.zeros(())
-            state["mean"], state["square"] = torch.zeros_like(p), torch.zeros_like(p)
-            state["last"] = torch.zeros(len(p), device=p.device)  # step at which each row was moved
+    def update(self, p, grad, state, group):
         state["step"] += 1
         (b1, b2), t = group["betas"], float(state["step"])
-        rate = group["lr"] * math.sqrt(1 - b2**t) / (1 - b1**t)
         width = math.prod(p.shape[1:])
-        rates = rate * torch.tensor(group["columns"] or [1.0] * width, device=p.device)
-        given = p, p.grad.contiguous(), state["mean"], state["square"]
+        rates = adam_rate(group, t) * torch.tensor(group["columns"] or [1.0] * width, device=p.device)
+        given = p, grad.contiguous(), state["mean"], state["square"]
         values, grad, mean, square = (x.detach().view(-1, width) for x in given)
         if p.is_cuda:
             _rows(values, grad, mean, square, state["last"], rates, t, b1, b2, group["eps"])

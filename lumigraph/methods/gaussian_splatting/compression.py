@@ -11,9 +11,9 @@ from torch.nn.functional import normalize
 
 from ...camera import Camera
 from ...exchange.morton import morton_order
+from ...exchange.packing import most_important
 from ...gaussians import Gaussians
 from ...gaussians.splatting import splat, view_of
-from ...packing import most_important
 
 
 def picture_share(cloud: Gaussians, camera: Camera, near: float) -> Float[Tensor, " gaussian"]:

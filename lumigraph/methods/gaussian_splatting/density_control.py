@@ -11,8 +11,8 @@ import torch
 from torch import Tensor
 
 from ...errors import LumigraphWarning
-from ...memory import room_for
-from ...ranges import CloudSize, PositiveShare, Share, Steps
+from ...files.ranges import CloudSize, PositiveShare, Share, Steps
+from ...system.memory import room_for
 from .addition import Addition
 from .cloud import Cloud
 from .interval_schedule import IntervalSchedule, intervals

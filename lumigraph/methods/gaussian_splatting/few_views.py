@@ -16,9 +16,9 @@ from torch import Tensor
 from ...camera import Camera
 from ...components.training.fog import evened
 from ...components.training.unseen_views import roughness, unseen_cameras
+from ...files.ranges import NonNegative
 from ...gaussians import Gaussians
 from ...gaussians.splatting import splat, view_of
-from ...ranges import NonNegative
 from .addition import Addition, Step
 
 MAX_DROP_RATE = 0.2  # share of Gaussians at the end of training, to which it grows evenly (Park 2025, section 3.2)

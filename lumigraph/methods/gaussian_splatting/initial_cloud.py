@@ -11,9 +11,9 @@ from torch import Tensor
 
 from ...components.clouds.dense_points import dense_points
 from ...components.sampling.carving import visual_hull
+from ...datasets.scene import Frame, Scene
 from ...gaussians import Gaussians
 from ...kernels.spherical_harmonics import K00
-from ...scene import Frame, Scene
 
 Initialization = Literal["dense", "sparse", "random"]
 

@@ -9,9 +9,9 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from ...files.ranges import NonNegative
 from ...gaussians import Gaussians
 from ...geometry import to_matrix
-from ...ranges import NonNegative
 from .addition import Step
 from .cloud import Cloud
 from .density_control import PRUNE_OPACITY, DensityControl, RefineNumbers

@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn import functional
 
-from ...ranges import Share
+from ...files.ranges import Share
 from .addition import Addition, Step
 
 INLIER_SHARE = 0.8  # share of pixels below the threshold; the authors' release

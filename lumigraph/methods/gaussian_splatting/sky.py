@@ -13,8 +13,8 @@ from torch import Tensor
 
 from ... import kernels
 from ...camera import Camera
+from ...datasets.scene import Photograph, Scene
 from ...kernels.spherical_harmonics import K00
-from ...scene import Photograph, Scene
 
 SKY_BANDS = 3  # of spherical harmonics
 SKY_NUMBERS = 3 * SKY_BANDS**2  # of a photograph's code: the harmonics by rows, three colours each

@@ -6,10 +6,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from ...capabilities import HasGaussians, can
 from ...components.fields.taken_over import TakenOver
 from ...errors import LumigraphError
 from ...gaussians import Gaussians
+from ...method.capabilities import HasGaussians, can
 from .initial_cloud import nearest_distance
 
 INITIAL_OPACITY = 0.8

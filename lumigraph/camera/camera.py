@@ -1,0 +1,191 @@
+"""Cameras: where photographs were taken from, and the rays that made their pixels."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from ..geometry import look_at
+from .lens import Lens, Pinhole, one_or_more, rows
+from .rays import Rays
+
+RING, ELEVATION = 24, 15.0  # cameras of a ring, and degrees that they stand above its middle
+ELEVATIONS = (0.0, 30.0, 60.0)  # degrees, of the rings of a dome
+# A disc of this radius varies as much as a square pixel of side one (Barron 2021, section 3.1).
+PIXEL_RADIUS = 2 / math.sqrt(12)
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A batch of cameras.
+
+    pose:        camera-to-world, rotation and position; +x right, +y down, +z forward; position in scene units
+    lens:        intrinsics, one row per camera
+    size:        (width, height) in pixels
+    time:        moment of exposure, if the capture moves
+    image_index: which photograph each camera took, if any
+    """
+
+    pose: Float[Tensor, "camera 3 4"]
+    lens: Lens
+    size: Int[Tensor, "camera 2"]
+    time: Float[Tensor, " camera"] | None = None
+    image_index: Int[Tensor, " camera"] | None = None
+
+    def __len__(self) -> int:
+        return len(self.pose)
+
+    def __getitem__(self, index: int | slice | Tensor) -> Camera:
+        """Some of the cameras; an int gives a batch of one."""
+        keep = one_or_more(index)
+        time, image_index = (None if x is None else x[keep] for x in (self.time, self.image_index))
+        return Camera(self.pose[keep], self.lens[keep], self.size[keep], time, image_index)
+
+    def to(self, device: torch.device | str) -> Camera:
+        time, image_index = (None if x is None else x.to(device) for x in (self.time, self.image_index))
+        return Camera(self.pose.to(device), self.lens.to(device), self.size.to(device), time, image_index)
+
+    @property
+    def position(self) -> Float[Tensor, "camera 3"]:
+        return self.pose[:, :, 3]
+
+    @property
+    def forward(self) -> Float[Tensor, "camera 3"]:
+        """Where each camera looks, unit length."""
+        return self.pose[:, :, 2]
+
+    def pixels(self) -> Float[Tensor, "pixel 2"]:
+        """The centres (x, y) of all pixels of a batch of one, row by row."""
+        if len(self) != 1:
+            raise ValueError(f"pixels() is for one camera at a time; this batch has {len(self)}")
+        width, height = self.size[0].tolist()
+        x = torch.arange(width, dtype=self.pose.dtype, device=self.pose.device) + 0.5
+        y = torch.arange(height, dtype=self.pose.dtype, device=self.pose.device) + 0.5
+        return torch.stack([x.expand(height, width), y[:, None].expand(height, width)], -1).reshape(-1, 2)
+
+    def rays(self, pixels: Float[Tensor, "ray 2"], index: Int[Tensor, " ray"] | None = None) -> Rays:
+        """The rays through pixels (x, y), in the world's frame; differentiable in the poses.
+
+        index: the camera of each pixel; None means camera 0 for all
+        """
+        inward = self.lens.unproject(pixels, index)
+        radius = PIXEL_RADIUS * self.lens.solid_angle(pixels, inward, index).sqrt()
+        pose = rows(self.pose.reshape(-1, 12), index).view(-1, 3, 4)
+        origins, begin = pose[:, :, 3], self.lens.origins(pixels, index)
+        if begin is not None:
+            origins = origins + rotate(pose, begin)
+        time, image_index = (gather(x, index, len(pixels)) for x in (self.time, self.image_index))
+        return Rays(origins.expand(len(pixels), 3), rotate(pose, inward), radius, time, image_index)
+
+    def project(
+        self, points: Float[Tensor, "point 3"], index: Int[Tensor, " point"] | None = None
+    ) -> tuple[Float[Tensor, "point 2"], Bool[Tensor, " point"]]:
+        """Pixels (x, y) of points in the world, and whether the lens sees them (see `Lens.project`).
+
+        index: the camera of each point; None means camera 0 for all
+        """
+        pose = rows(self.pose.reshape(-1, 12), index).view(-1, 3, 4)
+        return self.lens.project(rotate(pose[:, :, :3].mT, points - pose[:, :, 3]), index)
+
+    def locate(self, points: Float[Tensor, "point 3"]) -> tuple[Int[Tensor, "point 2"], Bool[Tensor, " point"]]:
+        """Row and column of the pixel that each point lies in, clamped to the picture, and whether it lies in one.
+
+        For a batch of one: the shared projection of cells into silhouettes, masks and superpixels.
+        """
+        pixels, valid = self.project(points)
+        places, last = (
+            pixels.nan_to_num(-1.0, -1.0, -1.0).clamp(-1, 1e6).floor().long().flip(-1),
+            self.size[0].flip(-1) - 1,
+        )
+        inside = valid & (places >= 0).all(-1) & (places <= last).all(-1)
+        return places.clamp_min(0).minimum(last), inside
+
+    def resized(self, factor: float) -> Camera:
+        """Cameras of pictures scaled by a factor. Sizes are rounded; intrinsics follow the rounded sizes exactly."""
+        size = (self.size * factor).round().clamp_min(1).to(self.size.dtype)
+        return replace(self, size=size, lens=self.lens.resized((size.double() / self.size).to(self.pose.dtype)))
+
+    def transformed(self, similarity: Float[Tensor, "4 4"]) -> Camera:
+        """The cameras in another frame, x' = M x: positions and eyes' distances scale, rotations stay rotations."""
+        similarity = similarity.to(self.pose)
+        scale = torch.linalg.det(similarity[:3, :3]) ** (1 / 3)
+        rotation = similarity[:3, :3] / scale @ self.pose[:, :, :3]
+        position = self.position @ similarity[:3, :3].mT + similarity[:3, 3]
+        return replace(
+            self, pose=torch.cat([rotation, position[:, :, None]], -1), lens=self.lens.enlarged(float(scale))
+        )
+
+    @staticmethod
+    def cat(cameras: Sequence[Camera]) -> Camera:
+        """One batch from several."""
+        pose, size = torch.cat([c.pose for c in cameras]), torch.cat([c.size for c in cameras])
+        return Camera(
+            pose,
+            Lens.cat([c.lens for c in cameras]),
+            size,
+            join(c.time for c in cameras),
+            join(c.image_index for c in cameras),
+        )
+
+
+def ring(
+    bounds: tuple[tuple[float, float, float], tuple[float, float, float]],
+    distance: float = 2.6,
+    angle: float = 50.0,
+    size: int = 800,
+    count: int = RING,
+) -> Camera:
+    """Cameras around a box that look at its middle, for what nobody has photographed.
+
+    distance: from the middle, scene units
+    angle:    of view, degrees
+    size:     pixels a side
+    """
+    middle = torch.tensor(bounds).mean(0)
+    azimuth = torch.arange(count) * (2 * math.pi / count)
+    height = torch.full_like(azimuth, math.radians(ELEVATION))
+    outward = torch.stack([height.cos() * azimuth.cos(), height.cos() * azimuth.sin(), height.sin()], -1)
+    pose = look_at(middle + distance * outward, -outward, torch.tensor([0.0, 0.0, 1.0]))
+    focal = 0.5 * size / math.tan(0.5 * math.radians(angle))
+    lens = Pinhole(torch.full((count, 2), focal), torch.full((count, 2), size / 2))
+    return Camera(pose, lens, torch.full((count, 2), size))
+
+
+def dome(ring: Camera) -> Camera:
+    """Cameras over a whole dome, at the distances and azimuths of a ring around the origin."""
+    parts = []
+    for degrees in ELEVATIONS:
+        angle = torch.full((len(ring),), math.radians(degrees))
+        flat = torch.nn.functional.normalize(ring.position[:, :2], dim=-1)
+        outward = torch.cat([angle.cos()[:, None] * flat, angle.sin()[:, None]], -1)
+        position = ring.position.norm(dim=-1, keepdim=True) * outward
+        pose = look_at(position, -outward, torch.tensor([0.0, 0.0, 1.0]))
+        parts.append(replace(ring, pose=pose))
+    return Camera.cat(parts)
+
+
+def rotate(matrix: Float[Tensor, "#ray 3 _"], vectors: Float[Tensor, "ray 3"]) -> Float[Tensor, "ray 3"]:
+    """The first three columns of each matrix, times each vector."""
+    if len(matrix) == 1:
+        return vectors @ matrix[0, :, :3].mT
+    x, y, z = vectors[:, :, None].unbind(1)
+    return torch.addcmul(torch.addcmul(x * matrix[:, :, 0], y, matrix[:, :, 1]), z, matrix[:, :, 2])
+
+
+def join(parts: Iterable[Tensor | None]) -> Tensor | None:
+    """One tensor from several, or None where any is missing."""
+    columns = list(parts)
+    found = [x for x in columns if x is not None]
+    return torch.cat(found) if len(found) == len(columns) else None
+
+
+def gather(values: Tensor | None, index: Tensor | None, count: int) -> Tensor | None:
+    """One value for each ray, or None where there are none."""
+    if values is None:
+        return None
+    return values[:1].expand(count) if index is None else values.index_select(0, index)

@@ -1,0 +1,1 @@
+"""Colours: sRGB encoding, and compositing before a background."""

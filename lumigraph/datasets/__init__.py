@@ -1,0 +1,1 @@
+"""Data that methods learn from: photographs with cameras, shapes, collections of either."""

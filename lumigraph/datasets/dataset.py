@@ -1,0 +1,70 @@
+"""Dataset: what a method learns from, whatever kind it is."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, ClassVar, Protocol, runtime_checkable
+
+import torch
+from jaxtyping import Int
+from torch import Tensor
+
+from ..camera import Camera
+from ..errors import LumigraphError
+from .scene import Frame
+
+HELD_OUT = 8  # every so many members by name, the first one among them, as with photographs
+
+
+@runtime_checkable
+class Dataset(Protocol):
+    """What the trainer, the run and the evaluation ask of all that can be learnt from.
+
+    kind:     what it holds, in a user's words: "photographs", "shapes", "a collection"
+    source:   the path that it came from, or "procedural:<name>"
+    frame:    bounds, and the way back to the source's frame; all that a method must know to be built
+    splits:   numbers of what it holds by purpose: "train", "test", maybe "val"
+    names:    what each of these is called
+    warnings: what the user should know about it, one sentence each
+    """
+
+    kind: ClassVar[str]
+
+    @property
+    def source(self) -> str: ...
+
+    @property
+    def frame(self) -> Frame: ...
+
+    @property
+    def splits(self) -> Mapping[str, Int[Tensor, " item"]]: ...
+
+    @property
+    def names(self) -> Sequence[str]: ...
+
+    @property
+    def warnings(self) -> Sequence[str]: ...
+
+    def preview(self) -> Camera | None:
+        """A camera whose picture shows how far training has come; None where there is nothing to look at."""
+
+
+def check_kind(learner: str, wanted: type[Any], found: type[Any], source: str, others: Sequence[str] = ()) -> None:
+    """Raise LumigraphError if a method that learns from one kind of dataset is to learn from another.
+
+    learner: the method's name
+    others:  names of methods that learn from what was found
+    """
+    if issubclass(found, wanted):
+        return
+    those = f"or train what does: {', '.join(others)}" if others else f"for no method here learns from {found.kind}"
+    raise LumigraphError(
+        f"{learner} learns from {wanted.kind}, and {source} holds {found.kind}; name {wanted.kind} instead, {those}"
+    )
+
+
+def splits_of(members: int) -> dict[str, Int[Tensor, " member"]]:
+    """Every 8th member of many is for testing; a single one is for both."""
+    index = torch.arange(members)
+    held_out = index % HELD_OUT == 0
+    return {"train": index, "test": index} if members == 1 else {"train": index[~held_out], "test": index[held_out]}

@@ -1,0 +1,120 @@
+"""Files of what can be made again: where they lie, what they are called, and that they are whole or not there."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import shutil
+import sys
+import time
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TypeVar
+
+import numpy as np
+
+from ...errors import LumigraphError
+from ...files import is_file
+
+FORMAT = 2  # of the cache's files
+MARK = "store.json"  # written last: a folder that holds it is whole
+
+Found = TypeVar("Found")
+
+
+def cache_folder() -> Path:
+    """Folder of this user for data that can be made again."""
+    if chosen := os.environ.get("LUMIGRAPH_CACHE"):
+        return Path(chosen)
+    if sys.platform == "darwin":
+        return Path.home() / "Library" / "Caches" / "lumigraph"
+    if sys.platform == "win32":
+        return Path(os.environ.get("LOCALAPPDATA", Path.home())) / "lumigraph" / "cache"
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "lumigraph"
+
+
+def key(parts: Iterable[str | None]) -> str:
+    """A name for files that are made of these parts; with a part that has no name, one that nobody else will ask
+    for."""
+    digest = hashlib.sha256(f"{FORMAT} {sys.byteorder}".encode())
+    for number, part in enumerate(parts):
+        digest.update(f"\n{part or f'{os.getpid()} {time.time_ns()} {number}'}".encode())
+    return digest.hexdigest()[:32]
+
+
+@contextmanager
+def filled(folder: Path, size: int) -> Iterator[Path]:
+    """A folder to fill with so many bytes and MARK; it appears complete under its name or not at all."""
+    part = folder.with_name(f"{folder.name}.{os.getpid()}.part")
+    with full_disk_told(part, size):
+        shutil.rmtree(part, ignore_errors=True)
+        part.mkdir(parents=True)
+        try:
+            yield part
+            if not (folder / MARK).exists():  # else another process was quicker
+                os.replace(part, folder)
+        finally:
+            shutil.rmtree(part, ignore_errors=True)
+
+
+def new_file(path: Path, dtype: np.dtype | type, shape: tuple[int, ...]) -> np.memmap:
+    """A mapped file to write to."""
+    size = int(np.prod(shape)) * np.dtype(dtype).itemsize
+    with open(path, "wb") as file:
+        reserve(file, size)
+    return np.memmap(path, dtype, "r+", shape=shape)
+
+
+def check_size(path: Path, size: int) -> None:
+    """Raise LumigraphError unless a file of the cache has so many bytes."""
+    if not is_file(path) or path.stat().st_size != size:
+        raise LumigraphError(f"{path} is damaged; delete the folder {path.parent}, which is made again when needed")
+
+
+def free_space(folder: Path) -> int:
+    """Bytes that a disk has for a folder, which need not be there yet; very many where it does not say."""
+    there = next((place for place in (folder, *folder.parents) if place.is_dir()), Path.cwd())
+    try:
+        return shutil.disk_usage(there).free
+    except OSError:
+        return 1 << 60
+
+
+def reserve(file, size: int) -> None:
+    """Claim the disk now: writing to a mapped file on a full disk would kill the process."""
+    if hasattr(os, "posix_fallocate"):
+        os.posix_fallocate(file.fileno(), 0, size)
+        return
+    block = bytes(1 << 20)
+    for begin in range(0, size, len(block)):
+        file.write(block[: size - begin])
+
+
+@contextmanager
+def full_disk_told(path: Path, size: int) -> Iterator[None]:
+    try:
+        yield
+    except OSError as fault:
+        raise LumigraphError(
+            f"{path.parent}: cannot keep {size / 1e9:.1f} GB of decoded images here ({fault.strerror or fault}); "
+            f"free some space, set LUMIGRAPH_CACHE to a folder on another disk, or use a larger --downscale"
+        ) from fault
+
+
+def in_parallel(
+    read: Callable[[int], Found], numbers: Sequence[int], progress: Callable[[int], object] = lambda done: None
+) -> list[Found]:
+    """Results of `read` for each number, from several threads. progress: called with the number that is done."""
+    with ThreadPoolExecutor(min(os.cpu_count() or 1, 16)) as pool:
+        tasks = [pool.submit(read, number) for number in numbers]
+        found = []
+        try:
+            for task in tasks:
+                found.append(task.result())
+                progress(len(found))
+        except BaseException:
+            pool.shutdown(wait=False, cancel_futures=True)
+            raise
+    return found

@@ -1,0 +1,206 @@
+"""Layer: one named plane of values that is known of every pixel beside its colour, read when somebody asks for it."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from .cache import MARK, cache_folder, check_size, filled, in_parallel, key, new_file
+from .resize import resized
+from .store import ImageStore
+
+ENCODINGS = {
+    "sRGB": "colours as photographed; a fourth channel is alpha, by which they are not multiplied",
+    "linear": "light; a fourth channel is alpha, by which it is not multiplied",
+    "linear premultiplied": "light multiplied by the alpha in a fourth channel",
+    "distance": "lengths along the pixel's ray",
+    "z-depth": "lengths along the optical axis",
+    "mosaic": "light behind a filter of one colour each, in squares of two by two pixels that repeat",
+    "index": "whole numbers that name something",
+    "filter": "whole numbers that name the filter over each pixel of a mosaic",
+    "direction": "unit vectors in the scene's frame",
+    "pixels": "offsets (x, y) in pixels of the picture",
+    "plain": "numbers of any other kind",
+}
+NUMBERED = ("index", "filter")  # encodings of whole numbers
+UNNAMED = -1  # an index that is not known
+
+
+@dataclass(frozen=True)
+class LayerSource:
+    """Source of one photograph's values of a layer.
+
+    read:     makes the stored numbers, (height, width) or (height, width, channels), of the photograph's size
+    identity: says all that they depend on, as in `ImageSource`
+    """
+
+    read: Callable[[], np.ndarray]
+    identity: str | None = None
+
+
+class Layer:
+    """Values of one kind for every pixel of the photographs, as their source stores them, and what they mean.
+
+    They lie in the order of the store, so that a pixel's position there is its position here: under the same budget of
+    memory, else in a file. A photograph's values are read when they are first asked for.
+
+    planes:   of each photograph; None where this one has no such values
+    dtype:    of stored numbers
+    channels: numbers to a pixel; one alone has no axis of its own
+    encoding: what the numbers mean, a key of ENCODINGS
+    scale:    what a stored 1 is worth, in scene units for lengths
+    unknown:  stored numbers that say that nobody knows; NaN always does. Photographs without a plane hold the first
+    empty:    stored lengths that say that nothing is there
+    names:    of what an index counts, if they have some
+    """
+
+    def __init__(
+        self,
+        images: ImageStore,
+        planes: Sequence[LayerSource | None],
+        dtype: np.dtype,
+        channels: int,
+        encoding: str,
+        scale: float = 1.0,
+        unknown: tuple[float, ...] = (),
+        empty: tuple[float, ...] = (),
+        names: tuple[str, ...] = (),
+    ):
+        assert len(planes) == len(images) and encoding in ENCODINGS
+        self.dtype, self.channels, self.encoding, self.scale = dtype, channels, encoding, scale
+        self.unknown, self.empty, self.names = unknown, empty, names
+        self._images, self._planes = images, list(planes)
+        self._values: np.ndarray | None = None
+        self._read = np.zeros(len(planes), bool)
+
+    def __len__(self) -> int:
+        """Photographs that have such values of their own."""
+        return sum(plane is not None for plane in self._planes)
+
+    def stored(self, image: int) -> np.ndarray:
+        """One photograph's numbers as the source stores them, (height, width) or (height, width, channels)."""
+        if self._images.streams:
+            return self._alone(image)
+        values, order = self._hold([image])[self._images.span(image)], self._images.order(image)
+        if order is not None:
+            natural = np.empty_like(values)
+            natural[order] = values
+            values = natural
+        width, height = self._images.sizes[image].tolist()
+        return values.reshape(height, width, *values.shape[1:])
+
+    def gathered(self, position: Int[Tensor, " pixel"], images: Int[Tensor, " choice"]) -> np.ndarray:
+        """Stored numbers at positions of the store, which lie in some of the photographs."""
+        return self._hold(images.numpy())[position.numpy()]
+
+    def decoded(self, stored: np.ndarray, cosine: Callable[[], Tensor]) -> Tensor:
+        """Values of stored numbers, in the project's units: float32 with NaN for unknown and infinity for empty; whole
+        numbers for an index, -1 for unknown.
+
+        cosine: of the angle between each pixel's ray and the optical axis; asked for where lengths lie along the axis
+        """
+        sure = self.known(stored)
+        if self.encoding in NUMBERED:
+            return torch.from_numpy(np.where(sure, stored, UNNAMED).astype(np.int64))
+        values = torch.from_numpy(stored.astype(np.float64) * self.scale)
+        if self.empty:
+            values[torch.from_numpy(np.isin(stored, self.empty))] = torch.inf
+        values.numpy()[~sure] = np.nan
+        if self.encoding == "z-depth":
+            values = values / cosine().double()
+        elif self.encoding == "linear premultiplied" and self.channels == 4:
+            values[..., :3] /= torch.where(values[..., 3:] > 0, values[..., 3:], 1)
+        return values.float()
+
+    def known(self, stored: np.ndarray) -> Bool[np.ndarray, "*pixels"]:
+        """Mask of the pixels with a known value."""
+        return known(stored, self.unknown, self.channels)
+
+    def reduced(self, image: int, factor: int) -> np.ndarray:
+        """A photograph's stored numbers so many times smaller; see `resized`. What fills no square is left out."""
+        stored = self.stored(image)
+        height, width = (n // factor * factor for n in stored.shape[:2])
+        stored = stored[:height, :width]
+        return resized(stored, (width // factor, height // factor), self.encoding, self.known(stored))
+
+    def like(self, images: ImageStore, planes: Sequence[LayerSource | None]) -> Layer:
+        """A layer of the same kind, of other photographs."""
+        about = self.dtype, self.channels, self.encoding, self.scale, self.unknown, self.empty, self.names
+        return Layer(images, planes, *about)
+
+    def _hold(self, wanted: Sequence[int] | np.ndarray) -> np.ndarray:
+        """All stored numbers, in the order of the store; those of the wanted photographs have been read."""
+        if self._values is None:
+            shape = (int(self._images.sizes.prod(-1).sum()), *((self.channels,) if self.channels > 1 else ()))
+            if self._images.grant(int(np.prod(shape)) * self.dtype.itemsize):
+                self._values = np.empty(shape, self.dtype)
+            else:
+                self._values = self._mapped(shape)
+                self._read[:] = True
+        values = self._values
+        if not self._read[wanted].all():
+            in_parallel(lambda image: self._fill(values, image), [int(i) for i in wanted if not self._read[i]])
+        return values
+
+    def _alone(self, image: int) -> np.ndarray:
+        """One photograph's numbers, row by row, read now."""
+        width, height = self._images.sizes[image].tolist()
+        values = np.empty((width * height, *((self.channels,) if self.channels > 1 else ())), self.dtype)
+        self._put(values, image, None)
+        return values.reshape(height, width, *values.shape[1:])
+
+    def _fill(self, values: np.ndarray, image: int) -> None:
+        """Read one photograph's numbers to their place."""
+        self._put(values[self._images.span(image)], image, self._images.order(image))
+        self._read[image] = True
+
+    def _put(self, place: np.ndarray, image: int, order: np.ndarray | None) -> None:
+        """Read one photograph's numbers, in an order; None for row by row."""
+        plane = self._planes[image]
+        if plane is None:
+            place[:] = self.unknown[0] if self.unknown else UNNAMED if self.encoding == "index" else np.nan
+            return
+        found = plane.read()
+        width, height = self._images.sizes[image].tolist()
+        assert found.shape[:2] == (height, width), f"promised {width}x{height}, read {found.shape}"
+        flat = found.reshape(place.shape)
+        place[:] = flat if order is None else flat[order]
+
+    def _mapped(self, shape: tuple[int, ...]) -> np.ndarray:
+        """All numbers in a file, which stays for others that ask for the same."""
+        nameless = self._images.name is None or any(p is not None and p.identity is None for p in self._planes)
+        parts = [p.identity if p else "nothing" for p in self._planes]
+        called = key([None if nameless else f"{self._images.name} {self.dtype.str} {self.channels}", *parts])
+        folder = (self._images.cache or cache_folder() / "images") / called
+        if not (folder / MARK).exists():
+            with filled(folder, int(np.prod(shape)) * self.dtype.itemsize) as part:
+                values = new_file(part / "values", self.dtype, shape)
+                in_parallel(lambda image: self._fill(values, image), range(len(self._planes)))
+                values.flush()
+                (part / MARK).write_text(json.dumps({"dtype": self.dtype.str, "channels": self.channels}))
+        check_size(folder / "values", int(np.prod(shape)) * self.dtype.itemsize)
+        found = np.memmap(folder / "values", self.dtype, "c", shape=shape)
+        if nameless:
+            shutil.rmtree(folder, ignore_errors=True)
+        return found
+
+
+def cosines(directions: Float[Tensor, "*pixels 3"], forward: Float[Tensor, "*#pixels 3"]) -> Float[Tensor, "*pixels"]:
+    """Cosine of the angle between rays and the optical axes of their cameras."""
+    return (directions.double() * forward.double()).sum(-1)
+
+
+def known(stored: np.ndarray, unknown: tuple[float, ...], channels: int) -> Bool[np.ndarray, "*pixels"]:
+    """Mask of the pixels with a known value; see `Layer`."""
+    numbers = stored if channels > 1 else stored[..., None]
+    sure = np.ones(numbers.shape[:-1], bool)
+    for number in unknown:
+        sure &= (numbers != number).any(-1)
+    return np.asarray(sure & ~np.isnan(numbers).any(-1) if stored.dtype.kind == "f" else sure)

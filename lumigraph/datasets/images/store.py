@@ -1,0 +1,251 @@
+"""ImageStore: all photographs of a scene as bytes, in memory or, where they are too many, in a file."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int, UInt8
+from torch import Tensor
+
+from ...files import read_json
+from ...system.memory import memory_for_images
+from .cache import MARK, cache_folder, check_size, filled, in_parallel, key, new_file
+from .order import Runs, shuffled_order, spread
+from .pixel_sampling import sample_pixels
+
+PIECES = 64  # a batch from a file comes in about so many reads
+SHORTEST_PIECE, LONGEST_PIECE = 64, 1024  # pixels; the longest fills a page
+
+
+@dataclass(frozen=True)
+class Mark:
+    """Contents of the mark of a store in a file."""
+
+    has_alpha: bool
+    trusted: bool
+
+
+@dataclass(frozen=True)
+class ImageSource:
+    """Source of one photograph.
+
+    size:     (width, height) that `read` will give
+    read:     makes the pixels, uint8 (height, width, 3 or 4), and which of them to trust (None: all)
+    identity: says all that the pixels depend on (file, its date and size, scaling); None if nothing can
+    """
+
+    size: tuple[int, int]
+    read: Callable[[], tuple[np.ndarray, np.ndarray | None]]
+    identity: str | None = None
+
+
+@dataclass(frozen=True)
+class PixelBatch:
+    """Random pixels: which image, where (x, y), and their bytes (red, green, blue, alpha; 255 where there is none).
+
+    position: where they lie in the store, which is where they lie in every layer; None where nobody asked
+    """
+
+    image: Int[Tensor, " pixel"]
+    xy: Float[Tensor, "pixel 2"]
+    rgba: UInt8[Tensor, "pixel 4"]
+    position: Int[Tensor, " pixel"] | None = None
+
+
+class ImageStore:
+    """Photographs of any sizes, end to end, four bytes to a pixel so that a pixel is one load.
+
+    In a file, each image's pixels lie shuffled: pixel (a s) mod n at position s, with a the whole number beside
+    n / golden ratio that shares no factor with n. Consecutive positions are then spread evenly over the picture, so
+    a random batch is a few short reads rather than one disk access for every ray.
+
+    rgba:     all pixels, four bytes seen as one int32
+    sizes:    (width, height) of each image
+    trusted:  per image the pixels to learn from, or None for all
+    name:     of what the pictures decode to; None where nothing can name it
+    memory:   bytes that layers may still take of it; None means a share of the machine's
+    cache:    where what does not fit goes; None means the user's cache folder
+    """
+
+    streams = False  # whether photographs are read again and again, so that they have no place
+
+    def __init__(
+        self,
+        rgba: Int[Tensor, " pixel"],
+        sizes: Int[Tensor, "image 2"],
+        has_alpha: bool,
+        trusted: Runs | None = None,
+        shuffled: bool = False,
+        name: str | None = None,
+        memory: int | None = None,
+        cache: Path | None = None,
+    ):
+        self._rgba, self.sizes, self.has_alpha, self._trusted, self.shuffled = rgba, sizes, has_alpha, trusted, shuffled
+        self.name, self.cache = name, cache
+        self._memory = memory_for_images() if memory is None else memory
+        pixels = sizes.prod(-1)
+        self._first = pixels.cumsum(0) - pixels
+        self._width = sizes[:, 0].contiguous()
+        self._count = pixels if trusted is None else trusted.count
+        self._stride = torch.tensor([spread(n) if shuffled else 1 for n in self._count.tolist()])
+
+    @classmethod
+    def load(
+        cls,
+        pictures: Sequence[ImageSource],
+        memory: int | None = None,
+        cache: Path | None = None,
+        progress: Callable[[int], object] = lambda done: None,
+    ) -> ImageStore:
+        """Read pictures in parallel.
+
+        memory:   bytes that may stay in memory; None means a share of the machine's
+        cache:    where larger captures go; None means the user's cache folder. It may be deleted at any time.
+        progress: told how many are done
+        Raises LumigraphError where the cache's disk is full, and whatever the pictures' `read` raises.
+        """
+        sizes = torch.tensor([p.size for p in pictures])
+        total, memory = int(sizes.prod(-1).sum()), memory_for_images() if memory is None else memory
+        nameless = any(p.identity is None for p in pictures)
+        called = name_of(pictures)
+        if 4 * total <= memory:
+            rgba = np.empty(total, np.int32)
+            has_alpha, trusted = fill(rgba, pictures, progress, shuffled=False)
+            left, name = memory - 4 * total, None if nameless else f"{called} in order"
+            return cls(torch.from_numpy(rgba), sizes, has_alpha, trusted, False, name, left, cache)
+        folder = (cache or cache_folder() / "images") / called
+        if not (folder / MARK).exists():
+            write_store(folder, total, pictures, progress)
+        about = read_json(folder / MARK, Mark)
+        check_size(folder / "pixels", 4 * total)
+        trusted = None
+        if about.trusted:
+            trusted = Runs(*map(torch.from_numpy, np.load(folder / "trusted.npz", allow_pickle=False).values()))
+        # Copy on write: PyTorch wants a writable array, and the file must stay as it is.
+        rgba = np.memmap(folder / "pixels", np.int32, "c")
+        if nameless:
+            shutil.rmtree(folder, ignore_errors=True)  # nobody can ask for it again; what is mapped stays
+        name = None if nameless else f"{called} shuffled"
+        return cls(torch.from_numpy(rgba), sizes, about.has_alpha, trusted, True, name, memory, cache)
+
+    @classmethod
+    def from_arrays(cls, images: Sequence[np.ndarray], masks: Sequence[np.ndarray | None] | None = None) -> ImageStore:
+        """Pictures that are already here: uint8 (height, width, 3 or 4), and optionally which pixels to trust."""
+        pairs = zip(images, masks or [None] * len(images), strict=True)
+        return cls.load(
+            [ImageSource((i.shape[1], i.shape[0]), partial(pair, i, m)) for i, m in pairs], memory=sys.maxsize
+        )
+
+    def __len__(self) -> int:
+        return len(self.sizes)
+
+    def __getitem__(self, index: int) -> UInt8[Tensor, "height width channel"]:
+        """One image's bytes, with alpha where the store has it."""
+        width, height = self.sizes[index].tolist()
+        first = int(self._first[index])
+        rgba = self._rgba[first : first + width * height]
+        if self.shuffled:
+            natural = torch.empty_like(rgba)
+            natural[torch.from_numpy(shuffled_order(width * height, self.mask(index)))] = rgba
+            rgba = natural
+        return rgba.view(torch.uint8).view(height, width, 4)[..., : 4 if self.has_alpha else 3]
+
+    def mask(self, index: int) -> Bool[Tensor, "height width"] | None:
+        """Mask of an image's pixels to use; None if no image of the store has a mask."""
+        if self._trusted is None:
+            return None
+        width, height = self.sizes[index].tolist()
+        return self._trusted.mask(index, width * height).view(height, width)
+
+    @property
+    def trusted_pixels(self) -> Int[Tensor, " image"]:
+        """Number of pixels of each image to learn from."""
+        return self._count
+
+    def order(self, index: int) -> Int[np.ndarray, " pixel"] | None:
+        """Pixel of an image, row by row, at each of its positions; None if they lie row by row."""
+        return shuffled_order(int(self.sizes[index].prod()), self.mask(index)) if self.shuffled else None
+
+    def span(self, index: int) -> slice:
+        """The positions of an image."""
+        first = int(self._first[index])
+        return slice(first, first + int(self.sizes[index].prod()))
+
+    def grant(self, size: int) -> bool:
+        """True if so many more bytes may stay in memory; they count as taken from then on."""
+        granted = size <= self._memory
+        self._memory -= size if granted else 0
+        return granted
+
+    def draw(
+        self, count: int, images: Int[Tensor, " choice"], generator: torch.Generator, positions: bool = False
+    ) -> PixelBatch:
+        """Random pixels: each of the given images as likely as the next, each trusted pixel of it as well.
+
+        positions: whether to tell where they lie, for layers
+        """
+        piece = min(max(count // PIECES, SHORTEST_PIECE), LONGEST_PIECE) if self.shuffled else 1
+        chance = torch.rand(-(-count // piece), dtype=torch.float64, generator=generator)
+        image, xy = torch.empty(count, dtype=torch.int64), torch.empty(count, 2)
+        rgba = torch.empty(count, 4, dtype=torch.uint8)
+        nothing = torch.empty(0, dtype=torch.int64)
+        position = torch.empty(count, dtype=torch.int64) if positions else nothing
+        runs = (nothing,) * 4 if self._trusted is None else self._trusted.columns()
+        inputs = (chance, images, self._first, self._count, self._stride, self._width, *runs, self._rgba)
+        sample_pixels(piece, *(x.numpy() for x in (*inputs, image, xy, rgba.view(torch.int32)[:, 0], position)))
+        return PixelBatch(image, xy, rgba, position if positions else None)
+
+
+def name_of(pictures: Sequence[ImageSource]) -> str:
+    """File name for these pictures."""
+    return key(p.identity and f"{p.size} {p.identity}" for p in pictures)
+
+
+def pair(image: np.ndarray, mask: np.ndarray | None) -> tuple[np.ndarray, np.ndarray | None]:
+    return image, mask
+
+
+def fill(
+    rgba: np.ndarray, pictures: Sequence[ImageSource], progress: Callable[[int], object], shuffled: bool
+) -> tuple[bool, Runs | None]:
+    """Read all pictures into their places. Returns whether any is see-through, and what to trust."""
+    ends = np.cumsum([p.size[0] * p.size[1] for p in pictures])
+
+    def read(index: int) -> tuple[bool, np.ndarray | None]:
+        picture = pictures[index]
+        image, mask = picture.read()
+        assert image.shape[1::-1] == picture.size, f"promised {picture.size}, read {image.shape}"
+        pixels = image.shape[0] * image.shape[1]
+        four = np.full((pixels, 4), 255, np.uint8)
+        four[:, : image.shape[2]] = image.reshape(pixels, -1)
+        one = four.view(np.int32)[:, 0]
+        mask = None if mask is None or mask.all() else mask.astype(bool)
+        rgba[ends[index] - pixels : ends[index]] = one[shuffled_order(pixels, mask)] if shuffled else one
+        return bool((four[:, 3] < 255).any()), mask
+
+    found = in_parallel(read, range(len(pictures)), progress)
+    masks = [mask for _, mask in found]
+    trusted = None
+    if any(mask is not None for mask in masks):
+        whole = (np.ones(p.size[::-1], bool) for p in pictures)
+        trusted = Runs.of([w if m is None else m for m, w in zip(masks, whole, strict=True)])
+    return any(alpha for alpha, _ in found), trusted
+
+
+def write_store(folder: Path, total: int, pictures: Sequence[ImageSource], progress: Callable[[int], object]) -> None:
+    with filled(folder, 4 * total) as part:
+        rgba = new_file(part / "pixels", np.int32, (total,))
+        has_alpha, trusted = fill(rgba, pictures, progress, shuffled=True)
+        rgba.flush()
+        if trusted is not None:
+            start, before, count = (x.numpy() for x in (trusted.start, trusted.before, trusted.count))
+            np.savez(part / "trusted.npz", start=start, before=before, count=count)
+        (part / MARK).write_text(json.dumps({"has_alpha": has_alpha, "trusted": trusted is not None}))

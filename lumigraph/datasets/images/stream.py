@@ -1,0 +1,176 @@
+"""ImageStream: photographs that neither memory nor a file can hold, read again and again while they are learnt from."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Int, UInt8
+from torch import Tensor
+
+from ...errors import LumigraphError
+from ...geometry.choice import evenly
+from ...system.memory import memory_for_images
+from .cache import MARK, cache_folder, free_space
+from .kept import kept
+from .store import ImageSource, ImageStore, PixelBatch, name_of
+
+OF_DISK = 0.5  # share of what is free there that a file of photographs may take
+KEPT = 1 << 16  # random pixels that stay of a photograph
+RAYS = 1 << 13  # that are drawn before another photograph is read
+BEGIN = 16  # photographs that are there for the first batch
+READERS = 2  # threads that read ahead
+AHEAD = 4  # photographs that are read before their turn
+COPIES = 3  # of a photograph, while it is read
+LOOKED_AT = 4  # photographs that say whether all have alpha
+
+Some = tuple[UInt8[np.ndarray, "kept 4"], Int[np.ndarray, " kept"]]  # pixels of a photograph, and where they lie in it
+
+
+def load(
+    pictures: Sequence[ImageSource],
+    memory: int | None = None,
+    cache: Path | None = None,
+    progress: Callable[[int], object] = lambda done: None,
+    keep: bool = False,
+) -> ImageStore:
+    """Photographs in memory, else in a file, else, where that would take more than half of what is free on its disk,
+    read again and again. Arguments and faults as of `ImageStore.load`.
+
+    keep: whether each picture goes to a file of the cache even if all fit, so that nobody makes it again
+    """
+    memory = memory_for_images() if memory is None else memory
+    size = 4 * sum(width * height for width, height in (p.size for p in pictures))
+    if keep:
+        pictures = [kept(picture, cache or cache_folder()) for picture in pictures]
+    if size > memory:
+        folder = (cache or cache_folder() / "images") / name_of(pictures)
+        if not (folder / MARK).exists() and size > OF_DISK * free_space(folder):
+            return ImageStream(pictures, memory, cache)
+    return ImageStore.load(pictures, memory, cache, progress)
+
+
+class ImageStream(ImageStore):
+    """Photographs of any sizes, of which some random pixels are in memory at a time.
+
+    Readers go through all photographs in a random order, and then in another one, and leave KEPT random pixels of each;
+    a batch is drawn from those that are there, of which the oldest makes room for the next. So each photograph is as
+    likely as any other in the long run, each of its trusted pixels as well, and nobody waits for a photograph that one
+    batch alone would need. What is drawn depends on the generator of the first batch, on all batches since, and on
+    nothing else; a run that is resumed begins anew.
+
+    pictures: how to get each
+    memory:   bytes that all of it may take, photographs that are being read included
+    """
+
+    streams = True
+
+    def __init__(self, pictures: Sequence[ImageSource], memory: int, cache: Path | None = None):
+        sizes = torch.tensor([p.size for p in pictures])
+        self._pictures = list(pictures)
+        has_alpha = any(see_through(whole(self._pictures[i])[0]) for i in evenly(range(len(pictures)), LOOKED_AT))
+        super().__init__(torch.empty(0, dtype=torch.int32), sizes, has_alpha, memory=0, cache=cache)
+        reading = READERS * COPIES * 4 * int(sizes.prod(-1).max())
+        self._room = int(np.clip((memory - reading) // (8 * KEPT) - AHEAD, BEGIN, max(len(pictures), BEGIN)))
+        self._readers = ThreadPoolExecutor(READERS, "reading ahead")
+        self._images: Tensor | None = None  # those that are drawn from
+
+    def __getitem__(self, index: int) -> UInt8[Tensor, "height width channel"]:
+        """One image's bytes, read now."""
+        pixels, _ = whole(self._pictures[index])
+        return torch.from_numpy(pixels)[..., : 4 if self.has_alpha else 3]
+
+    def mask(self, index: int) -> Bool[Tensor, "height width"] | None:
+        """Mask of an image's pixels to use, read now; None if all."""
+        _, trusted = whole(self._pictures[index])
+        return None if trusted is None else torch.from_numpy(trusted)
+
+    def draw(
+        self, count: int, images: Int[Tensor, " choice"], generator: torch.Generator, positions: bool = False
+    ) -> PixelBatch:
+        """Random pixels; see `ImageStore.draw`. Raises LumigraphError where layers ask for positions."""
+        if positions:
+            raise LumigraphError(
+                "what is known beside photographs cannot be learnt from while they stream from their files, which they "
+                "do where neither memory nor the cache's disk holds them; use a larger --downscale or free some space"
+            )
+        if self._images is None or not torch.equal(self._images, images):
+            self._begin(images, generator)
+        self._due += count
+        while self._due >= RAYS:
+            self._take()
+            self._due -= RAYS
+        which, share = torch.rand(2, count, dtype=torch.float64, generator=generator).numpy()
+        place = (which * self._filled).astype(np.int64)
+        rank = (share * self._held[place]).astype(np.int64)
+        image, pixel = self._number[place], self._pixel[place, rank]
+        width = self.sizes[:, 0].numpy()[image]
+        xy = torch.from_numpy(np.stack([pixel % width, pixel // width], -1)).float() + 0.5
+        return PixelBatch(torch.from_numpy(image), xy, torch.from_numpy(self._rgba_of[place, rank]))
+
+    def _begin(self, images: Tensor, generator: torch.Generator) -> None:
+        """Draw from these photographs from now on."""
+        self._images, self._due = images.clone(), 0
+        self._random = np.random.default_rng(int(torch.randint(1 << 62, (1,), generator=generator)))
+        self._left: list[int] = []
+        self._coming: deque[tuple[int, Future[Some]]] = deque()
+        self._filled, self._next = 0, 0
+        self._rgba_of = np.empty((self._room, KEPT, 4), np.uint8)
+        self._pixel = np.empty((self._room, KEPT), np.int32)
+        self._held, self._number = np.zeros((2, self._room), np.int64)
+        for _ in range(min(BEGIN, len(images))):
+            self._take()
+
+    def _take(self) -> None:
+        """Wait for the next photograph, and have further ones read meanwhile."""
+        assert self._images is not None
+        while len(self._coming) <= AHEAD:
+            if not self._left:
+                self._left = self._random.permutation(self._images.numpy()).tolist()
+            number = self._left.pop()
+            seed = int(self._random.integers(1 << 62))
+            self._coming.append((number, self._readers.submit(self._some, number, seed)))
+        number, coming = self._coming.popleft()
+        rgba, pixel = coming.result()
+        place, count = self._next, len(pixel)
+        self._rgba_of[place, :count], self._pixel[place, :count] = rgba, pixel
+        self._held[place], self._number[place] = count, number
+        self._filled, self._next = max(self._filled, place + 1), (place + 1) % self._room
+
+    def _some(self, number: int, seed: int) -> Some:
+        """Random pixels of a photograph, or all that are to be trusted where they are few."""
+        pixels, trusted = whole(self._pictures[number])
+        if not self.has_alpha and see_through(pixels):
+            raise LumigraphError(
+                f"photograph {number} is see-through, and those that were looked at first are not; store all alike"
+            )
+        rgba = pixels.reshape(-1, 4)
+        known = None if trusted is None else np.flatnonzero(trusted)
+        count = len(rgba) if known is None else len(known)
+        if not count:
+            raise LumigraphError(
+                f"the mask of photograph {number} trusts no pixel; correct it or remove the photograph"
+            )
+        if count <= KEPT:
+            chosen = np.arange(count)
+        else:
+            chosen = np.sort(np.random.default_rng(seed).integers(count, size=KEPT))  # in the order of memory
+        chosen = chosen if known is None else known[chosen]
+        return rgba[chosen], chosen.astype(np.int32)
+
+
+def whole(picture: ImageSource) -> tuple[UInt8[np.ndarray, "height width 4"], Bool[np.ndarray, "height width"] | None]:
+    """A photograph's pixels, four bytes each, and which of them to trust; None for all."""
+    image, mask = picture.read()
+    assert image.shape[1::-1] == picture.size, f"promised {picture.size}, read {image.shape}"
+    four = np.full((*image.shape[:2], 4), 255, np.uint8)
+    four[..., : image.shape[2]] = image
+    return four, None if mask is None or mask.all() else mask.astype(bool)
+
+
+def see_through(pixels: UInt8[np.ndarray, "height width 4"]) -> bool:
+    return bool((pixels[..., 3] < 255).any())

@@ -1,0 +1,300 @@
+"""Scene: photographs, where they were taken from, and what is known of the space between them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, field, replace
+from functools import partial
+from pathlib import Path
+from typing import Annotated, Any, ClassVar
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int, Shaped, UInt8
+from torch import Tensor
+
+from ..camera import Camera
+from ..camera.rays import Rays
+from ..color.blending import before
+from ..errors import LumigraphError
+from ..files.ranges import Coordinate, Point, Row, Share, between, typed
+from ..geometry import Similarity, is_similarity
+from ..geometry import Vector as Vector
+from .images import UNNAMED, ImageStore, Layer, cosines, resized
+
+# How values of a layer are reduced, by its name (see `resized`); all others are picked, not averaged.
+AVERAGED = {
+    "colours": "sRGB",
+    "raw": "linear",
+    "albedo": "linear",
+    "radiance": "linear",
+    "mosaic": "mosaic",
+    "filter": "filter",
+    "flow": "pixels",
+}
+
+
+Size = Annotated[float, between(1e-9, 1e9)]  # scene units
+
+
+@dataclass(frozen=True)
+class Forward:
+    """How a capture looks one way: the mean of its cameras, before a plane that they look through.
+
+    pose:  camera-to-world of the mean camera, in scene units
+    scale: of x / z and y / z in that camera, bringing all that the cameras see within [-1, 1]
+    near:  distance of that plane from the mean camera; what is to be modelled lies beyond
+    """
+
+    pose: tuple[Row, ...]
+    scale: tuple[Size, Size]
+    near: Size
+
+
+@dataclass(frozen=True)
+class Frame:
+    """Where a scene is, in plain numbers; all that a method must know to be built, with or without photographs.
+
+    bounds:      two corners of the box of interest, inside [-1, 1]^3
+    reach:       half-size of the cube around the origin that holds everything to be modelled: 1 for an object, a power
+                 of two up to 64 for a room or an unbounded capture
+    near:        distance from a camera at which its rays may begin; nothing is nearer
+    background:  colour behind everything
+    has_alpha:   whether the photographs say how opaque each pixel is
+    image_count: photographs in the scene, held-out ones included
+    source_from_scene: the similarity x_source = M x_scene back to the frame that the capture came in, so that exports
+                 line up with it
+    forward:     of a capture without bounds whose cameras all look one way; None for any other
+    times:       first and last moment of a capture whose photographs say when they were taken, in its own unit; None
+                 for any other, and where all were taken at once
+    """
+
+    bounds: tuple[Point, Point] = ((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0))
+    reach: Size = 1.0
+    near: Size = 0.05
+    background: tuple[Share, Share, Share] = (0.0, 0.0, 0.0)
+    has_alpha: bool = False
+    image_count: Annotated[int, between(0, 10**6)] = 0
+    source_from_scene: tuple[Row, ...] = (
+        (1.0, 0.0, 0.0, 0.0),
+        (0.0, 1.0, 0.0, 0.0),
+        (0.0, 0.0, 1.0, 0.0),
+        (0.0, 0.0, 0.0, 1.0),
+    )
+    forward: Forward | None = None
+    times: tuple[Coordinate, Coordinate] | None = None
+
+    @property
+    def is_open(self) -> bool:
+        """Whether the scene has no bounds: a room or the open, not an object."""
+        return self.reach > 1
+
+    @property
+    def to_source(self) -> Similarity:
+        """The way back to the frame that the capture came in."""
+        return Similarity.of(self.source_from_scene)
+
+    def to_json(self) -> dict[str, Any]:
+        """Plain numbers and lists; `from_json` turns them back exactly."""
+        return asdict(self)
+
+    @staticmethod
+    def from_json(data: Any, where: Path | str = "a frame") -> Frame:
+        """What a run says of its frame. Raises LumigraphError, naming `where`, for what is none."""
+        frame = typed(Frame, data, where, closed=True)
+        low, high = frame.bounds
+        if not all(a < b for a, b in zip(low, high, strict=True)):
+            raise LumigraphError(f"{where}: bounds from {low} to {high} hold nothing; correct them")
+        if not is_similarity(torch.tensor(frame.source_from_scene, dtype=torch.float64)):
+            raise LumigraphError(f"{where}: source_from_scene does more than move, turn and scale; correct it")
+        if frame.forward is not None and len(frame.forward.pose) != 3:
+            raise LumigraphError(f"{where}: forward.pose should be 3 rows of 4 numbers; correct it")
+        return frame
+
+
+@dataclass(frozen=True)
+class Batch:
+    """Rays, and what the photographs say they saw.
+
+    rgb:   sRGB-encoded, not multiplied by alpha
+    alpha: opacity, where the photographs have it
+    extra: values of the layers that were asked for, by name; see `Layer.decoded`
+    """
+
+    unit: ClassVar[str] = "rays"
+
+    rays: Rays
+    rgb: Float[Tensor, "ray 3"]
+    alpha: Float[Tensor, " ray"] | None = None
+    extra: dict[str, Tensor] = field(default_factory=dict)
+
+    def __len__(self) -> int:
+        return len(self.rgb)
+
+    def before(self, background: Float[Tensor, "#ray 3"]) -> Float[Tensor, "ray 3"]:
+        """The colours with a background behind what is not opaque."""
+        return before(self.rgb, self.alpha, background)
+
+    def to(self, device: torch.device | str) -> Batch:
+        alpha = None if self.alpha is None else self.alpha.to(device)
+        extra = {name: values.to(device) for name, values in self.extra.items()}
+        return Batch(self.rays.to(device), self.rgb.to(device), alpha, extra)
+
+
+@dataclass(frozen=True)
+class Photograph:
+    """One whole photograph, and what took it.
+
+    rgb:   sRGB-encoded, not multiplied by alpha
+    alpha: opacity, where the photographs have it
+    mask:  which pixels are to be trusted; None for all
+    extra: values of the layers that were asked for, by name; see `Layer.decoded`
+    """
+
+    unit: ClassVar[str] = "rays"  # one through each pixel
+
+    camera: Camera
+    rgb: Float[Tensor, "height width 3"]
+    alpha: Float[Tensor, "height width"] | None = None
+    mask: Bool[Tensor, "height width"] | None = None
+    extra: dict[str, Tensor] = field(default_factory=dict)
+
+    def __len__(self) -> int:
+        """Pixels."""
+        return self.rgb.shape[0] * self.rgb.shape[1]
+
+    def before(self, background: Float[Tensor, " 3"] | Vector) -> Float[Tensor, "height width 3"]:
+        """The colours with a background behind what is not opaque."""
+        return before(self.rgb, self.alpha, background)
+
+    def to(self, device: torch.device | str) -> Photograph:
+        rgb, alpha, mask = (None if x is None else x.to(device) for x in (self.rgb, self.alpha, self.mask))
+        assert rgb is not None
+        extra = {name: values.to(device) for name, values in self.extra.items()}
+        return Photograph(self.camera.to(device), rgb, alpha, mask, extra)
+
+    def reduced(self, factor: int) -> Photograph:
+        """A whole number of times smaller: means over squares of pixels. What does not fill a square is left out.
+
+        Of the layers light is averaged too; depth, labels and all else are picked (see `resized`).
+        """
+        if factor == 1:
+            return self
+        height, width = (n // factor * factor for n in self.rgb.shape[:2])
+
+        def mean(x: Tensor) -> Tensor:
+            x = x[:height, :width]
+            return x.reshape(height // factor, factor, width // factor, factor, *x.shape[2:]).mean((1, 3))
+
+        rgb, alpha, mask = self.rgb, self.alpha, self.mask
+        if alpha is not None:  # colours count as much as they cover
+            covered = mean(alpha)
+            rgb = mean(rgb * alpha[..., None]) / covered.clamp_min(1e-6)[..., None]
+            alpha = covered
+        else:
+            rgb = mean(rgb)
+        mask = None if mask is None else mean(mask.float()) == 1
+        lens = self.camera.lens.resized(torch.full((1, 2), 1 / factor, device=self.rgb.device))
+        size = self.camera.size.new_tensor([[width // factor, height // factor]])
+        extra = {
+            name: smaller(values[:height, :width], factor, AVERAGED.get(name, "plain"))
+            for name, values in self.extra.items()
+        }
+        return Photograph(replace(self.camera, lens=lens, size=size), rgb, alpha, mask, extra)
+
+
+def smaller(values: Shaped[Tensor, "height width *channels"], factor: int, encoding: str) -> Tensor:
+    """Decoded values of a layer, a whole number of times smaller; see `resized`."""
+    height, width = values.shape[:2]
+    stored = values.cpu().numpy()
+    per_pixel = stored.reshape(height, width, -1)
+    known = ~np.isnan(per_pixel).any(-1) if values.is_floating_point() else (per_pixel != UNNAMED).any(-1)
+    return torch.from_numpy(resized(stored, (width // factor, height // factor), encoding, known)).to(values.device)
+
+
+@dataclass(frozen=True)
+class Scene:
+    """Image i was taken by camera i and is called names[i].
+
+    cameras: in the scene's frame; image_index counts them
+    frame:   bounds, reach, background, and the way back to the source's frame
+    splits:  image numbers by purpose: "train", "test", maybe "val"
+    points:  sparse points in the scene's frame, where structure from motion gave some
+    source:  the folder it came from, or "procedural:<name>"
+    warnings: what the user should know about the capture, one sentence each
+    layers:  what else is known of every pixel, by name: depth, labels ...; read when asked for
+    about:   what else is known of each photograph, by name: exposure, boxes ...; the first axis is the image
+    full_sizes: width and height of the photographs before they were reduced, where they come from files
+    """
+
+    kind: ClassVar[str] = "photographs"
+
+    cameras: Camera
+    images: ImageStore
+    frame: Frame
+    splits: dict[str, Int[Tensor, " image"]]
+    names: list[str]
+    source: str = ""
+    points: Float[Tensor, "point 3"] | None = None
+    point_colours: UInt8[Tensor, "point 3"] | None = None
+    warnings: list[str] = field(default_factory=list)
+    layers: dict[str, Layer] = field(default_factory=dict)
+    about: dict[str, Tensor] = field(default_factory=dict)
+    full_sizes: Int[Tensor, "photograph 2"] | None = None
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    def pixels(self, split: str) -> int:
+        """How many pixels there are to learn from, or to compare."""
+        return int(self.images.trusted_pixels[self.splits[split]].sum())
+
+    def layer(self, name: str) -> Layer:
+        """A layer by its name. Raises LumigraphError, naming those that there are, if there is none."""
+        if name not in self.layers:
+            there = f"only {', '.join(self.layers)}" if self.layers else "nothing else"
+            raise LumigraphError(f"{self.source} has no {name} beside its photographs, {there}; add it, or do without")
+        return self.layers[name]
+
+    def sample_rays(
+        self,
+        count: int,
+        generator: torch.Generator,
+        split: str = "train",
+        layers: Sequence[str] = (),
+        places: bool = False,
+    ) -> Batch:
+        """Random pixels of random photographs: photographs evenly, then their trusted pixels evenly.
+
+        layers: names of what else to tell of these pixels, in `Batch.extra`. Raises LumigraphError if there is no such
+        places: whether to tell where on their pictures they lie, as shares of width and height, in `extra["place"]`
+        """
+        chosen = self.splits[split]
+        drawn = self.images.draw(count, chosen, generator, positions=bool(layers))
+        rays = self.cameras.rays(drawn.xy, drawn.image)
+        rgb = drawn.rgba[:, :3].float().div_(255)
+        alpha = drawn.rgba[:, 3].float().div_(255) if self.images.has_alpha else None
+        extra = {"place": drawn.xy / self.cameras.size[drawn.image]} if places else {}
+        for name in layers:
+            layer = self.layer(name)
+            assert drawn.position is not None
+            cosine = partial(cosines, rays.directions, self.cameras.forward[drawn.image])
+            extra[name] = layer.decoded(layer.gathered(drawn.position, chosen), cosine)
+        return Batch(rays, rgb, alpha, extra)
+
+    def preview(self) -> Camera:
+        """The camera of the first held-out photograph; of the first one, where none is held out."""
+        held_out = self.splits.get("test")
+        return self.cameras[int((held_out if held_out is not None and len(held_out) else self.splits["train"])[0])]
+
+    def photograph(self, index: int, layers: Sequence[str] = ()) -> Photograph:
+        """One photograph, its camera, and of the layers those that are named. Raises LumigraphError as `layer` does."""
+        camera, image = self.cameras[index], self.images[index].div(255)
+        alpha = image[..., 3] if image.shape[-1] == 4 else None
+
+        def cosine() -> Tensor:
+            directions = camera.rays(camera.pixels()).directions
+            return cosines(directions, camera.forward).view(image.shape[:2])
+
+        extra = {name: self.layer(name).decoded(self.layer(name).stored(index), cosine) for name in layers}
+        return Photograph(camera, image[..., :3].contiguous(), alpha, self.images.mask(index), extra)

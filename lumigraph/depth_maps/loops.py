@@ -1,0 +1,65 @@
+"""The loops over points and the depth that a camera sees in their direction (Numba).
+
+pixels, valid: where points lie in the picture (x, y), and whether the lens sees them
+away:          distances of the points from the camera
+depth:         distances of the surface along the pixels' rays; infinity where nothing is, NaN where nobody measured
+"""
+
+from __future__ import annotations
+
+import math
+
+from numba import njit, prange
+
+
+@njit(inline="always")
+def depth_at(depth, x, y, edge):
+    """Depth between pixels' centres, bilinear, and True; at an edge, where the four differ by `edge`, the nearest of
+    them and False. NaN and False where one of them is NaN."""
+    height, width = depth.shape
+    u, v = min(max(x - 0.5, 0.0), width - 1.0), min(max(y - 0.5, 0.0), height - 1.0)
+    left, top = int(u), int(v)
+    right, below = min(left + 1, width - 1), min(top + 1, height - 1)
+    a, b, c, d = depth[top, left], depth[top, right], depth[below, left], depth[below, right]
+    if math.isnan(a + b + c + d):
+        return a + b + c + d, False
+    nearest = min(a, b, c, d)
+    if nearest == math.inf:
+        return nearest, True
+    if max(a, b, c, d) - nearest >= edge:
+        return nearest, False
+    u, v = u - left, v - top
+    return (1 - v) * ((1 - u) * a + u * b) + v * ((1 - u) * c + u * d), True
+
+
+@njit(parallel=True, cache=True, error_model="numpy")
+def compare(pixels, valid, away, depth, edge, edge_per_distance, ahead, smooth):
+    """DepthMap.compare: how far the surface lies behind each point; NaN outside the picture and where it is unknown."""
+    height, width = depth.shape
+    for i in prange(len(away)):
+        x, y = pixels[i, 0], pixels[i, 1]
+        ahead[i], smooth[i] = math.nan, False
+        if valid[i] and 0 <= x < width and 0 <= y < height:
+            surface, smooth[i] = depth_at(depth, x, y, edge + edge_per_distance * away[i])
+            ahead[i] = surface - away[i]
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def fuse(pixels, valid, away, depth, facing, least, edges, truncations, total, weight, truncated, pictured):
+    """TSDF: one camera's distances, added to those of the others. edges and truncations are
+    tolerances (constant, per distance)."""
+    height, width = depth.shape
+    for i in range(len(away)):
+        x, y = pixels[i, 0], pixels[i, 1]
+        if valid[i] and 0 <= x < width and 0 <= y < height:
+            truncation = truncations[0] + truncations[1] * away[i]
+            surface, smooth = depth_at(depth, x, y, edges[0] + edges[1] * away[i])
+            ahead = surface - away[i]
+            if not math.isnan(ahead):
+                pictured[i] = True
+            # At an edge only what lies in front of both sides is known; where the depth is NaN, nothing.
+            if ahead > (-truncation if smooth else truncation):
+                share = max(facing[int(y), int(x)], least) / (away[i] * away[i])
+                total[i] += share * min(ahead / truncation, 1.0)
+                weight[i] += share
+                truncated[i] += share * truncation

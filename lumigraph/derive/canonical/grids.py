@@ -1,0 +1,61 @@
+"""Density grids of fields: where an instance is opaque, centred and scaled, as weighted points."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from ...datasets.scene import Vector
+from ...errors import LumigraphError
+from ...geometry import Similarity
+
+LEAST = 0.1  # opacity of a cell below which it counts as empty
+CHUNK = 1 << 16  # points asked at once
+
+Density = Callable[[Float[Tensor, "point 3"]], Float[Tensor, " point"]]
+
+
+@dataclass(frozen=True)
+class Instance:
+    """What is opaque in a grid of cells, in a frame of its own: centred at the weighted mean, of spread one.
+
+    points:  centres of the cells that are not empty
+    weights: how much light each cell stops, 1 - exp(-density times its side); they add up to one
+    place:   the similarity from that frame back to the one that the grid was sampled in
+    """
+
+    points: Float[Tensor, "cell 3"]
+    weights: Float[Tensor, " cell"]
+    place: Similarity
+
+    def turned(self, rotation: Float[Tensor, "3 3"]) -> Instance:
+        """The same thing turned about its middle."""
+        back = Similarity.make(1.0, rotation.T)
+        return Instance(self.points @ rotation.T.to(self.points), self.weights, self.place @ back)
+
+
+def sampled(density: Density, bounds: tuple[Vector, Vector], cells: int, name: str = "It") -> Instance:
+    """The instance that a density has within bounds.
+
+    density: per unit of the frame of the bounds
+    cells:   of the grid along the longest side
+    Raises LumigraphError, naming it, where there is nothing.
+    """
+    low, high = torch.tensor(bounds, dtype=torch.float64)
+    side = float((high - low).max()) / cells
+    axes = [torch.arange(a + side / 2, b, side, dtype=torch.float64) for a, b in zip(low, high, strict=True)]
+    points = torch.cartesian_prod(*axes).float()
+    with torch.no_grad():
+        opacity = torch.cat([1 - (-side * density(some).float().cpu()).exp() for some in points.split(CHUNK)])
+    there = opacity > LEAST
+    if not there.any():
+        raise LumigraphError(f"{name} is empty, nothing in it is opaque; leave it out, or train it for longer")
+    weights = (opacity[there] / opacity[there].sum()).double()
+    middle = (weights[:, None] * points[there]).sum(0)
+    away = points[there].double() - middle
+    spread = float((weights * away.square().sum(-1)).sum().sqrt().clamp_min(1e-9))
+    return Instance((away / spread).float(), weights.float(), Similarity.make(spread, translation=middle))

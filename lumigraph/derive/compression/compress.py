@@ -1,0 +1,206 @@
+"""compress(): which rung of the ladder a run stands on, tuned there, and written as a run of its own."""
+
+from __future__ import annotations
+
+import shutil
+from bisect import bisect_left
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from ... import files
+from ...errors import LumigraphError
+from ...evaluation import evaluate
+from ...geometry.choice import evenly
+from ...method import Method
+from ...method.capabilities import CanCompress, needs
+from ...run import Run, check_new
+from ...run.budget import Budget
+from ...run.checkpoint import Checkpoints
+from ...run.compressed import Compressed, bytes_in
+from ...system.progress import track
+from .ladder import LADDER, PLACES, Rung, rung_at
+from .measure import Truth, truth_of
+from .model import Model
+
+LOOKED_AT = 6  # photographs that were learnt from, by which a rung is judged; held-out ones judge the outcome alone
+WEIGHED = 40  # photographs that say what is important
+TRIAL = 1 / 6  # of all tuning, for each rung that is tried; as much as is left goes to the one that stays
+
+
+@dataclass(frozen=True)
+class Aim:
+    """What is wanted, and what it may take; exactly one of size and loss.
+
+    size:     bytes of the model at most
+    loss:     dB that photographs which were learnt from may lose at most
+    codebook: rows of the codebook at most, where the ladder's are not wanted
+    steps, seconds: of tuning in all; one of them
+    views:    held-out views to compare; None for all
+    """
+
+    size: int | None = None
+    loss: float | None = None
+    codebook: int | None = None
+    steps: int | None = None
+    seconds: float | None = None
+    views: int | None = None
+
+    def part(self, share: float) -> tuple[int | None, float | None]:
+        """Steps or seconds of a share of all tuning."""
+        return self.steps and max(1, round(share * self.steps)), self.seconds and share * self.seconds
+
+
+def compress(
+    run: Run, output: Path, aim: Aim, source: str | None = None, device: torch.device | str = "cpu"
+) -> Compressed:
+    """A smaller run in a new folder, which opens like any other; gives what compress.json says.
+
+    source: where the photographs are now, if they have moved. Where they cannot be opened, the run's own renderings are
+            learnt from and compared with.
+    Raises LumigraphError for a run that was compressed already, a method that cannot be, a codebook larger than what it
+    would stand for, and a size that no rung reaches.
+    """
+    if run.compressed:
+        raise LumigraphError(f"{run.folder} is compressed already; compress the run that it was made of")
+    check_new(output)
+    before = run.method(device)
+    needs(before, CanCompress)
+    if aim.codebook is not None:
+        check_codebook(before, aim.codebook)
+    truth = truth_of(run, before, source, LOOKED_AT)
+    ladder = Ladder(run, truth, aim, device, important(before, truth))
+    model = ladder.by_size(aim.size) if aim.size is not None else ladder.by_loss(aim.loss or 0.0)
+    return written(run, before, model, truth, output, aim)
+
+
+class Ladder:
+    """Rungs that are tried, each from the run's own weights."""
+
+    def __init__(self, run: Run, truth: Truth, aim: Aim, device: torch.device | str, importance: dict[str, Tensor]):
+        self.run, self.truth, self.aim, self.device, self.importance = run, truth, aim, device, importance
+        self.tuned = 0.0  # share of all tuning
+
+    def by_loss(self, most: float) -> Model:
+        """The highest rung on which no more is lost, by halving; the lowest, where even there more is."""
+        low, high, best = 0, len(LADDER) - 1, None
+        while low <= high:
+            middle = (low + high) // 2
+            model = self.at(middle)
+            self.tune(model, TRIAL)
+            if self.truth.loss(model.method, LOOKED_AT) <= most:
+                low, best = middle + 1, model
+            else:
+                high = middle - 1
+        model = best or self.at(0)
+        self.tune(model, 1 - self.tuned)
+        return model
+
+    def by_size(self, most: int) -> Model:
+        """The lowest place that is as small, on a rung or between two. Tuning changes the size a little, so that it may
+        take the next one."""
+        first = bisect_left(PLACES, True, key=lambda place: len(self.at(place).packed()) <= most)
+        for place in PLACES[first:]:
+            model, self.tuned = self.at(place), 0.0
+            self.tune(model, 1.0)
+            if len(model.packed()) <= most:
+                return model
+        smallest = len(self.at(len(LADDER) - 1).packed())
+        raise LumigraphError(
+            f"{self.run.folder} cannot be made as small as {told(most)}; the smallest reached is {told(smallest)}"
+        )
+
+    def at(self, place: float) -> Model:
+        """The run on a rung, or between two."""
+        rung, step = self.rung(place), self.run.state.step
+        method = self.run.method(self.device)
+        if self.run.settings.budget:
+            spent = Budget.from_json(self.run.settings.budget).progress(step, self.run.state.seconds)
+            method.before_step(step, spent)  # how finely it looks, at this share of its training
+            self.run.restore_weights(method)
+        return Model(method, self.importance, rung, step)
+
+    def rung(self, place: float) -> Rung:
+        rung = rung_at(place)
+        if self.aim.codebook is None:
+            return rung
+        return replace(rung, recipe=replace(rung.recipe, codebook=self.aim.codebook))
+
+    def tune(self, model: Model, share: float) -> None:
+        if share > 0:
+            model.tune(self.truth.scene, *self.aim.part(share))
+            self.tuned += share
+
+
+def important(method: Method, truth: Truth) -> dict[str, Tensor]:
+    """What each row of the method's tensors adds to the photographs, or to many of them."""
+    train = evenly(truth.scene.splits["train"].tolist(), WEIGHED)
+    total: dict[str, Tensor] = {}
+    for i in track(train, "Weighing what matters", len(train)):
+        camera = method.refined(truth.scene.cameras[i])
+        for name, weights in needs(method, CanCompress).importance(camera).items():
+            total[name] = total[name] + weights if name in total else weights
+    return total
+
+
+def check_codebook(method: Method, size: int) -> None:
+    """Raise LumigraphError for a codebook with more rows than there are to be coded."""
+    state = method.state_dict()
+    counts = {
+        name: state[name].numel() // row_width(state[name], how.layout)
+        for name, how in needs(method, CanCompress).storage().items()
+        if how.how == "coded"
+    }
+    for name, count in counts.items():
+        if size > count:
+            raise LumigraphError(
+                f"A codebook of {size:,} rows is larger than what it would stand for: {name} has {count:,}; give a "
+                "smaller --codebook"
+            )
+
+
+def row_width(tensor: Tensor, layout: str) -> int:
+    """Columns of a tensor's rows, see `packing.Stored`."""
+    return {"rows": tensor[:1].numel(), "cells": tensor.shape[-1], "channels": tensor.shape[min(1, tensor.dim() - 1)]}[
+        layout
+    ]
+
+
+def written(run: Run, before: Method, model: Model, truth: Truth, output: Path, aim: Aim) -> Compressed:
+    """Write the run; what it says of itself is measured on what was written, opened again."""
+    views = min(aim.views or len(truth.scene.splits["test"]), len(truth.scene.splits["test"]))
+    settings = replace(run.settings, said=run.settings.said | {"compressed": {"source": str(run.folder.resolve())}})
+    rung = model.rung
+    with files.replacing_folder(output) as partial:
+        if files.is_file(run.folder / "cameras.json"):
+            shutil.copy2(run.folder / "cameras.json", partial / "cameras.json")
+        Checkpoints(partial, run.method_name).save_packed(run.state, model.packed())
+        settings.write(partial / "config.json")
+        small = Run(partial)
+        told_of = Compressed(
+            source=str(run.folder.resolve()),
+            method=run.method_name,
+            bytes_before=run.model_bytes,
+            bytes_after=small.model_bytes,
+            folder_before=bytes_in(run.folder),
+            folder_after=bytes_in(partial),
+            psnr_before=evaluate(before, truth.scene, "test", views=views).psnr if truth.photographed else None,
+            psnr_after=evaluate(small.method(before.device), truth.scene, "test", views=views).psnr,
+            compared_with="photographs" if truth.photographed else "renderings of the run",
+            views=views,
+            pruned=rung.pruned,
+            codebook=rung.recipe.codebook,
+            apart=rung.recipe.apart,
+            coarser=rung.recipe.coarser,
+            steps=model.steps,
+            seconds=model.seconds,
+        )
+        told_of.write(partial)
+    return told_of
+
+
+def told(size: float) -> str:
+    """Bytes for people, to three digits, as --to takes them."""
+    return f"{size / 1e6:.3g}MB" if size >= 1e6 else f"{size / 1e3:.3g}kB"

@@ -1,0 +1,113 @@
+"""Model: a method whose tensors are tables in few bytes, and that can be tuned as such."""
+
+from __future__ import annotations
+
+import time
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from ...datasets.scene import Scene
+from ...errors import LumigraphError
+from ...exchange import packing
+from ...exchange.packing import Table
+from ...method import Method
+from ...method.capabilities import CanCompress, needs
+from ...system.progress import counting
+from .ladder import Rung
+
+PACE = 0.1  # of the error that storing made: how far a step of tuning moves
+LAST_PACE = 0.1  # of that pace, at the end
+BETAS = 0.9, 0.99
+
+
+class Model:
+    """A trained method on a rung of the ladder.
+
+    step: of its training, at which it goes on being tuned
+    Raises LumigraphError for a method that cannot be compressed.
+    """
+
+    def __init__(self, method: Method, importance: dict[str, Tensor], rung: Rung, step: int):
+        self.method, self.rung, self.step = method, rung, step
+        weights = needs(method, CanCompress).thin(importance, rung.pruned)
+        stored = needs(method, CanCompress).storage()
+        chance = torch.Generator().manual_seed(0)
+        self.tensors: dict[str, Tensor | Table] = {}
+        for name, tensor in method.state_dict().items():
+            how = stored.get(name)
+            self.tensors[name] = (
+                tensor if how is None else packing.packed(tensor, how, rung.recipe, weights.get(name), chance)
+            )
+        parameters = dict(method.named_parameters())
+        self.tuned = [(parameters[name], x) for name, x in self.tables.items() if x.forms and name in parameters]
+        self.steps, self.seconds = 0, 0.0
+        self.show()
+
+    @property
+    def tables(self) -> dict[str, Table]:
+        return {name: x for name, x in self.tensors.items() if isinstance(x, Table)}
+
+    def show(self) -> None:
+        """Let the method have the numbers as they will be read."""
+        own = self.method.state_dict()
+        for name, table in self.tables.items():
+            if table.forms:
+                table.put(own[name])
+
+    def packed(self) -> bytes:
+        """The file of it."""
+        return packing.write(self.tensors)
+
+    def tune(self, scene: Scene, steps: int | None, seconds: float | None) -> None:
+        """Learn from photographs with the rows' codes as they are: codebooks, rows apart from them and scaled numbers
+        descend together, through the rounding, at a pace that falls with progress."""
+        rates = [(latent.requires_grad_(), unit) for _, table in self.tuned for latent, unit in learning(table)]
+        optimizer = torch.optim.Adam([{"params": [x], "lr": 0.0, "unit": unit} for x, unit in rates], betas=BETAS)
+        generator, begin, taken = torch.Generator().manual_seed(self.steps), time.perf_counter(), 0
+        self.method.train()
+        total = steps if steps is not None else round(seconds or 0)
+        with counting("Tuning", total) as done:
+            while (share := progress(taken, time.perf_counter() - begin, steps, seconds)) < 1:
+                for group in optimizer.param_groups:
+                    group["lr"] = PACE * LAST_PACE**share * group["unit"]
+                self._descend(self.method.batch(scene, generator), optimizer)
+                taken, self.steps = taken + 1, self.steps + 1
+                done(int(share * total))
+        self.method.eval()
+        for latent, _ in rates:
+            latent.requires_grad_(False)
+        self.show()
+        self.seconds += time.perf_counter() - begin
+
+    def _descend(self, batch: Any, optimizer: torch.optim.Optimizer) -> None:
+        """One step: gradients reach the method's own tensors, and from there what their rows were made of."""
+        values = [table.values() for _, table in self.tuned]
+        for (parameter, table), some in zip(self.tuned, values, strict=True):
+            table.put(parameter.data, some.detach())
+            parameter.grad = None
+        terms = self.method.loss(batch, self.step + self.steps)
+        loss = torch.stack(list(terms.values())).sum()
+        if not loss.isfinite():
+            raise LumigraphError("Tuning stopped because the loss is not finite; give fewer --steps or --seconds")
+        loss.backward()
+        reached = [
+            (some, table.taken(parameter.grad.to_dense()))
+            for (parameter, table), some in zip(self.tuned, values, strict=True)
+            if parameter.grad is not None and some.requires_grad
+        ]
+        optimizer.zero_grad()
+        torch.autograd.backward([some for some, _ in reached], [grad for _, grad in reached])
+        optimizer.step()
+
+
+def learning(table: Table) -> list[tuple[Tensor, float]]:
+    return [pair for form in table.forms for pair in form.learning()]
+
+
+def progress(step: int, passed: float, steps: int | None, seconds: float | None) -> float:
+    """The share of tuning that is over."""
+    if steps is not None:
+        return step / steps if steps else 1.0
+    return passed / seconds if seconds else 1.0

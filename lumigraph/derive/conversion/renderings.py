@@ -1,0 +1,61 @@
+"""What a student learns from where there are no photographs: pictures that its teacher renders, as a Scene."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import replace
+
+import torch
+
+from ...camera import Camera
+from ...datasets.images import ImageStore
+from ...datasets.scene import Scene
+from ...geometry import look_at
+from ...geometry.choice import evenly
+from ...method import Method
+from ...system.progress import track
+from ..compression.measure import bytes_of
+
+MOST, FEWEST = 80, 8  # pictures, and however short the time
+LONGEST = 400  # pixels of their longer side
+ASIDE = 1 / 3  # of the way from a camera to its nearest neighbour, where another one stands
+
+
+@torch.no_grad()
+def rendered_scene(teacher: Method, cameras: Camera, source: str, seconds: float) -> Scene:
+    """A Scene whose photographs are what a teacher shows from its cameras, and from others between them.
+
+    seconds: that rendering may take, about
+    """
+    some = evenly(range(len(cameras)), MOST // 2)
+    own = Camera.cat([cameras[i] for i in some])
+    both = own if len(own) < 2 else Camera.cat([own, between(own)])
+    both = both.resized(min(1.0, LONGEST / int(both.size.max())))
+    affordable = MOST if seconds == float("inf") else int(seconds / seconds_of_one(teacher, both[0]))
+    chosen = evenly(range(len(both)), max(affordable, FEWEST))
+    frame, pictures = teacher.frame, []
+    for i in track(chosen, "Rendering what to learn from", len(chosen)):
+        pictures.append(bytes_of(teacher.render(both[i]).cpu(), frame.background if frame.has_alpha else None))
+    index = torch.arange(len(chosen))
+    names = [f"{i:03d}" for i in chosen]
+    return Scene(both[torch.tensor(chosen)], ImageStore.from_arrays(pictures), frame, {"train": index}, names, source)
+
+
+def between(cameras: Camera) -> Camera:
+    """For each camera another one on the way to its nearest neighbour, which looks in between as well."""
+    apart = torch.cdist(cameras.position, cameras.position).fill_diagonal_(torch.inf)
+    other = apart.argmin(-1)
+
+    def mixed(values: torch.Tensor) -> torch.Tensor:
+        return torch.lerp(values, values[other], ASIDE)
+
+    pose = look_at(mixed(cameras.position), mixed(cameras.forward), -mixed(cameras.pose[:, :, 1]))
+    return replace(cameras, pose=pose)
+
+
+def seconds_of_one(teacher: Method, camera: Camera) -> float:
+    """What rendering a picture takes; kernels are compiled before."""
+    teacher.render(camera.resized(min(1.0, 32 / int(camera.size.max()))))
+    begin = time.perf_counter()
+    teacher.render(camera)
+    return max(time.perf_counter() - begin, 1e-6)

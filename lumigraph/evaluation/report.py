@@ -1,0 +1,264 @@
+"""A run on one page: figures, film, curves, contact sheet and settings in one HTML file that needs nothing else."""
+
+from __future__ import annotations
+
+import base64
+import io
+import json
+import math
+from collections.abc import Sequence
+from html import escape
+from pathlib import Path
+from typing import Any
+
+from PIL import Image
+
+from .. import __version__, methods
+from ..capture.pictures import readable
+from ..figures.charts import STYLE as CHARTS
+from ..figures.charts import Series, bar_chart, line_chart
+from ..files import claim, write_bytes
+from ..metrics import scores_of
+from ..run import Run
+from ..run.budget import Budget
+from ..system.progress import clock, short
+from ..training.verdict import cameras_moved
+
+LARGEST_FILM = 12 << 20  # bytes; larger ones are named instead of embedded
+STYLE = CHARTS + (Path(__file__).parent / "report.css").read_text("utf-8")
+
+
+def write_report(run: Run) -> Path:
+    """Write RUN/report.html from what the run's folder holds: the more commands have run, the more it shows."""
+    path = claim_report(run)
+    evaluation = run.evaluation()
+    title = f"{run.title} · {run.method_name}"
+    sections = [
+        header(run, evaluation),
+        films(run),
+        previews(run),
+        curves(run),
+        views(run, evaluation),
+        cameras(run),
+        contact_sheet(run),
+        settings(run, evaluation),
+    ]
+    write_bytes(path, page(title, "".join(sections), str(run.folder)), "report")
+    return path
+
+
+def claim_report(run: Run, overwrite: bool | None = None) -> Path:
+    """RUN/report.html. Raises LumigraphError unless a report may be written there; see `files.claim`."""
+    path = run.folder / "report.html"
+    claim(path, "report", overwrite)
+    return path
+
+
+def page(title: str, body: str, footer: str) -> bytes:
+    """A whole HTML page, with its style inside."""
+    return (
+        f'<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
+        f'<meta name="viewport" content="width=device-width, initial-scale=1">\n<title>{escape(title)}</title>\n'
+        f"<style>\n{STYLE}</style>\n</head>\n<body>\n<main>\n{body}</main>\n"
+        f"<footer>Lumigraph {escape(__version__)} · {escape(footer)}</footer>\n</body>\n</html>\n"
+    ).encode()
+
+
+def header(run: Run, evaluation: dict[str, Any] | None) -> str:
+    figures: list[tuple[str, str, str]] = []
+    if evaluation:
+        protocol = evaluation["protocol"]
+        what = "views" if "views" in protocol else "shapes"
+        count, split = protocol[what], "held-out" if protocol["split"] == "test" else protocol["split"]
+        if what == "shapes" and count == 1:
+            split, what = "", "shape"
+        for i, score in enumerate(scores_of(evaluation)):
+            value = f"{score.value:.{min(score.digits, 3)}f}"
+            figures.append(
+                (value, score.unit, score.name if i else f"{score.name}, {count} {split} {what}".replace("  ", " "))
+            )
+    if run.has_state:
+        state = run.state
+        figures.append((f"{state.seconds:.0f}" if state.seconds < 1000 else clock(state.seconds), "s", "of training"))
+        figures.append((f"{state.step:,}".replace(",", "\u202f"), "", "steps"))
+    if evaluation and "seconds_per_view" in evaluation:
+        figures.append((f"{evaluation['seconds_per_view']:.2f}", "s", "to render a view"))
+    sentence = f"{run.method_name}, trained on {counted(run)}"
+    return heading(run.title, sentence, figures)
+
+
+def counted(run: Run) -> str:
+    """What a run learnt from, and how many of it."""
+    count, one = run.settings.splits.get("train", 0), {"photographs": "photograph", "shapes": "shape"}.get(run.kind)
+    return f"{count} {one}{'' if count == 1 else 's'}" if one else f"{run.kind} of {count}"
+
+
+def heading(title: str, sentence: str, figures: Sequence[tuple[str, str, str]]) -> str:
+    """The top of a page. figures: value, unit, and what it is the value of."""
+    cells = "".join(
+        f"<div><b>{escape(value)}<small>{escape(unit)}</small></b><span>{escape(label)}</span></div>"
+        for value, unit, label in figures
+    )
+    return f"<header><h1>{escape(title)}</h1><p>{escape(sentence)}</p><div class='figures'>{cells}</div></header>\n"
+
+
+def films(run: Run) -> str:
+    """HTML of the first film in the run's folder, beside its depth."""
+    found = [path for path in sorted((run.folder / "renders").glob("*.mp4")) if not path.stem.endswith("-depth")]
+    found = sorted(found, key=lambda path: path.stem not in ("orbit", "sweep"))
+    if not found:
+        return ""
+    players = "".join(
+        f"<figure><video src='{data_uri(path, 'video/mp4')}' autoplay loop muted playsinline controls></video>"
+        f"<figcaption>{name}</figcaption></figure>"
+        for path, name in ((found[0], "colour"), (found[0].with_stem(f"{found[0].stem}-depth"), "depth"))
+        if path.exists() and path.stat().st_size < LARGEST_FILM
+    )
+    names = ", ".join(f"<code>{escape(str(path.relative_to(run.folder)))}</code>" for path in found)
+    return section(found[0].stem.capitalize(), f"<div class='row'>{players}</div>", f"Films in the run: {names}")
+
+
+def previews(run: Run) -> str:
+    seconds = {row["step"]: row["seconds"] for row in run.metrics()}
+    cells = []
+    for step, path in run.previews().items():
+        near = min(seconds, key=lambda at: abs(at - step), default=None)
+        when = f" · {seconds[near]:.0f} s" if near is not None and abs(near - step) <= 0.1 * step + 10 else ""
+        cells.append(f"<figure><img src='{jpeg(path)}' alt=''><figcaption>step {step}{when}</figcaption></figure>")
+    if len(cells) < 2:
+        return ""
+    return section("How the picture came to be", f"<div class='row strip'>{''.join(cells)}</div>")
+
+
+def curves(run: Run) -> str:
+    rows = run.metrics()
+    if len(rows) < 3:
+        return ""
+    seconds, steps = [row["seconds"] for row in rows], [row["step"] for row in rows]
+    charts, own = [], methods.colour(run.method_name)
+    if any("psnr" in row for row in rows):
+        psnr = [row.get("psnr", math.nan) for row in rows]
+        charts += [
+            line_chart([Series("PSNR", seconds, psnr, own)], "seconds of training", "PSNR of training batches, dB"),
+            line_chart([Series("PSNR", steps, psnr, own)], "step", "PSNR of training batches, dB"),
+        ]
+    names = dict.fromkeys(name for row in rows for name in row["terms"])
+    losses = [
+        Series(name, steps, [row["terms"].get(name, math.nan) for row in rows], own + i) for i, name in enumerate(names)
+    ]
+    if losses:
+        charts.append(line_chart(losses, "step", "loss", log=True))
+    if all("samples" in row["statistics"] for row in rows):
+        speed = [
+            (b["step"] - a["step"]) * b["statistics"]["samples"] / max(b["seconds"] - a["seconds"], 1e-9)
+            for a, b in zip(rows, rows[1:], strict=False)
+        ]
+        charts.append(
+            line_chart([Series("samples/s", seconds[1:], speed, own)], "seconds of training", "samples per second")
+        )
+    if not charts:
+        return ""
+    return section("Curves", f"<div class='charts'>{''.join(f'<figure>{chart}</figure>' for chart in charts)}</div>")
+
+
+def views(run: Run, evaluation: dict[str, Any] | None) -> str:
+    if not evaluation or len(evaluation.get("views", ())) < 2:
+        return ""
+    scores = evaluation["views"]
+    values, own = [view["psnr"] for view in scores], methods.colour(run.method_name)
+    chart = bar_chart([view["name"] for view in scores], values, "PSNR, dB", own)
+    worst, best = (choose(scores, key=lambda view: view["psnr"]) for choose in (min, max))
+    note = (
+        f"From {worst['psnr']:.2f} dB ({escape(worst['name'])}) to {best['psnr']:.2f} dB ({escape(best['name'])}); "
+        f"the line is the mean. Single values are in <code>eval.json</code>."
+    )
+    return section("View by view", f"<figure>{chart}</figure>", note)
+
+
+def cameras(run: Run) -> str:
+    """How far each camera was moved, where the method refines poses."""
+    if not (run.has_state and run.settings.config.get("refine_cameras")):
+        return ""
+    moved = cameras_moved(run.method("cpu"), run.cameras()["train"])
+    if moved is None or len(names := run.view_names()["train"]) < 2:
+        return ""
+    own = methods.colour(run.method_name)
+    charts = (
+        bar_chart(names, moved.turned.tolist(), "turned, degrees", own, "degrees"),
+        bar_chart(names, moved.shifted.tolist(), "shifted, % of the extent", own, "%"),
+    )
+    body = f"<div class='charts'>{''.join(f'<figure>{chart}</figure>' for chart in charts)}</div>"
+    return section("How far cameras moved", body, f"Against all of them together: {moved}. The lines are means.")
+
+
+def contact_sheet(run: Run) -> str:
+    path = run.folder / "eval.png"
+    return section("Contact sheet", f"<img class='sheet' src='{jpeg(path)}' alt=''>") if path.exists() else ""
+
+
+def settings(run: Run, evaluation: dict[str, Any] | None) -> str:
+    said, frame = run.settings, run.frame
+    about = {
+        "scene": said.scene.source,
+        "shapes" if run.kind == "shapes" else "members" if run.kind == "a collection" else "photographs": ", ".join(
+            f"{count} {name}" for name, count in said.splits.items()
+        ),
+        **{name: value for name, value in said.scene.options.items() if value is not None},
+        "bounds": " to ".join("(" + ", ".join(f"{x:.3g}" for x in corner) + ")" for corner in frame.bounds),
+        "half-extent": f"{frame.reach:g} scene units",
+        "near": f"{frame.near:.3g}",
+        "background": ", ".join(f"{x:g}" for x in frame.background),
+        "budget": str(Budget.from_json(said.budget)) if said.budget else "unknown",
+        "seed": said.seed,
+    }
+    tables = [table("Scene", about), table(said.method, said.config)]
+    timings = {"trained on": f"{said.device}, {said.processor}"}
+    if run.has_state:
+        state = run.state
+        timings |= {"training": f"{state.seconds:.1f} s", "compiling, beside": f"{state.compile_seconds:.1f} s"}
+        timings["per step"] = f"{1000 * state.seconds / max(state.step, 1):.1f} ms"
+    rows = [row for row in run.metrics() if "samples" in row["statistics"]]
+    if rows:
+        timings["samples per step, at the end"] = short(rows[-1]["statistics"]["samples"])
+    if evaluation:
+        if "seconds_per_view" in evaluation:
+            timings["rendering"] = f"{evaluation['seconds_per_view']:.3f} s per view, on {evaluation['evaluated_on']}"
+        tables.append(table("Protocol", evaluation["protocol"]))
+    tables += [table("Time", timings), table("Made with", said.versions)]
+    return section("Settings", f"<div class='tables'>{''.join(tables)}</div>")
+
+
+def section(title: str, body: str, note: str = "") -> str:
+    return f"<section><h2>{escape(title)}</h2>{body}{f'<p class=note>{note}</p>' if note else ''}</section>\n"
+
+
+def table(title: str, rows: dict[str, Any]) -> str:
+    cells = "".join(
+        f"<tr><th>{escape(name.replace('_', ' '))}</th><td>{escape(plain(x))}</td></tr>" for name, x in rows.items()
+    )
+    return f"<table><caption>{escape(title)}</caption>{cells}</table>"
+
+
+def plain(value: Any) -> str:
+    match value:
+        case None:
+            return "none"
+        case bool():
+            return "yes" if value else "no"
+        case float():
+            return f"{value:g}"
+        case dict() | list():
+            return json.dumps(value)
+    return str(value)
+
+
+def jpeg(path: Path) -> str:
+    """A picture as a JPEG small enough to embed in a page."""
+    file = io.BytesIO()
+    with readable(path), Image.open(path) as image:
+        image.convert("RGB").save(file, "JPEG", quality=90, optimize=True)
+    return f"data:image/jpeg;base64,{base64.b64encode(file.getvalue()).decode()}"
+
+
+def data_uri(path: Path, kind: str) -> str:
+    return f"data:{kind};base64,{base64.b64encode(path.read_bytes()).decode()}"

@@ -1,0 +1,208 @@
+"""Evaluate a trained method's surface against the shapes that it learnt, under a stated protocol."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from PIL import Image
+from torch import Tensor
+
+from ..camera import Camera, dome, ring
+from ..camera.crop import Box
+from ..datasets.mesh import Mesh
+from ..datasets.scene import Frame
+from ..datasets.shapes import Shape, Shapes
+from ..errors import LumigraphError
+from ..export.mesh import AT_ONCE, TRUNCATION, extract_mesh, find_surface, make_grid
+from ..figures import Row, contact_sheet
+from ..geometry.choice import evenly
+from ..method import Method
+from ..method.capabilities import HasDistance, HasMesh, can
+from ..metrics import Score
+from ..metrics.surfaces import chamfer_distance, intersection_over_union, normal_consistency
+from ..system.progress import track
+from .reveal import reveal
+
+POINTS = 100_000  # in the volume, and on each surface (Mescheder 2019)
+CELLS = 128  # along the longest side, of the grid that the surface is found with
+SHOWN, PICTURE = 8, 256  # shapes of the contact sheet, and pixels of their pictures
+STEPS, TOUCHED, BEYOND = (
+    200,
+    2e-3,
+    6.0,
+)  # of a ray towards a surface; how near is there; how far is nowhere, scene units
+
+
+@dataclass(frozen=True)
+class ShapeScore:
+    """One shape. iou is None of a cloud of points, which has no inside; normals where it has none."""
+
+    name: str
+    chamfer: float
+    accuracy: float
+    completeness: float
+    iou: float | None
+    normals: float | None
+
+    @property
+    def scores(self) -> list[Score]:
+        found = [
+            ("IoU", self.iou, "higher"),
+            ("chamfer-L1", self.chamfer, "lower"),
+            ("normal consistency", self.normals, "higher"),
+        ]
+        return [Score(name, value, "", better) for name, value, better in found if value is not None]  # type: ignore[arg-type]
+
+
+@dataclass(frozen=True)
+class ShapesEvaluation:
+    """All shapes of a split, and how they were compared. shown: some shapes' pictures: true, learnt, rendered."""
+
+    shapes: list[ShapeScore]
+    protocol: dict[str, Any]
+    shown: dict[str, list[Float[Tensor, "height width 3"]]]
+
+    @property
+    def scores(self) -> list[Score]:
+        """Means over the shapes that have each."""
+        every = [score for shape in self.shapes for score in shape.scores]
+        by_name = {score.name: [other.value for other in every if other.name == score.name] for score in every}
+        return [
+            Score(name, sum(values) / len(values), "", next(x.better for x in every if x.name == name))
+            for name, values in by_name.items()
+        ]
+
+    @property
+    def compared(self) -> str:
+        count = len(self.shapes)
+        return f"{count} shape{'' if count == 1 else 's'}"
+
+    def to_json(self) -> dict[str, Any]:
+        return {
+            "scores": [score.to_json() for score in self.scores],
+            "protocol": self.protocol,
+            "shapes": [asdict(shape) for shape in self.shapes],
+        }
+
+    def contact_sheet(self, title: str) -> Image.Image:
+        """The normals of the true and of the learnt surface of the shown shapes, and what the method renders."""
+        about = {shape.name: shape for shape in self.shapes}
+        rows = []
+        for name, pictures in self.shown.items():
+            label = " · ".join([name, *(f"{score.name} {score}" for score in about[name].scores)])
+            rows.append(Row(label, pictures))
+        return contact_sheet(title, ["shape", "learnt", "rendering"], rows)
+
+
+@torch.no_grad()
+def evaluate_shapes(
+    method: Method,
+    shapes: Shapes,
+    split: str = "test",
+    most: int | None = None,
+    points: int = POINTS,
+    cells: int = CELLS,
+    size: int = PICTURE,
+) -> ShapesEvaluation:
+    """Compare a method's surface with the shapes of a split, each in its own scene units.
+
+    most:   so many shapes at most, evenly spread over the split; None means all
+    points: in the volume, and on each surface
+    cells:  along the longest side of the box in which the surface is looked for
+    size:   pixels of the pictures
+    Of several shapes each is told to the method first, if it accepts Shapes. Raises LumigraphError for a split without
+    shapes, and for a method in which there is no surface.
+    """
+    chosen = shapes.splits.get(split)
+    if chosen is None or not len(chosen):
+        raise LumigraphError(f"{shapes.source} has no shapes in the split {split!r}; choose one of: train, test")
+    if most is not None and most < 1:
+        raise LumigraphError(f"{most} shapes cannot be compared; give --views a number above 0")
+    compared = evenly(chosen.tolist(), most or len(chosen))
+    method.eval()
+    shown, scores = set(evenly(compared, SHOWN)), []
+    pictured: dict[str, list[Tensor]] = {}
+    for number in track(compared, "Comparing shapes", len(compared)):
+        true = shapes.members[number]
+        single = Shapes([true], {"train": torch.tensor([0])}, shapes.source)
+        told = reveal(method, single) if len(shapes) > 1 else method
+        learnt = Shape(true.name, surface_of(told, true.frame, cells), true.frame)
+        scores.append(compare_shapes(true, learnt, told, points))
+        if number in shown:
+            camera = ring(true.frame.bounds, size=size)[1]
+            rendering = told.render(camera).rgb.cpu().clamp(0, 1)
+            pictured[true.name] = [portrait(true, camera), portrait(learnt, camera), rendering]
+    return ShapesEvaluation(scores, protocol(shapes, split, compared, points, cells), pictured)
+
+
+def compare_shapes(true: Shape, learnt: Shape, method: Method, points: int) -> ShapeScore:
+    """A shape and what was learnt of it. Where the method knows distances, they say what is inside."""
+    generator = torch.Generator().manual_seed(0)
+    a, b = learnt.surface(points, generator), true.surface(points, generator)
+    size = float(np.ptp(true.mesh.vertices, 0).max())
+    chamfer, accuracy, completeness = chamfer_distance(a.points, b.points, size)
+    iou = normals = None
+    if not true.is_cloud:
+        low, high = torch.tensor(true.frame.bounds)
+        places = low + (high - low) * torch.rand(points, 3, generator=generator)
+        inside = distances(method, places) < 0 if can(method, HasDistance) else learnt.inside(places)
+        iou = intersection_over_union(inside, true.inside(places))
+    if a.normals is not None and b.normals is not None:
+        normals = normal_consistency(a.points, a.normals, b.points, b.normals)
+    return ShapeScore(true.name, chamfer, accuracy, completeness, iou, normals)
+
+
+def surface_of(method: Method, frame: Frame, cells: int) -> Mesh:
+    """The surface that a method holds: its own mesh, the zero level of its distance, or what `export mesh` makes of it.
+    Raises LumigraphError where there is none."""
+    if isinstance(method, HasMesh):
+        return method.mesh()
+    box = Box(*frame.bounds)
+    cell = max(b - a for a, b in zip(box.lower, box.upper, strict=True)) / cells
+    if not can(method, HasDistance):
+        return extract_mesh(method, dome(ring(frame.bounds)), cell=cell, smooth=0)
+
+    def value(points: Float[Tensor, "point 3"]) -> Float[Tensor, " point"]:
+        return (-distances(method, points) / (TRUNCATION * cell)).clamp(-1, 1)
+
+    vertices, faces = find_surface(make_grid(box, cell), 2, box.holds, value, -1.0)
+    if not len(faces):
+        raise LumigraphError("The learnt distance is nowhere zero, so there is no surface to compare; train for longer")
+    return Mesh(vertices, faces, np.full((len(vertices), 3), 160, np.uint8))
+
+
+def distances(method: Any, points: Float[Tensor, "point 3"]) -> Float[Tensor, " point"]:
+    """A method's distances, asked for on its device, some at a time."""
+    return torch.cat([method.distance(part.to(method.device)).cpu().float() for part in points.split(AT_ONCE)])
+
+
+def portrait(shape: Shape, camera: Camera) -> Float[Tensor, "height width 3"]:
+    """The normals of a surface as colours, found by walking along rays as far as nothing can be (Hart 1996)."""
+    rays, (width, height) = camera.rays(camera.pixels()), camera.size[0].tolist()
+    depth, walking = torch.zeros(len(rays)), torch.arange(len(rays))
+    for _ in range(STEPS):
+        away = shape.distance(rays[walking].at(depth[walking])).abs()
+        depth[walking] += away
+        walking = walking[(away > TOUCHED) & (depth[walking] < BEYOND)]
+    depth[walking] = BEYOND  # along the surface for so long that nobody knows
+    rgb, hit = torch.ones(len(rays), 3), (depth < BEYOND).nonzero()[:, 0]
+    rgb[hit] = 0.5 + 0.5 * shape.normals_near(rays[hit].at(depth[hit]))
+    return rgb.reshape(height, width, 3)
+
+
+def protocol(shapes: Shapes, split: str, compared: list[int], points: int, cells: int) -> dict[str, Any]:
+    """All that one must know to compare these figures with others."""
+    return {
+        "split": split,
+        "shapes": len(compared),
+        "of": len(shapes.splits[split]),
+        "surface": f"marching cubes, {cells} cells along the longest side of the box of interest; a mesh as it is",
+        "iou": f"{points} points evenly in the box of interest; inside: negative distance, or winding number > 0.5",
+        "chamfer-L1": f"{points} points on each surface; mean of accuracy and completeness, tenths of the longest side",
+        "normal consistency": "the same points; mean |cosine| to the nearest one on the other surface, both ways",
+        "source": "Mescheder 2019, Occupancy Networks",
+    }

@@ -1,0 +1,268 @@
+"""Evaluate a trained method on held-out views, under a stated protocol."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterable
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from PIL import Image
+from torch import Tensor
+
+from ..camera import Camera
+from ..camera.rays import Rendering
+from ..datasets.scene import Photograph, Scene
+from ..errors import LumigraphError
+from ..figures import ERROR_GAIN, Row, colour_depth, colour_error, contact_sheet, depth_range
+from ..geometry.choice import evenly
+from ..method import Method
+from ..metrics import WINDOW, Score, psnr, scores_of, ssim_map
+from ..metrics.lpips import DEFINITION, Lpips
+from ..system.progress import counting, track
+from . import halves
+from .held_out_poses import PROTOCOL, held_out_poses, pose_scores
+from .light import LIGHT, in_light
+from .light import PROTOCOL as LIGHT_PROTOCOL
+
+SHOWN = 8  # views of the contact sheet, evenly spread; the worst one joins them
+CLEAN = "clean"  # the layer of photographs in their own light without whoever passes by
+WARM_UP_SIZE = 32  # pixels; the first rendering compiles kernels, which is not the view's fault
+
+
+@dataclass(frozen=True)
+class ViewScore:
+    """One view: PSNR in dB, SSIM, the seconds that rendering it took, LPIPS where its weights are at hand, and PSNR
+    against the photograph without passers-by where that is known."""
+
+    name: str
+    resolution: str
+    psnr: float
+    ssim: float
+    seconds: float
+    lpips: float | None = None
+    clean_psnr: float | None = None
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """All views of a split, and how they were compared. compile_seconds: spent ahead of the first view."""
+
+    views: list[ViewScore]
+    protocol: dict[str, Any]
+    compile_seconds: float
+    shown: dict[str, tuple[Tensor, Rendering]]  # some views' photograph and rendering
+    poses: tuple[Score, ...] = ()  # how far refined poses are from true ones, where these are known
+
+    @property
+    def psnr(self) -> float:
+        return mean(view.psnr for view in self.views)
+
+    @property
+    def ssim(self) -> float:
+        return mean(view.ssim for view in self.views)
+
+    @property
+    def lpips(self) -> float | None:
+        """Mean LPIPS over the views; None if it was not measured."""
+        return mean_known(view.lpips for view in self.views)
+
+    @property
+    def seconds_per_view(self) -> float:
+        return mean(view.seconds for view in self.views)
+
+    @property
+    def by_resolution(self) -> dict[str, Evaluation]:
+        """The views of each size alone, sizes in the order in which they come."""
+        sizes = dict.fromkeys(view.resolution for view in self.views)
+        return {size: replace(self, views=[view for view in self.views if view.resolution == size]) for size in sizes}
+
+    def means(self) -> dict[str, Any]:
+        clean = mean_known(view.clean_psnr for view in self.views)
+        known = {} if clean is None else {"clean_psnr": clean}
+        return {"psnr": self.psnr, "ssim": self.ssim, "lpips": self.lpips} | known
+
+    @property
+    def scores(self) -> list[Score]:
+        return [*scores_of(self.means()), *self.poses]
+
+    @property
+    def compared(self) -> str:
+        """Title of the comparison."""
+        parts = "right halves of " if self.protocol["halves"] else ""
+        return f"{parts}{len(self.views)} {self.protocol['split']} views"
+
+    def to_json(self) -> dict[str, Any]:
+        parts = {size: part.means() | {"views": len(part.views)} for size, part in self.by_resolution.items()}
+        return {
+            **self.means(),
+            **({"by_resolution": parts} if len(parts) > 1 else {}),
+            "protocol": self.protocol,
+            "seconds_per_view": self.seconds_per_view,
+            "render_compile_seconds": self.compile_seconds,
+            "views": [asdict(view) for view in self.views],
+            "scores": [score.to_json() for score in self.scores],
+        }
+
+    def contact_sheet(self, title: str) -> Image.Image:
+        """Photograph, rendering, error and depth of the shown views, the worst of all last."""
+        scores = {view.name: view for view in self.views}
+        worst = min(self.views, key=lambda view: view.psnr).name
+        rows = []
+        for name in sorted(self.shown, key=lambda name: (name == worst, list(scores).index(name))):
+            photograph, seen = self.shown[name]
+            label = f"{name} · {scores[name].psnr:.2f} dB · SSIM {scores[name].ssim:.3f}"
+            depth = colour_depth(seen.depth, seen.opacity, depth_range(seen.depth, seen.opacity))
+            pictures = [photograph, seen.rgb, colour_error(photograph, seen.rgb), depth]
+            rows.append(Row(f"worst: {label}" if name == worst and len(self.views) > 1 else label, pictures))
+        return contact_sheet(title, ["photograph", "rendering", f"{ERROR_GAIN}x error", "depth"], rows)
+
+
+def evaluate(
+    method: Method,
+    scene: Scene,
+    split: str = "test",
+    keep: Callable[[str, Rendering], object] = lambda name, rendering: None,
+    views: int | None = None,
+    lpips: Lpips | None = None,
+    right_halves: bool = False,
+) -> Evaluation:
+    """Render the views of a split and compare them with their photographs.
+
+    keep:  told each view's name and rendering
+    views: so many of them at most, evenly spread over the split; None means all
+    right_halves: compare those alone also where a method is told nothing of left ones
+    Cameras are those that the method refined; held-out ones are then found as `held_out_poses` says. Pixels that the
+    photograph's mask rules out do not count, nor does a photograph that it rules out altogether. A method that
+    photographs can be given to is judged by halves (see `evaluate.halves`). Raises LumigraphError if the split has no
+    view.
+    """
+    chosen = scene.splits.get(split)
+    if chosen is None or not len(chosen):
+        there = ", ".join(f"{name} ({len(index)} views)" for name, index in scene.splits.items() if len(index))
+        raise LumigraphError(f"{scene.source} has no views in the split {split!r}; choose one of: {there}")
+    if views is not None and views < 1:
+        raise LumigraphError(f"{views} views cannot be compared; give --views a number above 0")
+    compared = evenly(chosen.tolist(), views or len(chosen))
+    method.eval()
+    with counting("Preparing to render"):
+        compile_seconds = warm_up(method, scene.cameras[compared[0]])
+    spread, by_halves = set(evenly(compared, SHOWN)), halves.judged_by_halves(method)
+    found = held_out_poses(method, scene)
+    scores: list[ViewScore] = []
+    shown: dict[str, tuple[Tensor, Rendering]] = {}
+    worst: dict[str, tuple[Tensor, Rendering]] = {}
+    for index in track(compared, "Comparing views", len(compared)):
+        shot = scene.photograph(index, [name for name in (CLEAN, LIGHT) if name in scene.layers])
+        camera = found.camera(index) if found else method.refined(shot.camera)
+        columns = halves.right_half(shot) if by_halves or right_halves else slice(None)
+        if shot.mask is not None and not shot.mask[:, columns].any():
+            continue
+        photograph = shot.before(scene.frame.background)
+        told = method.given(halves.left_half(shot)) if by_halves else method
+        begin = time.perf_counter()
+        seen = told.render(camera).cpu()
+        seconds = time.perf_counter() - begin
+        rgb = seen.rgb.clamp(0, 1)
+        if LIGHT in shot.extra:
+            rgb, photograph = in_light(seen, shot.extra[LIGHT])
+            seen = replace(seen, rgb=rgb)
+        score = compare(scene.names[index], rgb, shot, photograph, columns, seconds, lpips)
+        keep(score.name, seen)
+        if index in spread:
+            shown[score.name] = photograph, seen
+        if all(score.psnr < other.psnr for other in scores):
+            worst = {score.name: (photograph, seen)}
+        scores.append(score)
+    if not scores:
+        raise LumigraphError(
+            f"{scene.source} has masks that leave nothing of the views in the split {split!r} to compare"
+        )
+    stated = protocol(scene, split, compared, lpips, method, right_halves) | ({"poses": PROTOCOL} if found else {})
+    poses = tuple(pose_scores(method, scene))
+    return Evaluation(scores, stated, compile_seconds, shown | worst, poses)
+
+
+def compare(
+    name: str,
+    rgb: Float[Tensor, "height width 3"],
+    shot: Photograph,
+    photograph: Float[Tensor, "height width 3"],
+    columns: slice,
+    seconds: float,
+    lpips: Lpips | None = None,
+) -> ViewScore:
+    """A view's scores, by some of its columns.
+
+    photograph: of the shot, before the scene's background
+    """
+    size = resolution(photograph.shape[1], photograph.shape[0])
+    mask = None if shot.mask is None else shot.mask[:, columns]
+    rgb, photograph = rgb[:, columns], photograph[:, columns]
+    clean = None
+    if CLEAN in shot.extra:
+        truth = shot.extra[CLEAN][:, columns]
+        clean = psnr(rgb, truth) if mask is None else psnr(rgb[mask], truth[mask])
+    likeness = ssim_map(rgb, photograph)
+    if mask is None:
+        perceived = lpips(rgb, photograph) if lpips else None
+        return ViewScore(name, size, psnr(rgb, photograph), float(likeness.mean()), seconds, perceived, clean)
+    edge = WINDOW // 2
+    inner = likeness[mask[edge:-edge, edge:-edge]]
+    perceived = lpips(torch.where(mask[..., None], rgb, photograph), photograph) if lpips else None
+    closeness = float(inner.mean()) if len(inner) else 0.0
+    return ViewScore(name, size, psnr(rgb[mask], photograph[mask]), closeness, seconds, perceived, clean)
+
+
+def warm_up(method: Method, camera: Camera) -> float:
+    """Render a very small picture, so that what is compiled on first use does not count. Returns the seconds."""
+    begin = time.perf_counter()
+    method.render(camera.resized(min(1.0, WARM_UP_SIZE / int(camera.size.max()))))
+    return time.perf_counter() - begin
+
+
+def protocol(
+    scene: Scene, split: str, compared: list[int], lpips: Lpips | None, method: Method, right_halves: bool = False
+) -> dict[str, Any]:
+    """All that one must know to compare these figures with others."""
+    captured = scene.cameras[torch.tensor(compared)]
+    refined = not torch.equal(method.refined(captured).pose.cpu(), captured.pose)
+    sizes = list(dict.fromkeys(resolution(*size) for size in scene.cameras.size[compared].tolist()))
+    return {
+        "split": split,
+        "views": len(compared),
+        "of": len(scene.splits[split]),
+        "resolution": sizes[0] if len(sizes) == 1 else sizes,
+        "background": list(scene.frame.background) if scene.frame.has_alpha else None,
+        "poses": "as the method refined them" if refined else "as captured",
+        "controls": dict(method.told),
+        "halves": halves.definition(method, right_halves),
+        "masked": any(scene.images.mask(i) is not None for i in compared),
+        "colours": LIGHT_PROTOCOL if LIGHT in scene.layers else "sRGB in [0, 1]; renderings clipped, not rounded",
+        "psnr": "per view, then averaged",
+        "ssim": "Wang 2004: Gaussian window 11x11, deviation 1.5, K1 0.01, K2 0.03, windows inside the image",
+        "lpips": DEFINITION if lpips else None,
+    }
+
+
+def resolution(width: int, height: int) -> str:
+    return f"{width}x{height}"
+
+
+def file_name(name: str) -> str:
+    """A view's name without folders and ending."""
+    return str(Path(name).with_suffix("")).strip("./").replace("/", "-")
+
+
+def mean(values) -> float:
+    found = list(values)
+    return sum(found) / len(found)
+
+
+def mean_known(values: Iterable[float | None]) -> float | None:
+    """The mean of those that are known; None if none is."""
+    found = [value for value in values if value is not None]
+    return mean(found) if found else None

@@ -1,0 +1,185 @@
+"""Forms: tables of numbers as whole numbers with a scale, as rows of a codebook, as halves; each can learn on.
+
+`values()` is what a picture is made of: the stored numbers, whose gradients go straight through the rounding to what
+was rounded (Bengio 2013), so that a table can be tuned as it will be read.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from .clusters import clustered
+
+WIDEST = 8.0  # standard deviations that the levels of a whole number span; what lies beyond has more levels
+MOST = (1 << 16) - 1  # the largest whole number
+NOTICED = 0.02  # of a float16's typical size: what tuning takes for its unit
+
+
+class Form(ABC):
+    """A table in some form.
+
+    name:  of the form, in files
+    width: columns
+    """
+
+    name: str
+    width: int
+
+    @abstractmethod
+    def values(self) -> Float[Tensor, "row column"]:
+        """The numbers as they will be read; differentiable in what learns."""
+
+    @abstractmethod
+    def learning(self) -> list[tuple[Tensor, float]]:
+        """Trainable tensors, each with its storage error: the natural unit of its steps."""
+
+    @abstractmethod
+    def streams(self) -> list[np.ndarray]:
+        """The arrays that a file keeps."""
+
+
+class Half(Form):
+    """Numbers of 16 bits."""
+
+    name = "half"
+
+    def __init__(self, values: Float[Tensor, "row column"]):
+        self.exact, self.width = values.clone(), values.shape[1]
+
+    def values(self) -> Float[Tensor, "row column"]:
+        return straight(self.exact, self.exact.half().float())
+
+    def learning(self) -> list[tuple[Tensor, float]]:
+        return [(self.exact, NOTICED * rms(self.exact))]
+
+    def streams(self) -> list[np.ndarray]:
+        return [self.exact.detach().half().numpy()]
+
+    @staticmethod
+    def read(streams: Sequence[np.ndarray]) -> Half:
+        (halves,) = streams
+        return Half(torch.from_numpy(halves.astype(np.float32)))
+
+
+class Scaled(Form):
+    """low + step · n: whole numbers n, of 8 or 16 bits, with a scale for each column."""
+
+    name = "scaled"
+
+    def __init__(self, values: Float[Tensor, "row column"], bits: int):
+        self.exact, self.width = values.clone(), values.shape[1]
+        filled = values if len(values) else values.new_zeros(1, self.width)
+        self.low, high = filled.amin(0), filled.amax(0)
+        span = torch.minimum(high - self.low, WIDEST * filled.std(0, correction=0))
+        self.step = torch.maximum(span / ((1 << bits) - 1), (high - self.low) / MOST).clamp_min(1e-12)
+
+    def values(self) -> Float[Tensor, "row column"]:
+        return straight(self.exact, self.low + self.step * self._codes())
+
+    def learning(self) -> list[tuple[Tensor, float]]:
+        return [(self.exact, float(self.step.mean()))]
+
+    def streams(self) -> list[np.ndarray]:
+        codes = self._codes()
+        kind = np.uint8 if not len(codes) or codes.max() < 256 else np.uint16
+        return [torch.stack([self.low, self.step]).numpy(), codes.numpy().astype(kind)]
+
+    def _codes(self) -> Float[Tensor, "row column"]:
+        return ((self.exact.detach() - self.low) / self.step).round_().clamp_(0, MOST)
+
+    @staticmethod
+    def read(streams: Sequence[np.ndarray]) -> Scaled:
+        scales, codes = streams
+        found = Scaled.__new__(Scaled)
+        found.low, found.step = torch.from_numpy(scales.astype(np.float32))
+        if codes.dtype.kind != "u" or not (found.low.isfinite() & found.step.isfinite() & (found.step > 0)).all():
+            raise ValueError("a scale is not sound")
+        found.exact = found.low + found.step * torch.from_numpy(codes.astype(np.float32))
+        found.width = found.exact.shape[1]
+        return found
+
+
+class Coded(Form):
+    """b_c: each row is one of a codebook's, and the most important ones are their own (Li 2023, VQRF).
+
+    weights: importance of the rows
+    size:    rows of the codebook
+    apart:   share of all importance whose rows, the most important ones first, are kept out of the codebook
+    """
+
+    name = "coded"
+
+    def __init__(
+        self,
+        values: Float[Tensor, "row column"],
+        weights: Float[Tensor, " row"],
+        size: int,
+        apart: float,
+        bits: int,
+        generator: torch.Generator,
+    ):
+        self.width = values.shape[1]
+        self.apart = most_important(weights, apart)
+        common = values[~self.apart]
+        book, self.codes = clustered(common, weights[~self.apart], min(size, len(common)), generator)
+        self.error = rms(common - book[self.codes])
+        self.book, self.own = Scaled(book, bits), Scaled(values[self.apart], bits)
+
+    def values(self) -> Float[Tensor, "row column"]:
+        found = self.own.exact.new_empty(len(self.apart), self.width)
+        return found.index_put((self.apart,), self.own.values()).index_put(
+            (~self.apart,), self.book.values()[self.codes]
+        )
+
+    def learning(self) -> list[tuple[Tensor, float]]:
+        return [(self.book.exact, self.error), *self.own.learning()]
+
+    def streams(self) -> list[np.ndarray]:
+        codes = self.codes.numpy().astype(np.uint16)[:, None]
+        return [*self.book.streams(), codes, self.apart.numpy(), *self.own.streams()]
+
+    @staticmethod
+    def read(streams: Sequence[np.ndarray]) -> Coded:
+        *book, codes, apart, scales, own = streams
+        found = Coded.__new__(Coded)
+        found.book, found.own, found.error = Scaled.read(book), Scaled.read([scales, own]), 0.0
+        found.apart, found.width = torch.from_numpy(apart), found.book.width
+        found.codes = torch.from_numpy(codes[:, 0].astype(np.int64))
+        if apart.dtype != bool or apart.ndim != 1 or found.own.width != found.width:
+            raise ValueError("a codebook does not fit its rows")
+        if int(apart.sum()) != len(own) or int((~apart).sum()) != len(codes):
+            raise ValueError("rows of a codebook are missing")
+        if len(codes) and codes.max() >= len(found.book.exact):
+            raise ValueError(f"code {codes.max()} is not in a codebook of {len(found.book.exact)}")
+        return found
+
+
+FORMS: dict[str, tuple[type[Half] | type[Scaled] | type[Coded], int]] = {  # and of how many streams
+    "half": (Half, 1),
+    "scaled": (Scaled, 2),
+    "coded": (Coded, 6),
+}
+
+
+def straight(exact: Float[Tensor, "*shape"], rounded: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
+    """The rounded tensor with the gradient of the exact one (straight-through)."""
+    return exact + (rounded - exact).detach() if exact.requires_grad else rounded
+
+
+def most_important(weights: Float[Tensor, " row"], share: float) -> Bool[Tensor, " row"]:
+    """The fewest rows that add up to a share of all weight."""
+    order = weights.double().argsort(descending=True, stable=True)
+    before = weights.double()[order].cumsum(0) - weights.double()[order]
+    chosen = torch.zeros(len(weights), dtype=torch.bool)
+    chosen[order[before < share * float(weights.double().sum())]] = True
+    return chosen
+
+
+def rms(values: Float[Tensor, "*shape"]) -> float:
+    return float(values.detach().square().mean().sqrt()) if values.numel() else 0.0

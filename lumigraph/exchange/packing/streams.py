@@ -1,0 +1,104 @@
+"""Streams: arrays of few kinds, entropy-coded with zstandard, and taken out again no larger than they said."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Annotated, Any, Literal, cast, get_args
+
+import numpy as np
+import zstandard
+from jaxtyping import Shaped
+
+from ...files.ranges import Tally, between
+
+LEVEL = 19  # of zstandard: 3 takes a tenth of the time and gives 5 % more
+DENSEST = 1 << 15  # times that zstandard can shrink what it is given
+PIECE = 1 << 24  # bytes
+
+Extent = Annotated[int, between(0, 1 << 32)]  # of a tensor along an axis
+Number = Literal["bool", "uint8", "uint16", "int32", "int64", "float16", "float32", "float64"]
+
+
+@dataclass(frozen=True)
+class Stream:
+    """An array within a file.
+
+    bytes: that it takes there
+    delta: whether each row is stored as its difference to the one before; of whole numbers alone
+    """
+
+    dtype: Number
+    shape: tuple[Extent, ...]
+    bytes: Tally
+    delta: bool = False
+
+    @property
+    def size(self) -> int:
+        """Bytes of the array before it is entropy-coded, as the file declares them."""
+        count = math.prod(self.shape)
+        return -(-count // 8) if self.dtype == "bool" else count * np.dtype(self.dtype).itemsize
+
+
+def packed(array: Shaped[np.ndarray, "*shape"]) -> tuple[Stream, bytes]:
+    """An array as a stream, whichever way is smaller."""
+    ways = (False, True) if array.dtype.kind in "ui" and array.ndim else (False,)
+    coder = zstandard.ZstdCompressor(level=LEVEL)
+    found = [(delta, coder.compress(_bytes(_differences(array) if delta else array))) for delta in ways]
+    delta, data = min(found, key=lambda pair: len(pair[1]))
+    return Stream(kind_of(array), array.shape, len(data), delta), data
+
+
+def kind_of(array: Shaped[np.ndarray, "*shape"]) -> Number:
+    """The name of an array's numbers, one of those that a file may hold."""
+    assert array.dtype.name in get_args(Number)
+    return cast(Number, array.dtype.name)
+
+
+def unpacked(stream: Stream, data: bytes) -> Shaped[np.ndarray, "*shape"]:
+    """The inverse. Raises ValueError, EOFError or ZstdError for what is not as the stream says."""
+    if stream.size > DENSEST * max(len(data), 1):
+        raise ValueError(f"{len(data)} bytes cannot hold {stream.size:,}")
+    reader = zstandard.ZstdDecompressor().stream_reader(data)
+    raw = take(reader, stream.size)
+    if reader.read(1):
+        raise ValueError("a stream goes on after what it declares")
+    array = _array(raw, stream.dtype, stream.shape)
+    if not stream.delta:
+        return array
+    if array.dtype.kind not in "ui" or not array.ndim:
+        raise ValueError(f"differences of {stream.dtype} mean nothing")
+    return np.cumsum(array, 0, dtype=array.dtype)
+
+
+def take(stream: Any, size: int) -> bytes:
+    """Exactly `size` bytes, in pieces, so that memory grows with what is there and not with what is promised."""
+    pieces = []
+    while size:
+        piece = stream.read(min(size, PIECE))
+        if not piece:
+            raise EOFError("it ends early")
+        pieces.append(piece)
+        size -= len(piece)
+    return b"".join(pieces)
+
+
+def _differences(array: Shaped[np.ndarray, "*shape"]) -> Shaped[np.ndarray, "*shape"]:
+    return np.diff(array, axis=0, prepend=np.zeros_like(array[:1]))
+
+
+def _bytes(array: Shaped[np.ndarray, "*shape"]) -> bytes:
+    """Column by column, and of each number the first bytes, then the second ones: like stands beside like."""
+    if array.dtype == bool:
+        return np.packbits(array).tobytes()
+    columns = np.ascontiguousarray(array.reshape(array.shape[0] if array.ndim else 1, -1).T) if array.size else array
+    return np.ascontiguousarray(columns.reshape(-1, 1).view(np.uint8).T).tobytes()
+
+
+def _array(raw: bytes, dtype: str, shape: tuple[int, ...]) -> Shaped[np.ndarray, "*shape"]:
+    found = np.frombuffer(raw, np.uint8)
+    if dtype == "bool":
+        return np.unpackbits(found, count=math.prod(shape)).astype(bool).reshape(shape)
+    numbers = np.ascontiguousarray(found.reshape(np.dtype(dtype).itemsize, -1).T).view(dtype)[:, 0]
+    rows = shape[0] if shape else 1
+    return np.ascontiguousarray(numbers.reshape(-1, rows).T).reshape(shape) if numbers.size else numbers.reshape(shape)

@@ -1,0 +1,18 @@
+"""Files: written whole or not at all, read as typed values."""
+
+from .atomic import Kind as Kind
+from .atomic import claim as claim
+from .atomic import claim_folder as claim_folder
+from .atomic import exists as exists
+from .atomic import expanded as expanded
+from .atomic import explained as explained
+from .atomic import from_json as from_json
+from .atomic import is_file as is_file
+from .atomic import read_json as read_json
+from .atomic import refusal as refusal
+from .atomic import remove as remove
+from .atomic import replacing as replacing
+from .atomic import replacing_folder as replacing_folder
+from .atomic import scene_name as scene_name
+from .atomic import write_bytes as write_bytes
+from .atomic import write_json as write_json

@@ -1,0 +1,311 @@
+"""Files that are written whole or not at all, and nowhere where somebody else's lie.
+
+What is there already is replaced only if Lumigraph wrote it, as a thing of the same kind, and nobody has changed it
+since (`marks`), or if the user said --overwrite to this very file. A folder goes only if Lumigraph wrote it as one and
+all that is in it. Commands ask by `claim` before any work; whoever writes asks again.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import errno
+import itertools
+import json
+import os
+import re
+import stat
+import sys
+from collections.abc import Callable, Iterable, Iterator
+from itertools import accumulate
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from ..errors import LumigraphError
+from . import marks
+from .marks import Kind as Kind
+from .partials import partial
+from .partials import remove as remove
+from .ranges import typed
+
+HERE, EXCHANGE = -100, 2  # AT_FDCWD, RENAME_EXCHANGE
+NUMBERS = re.compile(r"\[[-+.eE\d,\s]*\]")
+DEEPEST = 100  # levels that JSON may nest; whoever walks through it again has room for them
+BUT_BRACKETS = bytes(set(range(256)) - set(b"[]{}"))
+
+Seen = tuple[int, ...]  # by which a file is known to be the same, unchanged
+
+_granted: dict[Path, Seen | None] = {}  # what lay there when this process was allowed to write there
+
+
+def claim(path: Path, kind: Kind, overwrite: bool | None = None, reads: Iterable[Path] = ()) -> None:
+    """Raise LumigraphError unless a file may be written there. For whoever has work to do first: before it.
+
+    kind:      what it will be; in the place of anything else it does not go
+    overwrite: whether the user wants whatever file lies there replaced; None where there is no option to say so
+    reads:     what the work begins with, which stays in any case
+    """
+    place = Path(os.path.abspath(path))
+    with explained(path):
+        if any(one.exists() and path.exists() and one.samefile(path) for one in reads):
+            raise LumigraphError(f"{path} would be replaced, and is what the command reads; choose another name")
+        there = seen(path)
+        if place in _granted and _granted[place] == there:
+            return
+        check_room(place)
+        if there is not None:
+            refuse_all_but_files(path)
+            if not (overwrite or marks.is_ours(path, kind)):
+                option = "" if overwrite is None else ", or give --overwrite"
+                raise LumigraphError(
+                    f"{path} is there already, and not as Lumigraph has written it; move it away, choose another "
+                    f"name{option}"
+                )
+        _granted[place] = there
+
+
+def claim_folder(path: Path, kind: Kind | None = None) -> None:
+    """Raise LumigraphError unless a folder may be written there, as a whole: in the place of nothing, of an empty
+    folder, or of one of the same kind."""
+    with explained(path):
+        check_room(Path(os.path.abspath(path)))
+        if seen(path) is None:
+            return
+        if path.is_symlink() or not path.is_dir():
+            raise LumigraphError(
+                f"{path} is to be a folder and is something else; move it away, or choose another name"
+            )
+        if not any(path.iterdir()):
+            return
+        if kind is None or not marks.is_whole(path, kind):
+            raise LumigraphError(f"{path} is a folder with something else in it; move it away, or choose another name")
+        if foreign := marks.foreign_in(path, kind):
+            raise LumigraphError(
+                f"{path} would be replaced, and {foreign.relative_to(path)} in it is not as Lumigraph has written it; "
+                "move that away, or choose another name"
+            )
+
+
+@contextlib.contextmanager
+def replacing(path: Path, kind: Kind = "file", ours: bool = False) -> Iterator[Path]:
+    """An empty file to fill, in the folder of `path`; it takes that place once the block ends well.
+
+    ours: this is a part of a folder that was recognised by its own mark, such as a run's config.json: what may lie
+          there is ours, nobody needs to ask
+    After a fault or a kill the place holds what it held before. Raises LumigraphError as `claim` does, or if the disk
+    refuses.
+    """
+    if not ours:
+        claim(path, kind)
+    with explained(path):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with partial(path.parent) as new:
+            yield new
+            sync(new)
+            target = path
+            if not ours:
+                target = place_now(path, lambda: claim(path, kind))
+                marks.note(target, kind, new)
+            os.replace(new, target)
+            if not ours:
+                _granted[Path(os.path.abspath(target))] = seen(target)
+            sync_folder(path.parent)
+        tell_if_moved(path, target)
+
+
+@contextlib.contextmanager
+def replacing_folder(path: Path, kind: Kind | None = None, ours: bool = False) -> Iterator[Path]:
+    """An empty folder to fill; otherwise as `replacing`. Without a kind it replaces nothing, now or later."""
+    if not ours:
+        claim_folder(path, kind)
+    with explained(path):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with partial(path.parent, is_folder=True) as new:
+            yield new
+            sync(new)
+            target = path
+            if kind is not None:
+                marks.note_folder(new, kind)
+            if not ours:
+                target = place_now(path, lambda: claim_folder(path, kind))
+            exchange(new, target)
+            sync_folder(path.parent)
+        tell_if_moved(path, target)
+
+
+def exchange(new: Path, place: Path) -> None:
+    """Put a folder into a place. What was there has the folder's name afterwards, and is deleted with it."""
+    if seen(place) is None:
+        os.replace(new, place)
+    elif not swapped(new, place):  # no such call: a kill between these two costs what was there, and was to go
+        with partial(place.parent, is_folder=True) as aside:
+            old = aside / place.name
+            os.replace(place, old)
+            try:
+                os.replace(new, place)
+            except BaseException:
+                if seen(old) is not None:
+                    os.replace(old, place)
+                raise
+
+
+def swapped(one: Path, other: Path) -> bool:
+    """Let two paths change places in one step; False where the system has no such call (Linux has `renameat2`)."""
+    call = getattr(ctypes.CDLL(None), "renameat2", None) if sys.platform == "linux" else None
+    return call is not None and call(HERE, os.fsencode(one), HERE, os.fsencode(other), EXCHANGE) == 0
+
+
+def place_now(path: Path, ask: Callable[[], None]) -> Path:
+    """Where to put what has been made: where it was to go, or beside it if somebody else has been there meanwhile."""
+    try:
+        ask()
+        return path
+    except LumigraphError:
+        beside = (path.with_stem(f"{path.stem}-{number}") for number in itertools.count(2))
+        return next(other for other in beside if seen(other) is None)
+
+
+def tell_if_moved(wanted: Path, place: Path) -> None:
+    if place != wanted:
+        raise LumigraphError(f"{wanted} has been changed by somebody else meanwhile; what was made is {place}")
+
+
+def seen(path: Path) -> Seen | None:
+    """What lies at a path, links as such; None if nothing does."""
+    try:
+        about = os.lstat(path)
+    except (FileNotFoundError, NotADirectoryError):
+        return None
+    return about.st_dev, about.st_ino, about.st_mode, about.st_size, about.st_mtime_ns
+
+
+def check_room(place: Path) -> None:
+    """Raise OSError unless something may be written there, as far as that can be told beforehand."""
+    above = next(folder for folder in [*place.parents, Path(place.anchor)] if os.path.lexists(folder))
+    if not above.is_dir():
+        raise NotADirectoryError(errno.ENOTDIR, os.strerror(errno.ENOTDIR), str(above))
+    if not os.access(above, os.W_OK | os.X_OK):
+        raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(above))
+
+
+def refuse_all_but_files(path: Path) -> None:
+    mode = os.lstat(path).st_mode
+    if stat.S_ISLNK(mode):
+        raise LumigraphError(f"{path} is a link, which stays as it is; name the file that it leads to, or another one")
+    if not stat.S_ISREG(mode):
+        what = "a folder" if stat.S_ISDIR(mode) else "no ordinary file"
+        raise LumigraphError(f"{path} is {what}; choose another name for the file")
+
+
+def write_bytes(path: Path, data: bytes, kind: Kind = "file", ours: bool = False) -> None:
+    with replacing(path, kind, ours) as new:
+        new.write_bytes(data)
+
+
+def write_json(path: Path, value: Any, kind: Kind = "file", ours: bool = False) -> None:
+    """JSON for programs and people: indented, but rows of numbers stay rows."""
+    text = json.dumps(value, indent=2, ensure_ascii=False, allow_nan=False)
+    text = NUMBERS.sub(lambda match: " ".join(match[0].split()).replace("[ ", "[").replace(" ]", "]"), text)
+    write_bytes(path, text.encode() + b"\n", kind, ours)
+
+
+def read_json(path: Path, kind: Any = Any) -> Any:
+    """What a file of JSON says, as a value of a kind (see `ranges.typed`); as it stands there if none is named.
+
+    Raises LumigraphError, naming the file, if it is missing, is no JSON (NaN, infinity and numbers of hundreds of
+    digits are none either), nests deeper than anything sound does, or does not hold what the kind says.
+    """
+    with explained(path):
+        return typed(kind, from_json(path.read_bytes(), path), path)
+
+
+def from_json(data: bytes, where: Path | str) -> Any:
+    """Plain values of JSON. where: what to name in a LumigraphError; see `read_json`."""
+    nesting = accumulate(1 if bracket in b"[{" else -1 for bracket in data.translate(None, BUT_BRACKETS))
+    if max(nesting, default=0) > DEEPEST:
+        raise LumigraphError(f"{where} nests deeper than {DEEPEST} levels, as no sound file does; restore it")
+    try:
+        return msgspec.json.decode(data)
+    except (ValueError, RecursionError) as error:
+        at = re.search(r"byte (\d+)", str(error))
+        line = f", line {1 + data.count(bytes([10]), 0, int(at[1]))}" if at else ""
+        reason = str(error).partition(" (byte")[0]
+        raise LumigraphError(f"{where} cannot be read as JSON ({reason}{line}); restore it from a copy") from error
+
+
+def is_file(path: Path) -> bool:
+    """Whether a file lies there; none does under a name that the system takes for no name."""
+    try:
+        return path.is_file()
+    except (OSError, ValueError):
+        return False
+
+
+def exists(path: Path) -> bool:
+    """Whether something lies there; nothing does under a name that the system takes for no name."""
+    try:
+        return path.exists()
+    except (OSError, ValueError):
+        return False
+
+
+def expanded(name: Path | str) -> Path:
+    """A path with the home folder for its ~, or as it stands where nobody is called so."""
+    try:
+        return Path(name).expanduser()
+    except RuntimeError:
+        return Path(name)
+
+
+def sync(path: Path) -> None:
+    """Make sure that what was written survives a loss of power."""
+    if path.is_dir():
+        for file in path.rglob("*"):
+            if file.is_file():
+                sync(file)
+        sync_folder(path)
+        return
+    with open(path, "rb+") as handle:
+        os.fsync(handle.fileno())
+
+
+def sync_folder(folder: Path) -> None:
+    if os.name == "nt":
+        return  # Windows has no such call for folders, and does not need it
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+@contextlib.contextmanager
+def explained(path: Path) -> Iterator[None]:
+    """Turn the operating system's refusals into one sentence about `path`."""
+    try:
+        yield
+    except OSError as error:
+        raise LumigraphError(refusal(path, error)) from error
+
+
+def refusal(path: Path, error: OSError) -> str:
+    match error.errno:
+        case errno.ENOSPC | errno.EDQUOT:
+            return f"{path} could not be written because the disk is full; free some space and try again"
+        case errno.ENOENT:
+            return f"{path} does not exist; check the path"
+        case errno.EACCES | errno.EPERM | errno.EROFS:
+            return f"{path} may not be read or written by this user; change its permissions or choose another place"
+        case errno.EEXIST | errno.ENOTDIR:
+            return f"{path} needs a folder where a file of that name lies; choose another place"
+        case _:
+            return f"{path} could not be read or written ({error.strerror or error}); choose another place"
+
+
+def scene_name(source: str) -> str:
+    """A short name for files: the last part of a path, without a file's suffix, or of "procedural:<name>"."""
+    path = Path(source).resolve()
+    last = source.partition(":")[2] if source.startswith("procedural:") else path.stem if path.is_file() else path.name
+    return re.sub(r"[^\w.-]+", "-", last) or "scene"

@@ -1,0 +1,129 @@
+"""One at a time: who works in a folder holds a lock on it, which the system drops when the process ends, even killed.
+
+So a lock that a killed process has left behind is no lock, and nobody has to delete it.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import json
+import os
+import socket
+import sys
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TextIO
+
+from ..errors import LumigraphError
+from .atomic import explained, read_json
+
+NAME = "lock.json"  # in the folder: who holds it, for people; what counts is the system's lock on this file
+BEGINS = b'{"process": '
+FAR = 1 << 30  # byte that Windows locks, for it lets nobody read what is locked
+
+_ours: set[Path] = set()  # held by this process
+
+
+@dataclass(frozen=True)
+class Holder:
+    """What the file says."""
+
+    process: int
+    host: str
+    since: str
+
+
+@contextlib.contextmanager
+def held(folder: Path, doing: str) -> Iterator[None]:
+    """Hold an existing folder inside this block; a process that holds it already goes on holding it.
+
+    doing: what is done with the folder meanwhile, as in "trained"
+    Raises LumigraphError, which says who it is, if another process holds it.
+    """
+    place = folder.resolve() / NAME
+    if place in _ours:
+        yield
+        return
+    check_place(folder)
+    with explained(place):
+        file = taken(place)
+    if file is None:
+        raise LumigraphError(f"{folder} is being {doing} by {holder(place)}; wait until that ends, or end it")
+    _ours.add(place)
+    try:
+        yield
+    finally:
+        _ours.discard(place)
+        with contextlib.suppress(OSError):  # Windows deletes no open file; then it stays, and means nothing
+            place.unlink()
+        file.close()
+
+
+def check_place(folder: Path) -> None:
+    """Raise LumigraphError if somebody's file lies where a folder's lock would: it would be replaced, and deleted."""
+    with explained(folder / NAME):
+        if not is_lock(folder / NAME):
+            raise LumigraphError(f"{folder / NAME} is no lock of Lumigraph's; rename it, or choose another folder")
+
+
+def is_lock(place: Path) -> bool:
+    """Whether a lock's file may be put there: nothing is, or one that somebody holds or has left behind."""
+    if not os.path.lexists(place):
+        return True
+    if place.is_symlink() or not place.is_file():
+        return False
+    try:
+        return place.read_bytes()[: len(BEGINS)] in (BEGINS, b"")
+    except FileNotFoundError:
+        return True  # it went just now
+
+
+def taken(place: Path) -> TextIO | None:
+    """The lock's file, open and locked; None if somebody else has it."""
+    while True:
+        file = open(place, "a+", encoding="utf-8")
+        if not lock(file):
+            file.close()
+            return None
+        if os.name == "nt" or is_still(place, file):
+            file.truncate(0)
+            json.dump({"process": os.getpid(), "host": socket.gethostname(), "since": time.strftime("%F %T")}, file)
+            file.flush()
+            return file
+        file.close()  # whoever had it deleted it just now: the next one will be another file
+
+
+def is_still(place: Path, file: TextIO) -> bool:
+    try:
+        return os.path.samestat(os.stat(place), os.fstat(file.fileno()))
+    except FileNotFoundError:
+        return False
+
+
+def lock(file: TextIO) -> bool:
+    """Whether an open file could be locked. Where the file system knows no locks, it could."""
+    try:
+        if sys.platform == "win32":
+            import msvcrt
+
+            file.seek(FAR)
+            msvcrt.locking(file.fileno(), msvcrt.LK_NBLCK, 1)
+        else:
+            import fcntl
+
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError as fault:
+        return fault.errno in (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP)
+    return True
+
+
+def holder(place: Path) -> str:
+    """Who holds a lock, in words."""
+    try:
+        said = read_json(place, Holder)
+    except LumigraphError:  # it is being written just now
+        return "another process"
+    return f"process {said.process} on {said.host} since {said.since}"

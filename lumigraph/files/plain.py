@@ -1,0 +1,66 @@
+"""Values as plain JSON and named tensors, and back. Never pickle: a file that is read must not run."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from torch import Tensor
+
+from ..errors import LumigraphError
+
+
+def flatten(value: Any, tensors: dict[str, Tensor], name: str = "optimizers") -> Any:
+    """The value as JSON, its tensors put into `tensors` under the path that leads to them."""
+    match value:
+        case Tensor():
+            tensors[name] = value
+            return {"tensor": name}
+        case dict():
+            return {"dict": [[key, flatten(x, tensors, f"{name}.{key}")] for key, x in value.items()]}
+        case list() | tuple():
+            items = [flatten(x, tensors, f"{name}.{i}") for i, x in enumerate(value)]
+            return {"tuple": items} if isinstance(value, tuple) else items
+        case None | bool() | int() | float() | str():
+            return value
+    raise TypeError(f"{name} holds a {type(value).__name__}, which a checkpoint cannot keep")
+
+
+def unflatten(value: Any, tensors: dict[str, Tensor]) -> Any:
+    """The inverse of `flatten`."""
+    match value:
+        case {"tensor": str(name)}:
+            return tensors[name]
+        case {"dict": items}:
+            return {key: unflatten(x, tensors) for key, x in items}
+        case {"tuple": items}:
+            return tuple(unflatten(x, tensors) for x in items)
+        case list():
+            return [unflatten(x, tensors) for x in value]
+    return value
+
+
+@contextlib.contextmanager
+def understood(path: Path) -> Iterator[None]:
+    """Turn the ways in which a file can fail to hold what was expected into one sentence."""
+    try:
+        yield
+    except (LookupError, TypeError, ValueError, AttributeError, RuntimeError, ArithmeticError) as error:
+        raise LumigraphError(
+            f"{path} does not hold what it should ({type(error).__name__}: {error}); it was edited, "
+            f"or written by another version"
+        ) from error
+
+
+def alike(a: Any, b: Any, tolerance: float = 1e-4) -> bool:
+    """Whether two JSON values agree, numbers up to a tolerance."""
+    match a, b:
+        case dict(), dict():
+            return a.keys() == b.keys() and all(alike(a[k], b[k], tolerance) for k in a)
+        case ((list() | tuple()), (list() | tuple())):
+            return len(a) == len(b) and all(alike(x, y, tolerance) for x, y in zip(a, b, strict=True))
+        case ((int() | float()), (int() | float())):
+            return bool(abs(a - b) <= tolerance * max(1.0, abs(a)))
+    return bool(a == b)

@@ -1,0 +1,47 @@
+"""Contraction: all of space in a ball of radius 1, as networks and grids of open captures need it."""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from .._dispatch import implementation
+from .._doors import door
+from .._facts import Facts
+
+FACTS = Facts(unit="points", outputs=2, differentiable=(), typical=3, compiled=3)
+
+
+@door
+def contract(
+    points: Float[Tensor, "point 3"], stretch: bool = False
+) -> tuple[Float[Tensor, "point 3"], Float[Tensor, " point"] | None]:
+    """Coordinates of points, half of contract(x) (Barron 2022, eq. 10), and their stretch where it is asked for.
+
+        c(x) = x / 2 for |x| <= 1, else (2 - 1 / |x|) x / (2 |x|)
+
+    stretch: whether to return |det dc/dx|^(1/3) as well, the length in coordinates of a scene unit, averaged over
+             directions
+    Not differentiable.
+    """
+    return implementation("contract", points)(points, stretch)
+
+
+def cases(generator: torch.Generator):
+    """Inputs that every engine must agree on: the origin, points on the unit sphere, and points far out."""
+    for points, stretch in [(0, True), (1, False), (70, False), (300, True)]:
+        yield _inputs(points, generator), stretch
+    axes = torch.cat([torch.eye(3), -torch.eye(3)])
+    yield torch.cat([torch.zeros(1, 3), axes, 1e4 * axes, 1e-4 * axes]), True
+
+
+def benchmark_case(generator: torch.Generator, size: int = 2**18):
+    """Points of which about half lie within the unit ball."""
+    return _inputs(size, generator), False
+
+
+def _inputs(points: int, generator: torch.Generator) -> Tensor:
+    """Points at distances from 0.06 to 16 in all directions."""
+    directions = torch.nn.functional.normalize(torch.randn(points, 3, generator=generator), dim=-1)
+    return 2 ** (8 * torch.rand(points, 1, generator=generator) - 4) * directions

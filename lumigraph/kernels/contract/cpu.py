@@ -1,0 +1,41 @@
+"""Numba: each point by itself."""
+
+import math
+
+import numpy as np
+from numba import njit, prange
+
+from .._dispatch import empty
+
+
+@njit(inline="always")
+def scale_of(x, y, z):
+    """1 / |x|, at most 1, and the factor that takes a point into the contraction's ball."""
+    one, radius = np.float32(1), np.float32(math.sqrt(x * x + y * y + z * z))
+    inverse = one / radius if radius > one else one
+    return inverse, np.float32(0.5) * (one + one - inverse) * inverse
+
+
+@njit(inline="always")
+def _stretch(inverse, across):
+    """|det J|^(1/3) from the two numbers of `scale_of`; a half within the unit ball."""
+    if inverse == 1:
+        return across
+    return (np.float32(0.5) * inverse * inverse * across * across) ** np.float32(1 / 3)
+
+
+@njit(parallel=True, cache=True, error_model="numpy")
+def _contract(points, coordinates, stretch):
+    """stretch: filled, unless it is empty"""
+    for i in prange(len(points)):
+        inverse, across = scale_of(points[i, 0], points[i, 1], points[i, 2])
+        for axis in range(3):
+            coordinates[i, axis] = across * points[i, axis]
+        if len(stretch):
+            stretch[i] = _stretch(inverse, across)
+
+
+def run(points, stretch):
+    coordinates, lengths = empty(len(points), 3), empty(len(points) if stretch else 0)
+    _contract(*(x.numpy() for x in (points.detach().contiguous(), coordinates, lengths)))
+    return coordinates, lengths if stretch else None

@@ -1,0 +1,149 @@
+"""Appearance alignment: the code of each block is fitted to the pictures of its neighbours (Tancik 2022, 4.3.3)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from ..camera import Camera
+from ..components.fields.appearance import Appearance, Patches
+from ..composition import Placed
+from ..datasets.scene import Batch
+from ..geometry.choice import evenly
+from ..method.capabilities import HasAppearance, can, needs
+from ..system.progress import track
+from .block_cache import Nearby
+from .exposure_alignment import Asked, exposed
+from .visibility import saw
+
+TRIED, CHOSEN = 8, 6  # cameras between two blocks that are looked through, and those whose pictures are compared
+WIDTH = 48  # pixels along the longer side of these pictures
+SIDE = 4  # pixels of a patch
+WELL = 0.5  # of the best seen patch's visibility, from which on patches are compared
+
+
+def align_appearance(
+    parts: Sequence[Placed] | Nearby,
+    centres: Float[Tensor, "block 3"],
+    radii: Float[Tensor, " block"],
+    cameras: Camera,
+    kept: Iterable[int] | None = None,
+) -> list[Float[Tensor, " code"]]:
+    """The appearance code of each block, in which it looks like its neighbours.
+
+    Some blocks keep the appearance that they show: those of `kept`, or where it is None the one nearest to the middle
+    of all, in the average of its photographs. Outward from there, nearest first, each block's code is optimised so that
+    rays of cameras which it and blocks that are aligned already see well show the same colours, with all weights as
+    they are. All neighbours that are aligned are compared with. A block with none in reach is aligned to the nearest.
+
+    parts, centres, radii: as `InBlocks` takes them, in one common frame
+    cameras: from which places to compare are chosen: the capture's photographs, in the common frame
+
+    A code is stored as a plain list of numbers, `code.tolist()`. When a run opens, it is given back:
+
+        from lumigraph.components.fields.appearance import Appearance, Patches
+        method = method.given(Appearance(torch.tensor(numbers)))
+
+    A block that learnt no appearance has an empty code, and is given nothing. To align a block that was trained again,
+    give the others their codes first and name them in `kept`.
+    """
+    parts = Nearby.of(parts)
+    exposure, order = Asked.of(parts).usual, []
+    found = dict[int, Appearance]()
+
+    def lit(number: int) -> Placed:
+        """A part in its light, as far as that is found."""
+        part = exposed(parts[number], exposure)
+        return replace(part, method=part.method.given(found[number])) if number in found else part
+
+    if kept is None:
+        middle = centres.mean(0)
+        kept = [int((centres - middle).norm(dim=-1).argmin())]
+    aligned = sorted(set(kept))
+    distance = torch.cdist(centres.double(), centres.double())
+    done = list(aligned)
+    while waiting := [i for i in range(len(parts)) if i not in done]:
+        i, j = min(((i, j) for i in waiting for j in done), key=lambda pair: float(distance[pair]))
+        reached = [k for k in done if distance[i, k] < radii[i] + radii[k]] or [j]
+        order.append((i, reached))
+        done.append(i)
+    for i, neighbours in track(order, "Aligning blocks", len(order)):
+        own = lit(i)
+        if not appearance_of(own).numel():
+            continue
+        alike = [x for k in neighbours if (x := patch(lit(k), own, centres[[k, i]], radii[[k, i]], cameras))]
+        if alike:
+            seen = Patches(joined(alike), SIDE * SIDE)
+            found[i] = Appearance(appearance_of(replace(own, method=own.method.given(seen))))
+    return [appearance_of(lit(i)) for i in range(len(parts))]
+
+
+def appearance_of(part: Placed) -> Float[Tensor, " code"]:
+    """The code that a part is shown in; empty where it has none."""
+    if not can(part.method, HasAppearance):
+        return torch.zeros(0)
+    return needs(part.method, HasAppearance).shown_in.code.detach().cpu()
+
+
+def patch(
+    known: Placed, other: Placed, centres: Float[Tensor, "2 3"], radii: Float[Tensor, 2], cameras: Camera
+) -> Batch | None:
+    """Rays in the frame of one block, with the colours that another shows along them: those of some cameras between the
+    two, of pixels that both saw well (section 4.3.3). None where there are no cameras."""
+    views = [looked(known, other, camera) for camera in between(centres, radii, cameras)]
+    views = sorted(views, key=lambda view: float(view.visibility.mean()), reverse=True)[:CHOSEN]
+    return joined([view.well_seen() for view in views]) if views else None
+
+
+@dataclass(frozen=True)
+class View:
+    """Colours that one block shows a camera, the camera in the frame of another, and how well both saw each pixel."""
+
+    rgb: Float[Tensor, "height width 3"]
+    camera: Camera
+    visibility: Float[Tensor, "height width"]
+
+    def well_seen(self) -> Batch:
+        """Patches of SIDE by SIDE pixels that both saw well, one after the other, as rays of the other block."""
+        height, width = (n // SIDE * SIDE for n in self.visibility.shape)
+        pixel = torch.arange(self.visibility.numel(), device=self.visibility.device).view_as(self.visibility)[
+            :height, :width
+        ]
+        patches = pixel[:height, :width].unfold(0, SIDE, SIDE).unfold(1, SIDE, SIDE).reshape(-1, SIDE * SIDE)
+        visibility = self.visibility.flatten()[patches].mean(-1)
+        chosen = patches[visibility >= WELL * visibility.max()].flatten()
+        rays = self.camera.rays(self.camera.pixels()[chosen])
+        return Batch(rays, self.rgb.flatten(0, 1)[chosen].clamp(0, 1))
+
+
+def looked(known: Placed, other: Placed, camera: Camera) -> View:
+    """One block looked at through a small picture, and by how much the less seeing of both saw each pixel."""
+    small = camera.resized(min(1.0, WIDTH / int(camera.size.max())))
+    seen, theirs = known.rendering(small), other.rendering(small)
+    both = torch.minimum(saw(known, small, seen), saw(other, small, theirs))
+    background = torch.tensor(other.method.frame.background, device=seen.rgb.device)
+    return View(seen.rgb + (1 - seen.opacity)[..., None] * background, other.camera(small), both)
+
+
+def between(centres: Float[Tensor, "2 3"], radii: Float[Tensor, 2], cameras: Camera) -> list[Camera]:
+    """Some of the cameras that are about as near to one block as to the other, by their radii, the nearest of them."""
+    farther = ((cameras.position[:, None] - centres) / radii[:, None]).norm(dim=-1).amax(-1)
+    near = farther.argsort()[: 3 * TRIED]
+    return [cameras[int(i)] for i in evenly(near.tolist(), TRIED)]
+
+
+def joined(batches: Sequence[Batch]) -> Batch:
+    """One batch of several, none of them with alpha."""
+    rays = replace(
+        batches[0].rays,
+        origins=torch.cat([x.rays.origins for x in batches]),
+        directions=torch.cat([x.rays.directions for x in batches]),
+        radius=torch.cat([x.rays.radius for x in batches]),
+        time=None,
+        image_index=None,
+    )
+    return Batch(rays, torch.cat([x.rgb for x in batches]))

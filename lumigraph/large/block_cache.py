@@ -1,0 +1,53 @@
+"""Cache of the blocks of a scene that is too large for memory: opened when a camera comes near, the oldest closed."""
+
+from __future__ import annotations
+
+import threading
+from collections import OrderedDict
+from collections.abc import Callable, Iterator, Mapping, Sequence
+
+from ..composition import Placed
+
+AT_HAND = 8  # parts that stay open; a picture asks for three
+
+
+class Nearby:
+    """Parts by number, of which those that were asked for last are open.
+
+    open:  gives a part by its number, on the device where it is to be
+    count: how many there are
+    most:  that stay open at a time
+    """
+
+    def __init__(self, open: Callable[[int], Placed], count: int, most: int = AT_HAND):
+        self._open, self._count, self._most = open, count, most
+        self._there: OrderedDict[int, Placed] = OrderedDict()
+        self._lock = threading.RLock()
+
+    @classmethod
+    def of(cls, parts: Sequence[Placed] | Nearby) -> Nearby:
+        """The same parts; those of a list are all open, and stay so."""
+        return parts if isinstance(parts, Nearby) else cls(parts.__getitem__, len(parts), max(1, len(parts)))
+
+    def __len__(self) -> int:
+        return self._count
+
+    def __getitem__(self, number: int) -> Placed:
+        with self._lock:
+            if number not in self._there:
+                while len(self._there) >= self._most:
+                    self._there.popitem(last=False)
+                self._there[number] = self._open(number)
+            self._there.move_to_end(number)
+            return self._there[number]
+
+    def __iter__(self) -> Iterator[Placed]:
+        return (self[number] for number in range(len(self)))
+
+    def each(self, change: Callable[[Placed], Placed]) -> Nearby:
+        """The same parts, each changed when it is asked for."""
+        return Nearby(lambda number: change(self[number]), len(self), self._most)
+
+    def but(self, others: Mapping[int, Placed]) -> Nearby:
+        """The same parts, but for some that others stand for; these stay open."""
+        return Nearby(lambda number: others[number] if number in others else self[number], len(self), self._most)

@@ -1,0 +1,268 @@
+"""A run in blocks, opened as one scene: every block in its place, those in reach of a camera in its picture.
+
+RUN/
+├── blocks.json    see `plan`;  blocks.png  the plan seen from above
+├── blocks/0/      an ordinary run for each block, in a frame of its own
+└── eval.json, eval.png, renders/ ...   as of any run
+"""
+
+from __future__ import annotations
+
+import math
+import warnings
+from dataclasses import replace
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from .. import files, methods
+from ..camera import Camera
+from ..capture import Before, Part, open_dataset
+from ..composition import PickedCloud, Placed
+from ..datasets.scene import Frame, Scene
+from ..errors import LumigraphError, LumigraphWarning
+from ..files.names import natural
+from ..geometry import Similarity
+from ..method import Method
+from ..method.capabilities import HasGaussians, can
+from ..run.checkpoint import State
+from ..run.folder import Run
+from ..run.opened import Trained
+from ..run.settings import Settings, Source
+from .block_cache import Nearby
+from .compositing import InBlocks
+from .merging import merged
+from .plan import FOLDER, NAME, Block, Plan
+
+LARGEST_REACH = 64.0
+NONE = "it has no block that has learnt anything yet; `lumigraph train` with the same options goes on with it"
+
+
+class BlockRun(Trained):
+    """A folder with a run in blocks. Raises LumigraphError where none of its blocks has a state.
+
+    plan:   what blocks.json says
+    blocks: those that have a state, and their runs by name; the others are named in a LumigraphWarning
+    frame:  upright, all blocks within [-1, 1]^3
+    """
+
+    def __init__(self, folder: Path | str):
+        self.path = self.folder = Path(folder)
+        self.plan = Plan.read(self.folder / NAME)
+        self.runs = {block.name: run for block in self.plan.blocks if (run := state_of(self.folder, block)) is not None}
+        self.blocks = [block for block in self.plan.blocks if block.name in self.runs]
+        if not self.blocks:
+            raise LumigraphError(f"{self.folder} cannot be shown: {NONE}")
+        if missing := [block.name for block in self.plan.blocks if block.name not in self.runs]:
+            warnings.warn(
+                f"{self.folder} is shown without {len(missing)} of its blocks, which have learnt nothing yet: "
+                f"{', '.join(missing[:20])}",
+                LumigraphWarning,
+                2,
+            )
+        self.frame = self._frame()
+
+    # Where blocks are
+
+    @property
+    def centres(self) -> Float[Tensor, "block 3"]:
+        """Centres of the blocks, in the frame."""
+        source = torch.tensor([block.centre for block in self.blocks], dtype=torch.float64)
+        return self.frame.to_source.inverse.points(source).float()
+
+    @property
+    def radii(self) -> Float[Tensor, " block"]:
+        """Radii of the blocks, in the frame's units."""
+        return torch.tensor([block.radius for block in self.blocks]) / self.frame.to_source.scale
+
+    @cached_property
+    def _around(self) -> Part:
+        """A ball on the ground that holds all blocks of the plan, in the source's frame."""
+        upright = np.array(self.plan.upright)
+        centres = np.array([block.centre for block in self.plan.blocks]) @ upright.T
+        radii = np.array([[block.radius] for block in self.plan.blocks])
+        low, high = (centres - radii).min(0), (centres + radii).max(0)
+        x, y, z = (0.5 * (low + high) @ upright).tolist()
+        return Part([], (x, y, z), 0.5 * float((high - low)[:2].max()))
+
+    def _frame(self) -> Frame:
+        around, upright = self._around, np.array(self.plan.upright)
+        rotation = torch.from_numpy(upright.T).double()
+        to_source = Similarity.make(around.radius, rotation, torch.tensor(around.centre, dtype=torch.float64))
+        frames = [self.runs[block.name].frame for block in self.blocks]
+        rescaled = [frame.to_source.scale / around.radius for frame in frames]
+        own = Frame(source_from_scene=to_source.rows)
+        centres = [(own.to_source.inverse @ frame.to_source).matrix[:3, 3] for frame in frames]
+        low = torch.stack([c - scale for c, scale in zip(centres, rescaled, strict=True)]).amin(0).clamp(-1, 1)
+        high = torch.stack([c + scale for c, scale in zip(centres, rescaled, strict=True)]).amax(0).clamp(-1, 1)
+        farthest = max(
+            float(c.abs().max()) + scale * frame.reach
+            for c, scale, frame in zip(centres, rescaled, frames, strict=True)
+        )
+        return replace(
+            own,
+            bounds=(tuple(low.tolist()), tuple(high.tolist())),
+            reach=min(2.0 ** max(1, math.ceil(math.log2(farthest))), LARGEST_REACH),
+            near=min(frame.near * scale for frame, scale in zip(frames, rescaled, strict=True)),
+            background=frames[0].background,
+            has_alpha=any(frame.has_alpha for frame in frames),
+            image_count=sum(len(block.photographs) for block in self.blocks),
+            times=span(frames),
+        )
+
+    # What it shows
+
+    def method(
+        self, device: torch.device | str = "cpu", exposures: Float[Tensor, " photograph"] | None = None
+    ) -> Method:
+        """All blocks as one method; clouds of Gaussians, each cut to its cell, as one cloud.
+
+        exposures: of photographs that it will be given, by their `image_index`
+        """
+        if all(can(methods.find(run.method_name), HasGaussians) for run in self.runs.values()):
+            parts = [self.placed(block, device) for block in self.blocks]
+            level = self.centres
+            level[:, 2] = level[:, 2].mean()  # so that cells stand upright
+            return PickedCloud(self.frame, merged(parts, level)).to(device)
+        nearby = Nearby(lambda i: self.placed(self.blocks[i], device), len(self.blocks))
+        return InBlocks(self.frame, nearby, self.centres, self.radii, exposures=exposures).to(device)
+
+    def placed(self, block: Block, device: torch.device | str = "cpu") -> Placed:
+        """A block in its place, in the light that all are shown in where they have been aligned."""
+        run = self.runs[block.name]
+        method = run.method(device)
+        if code := self.plan.appearance.get(block.name):
+            from ..components.fields.appearance import Appearance
+
+            method = method.given(Appearance(torch.tensor(code, device=device)))
+        return Placed(method, self.frame.to_source.inverse @ run.frame.to_source)
+
+    # What it learnt from
+
+    @cached_property
+    def _photographs(self) -> dict[tuple[str, str], tuple[str, str]]:
+        """By source and name, the block nearest to each photograph, and what it serves there."""
+        found: dict[tuple[str, str], tuple[float, str, str]] = {}
+        for block in self.blocks:
+            run, source = self.runs[block.name], self._source(block)
+            centre, cameras = torch.tensor(block.centre, dtype=torch.float64), run.cameras()
+            for split, names in run.view_names().items():
+                away = (run.frame.to_source.points(cameras[split].position.double()) - centre).norm(dim=-1)
+                for name, distance in zip(names, away.tolist(), strict=True):
+                    if (source, name) not in found or distance < found[source, name][0]:
+                        found[source, name] = distance, block.name, split
+        return {key: (block, split) for key, (_, block, split) in found.items()}
+
+    def _source(self, block: Block) -> str:
+        return (block.scene or self.plan.scene).source
+
+    def cameras(self) -> dict[str, Camera]:
+        """The photographs' cameras by split, in the frame: each once, as the block nearest to it has it."""
+        return {split: Camera.cat([camera for _, camera in some]) for split, some in self._views.items()}
+
+    def view_names(self) -> dict[str, list[str]]:
+        return {split: [name for name, _ in some] for split, some in self._views.items()}
+
+    @cached_property
+    def _views(self) -> dict[str, list[tuple[str, Camera]]]:
+        """Names and cameras of photographs by split, those to learn from first."""
+        found: dict[str, list[tuple[str, Camera]]] = {"train": []}
+        for block in self.blocks:
+            run, names = self.runs[block.name], self.runs[block.name].view_names()
+            place = (self.frame.to_source.inverse @ run.frame.to_source).matrix
+            for split, cameras in run.cameras().items():
+                moved = replace(cameras.transformed(place), image_index=None)
+                for i, name in enumerate(names[split]):
+                    if self._photographs[self._source(block), name] == (block.name, split):
+                        found.setdefault(split, []).append((name, moved[i]))
+        return found
+
+    @property
+    def photographed(self) -> bool:
+        return True
+
+    @property
+    def conversion_fault(self) -> str:
+        return f"is a run in blocks; convert each by itself: {self.folder / FOLDER / self.blocks[0].name}"
+
+    def dataset(self, source: str | None = None, split: str | None = None) -> Scene:
+        """The photographs again, in the frame.
+
+        source: where they are now, if they have moved; that of a block which was learnt again, for those of it alone
+        split:  those of this one alone, and one to learn from, which no scene is without; None for all
+        """
+        again = {self._source(block) for block in self.blocks if block.scene is not None}
+        asked = str(Path(source).resolve()) if source and Path(source).exists() else source
+        origin = asked if asked in again else self.plan.scene.source
+        there = {name: use for (place, name), (_, use) in self._photographs.items() if place == origin}
+        names = [name for name, purpose in there.items() if split in (None, purpose)]
+        if split not in (None, "train"):
+            names += [name for name, purpose in there.items() if purpose == "train"][:1]
+        names = sorted(dict.fromkeys(names), key=natural)
+        options = {name: value for name, value in self.plan.scene.options.items() if value is not None}
+        part = replace(self._around, photographs=names)
+        before = Before(names, np.array(self.plan.upright))
+        data = open_dataset(source or origin, Scene, **options, part=part, before=before)
+        assert isinstance(data, Scene)
+        return replace(data, frame=self.frame)
+
+    def scene(self, source: str | None = None) -> Scene:
+        """All photographs."""
+        return self.dataset(source)
+
+    # What evaluation says of it
+
+    @property
+    def learnt_from(self) -> Source:
+        return self.plan.scene
+
+    @property
+    def method_name(self) -> str:
+        return self.plan.method
+
+    @property
+    def state(self) -> State:
+        """Steps and seconds of all blocks together, and the memory of the one that needed most."""
+        states = [run.state for run in self.runs.values()]
+        return State(
+            sum(x.step for x in states),
+            sum(x.seconds for x in states),
+            sum(x.compile_seconds for x in states),
+            max(x.peak_memory for x in states),
+        )
+
+    @property
+    def model_bytes(self) -> int:
+        return sum(run.model_bytes for run in self.runs.values())
+
+    @property
+    def settings(self) -> Settings:  # type: ignore[override]  # from all blocks, when it is asked for
+        """Settings that an ordinary run of the whole would have."""
+        plan, counts = self.plan, dict[str, int]()
+        for _, split in self._photographs.values():
+            counts[split] = counts.get(split, 0) + 1
+        return Settings(
+            plan.method, plan.config, self.frame, plan.scene, counts, plan.seed, {}, plan.device, plan.processor,
+            plan.versions,
+        )  # fmt: skip
+
+
+def state_of(folder: Path, block: Block) -> Run | None:
+    """The run of a block, if it has a state."""
+    place = folder / FOLDER / block.name
+    if not files.is_file(place / "config.json"):
+        return None
+    run = Run(place)
+    if run.method_name not in methods.available():
+        run.new_method()  # says which methods there are
+    return run if run.has_state else None
+
+
+def span(frames: list[Frame]) -> tuple[float, float] | None:
+    """From the first moment of all to the last."""
+    times = [time for frame in frames if frame.times for time in frame.times]
+    return (min(times), max(times)) if times else None

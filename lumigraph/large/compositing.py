@@ -1,0 +1,202 @@
+"""Compositing of blocks: a scene too large for one field, rendered by the blocks that saw what a camera looks at.
+
+Tancik et al. 2022 (Block-NeRF, arXiv 2202.05263), section 4.3: blocks within reach of a camera, without those that do
+not see what it sees (4.3.1), each rendered by itself, their pictures mixed by how near the camera is to each (4.3.2).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import partial
+from typing import Any, NoReturn
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from ..camera import Camera
+from ..camera.rays import Rendering
+from ..composition import Placed
+from ..datasets.scene import Frame, Photograph
+from ..errors import LumigraphError
+from ..method import Method
+from ..method.controls import Control, Value
+from .block_cache import Nearby
+from .exposure_alignment import EXPOSURE, Asked, exposed
+from .visibility import GLANCE, saw
+from .weights import UNSEEN, Mixing, inverse_distance, seeing, shares
+
+LITTLE = 1e-3  # share of a picture below which a block is not rendered: a quarter of a step of 8 bits
+ENTERED = 0.02  # share of a picture from which on a block counts fully where pixels are mixed one by one
+
+
+class InBlocks(Method):
+    """Several placed methods, each for a part of one large scene. Ready to render, and nothing else.
+
+    frame:     the common frame, in which cameras, centres and radii are given
+    parts:     a block each: its method, on the device where it stays, and the way from its own frame to the common one,
+               which is `frame.to_source.inverse @ part_frame.to_source`. None of them leads: cameras of the common
+               frame belong to no block's photographs. `Nearby` opens them where a camera comes near; here each is
+               asked once what it can be told
+    centres:   where blocks are
+    radii:     how far from its centre a camera may be that a block is asked about. A camera that is in reach of none is
+               shown by the nearest block
+    mixing:    numbers of the composition
+    exposures: of the capture's photographs, by their `image_index`, as `Scene.about["exposure"]` has them, where known
+
+    Blocks are shown as if photographed with one exposure, the median of what is usual in each. The control `exposure`
+    counts stops from there; others that blocks have, but for those that name photographs, are passed on to all. A
+    Photograph may be given: each block in reach of its camera finds its own appearance in it.
+    """
+
+    any_lens = True
+    centres: Tensor
+    radii: Tensor
+
+    def __init__(
+        self,
+        frame: Frame,
+        parts: Sequence[Placed] | Nearby,
+        centres: Float[Tensor, "block 3"],
+        radii: Float[Tensor, " block"],
+        mixing: Mixing | None = None,
+        exposures: Float[Tensor, " photograph"] | None = None,
+    ):
+        super().__init__(frame, mixing or Mixing())
+        if not len(parts) == len(centres) == len(radii) > 0:
+            raise LumigraphError(f"{len(parts)} blocks need as many centres and radii, and at least one block")
+        parts = Nearby.of(parts)
+        self.asked = Asked.of(parts)
+        self.usual = self.asked.usual
+        self.register_buffer("centres", centres.float(), persistent=False)
+        self.register_buffer("radii", radii.float(), persistent=False)
+        self.exposures = exposures
+        self.parts = parts.each(partial(exposed, exposure=self.usual))
+        self.eval()
+
+    # Being seen
+
+    @torch.no_grad()
+    def render(self, camera: Camera) -> Rendering:
+        camera = camera.to(self.device)
+        weights = self.weights(camera)
+        chosen = (weights >= LITTLE).nonzero()[:, 0]
+        seen = [self.parts[i].rendering(camera) for i in chosen.tolist()]
+        if self.config.by in ("points", "visibility"):
+            return mixed(seen, self._by_pixel(camera, chosen, weights[chosen], seen), self.frame)
+        return mixed(seen, shares(weights[chosen]).expand(*seen[0].depth.shape, -1), self.frame)
+
+    @torch.no_grad()
+    def weights(self, camera: Camera) -> Float[Tensor, " block"]:
+        """Weight of each block in the picture of a camera; they sum up to 1. Pixels have weights of their own where
+        mixing is not by the camera."""
+        c = self.config
+        distance = (camera.position.to(self.centres) - self.centres).norm(dim=-1)
+        weights = inverse_distance(distance, self.radii, c.power, c.most)
+        chosen = (weights > 0).nonzero()[:, 0]
+        if len(chosen) > 1:
+            small = camera.resized(min(1.0, GLANCE / int(camera.size.max())))
+            sights = [saw(self.parts[i], small, self.parts[i].rendering(small)).mean() for i in chosen.tolist()]
+            weights[chosen] *= seeing(torch.stack(sights), c.threshold)
+        if c.by == "nearest":
+            weights = nn.functional.one_hot(weights.argmax(), len(weights)).to(weights)
+        return shares(weights)
+
+    def _by_pixel(
+        self, camera: Camera, chosen: Tensor, weights: Float[Tensor, " chosen"], seen: Sequence[Rendering]
+    ) -> Float[Tensor, "height width chosen"]:
+        """Shares of each pixel: by how far from a block's centre lies what it shows there, or by how much of it the
+        block saw; a block that has hardly a say in the picture has no more in its pixels."""
+        c, entered = self.config, (weights / ENTERED).clamp(max=1)
+        if c.by == "visibility":
+            found = [saw(self.parts[i], camera, x) for i, x in zip(chosen.tolist(), seen, strict=True)]
+            return shares(torch.stack(found, -1).clamp_min(UNSEEN) * entered)
+        rays = camera.rays(camera.pixels())
+        far = 2 * self.frame.reach
+        distances = [
+            (rays.at(x.depth.reshape(-1).clamp(max=far)) - self.centres[i]).norm(dim=-1).view(x.depth.shape)
+            for i, x in zip(chosen.tolist(), seen, strict=True)
+        ]
+        distance = torch.stack(distances, -1).clamp_min(UNSEEN)
+        return shares((distance / distance.amin(-1, keepdim=True)) ** -c.power * entered)
+
+    # What is known of places
+
+    def density(self, points: Float[Tensor, "point 3"]) -> Float[Tensor, " point"]:
+        """Density per unit of the common frame: that of blocks in whose reach points lie, mixed by inverse distance.
+        Raises LumigraphError where a block knows none."""
+        weights = self._at(points)
+        density = torch.zeros_like(points[:, 0])
+        for i in (weights > LITTLE).any(0).nonzero()[:, 0].tolist():
+            here = (weights[:, i] > LITTLE).nonzero()[:, 0]
+            density = density.index_add(0, here, weights[here, i] * self.parts[i].density(points[here]))
+        return density
+
+    def _at(self, points: Float[Tensor, "point 3"]) -> Float[Tensor, "point block"]:
+        """Shares that blocks have at places."""
+        distance = (points[:, None] - self.centres).norm(dim=-1)
+        return shares(inverse_distance(distance, self.radii, self.config.power, self.config.most))
+
+    # Being told something
+
+    @property
+    def accepts(self) -> tuple[type, ...]:  # type: ignore[override]  # it depends on the blocks
+        return (Photograph,) if self.asked.photographs else ()
+
+    @property
+    def controls(self) -> tuple[Control, ...]:
+        """Exposure, and what else any block can be told that does not name photographs."""
+        found = self.asked.controls
+        if self.asked.exposures and self.usual is not None:
+            least, most = (x - self.usual for x in self.asked.exposures)
+            about = "As if photographed with so much more or less exposure than usual, within what was photographed."
+            found = (*found, Control(EXPOSURE, 0.0, (least, most), unit="stops", about=about))
+        return found
+
+    def given(self, *evidence: Any, **controls: Value) -> Method:
+        """The same blocks, each told what it has a control for; or each in the appearance that it finds in a
+        Photograph, where its camera is in reach."""
+        mine: list[Any] = [piece for piece in evidence if isinstance(piece, self.accepts)]
+        told = super().given(*(piece for piece in evidence if not isinstance(piece, self.accepts)), **controls)
+        assert isinstance(told, InBlocks)
+        passed = {name: value for name, value in told.told.items() if name != EXPOSURE and name in controls}
+        parts = self.parts.each(lambda part: part.given(passed))
+        if EXPOSURE in controls and self.usual is not None:
+            parts = parts.each(partial(exposed, exposure=self.usual + float(told.told[EXPOSURE])))
+        for photograph in mine:
+            parts = self._seen_in(photograph, parts)
+        told.parts = parts
+        return told
+
+    def _seen_in(self, photograph: Photograph, parts: Nearby) -> Nearby:
+        """Parts in the light of a photograph, and in its exposure where that is known, those in reach of its camera."""
+        camera, exposure = photograph.camera.to(self.device), None
+        if self.exposures is not None and camera.image_index is not None:
+            found = float(self.exposures[int(camera.image_index[0])].log2())
+            exposure = found if abs(found) < float("inf") else None
+        distance = (camera.position - self.centres).norm(dim=-1)
+        asked = inverse_distance(distance, self.radii, self.config.power, self.config.most) > 0
+        lit = {}
+        for i in asked.nonzero()[:, 0].tolist():
+            part = exposed(parts[i], exposure)
+            local = replace(photograph, camera=part.camera(photograph.camera))
+            lit[i] = replace(part, method=part.method.given(local))
+        return parts.but(lit)
+
+    def batch(self, data: Any, generator: torch.Generator) -> NoReturn:
+        raise LumigraphError("A scene in blocks does not learn as a whole; train its blocks, each by itself")
+
+
+def mixed(seen: Sequence[Rendering], weights: Float[Tensor, "height width block"], frame: Frame) -> Rendering:
+    """One picture of several over black, by their shares of each pixel, before a frame's background.
+
+    Depth is the mean of what is opaque, by the same shares; infinity where most say that nothing is there.
+    """
+    rgb, opacity, depth = (torch.stack([getattr(x, name) for x in seen], -1) for name in ("rgb", "opacity", "depth"))
+    rgb, opacity = (rgb * weights[..., None, :]).sum(-1), (opacity * weights).sum(-1)
+    there = depth.isfinite() * weights
+    held = there.sum(-1)
+    distance = (there * depth.nan_to_num(posinf=0.0)).sum(-1) / held.clamp_min(1e-6)
+    background = rgb.new_tensor(frame.background)
+    return Rendering(rgb + (1 - opacity)[..., None] * background, torch.where(held > 0.5, distance, torch.inf), opacity)

@@ -1,0 +1,56 @@
+"""The plan of a large scene seen from above: photographs, where they look, and the blocks around them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from PIL import Image, ImageDraw, ImageFont
+
+from ..capture import Places
+from .plan import Block
+
+WIDE, FINE = 1000, 3  # pixels of the longer side, and how many times finer it is drawn
+MARGIN, HEAD = 40, 60
+PAPER, INK, FAINT, HELD_OUT = "#fbfaf8", "#1b1d22", "#6d717a", "#d97706"
+COLOURS = ("#2563eb", "#059669", "#7c3aed", "#db2777", "#0891b2", "#65a30d")
+LOOK = 14  # pixels of the line that says where a photograph looks
+SHOWN = 20_000  # photographs at most
+
+
+def draw_plan(places: Places, blocks: Sequence[Block]) -> Image.Image:
+    """North is where the second axis of the levelled source points; photographs that are held out are orange."""
+    turn = places.upright.T
+    centres = np.array([block.centre for block in blocks]) @ turn
+    radii = np.array([block.radius for block in blocks])
+    ground, gaze = places.ground, (places.forwards @ turn)[:, :2]
+    low = np.minimum(ground.min(0), (centres[:, :2] - radii[:, None]).min(0))
+    high = np.maximum(ground.max(0), (centres[:, :2] + radii[:, None]).max(0))
+    scale = FINE * WIDE / max(float((high - low).max()), 1e-9)
+    width, height = (np.ceil((high - low) * scale) + 2 * FINE * MARGIN).astype(int)
+    image = Image.new("RGB", (int(width), int(height) + FINE * HEAD), PAPER)
+    draw = ImageDraw.Draw(image, "RGBA")
+
+    def at(point: np.ndarray) -> tuple[float, float]:
+        x, y = (point - low) * scale + FINE * MARGIN
+        return float(x), float(height - y) + FINE * HEAD
+
+    letters = ImageFont.load_default(18 * FINE)
+    for i, (centre, radius) in enumerate(zip(centres[:, :2], radii, strict=True)):
+        colour, (x, y), r = COLOURS[i % len(COLOURS)], at(centre), radius * scale
+        draw.ellipse([x - r, y - r, x + r, y + r], f"{colour}18", colour, 2 * FINE)
+    for i in range(0, len(ground), max(1, len(ground) // SHOWN)):
+        held_out = places.splits[i] != "train"
+        (x, y), colour, dot = at(ground[i]), HELD_OUT if held_out else FAINT, 2.2 * FINE
+        draw.line([x, y, x + FINE * LOOK * gaze[i, 0], y - FINE * LOOK * gaze[i, 1]], colour, FINE)
+        draw.ellipse([x - dot, y - dot, x + dot, y + dot], colour)
+    for i, (block, centre) in enumerate(zip(blocks, centres[:, :2], strict=True)):
+        (x, y), text = at(centre), f"{block.name}: {len(block.photographs)}"
+        box = draw.textbbox((x, y), text, letters, anchor="mm")
+        draw.rounded_rectangle([box[0] - 12, box[1] - 9, box[2] + 12, box[3] + 9], 12, f"{PAPER}e0")
+        draw.text((x, y), text, COLOURS[i % len(COLOURS)], letters, anchor="mm")
+    head = (
+        f"{len(blocks)} blocks, {len(places)} photographs; beside each name how many are of it, overlap counted twice"
+    )
+    draw.text((FINE * MARGIN, FINE * 22), head, INK, ImageFont.load_default(17 * FINE))
+    return image.resize((image.width // FINE, image.height // FINE), Image.Resampling.LANCZOS)

@@ -1,0 +1,159 @@
+"""blocks.json: how a large scene was divided into blocks, and what each of them learns. One file for all of a run.
+
+{
+  "format": "lumigraph blocks 1",
+  "method": "block-nerf", "config": {...}, "scene": {"source": "/survey", "options": {}},
+  "budget": {"steps": 2000}, "seed": 0, "device": "cpu", "upright": [[...], [...], [...]],
+  "blocks": [{"name": "0", "centre": [12.5, 3.0, 1.6], "radius": 40.0, "photographs": ["0001.jpg", ...]}, ...],
+  "appearance": {"0": [...], ...}
+}
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Annotated, Any
+
+import msgspec
+
+from .. import files
+from ..capture import Part
+from ..errors import LumigraphError
+from ..files.ranges import Point, Positive, between, typed
+from ..run.settings import Source
+
+FORMAT = "lumigraph blocks 1"
+NAME, FOLDER, TASK, DONE = "blocks.json", "blocks", "task.json", "done.json"
+LABEL = Annotated[str, msgspec.Meta(pattern=r"\A[0-9]{1,6}\Z")]  # of a block, and of its folder
+Turn = tuple[Point, Point, Point]  # rows of a rotation
+Number = Annotated[float, between(-1e6, 1e6)]
+
+
+def source_of(source: str, options: dict[str, Any]) -> Source:
+    """The photographs of a scene or a block, and the options to open them with that say something."""
+    path, said = Path(source), {name: value for name, value in options.items() if value is not None}
+    return Source(str(path.resolve()) if path.exists() else source, said)
+
+
+@dataclass(frozen=True)
+class Block:
+    """A place and the photographs of it.
+
+    name:   of its folder
+    centre, radius: in the source's frame and units
+    photographs: by name, those held out among them
+    scene, budget: of a block that was learnt again from other photographs: where they are, and for how long
+    """
+
+    name: LABEL
+    centre: Point
+    radius: Positive
+    photographs: list[str]
+    scene: Source | None = None
+    budget: dict[str, Any] | None = None
+
+
+@dataclass(frozen=True)
+class Task:
+    """task.json: all that a block is made of; nothing else says what becomes of its folder.
+
+    scene:   what `open_dataset` is told, with the block as a `Part`
+    upright: the rotation from the source's frame that brings up to +z, the same for all blocks
+    budget:  {"steps": n}, {"seconds": s} or {"quality": word}
+    memory:  bytes of photographs that may stay in memory; a file holds what is more
+    threads: that a step may use; None for all there are
+    """
+
+    method: str
+    config: dict[str, Any]
+    scene: Source
+    upright: Turn
+    budget: dict[str, Any]
+    seed: int = 0
+    device: str = "cpu"
+    memory: Annotated[int, between(0, 1 << 50)] = 1 << 30
+    threads: Annotated[int, between(1, 4096)] | None = None
+
+    @property
+    def key(self) -> str:
+        """A hash of everything that the block's weights depend on."""
+        said = {name: value for name, value in asdict(self).items() if name != "threads"}
+        return hashlib.sha256(json.dumps(said, sort_keys=True).encode()).hexdigest()
+
+    @staticmethod
+    def read(folder: Path) -> Task:
+        """The task in a block's folder. Raises LumigraphError, naming the file, where it is missing or damaged."""
+        return files.read_json(folder / TASK, Task)
+
+
+@dataclass(frozen=True)
+class Done:
+    """done.json, the last file of a block: what it took.
+
+    key:     of the task
+    seconds: of training; compiling, and opening the photographs, are beside
+    """
+
+    key: str
+    steps: int
+    seconds: float
+    compile_seconds: float
+    opening_seconds: float
+    peak_memory: int
+    photographs: int
+    bytes: int
+
+
+@dataclass(frozen=True)
+class Plan:
+    """The contents of blocks.json.
+
+    budget:  of each block
+    appearance: the code that each block is shown in, once they are aligned
+    """
+
+    method: str
+    config: dict[str, Any]
+    scene: Source
+    upright: Turn
+    blocks: list[Block]
+    budget: dict[str, Any]
+    seed: int = 0
+    device: str = "cpu"
+    processor: str = "unknown"
+    versions: dict[str, str] = field(default_factory=dict)
+    appearance: dict[str, list[Number]] = field(default_factory=dict)
+
+    @staticmethod
+    def read(path: Path) -> Plan:
+        """The plan in a file. Raises LumigraphError, naming it, where it is none of ours or damaged."""
+        said = files.read_json(path)
+        if not isinstance(said, dict) or said.get("format") != FORMAT:
+            raise LumigraphError(f"{path} was not written by this version of Lumigraph; open it with the one that did")
+        plan = typed(Plan, said, path)
+        if not plan.blocks or len({block.name for block in plan.blocks}) < len(plan.blocks):
+            raise LumigraphError(f"{path} names no block, or two alike; restore it from a copy")
+        return plan
+
+    def write(self, path: Path) -> None:
+        said = {name: value for name, value in asdict(self).items() if name not in ("scene", "blocks")}
+        blocks = [{name: x for name, x in asdict(block).items() if x is not None} for block in self.blocks]
+        files.write_json(path, {"format": FORMAT, **said, "scene": self.scene.to_json(), "blocks": blocks}, ours=True)
+
+    def block(self, name: str) -> Block:
+        """Raises LumigraphError, naming those there are, for a block that there is not."""
+        for block in self.blocks:
+            if block.name == name:
+                return block
+        there = ", ".join(block.name for block in self.blocks)
+        raise LumigraphError(f"There is no block {name}; there are {there}")
+
+    def task(self, block: Block) -> Task:
+        """The task of a block."""
+        scene = block.scene or self.scene
+        part = asdict(Part(block.photographs, block.centre, block.radius))
+        told = replace(scene, options={**scene.options, "part": part})
+        return Task(self.method, self.config, told, self.upright, block.budget or self.budget, self.seed, self.device)

@@ -1,0 +1,123 @@
+"""Begin a run of many blocks: its folder, with the task of every block, before anything is trained."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from .. import files
+from ..capture import Places, places_of, read_capture
+from ..errors import LumigraphError
+from ..figures import save_picture
+from ..files.plain import alike
+from ..run import check_new, processor
+from ..run.budget import Budget
+from ..run.folder import versions
+from .drawing import draw_plan
+from .layout import lay_out
+from .plan import FOLDER, NAME, TASK, Block, Plan, Task, source_of
+
+BY_BLOCK = 60.0  # seconds, where nobody says
+PICTURE = "blocks.png"
+
+
+def survey(source: str, reader: str | None = None) -> Places:
+    """Positions of the photographs of a source; no pixel is read."""
+    return places_of(read_capture(source, reader))
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """Training of every block.
+
+    options: what `open_dataset` is told of the whole scene
+    budget:  of all blocks together, shared out evenly; None for a minute each, or a quality
+    here:    whether the device is this machine's
+    """
+
+    method: str
+    config: Any
+    options: dict[str, Any]
+    budget: Budget | None = None
+    quality: str | None = None
+    seed: int = 0
+    device: str = "cpu"
+    here: bool = True
+
+    def budget_of_each(self, blocks: int) -> dict[str, Any]:
+        """Budget of one of so many blocks."""
+        if self.quality:
+            return {"quality": self.quality}
+        if self.budget is None:
+            return {"seconds": BY_BLOCK}
+        if self.budget.steps is not None:
+            return {"steps": max(1, math.ceil(self.budget.steps / blocks))}
+        return {"seconds": self.budget.total / blocks}
+
+
+def make_plan(source: str, places: Places, wish: str, recipe: Recipe) -> Plan:
+    """The plan of a scene: its blocks, see `lay_out`, and what each of them learns."""
+    blocks = lay_out(places, wish, source)
+    turn: Any = tuple(tuple(float(x) for x in row) for row in places.upright)
+    return Plan(
+        recipe.method,
+        asdict(recipe.config),
+        source_of(source, recipe.options),
+        turn,
+        blocks,
+        recipe.budget_of_each(len(blocks)),
+        recipe.seed,
+        recipe.device,
+        processor(torch.device(recipe.device)) if recipe.here else "machines of a cluster",
+        versions(),
+    )
+
+
+def begin(folder: Path, plan: Plan, places: Places | None = None, threads: int | None = None) -> Plan:
+    """Write a run's plan, with a task for every block; where it is there already, find that it is the same.
+
+    places:  of all photographs, for the picture of the plan
+    threads: see `Task`
+    Returns the plan as the folder has it. Raises LumigraphError where something else lies there, or another plan.
+    """
+    if (folder / NAME).exists():
+        known = Plan.read(folder / NAME)
+        if (what := difference(known, plan)) is not None:
+            raise LumigraphError(f"{folder} holds a run in blocks with another {what}; choose another --output")
+        plan = known
+    else:
+        check_new(folder)
+        plan.write(folder / NAME)  # a folder with it is a run; what is missing of it is made anew
+    for block in plan.blocks:
+        write_task(place_of(folder, block), replace(plan.task(block), threads=threads))
+    if places is not None and not (folder / PICTURE).exists():
+        save_picture(folder / PICTURE, draw_plan(places, plan.blocks), ours=True)
+    return plan
+
+
+def write_task(folder: Path, task: Task) -> None:
+    """Leave a task in a block's folder; one that is there already stays if it is the same."""
+    if (folder / TASK).exists() and (there := Task.read(folder)).key == task.key and there.threads == task.threads:
+        return
+    files.write_json(folder / TASK, asdict(task))  # a run that begins there knows it for ours
+
+
+def place_of(run: Path, block: Block) -> Path:
+    """Folder of a block in a run."""
+    return run / FOLDER / block.name
+
+
+def difference(known: Plan, wanted: Plan) -> str | None:
+    """The first thing that two plans differ in, in a user's words; None if they come to the same. Blocks that were
+    learnt again from other photographs do not count."""
+    mine, other = asdict(known), asdict(wanted)
+    for name in ("method", "scene", "config", "budget", "seed", "device", "upright"):
+        if not alike(mine[name], other[name]):
+            return name
+    again = {block.name for block in known.blocks if block.scene is not None}
+    blocks = [[x for x in plan["blocks"] if x["name"] not in again] for plan in (mine, other)]
+    return None if alike(blocks[0], blocks[1]) else "layout of blocks"

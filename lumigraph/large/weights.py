@@ -1,0 +1,62 @@
+"""Weights of blocks in a picture and at a point (Tancik et al. 2022, Block-NeRF, section 4.3)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Annotated, Literal
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from ..files.ranges import Share, between
+
+NEAREST = 1e-6  # of a radius: distance that is divided by at least
+UNSEEN = 1e-12  # of its weight, that a block keeps which does not see: where none sees, they are mixed by distance
+
+
+@dataclass(frozen=True)
+class Mixing:
+    """Options for choosing the blocks of a picture and mixing them (section 4.3 and its comparison of ways).
+
+    by: "camera", inverse distance from the camera to the blocks' centres, one weight for all pixels (the paper's);
+        "points", from what each pixel shows; "visibility", how much a block saw of what each pixel shows;
+        "nearest", the block whose centre is nearest alone
+    """
+
+    by: Literal["camera", "points", "visibility", "nearest"] = "camera"
+    power: Annotated[float, between(0.1, 64)] = 4.0  # p, section 4.3.2
+    threshold: Share = 0.1  # mean visibility at which a block counts nothing; at twice that it counts fully
+    most: Annotated[int, between(1, 1024)] = 3  # blocks in one picture
+
+
+def inverse_distance(
+    distance: Float[Tensor, "*place block"], radii: Float[Tensor, " block"], power: float, most: int
+) -> Float[Tensor, "*place block"]:
+    """w = (1 / d - 1 / r)^p within reach, d < r, and 0 beyond; 1 for the nearest block where none is in reach.
+
+    The weights of section 4.3.2, d^-p, are those of large r. With r they fall to 0 where a block leaves the picture,
+    instead of a jump (Franke 1980). r is the block's radius, or the distance of the block `most` + 1 nearest where that
+    is less, so that no more than `most` have a weight.
+    """
+    count = distance.shape[-1]
+    reach = radii.expand_as(distance)
+    if most < count:
+        inside = torch.where(distance < radii, distance, torch.inf)
+        reach = torch.minimum(reach, inside.kthvalue(most + 1, -1, keepdim=True).values)
+    inverse = 1 / torch.maximum(distance, NEAREST * radii) - 1 / reach
+    largest = inverse.amax(-1, keepdim=True).clamp_min(1e-12)
+    weights = (inverse / largest).clamp_min(0) ** power  # a common factor, so that no power overflows
+    alone = torch.nn.functional.one_hot(distance.argmin(-1), count).to(weights)
+    return torch.where(weights.sum(-1, keepdim=True) > 0, weights, alone)
+
+
+def seeing(visibility: Float[Tensor, "*place block"], threshold: float) -> Float[Tensor, "*place block"]:
+    """Weights of blocks by the mean visibility of what they show (section 4.3.1): 0 up to a threshold, 1 from twice
+    that on, so that none leaves a film at once."""
+    return (visibility / max(threshold, UNSEEN) - 1).clamp(UNSEEN, 1)
+
+
+def shares(weights: Float[Tensor, "*place block"]) -> Float[Tensor, "*place block"]:
+    """Weights that sum up to 1."""
+    return weights / weights.sum(-1, keepdim=True)

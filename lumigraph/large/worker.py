@@ -1,0 +1,170 @@
+"""Train one block of a large scene: a function over the folder of the block, the same on every machine.
+
+    RUN/blocks/3/
+    ├── task.json     what it is made of, all of it
+    ├── config.json, cameras.json, checkpoints/, metrics.jsonl ...   an ordinary run
+    └── done.json     last, with a hash of the task
+
+What is done is skipped, what has a state goes on from it, anything else begins. So it may be called again whenever a
+process, a machine or whoever drives them was lost.
+"""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numba
+import numpy as np
+import torch
+
+from .. import files, methods
+from ..capture import Before, open_dataset
+from ..datasets.scene import Scene
+from ..errors import LumigraphError
+from ..files.locks import held
+from ..files.ranges import typed
+from ..method import Method
+from ..run import Run, build
+from ..run.budget import Budget
+from ..training import fit
+from .plan import DONE, Done, Task
+
+PATIENCE = 60.0  # seconds to wait for a process that was told to end, and still holds the folder
+SAVE_EVERY = 30.0  # seconds of training that a lost worker costs at most
+
+
+@dataclass(frozen=True)
+class Ended:
+    """End of a call: with what the block took, or by a signal before it was done."""
+
+    done: Done | None
+    signal: int | None = None
+
+
+@dataclass(frozen=True)
+class Conducted:
+    """Outcome of all blocks: what blocks took by name, a sentence for each that failed, and the signal that
+    stopped it."""
+
+    done: dict[str, Done]
+    failed: dict[str, str]
+    signal: int | None = None
+
+
+def train_block(folder: Path, save_every: float = SAVE_EVERY) -> Ended:
+    """Learn what a block's task.json says, as far as that is not done.
+
+    Of a budget in steps the weights are the same to the bit, however often this was interrupted, on a CPU. Ctrl-C and
+    SIGTERM save. Raises LumigraphError for a task that cannot be done, and where the folder may not be written.
+    """
+    task = Task.read(folder)
+    if (done := finished(folder, task)) is not None:
+        return Ended(done)
+    with patiently_held(folder), limited(task.threads):
+        if (done := finished(folder, task)) is not None:  # by whoever held it
+            return Ended(done)
+        begin = time.perf_counter()
+        data = opened(task)
+        opening = time.perf_counter() - begin
+        run, method = begun(folder, task, data)
+        budget = Budget.from_json(run.settings.budget)
+        outcome = fit(method, data, run, budget=budget, seed=task.seed, save_every=save_every, show=False)
+        if not outcome.finished:
+            return Ended(None, outcome.signal)
+        state = run.state
+        took = state.step, state.seconds, state.compile_seconds, opening, state.peak_memory
+        done = Done(task.key, *took, len(data), run.model_bytes)
+        files.write_json(folder / DONE, asdict(done), ours=True)
+    return Ended(done)
+
+
+def finished(folder: Path, task: Task) -> Done | None:
+    """Cost of a block that is done, None of any other. Raises LumigraphError for one that was another task's."""
+    if not (folder / DONE).exists():
+        return None
+    done: Done = files.read_json(folder / DONE, Done)
+    if done.key != task.key:
+        raise LumigraphError(
+            f"{folder} was trained for other settings than its task.json says; choose another --output"
+        )
+    return done
+
+
+def opened(task: Task) -> Scene:
+    """The photographs of a block, in a frame of its own that stands as all the others do."""
+    options = {name: value for name, value in task.scene.options.items() if value is not None}
+    before = Before(options["part"]["photographs"], np.array(task.upright))
+    data = open_dataset(task.scene.source, Scene, **options, memory=task.memory, before=before)
+    assert isinstance(data, Scene)
+    return data
+
+
+def begun(folder: Path, task: Task, data: Scene) -> tuple[Run, Method]:
+    """The run in a block's folder and its method, as far as it had come. Raises LumigraphError for another's run."""
+    kind, device = methods.find(task.method), torch.device(task.device)
+    if (folder / "config.json").exists():
+        run = Run(folder)
+        mine = task.config, task.seed, task.scene.options["part"]
+        if (run.settings.config, run.settings.seed, run.settings.scene.options.get("part")) != mine:
+            raise LumigraphError(f"{folder} holds a run of other settings; choose another --output")
+        return run, run.new_method(device)
+    config = typed(kind.Config, task.config, folder / "task.json", closed=True)
+    method = build(kind, data.frame, config, device, task.seed, learning=True)
+    said = dict(task.budget)
+    if "quality" in said:
+        said["steps"] = method.steps_for(said["quality"], data)
+    budget = Budget.from_json(said, folder / "task.json")
+    options = task.scene.options
+    return Run.create(folder, method, data, seed=task.seed, options=options, budget=budget.to_json()), method
+
+
+@contextmanager
+def patiently_held(folder: Path) -> Iterator[None]:
+    """Hold a block's folder; wait for a while for a process that is about to end. Raises LumigraphError as `held`."""
+    until = time.monotonic() + PATIENCE
+    while True:
+        holding = held(folder, "trained")
+        try:
+            holding.__enter__()
+            break
+        except LumigraphError:
+            if time.monotonic() > until:
+                raise
+            time.sleep(0.5)
+    try:
+        yield
+    finally:
+        holding.__exit__(None, None, None)
+
+
+@contextmanager
+def limited(threads: int | None) -> Iterator[None]:
+    """A block in which PyTorch and Numba use so many threads; None for as many as they did."""
+    if threads is None:
+        yield
+        return
+    before = torch.get_num_threads(), numba.get_num_threads()
+    torch.set_num_threads(threads)
+    numba.set_num_threads(min(threads, numba.config.NUMBA_NUM_THREADS))
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before[0])
+        numba.set_num_threads(before[1])
+
+
+def writable(folder: Path) -> None:
+    """Raise LumigraphError, naming this machine, unless a block's folder is seen from here and may be written."""
+    if not (folder / "task.json").is_file():
+        raise LumigraphError(
+            f"{os.uname().nodename} does not see {folder}; give --output a folder on storage that all machines share"
+        )
+    if not os.access(folder, os.W_OK | os.X_OK):
+        raise LumigraphError(
+            f"{os.uname().nodename} may not write to {folder}; change its permissions there, or choose another --output"
+        )

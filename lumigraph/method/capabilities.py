@@ -1,0 +1,192 @@
+"""What some methods can do beyond rendering, and one way to ask for it: `can(method, HasDensity)`."""
+
+from __future__ import annotations
+
+from typing import Any, Protocol, runtime_checkable
+
+from jaxtyping import Bool, Float
+from torch import Tensor, nn
+
+from ..camera import Camera
+from ..camera.rays import Look, Rays
+from ..datasets.mesh import Mesh
+from ..errors import LumigraphError
+from ..exchange.baked import Atlas, Octree
+from ..exchange.packing import Stored
+from ..gaussians import Gaussians
+
+
+@runtime_checkable
+class HasDensity(Protocol):
+    """Knows how dense space is."""
+
+    def density(self, points: Float[Tensor, "point 3"]) -> Float[Tensor, " point"]:
+        """Density per scene unit at points of the scene."""
+
+
+@runtime_checkable
+class HasField(Protocol):
+    """Knows density and colour at points, as baking, conversion and composition ask for them."""
+
+    def field(
+        self, points: Float[Tensor, "point 3"], directions: Float[Tensor, "point 3"]
+    ) -> tuple[Float[Tensor, " point"], Float[Tensor, "point 3"]]:
+        """Density per scene unit, and sRGB-encoded colour seen along unit directions."""
+
+
+@runtime_checkable
+class FromField(Protocol):
+    """Can begin as what another method holds, instead of from photographs."""
+
+    def from_field(self, teacher: Any, cameras: Camera) -> None:
+        """Take over what a teacher holds, which has the same frame, as far as cameras see it: its `field` where it has
+        one, else what it renders and its Gaussians. Stands in place of `begin`, ahead of the first step; what is learnt
+        from then on continues there. Raises LumigraphError, in one sentence, where it cannot be taken over."""
+
+
+@runtime_checkable
+class HasOctree(Protocol):
+    """Is an octree of density and harmonics, for browsers and files."""
+
+    def octree(self, depth: int | None = None) -> Octree:
+        """The scene as an octree, in the scene's frame, of so many levels at most. Raises LumigraphError while there is
+        none yet, and where it does not fit into memory, with the depth that does."""
+
+
+@runtime_checkable
+class HasAtlas(Protocol):
+    """Is an atlas of diffuse colours and features, for browsers and files."""
+
+    def atlas(self) -> Atlas:
+        """The scene as an atlas, in the scene's frame. Raises LumigraphError while there is none yet."""
+
+
+@runtime_checkable
+class HasDistance(Protocol):
+    """Knows how far surfaces are."""
+
+    def distance(self, points: Float[Tensor, "point 3"]) -> Float[Tensor, " point"]:
+        """Signed distance to the nearest surface in scene units, negative inside."""
+
+
+@runtime_checkable
+class HasGaussians(Protocol):
+    """Is a cloud of Gaussians."""
+
+    def gaussians(self) -> Gaussians:
+        """The scene as a cloud, in the scene's frame."""
+
+
+@runtime_checkable
+class RefinesPoses(Protocol):
+    """Can learn where photographs were taken from, besides the scene."""
+
+    poses: nn.Module | None  # a `PoseRefinement`; None where it was not asked to
+
+
+@runtime_checkable
+class HasVisibility(Protocol):
+    """Knows which places its photographs saw."""
+
+    def visibility(
+        self, points: Float[Tensor, "point 3"], directions: Float[Tensor, "point 3"]
+    ) -> Float[Tensor, " point"]:
+        """Share of the photographs' view of each place along a unit direction, in [0, 1]."""
+
+
+@runtime_checkable
+class HasExposure(Protocol):
+    """Knows the exposures of its photographs."""
+
+    usual_exposure: float | None  # log2 of their median; None where it is not known
+
+
+@runtime_checkable
+class HasAppearance(Protocol):
+    """Renders in the light of one appearance code, which it accepts as evidence."""
+
+    shown_in: Any  # the `Appearance`; of no numbers where none was learnt
+
+
+@runtime_checkable
+class CanPrune(Protocol):
+    """Is a cloud of Gaussians that can lose some and go on learning."""
+
+    def prune(self, keep: Bool[Tensor, " gaussian"]) -> None:
+        """Leave those of `gaussians()` that a mask picks, and of the optimizers' states what belongs to them."""
+
+
+@runtime_checkable
+class HasMesh(Protocol):
+    """Is a mesh, or makes one better than `export mesh` would."""
+
+    def mesh(self) -> Mesh:
+        """The scene as triangles, in the scene's frame."""
+
+
+@runtime_checkable
+class HasLooks(Protocol):
+    """Marches along rays."""
+
+    def looks(self, rays: Rays) -> list[Look]:
+        """What lies along rays, one entry for each pass, the one that is composited into the picture last."""
+
+
+@runtime_checkable
+class CanCompress(Protocol):
+    """Says how it may be stored in fewer bytes."""
+
+    def storage(self) -> dict[str, Stored]:
+        """How tensors of `state_dict` may be stored, by name; those that are not named are stored to the bit."""
+
+    def importance(self, camera: Camera) -> dict[str, Float[Tensor, " row"]]:
+        """How much each row of tensors, by name, adds to one picture (Li 2023, eq. 4): the sum over pixels of the
+        compositing weights that it has a share in."""
+
+    def thin(self, importance: dict[str, Float[Tensor, " row"]], share: float) -> dict[str, Float[Tensor, " kept"]]:
+        """Take out the rows that matter least, which together have a share of all importance; gives the importance of
+        the rows that there are now."""
+
+
+@runtime_checkable
+class CanDraw(Protocol):
+    """Knows what objects of a category are like, so that it can make one up."""
+
+    def drawn(self, seed: int) -> Any:
+        """The method as it shows an object that nobody has photographed, drawn at random by a seed."""
+
+
+LACKING = {
+    HasDensity: "holds no density at points; what is made of it comes from its renderings instead",
+    HasField: "holds no density and colour at points, so it can be neither baked nor converted",
+    FromField: "cannot begin as what another method holds; `lumigraph convert --list` says which can",
+    HasOctree: "is no octree; `lumigraph convert` makes one of it, as plenoctrees",
+    HasAtlas: "is no atlas of baked values; `lumigraph convert` makes one of it, as snerg",
+    HasDistance: "holds no distance to surfaces; a method that learns from shapes does",
+    HasGaussians: "holds no Gaussians, so no splats can be made of it; train gaussian-splatting",
+    RefinesPoses: "learns no poses of photographs; give --refine-cameras to a method that can",
+    HasVisibility: "does not know which places its photographs saw; block-nerf does",
+    HasExposure: "knows no exposures of its photographs",
+    HasAppearance: "learns no appearance of its photographs; block-nerf does",
+    CanPrune: "cannot learn on with fewer Gaussians; write a splat file instead, by an --output that ends in .ply",
+    HasMesh: "is no mesh; `lumigraph export mesh` makes one of what it renders",
+    CanDraw: "knows scenes by their photographs and draws none of its own; name a scene, or a prior of hyp-nerf",
+    CanCompress: "cannot be stored in fewer bytes; methods of grids, hash tables and Gaussians can",
+    HasLooks: "takes no samples along rays, so there is nothing to draw of one",
+}
+
+
+def can(method: object, capability: type[Any]) -> bool:
+    """Whether a method, or all of a class, has a capability. Its class must have the functions: a network may be called
+    `field` too. Values must be there and not None; `isinstance` does not find those that are submodules."""
+    kind = method if isinstance(method, type) else type(method)
+    functions = [name for name in vars(capability) if not name.startswith("_")]
+    values = [getattr(method, name, None) for name in capability.__annotations__]
+    return all(callable(getattr(kind, name, None)) for name in functions) and all(x is not None for x in values)
+
+
+def needs(method: object, capability: type[Any]) -> Any:
+    """The method, for whoever needs a capability of it. Raises LumigraphError, saying what it lacks, without."""
+    if not can(method, capability):
+        raise LumigraphError(f"{type(method).__name__} {LACKING[capability]}")
+    return method

@@ -1,0 +1,86 @@
+"""Budget: when training ends, what share of it is over, and what becomes of that share when it is extended."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from typing import Any
+
+from ..errors import LumigraphError
+from ..files.ranges import Lasted, Seconds, Share, Steps, typed
+
+# Where schedules go on, at the earliest, once a run is extended. Coarse beginnings (small photographs, few cells,
+# warm-up) lie before it in every method, and are not repeated on what has become fine.
+REJOIN = 0.3
+
+
+@dataclass(frozen=True)
+class Budget:
+    """A number of steps, or of seconds; exactly one of them.
+
+    quality: the word that the steps stand for; see `Method.steps_for`
+    joined:  of a budget that was extended: how much was spent by then, in its own unit, and the share from which
+             schedules went on
+    """
+
+    steps: Steps | None = None
+    seconds: Seconds | None = None
+    quality: str | None = None
+    joined: tuple[Lasted, Share] | None = None
+
+    def __post_init__(self) -> None:
+        if (self.steps is None) == (self.seconds is None):
+            raise LumigraphError("Training needs either steps or seconds, and not both; give one of them")
+        if not 0 < self.total < math.inf:
+            raise LumigraphError(f"Training cannot last {self.total}; give a number above 0")
+
+    @property
+    def total(self) -> float:
+        """Steps or seconds, whichever it counts."""
+        return self.seconds if self.steps is None else self.steps  # type: ignore[return-value]
+
+    def spent(self, step: int, seconds: float) -> float:
+        """How much is spent, in its own unit."""
+        return seconds if self.steps is None else step
+
+    def progress(self, step: int, seconds: float) -> float:
+        """The share that is over, in [0, 1], which all schedules follow. It rises evenly, from where it was joined."""
+        spent, (since, share) = self.spent(step, seconds), self.joined or (0.0, 0.0)
+        if spent >= self.total:
+            return 1.0
+        return share + (1 - share) * max(spent - since, 0.0) / (self.total - since)
+
+    def extended(self, to: Budget, step: int, seconds: float) -> Budget:
+        """Another total, for a run that has come to a step by this one.
+
+        Schedules follow the new total. They do not go back behind REJOIN, nor behind where they are if that is less.
+        """
+        if (to.steps, to.seconds) == (self.steps, self.seconds):
+            return replace(self, quality=to.quality or self.quality)
+        share = min(self.progress(step, seconds), REJOIN)
+        return to if to.progress(step, seconds) >= share else replace(to, joined=(to.spent(step, seconds), share))
+
+    def to_json(self) -> dict[str, Any]:
+        """As a run says it: {"seconds": 60.0}, {"steps": 500, "quality": "draft"}."""
+        said = {x.name: getattr(self, x.name) for x in fields(self) if getattr(self, x.name) is not None}
+        return said | ({"joined": list(self.joined)} if self.joined else {})
+
+    @staticmethod
+    def from_json(said: dict[str, Any], where: Path | str = "a run's budget") -> Budget:
+        """What a run says. Raises LumigraphError, naming `where`, for a run that says nothing, or no budget."""
+        return typed(Budget, said, where)
+
+    def __str__(self) -> str:
+        """For people: "60 s of training", "3,720 steps (quality: good)"."""
+        if self.steps is None:
+            return f"{lasting(self.total)} of training"
+        return f"{self.steps:,} steps" + (f" (quality: {self.quality})" if self.quality else "")
+
+
+def lasting(seconds: float) -> str:
+    """How long, for people: 0.5 is "0.5 s", 90 "90 s", 600 "10 min", 5400 "1 h 30 min"."""
+    if seconds < 120:
+        return f"{seconds:.3g} s"
+    hours, minutes = divmod(round(seconds / 60), 60)
+    return " ".join(f"{n} {unit}" for n, unit in ((hours, "h"), (minutes, "min")) if n)

@@ -1,0 +1,181 @@
+"""Procedural scenes: worlds made of formulas, photographed by our own ray tracer, with everything about them known.
+
+    stage = scenes.stage("still-life")                    a world and its cameras
+    render(stage.world, stage.cameras["test"][0])         picture, exact depth, normals, masks, albedo
+    signed_distance(stage.world, points)                  exact geometry
+    open_scene("procedural:still-life,size=400")          the same as any other capture
+    open_scene("procedural:tourists,jitter_poses=2")      with poses that are 2 degrees and 2 % off
+    render(stage.world_of(camera), camera)                the same, of a scene that moves: `swing`
+    write_blender(stage, folder)                          the same for other tools
+
+    open_scene("procedural:city,crossings=6")             scenes may have options of their own
+
+    open_dataset("procedural:toys,count=200")             a Collection of objects, see `members`
+    open_dataset("procedural:toys,count=20,turned=1")     the same, each in a pose that nobody chose
+
+A new scene is a new file in `scenes/`, a new category of objects one in `categories/`; nothing is compiled for it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from ..camera import Camera
+from ..capture.capture import Capture, Plane, Shot
+from ..capture.raw import RawPhoto, facts, planes
+from . import categories as categories
+from . import scenes as scenes
+from .blender_folder import write_blender as write_blender
+from .jitter import jittered as jittered
+from .members import is_category as is_category
+from .members import is_collection as is_collection
+from .members import member_stage
+from .members import members_of as members_of
+from .options import told
+from .rendering import eight_bits, photograph, radiance
+from .rendering import render as render
+from .rendering import signed_distance as signed_distance
+from .rendering import trace as trace
+from .stage import Stage as Stage
+from .world import Lamp as Lamp
+from .world import Material as Material
+from .world import Object as Object
+from .world import Pose as Pose
+from .world import Sky as Sky
+from .world import Sun as Sun
+from .world import World as World
+
+TRUE_POSE = "true_pose"  # of `Scene.about`: camera-to-world in the source's frame
+TURN = "turn"  # of `Scene.about`: rotation from an object's upright frame to the source's; see `Stage.turn`
+TRACER = 1  # of the pictures that are kept: another number traces them anew
+
+
+def confirm(request: str) -> None:
+    """Raise LumigraphError for a name that nothing here has."""
+    if not is_category(request):
+        scenes.scene(request.partition(",")[0])
+
+
+def read(request: str) -> Capture:
+    """The capture that a name stands for, with options after commas: "still-life", "still-life,size=400,seed=1".
+
+    Pictures are traced when somebody reads them. Raises LumigraphError for a name or an option that does not exist.
+    """
+    if is_category(request):
+        return capture(member_stage(request), f"procedural:{request}", kept=True)
+    name, options = told(scenes.options(request.partition(",")[0]), request)
+    asked = asdict(options)
+    amount = asked.pop("jitter_poses")
+    stage = scenes.stage(name, **asked)
+    off = jittered(stage, amount, options.seed) if amount else None
+    return capture(stage, f"procedural:{request}", off, kept=stage.differing is None or stage.called is not None)
+
+
+def capture(stage: Stage, source: str, found: dict[str, Camera] | None = None, kept: bool = False) -> Capture:
+    """A stage as photographs with known poses.
+
+    found: the cameras as they are said to be, where that differs; `about` has each `true_pose` then
+    kept:  whether pictures may be kept once they are traced
+    """
+    visible = stage.world.sky.visible
+    said = found or stage.cameras
+    shots = [
+        Shot(
+            name=f"{split}_{i:04d}",
+            pose=said[split].pose[i].double().numpy(),
+            lens=cameras.lens[i],
+            size=(int(cameras.size[i, 0]), int(cameras.size[i, 1])),
+            image=partial(picture, stage, cameras[i]),
+            split=split,
+            planes=known_planes(stage, cameras[i]),
+            time=None if cameras.time is None else float(cameras.time[i]),
+            about=known_facts(stage, cameras[i], jittered=found is not None),
+            identity=identity(stage, cameras[i]) if kept else None,
+        )
+        for split, cameras in stage.cameras.items()
+        for i in range(len(cameras))
+    ]
+    background = (0.0, 0.0, 0.0) if visible else (1.0, 1.0, 1.0)
+    return Capture(
+        source, shots, bounds=stage.bounds, reach=stage.reach, near=stage.near, background=background, kept=kept
+    )
+
+
+def identity(stage: Stage, camera: Camera) -> str:
+    """All that a picture depends on."""
+    if stage.called is not None and camera.image_index is not None:
+        world = stage.called(int(camera.image_index))
+    else:
+        world = repr(stage.world_of(camera))
+    taken = "" if stage.sensor is None else f" {stage.sensor} {camera.image_index}"
+    return f"traced {TRACER} {world} {camera.pose.tolist()} {camera.lens.to_json()} {camera.size.tolist()}{taken}"
+
+
+def known_planes(stage: Stage, camera: Camera) -> dict[str, Plane]:
+    """The layers of one photograph, of which nothing is traced before somebody asks."""
+
+    def plane(name: str, encoding: str, dtype: type, channels: int = 1, names: Sequence[str] = ()) -> Plane:
+        values = partial(known, stage, camera, name)
+        return Plane(values, encoding, dtype=np.dtype(dtype), channels=channels, names=tuple(names))
+
+    clean = partial(without_passers_by, stage, camera)
+    lasting = (
+        {} if stage.lasting is None else {"clean": Plane(clean, "sRGB", 1 / 255, dtype=np.dtype(np.uint8), channels=3)}
+    )
+    if stage.sensor is not None:
+        light = partial(radiance, stage.world_of(camera), camera)
+        truth = Plane(light, "linear", dtype=np.dtype(np.float32), channels=3)
+        lasting |= planes(taken_raw(stage, camera)) | {"radiance": truth}
+    return lasting | {
+        "depth": plane("depth", "distance", np.float32),
+        "normals": plane("normals", "direction", np.float32, 3),
+        "labels": plane("labels", "index", np.int64, names=stage.world.names),
+        "albedo": plane("albedo", "linear", np.float32, 3),
+    }
+
+
+def known_facts(stage: Stage, camera: Camera, jittered: bool) -> dict[str, Any]:
+    """Facts of one photograph. jittered: whether its pose is perturbed; the true one is then included"""
+    known = {TRUE_POSE: camera.pose[0].double().numpy()} if jittered else {}
+    if stage.facts is not None and camera.image_index is not None:
+        known |= stage.facts(int(camera.image_index))
+    if stage.turn is not None:
+        known[TURN] = np.array(stage.turn)
+    if stage.sensor is None or camera.image_index is None:
+        return known
+    return known | facts(taken_raw(stage, camera), stage.sensor.brightness(int(camera.image_index)))
+
+
+def taken_raw(stage: Stage, camera: Camera) -> RawPhoto:
+    """The photograph as the stage's sensor takes it; nothing is traced before its pixels are read."""
+    assert stage.sensor is not None and camera.image_index is not None
+    width, height = camera.size[0].tolist()
+    light = partial(radiance, stage.world_of(camera), camera)
+    return stage.sensor.photograph(light, (width, height), int(camera.image_index))
+
+
+def without_passers_by(stage: Stage, camera: Camera) -> np.ndarray:
+    """The photograph as it would be in its own light with nobody there, bytes (height, width, 3)."""
+    assert stage.lasting is not None and camera.image_index is not None
+    return eight_bits(*photograph(stage.lasting(int(camera.image_index)), camera), alpha=False)
+
+
+def known(stage: Stage, camera: Camera, name: str) -> np.ndarray:
+    """Ground-truth layers along the rays through pixel centres, from `render`."""
+    width, height = camera.size[0].tolist()
+    seen = trace(stage.world_of(camera), camera.rays(camera.pixels()), shaded=False)
+    values = {"depth": seen.depth, "normals": seen.normal, "labels": seen.identity, "albedo": seen.reflectance}[name]
+    values = values if name == "labels" else values.astype(np.float32)
+    return values.reshape(height, width, *values.shape[1:])
+
+
+def picture(stage: Stage, camera: Camera) -> np.ndarray:
+    """Bytes (height, width, 3), or (height, width, 4) with straight alpha where the background is transparent."""
+    if stage.sensor is not None and camera.image_index is not None:
+        return taken_raw(stage, camera).developed(stage.sensor.brightness(int(camera.image_index)))
+    return eight_bits(*photograph(stage.world_of(camera), camera), alpha=not stage.world.sky.visible)

@@ -1,0 +1,165 @@
+"""From a world and a camera to a picture: rays through every pixel, traced on all cores, averaged."""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from functools import cache
+from typing import NamedTuple
+
+import numba
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from ..camera import Camera
+from ..camera.rays import Rays, Rendering
+from ..color.srgb import srgb_from_linear
+from . import tracer
+from .world import World
+
+RAYS_PER_TASK = 4096
+HEADROOM = 64.0  # how much brighter than white light may be and still be below the film's shoulder
+CONTRAST = 0.08  # samples of a pixel that differ by more than this are not enough (0 is black, 1 white, as it looks)
+
+
+class Seen(NamedTuple):
+    """Hits of single rays; arrays with leading axis ray."""
+
+    radiance: np.ndarray
+    depth: np.ndarray
+    normal: np.ndarray
+    identity: np.ndarray
+    reflectance: np.ndarray
+
+
+def render(world: World, camera: Camera, samples: int = 4, more: int = 8) -> Rendering:
+    """Render a world for a camera (a batch of one, any lens): the exact ground truth.
+
+    samples: rays per pixel; more: further rays where the first ones differ
+
+    Returns (height, width, ...). Straight `rgb` (black where nothing is), `opacity` the share of the pixel that things
+    cover (sky counts where it is visible), and `depth` along the ray through the pixel's centre, infinite in the sky.
+    Extras, for the same ray: `normals` (unit, world frame, zero in the sky), `ids` (index into `world.names`, -1 for
+    none), `albedo` (diffuse reflectance, linear).
+    """
+    width, height = camera.size[0].tolist()
+    rgb, opacity = photograph(world, camera, samples, more)
+    seen = trace(world, camera.rays(camera.pixels()), shaded=False)
+    extra = {"normals": seen.normal, "ids": seen.identity, "albedo": seen.reflectance}
+    rendering = Rendering(
+        torch.from_numpy(rgb).reshape(-1, 3),
+        torch.from_numpy(seen.depth).float(),
+        torch.from_numpy(opacity).reshape(-1),
+        {k: torch.from_numpy(v) if k == "ids" else torch.from_numpy(v).float() for k, v in extra.items()},
+    )
+    return rendering.reshape(height, width)
+
+
+def photograph(world: World, camera: Camera, samples: int = 4, more: int = 8) -> tuple[np.ndarray, np.ndarray]:
+    """The picture alone, float32: straight sRGB colours (height, width, 3) and coverage (height, width) in [0, 1]."""
+    width, height = camera.size[0].tolist()
+    places = camera.pixels()
+    pixels = _gather(world, camera, places, samples, aims=1)
+    count = np.full((len(pixels), 1), samples)
+    again = np.flatnonzero(_uneven((pixels / samples).reshape(height, width, 5), pixels[:, 4].reshape(height, width)))
+    if more and len(again):
+        pixels[again] += _gather(world, camera, places[again], more, aims=3)
+        count[again] += more
+    rgb = srgb_from_linear(pixels[:, :3] / np.maximum(pixels[:, 3:4], 1)).astype(np.float32)
+    opacity = (pixels[:, 3:4] / count).astype(np.float32)
+    return rgb.reshape(height, width, 3), opacity.reshape(height, width)
+
+
+def radiance(world: World, camera: Camera, samples: int = 12) -> np.ndarray:
+    """The light of every pixel, linear sRGB (height, width, 3), without a film that bends what is bright."""
+    width, height = camera.size[0].tolist()
+    dim = replace(world, sky=replace(world.sky, exposure=world.sky.exposure / HEADROOM))
+    pixels = _gather(dim, camera, camera.pixels(), samples, aims=1)
+    return (HEADROOM / samples * pixels[:, :3]).astype(np.float32).reshape(height, width, 3)
+
+
+def eight_bits(rgb: np.ndarray, opacity: np.ndarray, alpha: bool) -> np.ndarray:
+    """A picture as bytes (height, width, 3), or with straight alpha (height, width, 4)."""
+    channels = np.concatenate([rgb, opacity[..., None]], -1) if alpha else rgb
+    return (channels.clip(0, 1) * 255 + 0.5).astype(np.uint8)
+
+
+def trace(world: World, rays: Rays, shaded: bool = True) -> Seen:
+    """Hits of rays. `radiance` is linear light after the film's response, in [0, 1]; black unless shaded."""
+    n = len(rays)
+    origins, directions, radius = _arrays(rays)
+    seen = Seen(np.empty((n, 3)), np.empty(n), np.empty((n, 3)), np.empty(n, np.int64), np.empty((n, 3)))
+
+    def work(first: int) -> None:
+        part = slice(first, first + RAYS_PER_TASK)
+        out = (x[part] for x in seen)
+        tracer.trace(world.arrays, origins[part], directions[part], radius[part], first, int(shaded), *out)
+
+    list(_workers().map(work, range(0, n, RAYS_PER_TASK)))
+    return seen
+
+
+def signed_distance(world: World, points: Float[Tensor, "point 3"]) -> Float[Tensor, " point"]:
+    """Distance from points to the nearest surface, scene units, negative inside: the surface is its zero level.
+
+    Exact outside; inside exact where objects do not overlap, otherwise no further than the true surface.
+    """
+    out = np.empty(len(points))
+    points_in = points.detach().double().contiguous().numpy()
+
+    def work(first: int) -> None:
+        part = slice(first, first + RAYS_PER_TASK)
+        tracer.signed_distance(world.arrays, points_in[part], out[part])
+
+    list(_workers().map(work, range(0, len(out), RAYS_PER_TASK)))
+    return torch.from_numpy(out).to(points.dtype)
+
+
+def _gather(world: World, camera: Camera, places: Tensor, samples: int, aims: int) -> np.ndarray:
+    """Sums over `samples` rays around each place on the picture, and how they differ: see `tracer.gather`.
+
+    aims: shadow rays that each of them sends to each light
+    """
+    offsets = torch.from_numpy(hammersley(samples)).to(places) - 0.5
+    rays = camera.rays((places[:, None] + offsets).reshape(-1, 2))
+    origins, directions, radius = _arrays(rays)
+    pixels = np.empty((len(places), 5))
+    step = -(-RAYS_PER_TASK // samples)
+
+    def work(first: int) -> None:
+        part, some = slice(first, first + step), slice(first * samples, (first + step) * samples)
+        width = radius[some] / samples**0.5
+        tracer.gather(world.arrays, origins[some], directions[some], width, first, aims, samples, pixels[part])
+
+    list(_workers().map(work, range(0, len(places), step)))
+    return pixels
+
+
+def _uneven(pixels: np.ndarray, spread: np.ndarray) -> np.ndarray:
+    """Pixels whose few samples may have missed something: they differ among themselves, or from their neighbours."""
+    uneven = spread > CONTRAST
+    seen = np.sqrt(pixels[..., :4])
+    for axis in (0, 1):
+        jump = np.abs(np.diff(seen, axis=axis)).max(-1) > 4 * CONTRAST
+        uneven[(slice(1, None), slice(None))[:: 1 - 2 * axis]] |= jump
+        uneven[(slice(None, -1), slice(None))[:: 1 - 2 * axis]] |= jump
+    return uneven
+
+
+def _arrays(rays: Rays) -> tuple[np.ndarray, ...]:
+    """Origins, directions and radius as the tracer reads them."""
+    return tuple(x.detach().double().contiguous().numpy() for x in (rays.origins, rays.directions, rays.radius))
+
+
+def hammersley(count: int) -> np.ndarray:
+    """Evenly spread points in the unit square; a rotated grid for four."""
+    k = np.arange(count)
+    mirrored = sum((k >> bit & 1) / 2.0 ** (bit + 1) for bit in range(count.bit_length()))
+    return np.stack([(k + 0.5) / count, mirrored + 0.5 / count], -1)
+
+
+@cache
+def _workers() -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(numba.config.NUMBA_NUM_THREADS, "tracer")

@@ -1,0 +1,39 @@
+"""The scenes that come with the package: one file or folder each, found by its name."""
+
+from __future__ import annotations
+
+import importlib
+import pkgutil
+from types import ModuleType
+
+from ...errors import LumigraphError
+from .. import categories
+from ..options import Pictures
+from ..stage import Stage
+
+
+def available() -> list[str]:
+    return sorted(module.name.replace("_", "-") for module in pkgutil.iter_modules(__path__))
+
+
+def options(name: str) -> type[Pictures]:
+    """Options of a scene. Raises LumigraphError for an unknown name."""
+    return getattr(scene(name), "Options", Pictures)
+
+
+def stage(name: str, size: int = 200, views: int = 100, seed: int = 0, **further: int) -> Stage:
+    """Build a scene. size: of the pictures, pixels; views: for training; seed: fixes where cameras stand; further: what
+    else its `Options` have.
+
+    Raises LumigraphError for a name that nothing here has.
+    """
+    return scene(name).stage(size, views, seed, **further)
+
+
+def scene(name: str) -> ModuleType:
+    if name not in available():
+        raise LumigraphError(
+            f"procedural:{name} does not exist; choose one of {', '.join(available())}, "
+            f"or of the collections {', '.join(categories.available())}"
+        )
+    return importlib.import_module(f".{name.replace('-', '_')}", __name__)

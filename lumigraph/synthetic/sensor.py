@@ -1,0 +1,76 @@
+"""A camera's sensor: light becomes the raw numbers of a mosaic, with the noise that counting photons and reading them
+out adds; and what a camera makes of those.
+
+Its numbers are those of a Nikon D3200's raw file of a still life at base sensitivity. In flat places the variance of
+its green pixels, by second differences over squares of 8 pixels, is 8 + 0.29 times the mean above black (DN², photon
+transfer): a photon that is counted is worth 0.29, and reading out adds 2.8.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from ..capture.raw import RawPhoto
+from ..capture.raw.demosaic import repeated
+from ..capture.raw.photo import srgb_from_camera
+
+COLOUR_MATRIX = ((0.9020, -0.2890, -0.0715), (-0.4535, 1.2436, 0.2348), (-0.0934, 0.1919, 0.7086))  # XYZ to camera
+GAINS = (1.949, 1.0, 1.344)  # of red, green and blue: its white balance
+PATTERN = ((0, 1), (1, 2))
+BLACK, WHITE, LARGEST = 600, 15520, (1 << 14) - 1  # DN
+READ_NOISE = 2.8  # DN, standard deviation
+PHOTON = 0.29  # DN of one that is counted
+
+
+@dataclass(frozen=True)
+class Sensor:
+    """Sensor of the camera: exposures and sensitivity.
+
+    exposures:   shares of the longest exposure; photographs take turns
+    sensitivity: share of what the sensor can hold that white gives it in the longest exposure
+    """
+
+    exposures: tuple[float, ...] = (1.0, 1 / 4, 1 / 16)
+    sensitivity: float = 1.0
+
+    def exposure(self, image: int) -> float:
+        return self.exposures[image % len(self.exposures)]
+
+    def brightness(self, image: int) -> float:
+        """Factor on the light of one photograph that makes white white."""
+        return 1 / (self.sensitivity * self.exposure(image))
+
+    def photograph(self, radiance: Callable[[], np.ndarray], size: tuple[int, int], image: int) -> RawPhoto:
+        """A raw photograph, whose noise depends on its number alone.
+
+        radiance: gives linear sRGB (height, width, 3), 1 for white
+        """
+
+        def read() -> np.ndarray:
+            return (self.numbers(radiance(), image).astype(np.float32) - BLACK) / np.float32(WHITE - BLACK)
+
+        return RawPhoto(
+            Path(f"{image:04d}"),
+            size,
+            PATTERN,
+            GAINS,
+            srgb_from_camera(np.array(COLOUR_MATRIX)),
+            self.exposure(image),
+            read,
+        )
+
+    def numbers(self, radiance: Float[np.ndarray, "height width 3"], image: int) -> np.ndarray:
+        """Sensor readout: whole numbers of 14 bits, (height, width)."""
+        random = np.random.default_rng(image)
+        camera = radiance @ np.linalg.inv(srgb_from_camera(np.array(COLOUR_MATRIX))).T / GAINS
+        filters = repeated(PATTERN, (radiance.shape[1], radiance.shape[0])).astype(np.int64)
+        light = np.take_along_axis(camera, filters[..., None], -1)[..., 0].clip(0, None)
+        mean = light * self.sensitivity * self.exposure(image) * (WHITE - BLACK)
+        counted = random.poisson(mean / PHOTON) * PHOTON
+        read = BLACK + counted + READ_NOISE * random.standard_normal(mean.shape)
+        return np.rint(read).clip(0, LARGEST).astype(np.uint16)

@@ -1,0 +1,307 @@
+"""Contents of a procedural scene: objects with a shape, a material and a rigid pose; lights; a sky.
+
+Everything is a frozen value, so a moved, relit or repainted scene is `dataclasses.replace` away and the first stays as
+it was. `World.arrays` flattens it for the tracer, which is compiled once and never again for a new scene.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ..color.srgb import linear_from_srgb
+from .boxes import hierarchy
+from .shapes import Shape
+from .textures import Colour, Texture
+
+Vector = tuple[float, float, float]
+Rotation = tuple[Vector, Vector, Vector]  # its rows
+
+OBJECT = np.dtype(
+    [
+        ("kind", "i8"),
+        ("material", "i8"),
+        ("identity", "i8"),
+        ("size", "f8", 6),
+        ("half", "f8", 3),
+        ("rotation", "f8", (3, 3)),
+        ("position", "f8", 3),
+    ]
+)
+MATERIAL = np.dtype(
+    [
+        ("texture", "i8"),
+        ("a", "f8", 3),
+        ("b", "f8", 3),
+        ("numbers", "f8", 4),
+        ("gloss", "f8"),
+        ("roughness", "f8"),
+        ("metal", "f8"),
+    ]
+)
+LIGHT = np.dtype([("distant", "i8"), ("position", "f8", 3), ("radius", "f8"), ("colour", "f8", 3)])
+SKY = np.dtype(
+    [
+        ("visible", "i8"),
+        ("zenith", "f8", 3),
+        ("horizon", "f8", 3),
+        ("ground", "f8", 3),
+        ("clouds", "f8"),
+        ("haze", "f8"),
+        ("reach", "f8"),
+        ("exposure", "f8", 3),
+    ]
+)
+
+
+KINDS = ("objects", "materials", "nodes")  # of `Arrays`, what is each object's own
+
+
+class Arrays(NamedTuple):
+    """A world as the tracer reads it."""
+
+    objects: np.ndarray
+    materials: np.ndarray
+    lights: np.ndarray
+    sky: np.ndarray
+    nodes: np.ndarray
+
+
+@dataclass(frozen=True)
+class Pose:
+    """A rigid motion from an object's own frame to the world: x -> rotation x + position."""
+
+    position: Vector = (0.0, 0.0, 0.0)
+    rotation: Rotation = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+
+    @staticmethod
+    def at(x: float, y: float, z: float, turn: float = 0.0, tilt: float = 0.0) -> Pose:
+        """The pose at a place, leaning by `tilt` degrees (about x), then turned by `turn` degrees (about z)."""
+        rotation = rotation_about((0, 0, 1), turn) @ rotation_about((1, 0, 0), tilt)
+        return Pose((x, y, z), nested(rotation))
+
+    @staticmethod
+    def about(axis: Vector, degrees: float) -> Pose:
+        return Pose(rotation=nested(rotation_about(axis, degrees)))
+
+    def __matmul__(self, inner: Pose) -> Pose:
+        """The pose that moves by `inner` first, then by this one."""
+        rotation, position = np.array(self.rotation), np.array(self.position)
+        moved = rotation @ np.array(inner.position) + position
+        return Pose(tuple(moved.tolist()), nested(rotation @ np.array(inner.rotation)))
+
+
+@dataclass(frozen=True)
+class Material:
+    """texture:   diffuse colour, and the colour of the reflection where it is metal
+    gloss:     strength of the clear coat, 0 for chalk, 1 for varnish (reflects 4 % head-on, more at grazing angles)
+    roughness: width of the highlights, 0.1 polished, 0.6 satin
+    metal:     0 for paint, wood and stone, 1 for bare metal
+    """
+
+    texture: Texture
+    gloss: float = 0.0
+    roughness: float = 0.4
+    metal: float = 0.0
+
+
+@dataclass(frozen=True)
+class Object:
+    """A shape somewhere. Objects of one name are parts of one thing: they share its mask and move together."""
+
+    shape: Shape
+    material: Material
+    pose: Pose = Pose()
+    name: str = "object"
+
+    def scaled(self, factor: float) -> Object:
+        """It so many times larger, seen from the world's origin; its texture stays as fine as it was."""
+
+        def times(value: Any) -> Any:
+            return tuple(map(times, value)) if isinstance(value, tuple) else factor * value
+
+        shape = type(self.shape)(**{name: times(value) for name, value in vars(self.shape).items()})
+        return replace(self, shape=shape, pose=replace(self.pose, position=times(self.pose.position)))
+
+    def bounds(self) -> tuple[np.ndarray, np.ndarray]:
+        """Lowest and highest corner of a box around it, scene units."""
+        reach = self.shape.reach(np.array(self.pose.rotation))
+        return np.array(self.pose.position) - reach, np.array(self.pose.position) + reach
+
+
+@dataclass(frozen=True)
+class Lamp:
+    """A glowing ball: shadows soften with its radius.
+
+    power: radiance of a white chalk surface that faces it at distance one; falls off with the distance squared
+    """
+
+    position: Vector
+    radius: float
+    power: float
+    colour: Colour = (1.0, 1.0, 1.0)
+
+    def describe(self):
+        return 0, self.position, self.radius, _linear(self.colour) * self.power
+
+    def moved(self, pose: Pose) -> Lamp:
+        return replace(self, position=(pose @ Pose(self.position)).position)
+
+
+@dataclass(frozen=True)
+class Sun:
+    """A light at infinity.
+
+    direction: towards it
+    radius:    half its apparent width, radians
+    power:     radiance of a white chalk surface that faces it
+    """
+
+    direction: Vector
+    radius: float
+    power: float
+    colour: Colour = (1.0, 1.0, 1.0)
+
+    def describe(self):
+        toward = np.array(self.direction) / np.linalg.norm(self.direction)
+        return 1, toward, self.radius, _linear(self.colour) * self.power
+
+    def moved(self, pose: Pose) -> Sun:
+        return replace(self, direction=(Pose(rotation=pose.rotation) @ Pose(self.direction)).position)
+
+
+@dataclass(frozen=True)
+class Sky:
+    """Environment of a scene: light from all sides, reflections, and the background if it is visible.
+
+    visible: False leaves the background transparent
+    light:   factor on the three colours
+    clouds:  share of white clouds, 0 for none
+    haze:    share of light lost per scene unit to the horizon's colour
+    reach:   how far things darken each other's corners (ambient occlusion), scene units
+    exposure: factor on all radiance before the film's response
+    balance: further factors on red, green and blue: the camera's white balance
+    """
+
+    zenith: Colour = (1.0, 1.0, 1.0)
+    horizon: Colour = (1.0, 1.0, 1.0)
+    ground: Colour = (1.0, 1.0, 1.0)
+    light: float = 1.0
+    visible: bool = False
+    clouds: float = 0.0
+    haze: float = 0.0
+    reach: float = 0.25
+    exposure: float = 1.0
+    balance: Colour = (1.0, 1.0, 1.0)
+
+    def describe(self):
+        colours = (_linear(c) * self.light for c in (self.zenith, self.horizon, self.ground))
+        exposure = self.exposure * np.array(self.balance)
+        return int(self.visible), *colours, self.clouds, self.haze, self.reach, exposure
+
+
+@dataclass(frozen=True)
+class World:
+    """A scene to photograph. z points up, lengths in scene units."""
+
+    objects: tuple[Object, ...]
+    lights: tuple[Lamp | Sun, ...] = ()
+    sky: Sky = Sky()
+
+    @cached_property
+    def names(self) -> tuple[str, ...]:
+        """Names of the numbers in a mask."""
+        return tuple(dict.fromkeys(o.name for o in self.objects))
+
+    def moved(self, name: str, motion: Pose) -> World:
+        """The world after the thing of this name made a rigid motion."""
+        if name not in self.names:
+            raise KeyError(f"nothing here is called {name!r}; there are {', '.join(self.names)}")
+        objects = (replace(o, pose=motion @ o.pose) if o.name == name else o for o in self.objects)
+        return replace(self, objects=tuple(objects))
+
+    def transformed(self, motion: Pose) -> World:
+        """The world after everything in it, lights included, made a rigid motion; the sky stays."""
+        objects = (replace(o, pose=motion @ o.pose) for o in self.objects)
+        return replace(self, objects=tuple(objects), lights=tuple(x.moved(motion) for x in self.lights))
+
+    def bounds(self) -> tuple[np.ndarray, np.ndarray]:
+        """Lowest and highest corner of the box around all objects; infinite where a plane is."""
+        boxes = [o.bounds() for o in self.objects]
+        return np.min([low for low, _ in boxes], 0), np.max([high for _, high in boxes], 0)
+
+    @cached_property
+    def arrays(self) -> Arrays:
+        """The world as flat arrays, for the tracer."""
+        objects = np.zeros(len(self.objects), OBJECT)
+        materials = numbered(o.material for o in self.objects)
+        names = numbered(self.names)
+        for row, thing in zip(objects, self.objects, strict=True):
+            kind, size, rounding, half = thing.shape.describe()
+            row["kind"], row["half"] = kind, half
+            row["size"][: len(size)], row["size"][5] = size, rounding
+            row["rotation"], row["position"] = thing.pose.rotation, thing.pose.position
+            row["material"], row["identity"] = materials[thing.material], names[thing.name]
+        return Arrays(
+            objects,
+            np.array([_material(m) for m in materials], MATERIAL),
+            np.array([x.describe() for x in self.lights], LIGHT),
+            np.array([self.sky.describe()], SKY),
+            hierarchy([o.bounds() for o in self.objects]),
+        )
+
+
+def joined(parts: Sequence[World], lights: tuple[Lamp | Sun, ...], sky: Sky) -> World:
+    """The objects of several worlds in one, and in one light. Each part is flattened once for all worlds that it
+    becomes part of. No name may be in two of them."""
+    world = World(tuple(o for part in parts for o in part.objects), lights, sky)
+    names = [name for part in parts for name in part.names]
+    assert len(names) == len(set(names)), "a name is in two parts"
+    flat = [part.arrays for part in parts]
+    objects, materials, nodes = (np.concatenate([getattr(a, kind) for a in flat]) for kind in KINDS)
+    begin = Arrays(*(np.cumsum([0, *(len(a[k]) for a in flat)]) for k in range(len(Arrays._fields))))
+    seen = np.cumsum([0, *(len(part.names) for part in parts)])
+    for k in range(len(parts)):
+        own = slice(begin.objects[k], begin.objects[k + 1])
+        objects["material"][own] += begin.materials[k]
+        objects["identity"][own] += seen[k]
+        tree = nodes[begin.nodes[k] : begin.nodes[k + 1]]
+        tree["skip"] += begin.nodes[k]
+        tree["object"][tree["object"] >= 0] += begin.objects[k]
+    light = World((), lights, sky).arrays
+    # What `arrays` would find, without building the tree again.
+    world.__dict__["arrays"] = Arrays(objects, materials, light.lights, light.sky, nodes)
+    return world
+
+
+def numbered(things: Iterable[Any]) -> dict[Any, int]:
+    """Each different thing with its number."""
+    return {thing: number for number, thing in enumerate(dict.fromkeys(things))}
+
+
+def rotation_about(axis: Vector, degrees: float) -> np.ndarray:
+    """The matrix that turns by an angle about an axis, anticlockwise seen from its tip (Rodrigues)."""
+    x, y, z = np.array(axis, float) / np.linalg.norm(axis)
+    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    angle = math.radians(degrees)
+    return np.eye(3) + math.sin(angle) * cross + (1 - math.cos(angle)) * cross @ cross
+
+
+def _material(material: Material):
+    texture, a, b, numbers = material.texture.describe()
+    numbers = (*numbers, 0.0, 0.0, 0.0, 0.0)[:4]
+    return texture, _linear(a), _linear(b), numbers, material.gloss, material.roughness, material.metal
+
+
+def _linear(colour: Colour) -> np.ndarray:
+    return linear_from_srgb(colour)
+
+
+def nested(matrix: np.ndarray):
+    """The rows of a matrix, as `Pose.rotation` has them."""
+    return tuple(tuple(row) for row in matrix.tolist())

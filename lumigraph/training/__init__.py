@@ -1,0 +1,8 @@
+"""Training: the loop, its display, and the verdict on its outcome."""
+
+from .loop import Clock as Clock
+from .loop import Descent as Descent
+from .loop import finite as finite
+from .loop import fit as fit
+from .loop import rehearse as rehearse
+from .loop import set_learning_rate as set_learning_rate

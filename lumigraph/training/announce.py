@@ -1,0 +1,56 @@
+"""What is said ahead of the first step: what is learnt from, what learns, on which machine, and how long."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from jaxtyping import Int
+from torch import Tensor
+
+from ..datasets.dataset import Dataset
+from ..datasets.scene import Scene
+from ..method.capabilities import HasGaussians, can
+from ..run.budget import Budget, lasting
+from ..system import threads
+
+
+def learnt_from(data: Dataset) -> str:
+    """How many photographs, or whatever else, are learnt from and held out; photographs' size, and what it was."""
+    held_out = len(data.splits.get("test", ()))
+    aside = f", {held_out:,} held out"
+    if not isinstance(data, Scene):
+        return f"Learning from {len(data.splits['train']):,} of {data.kind}{aside}"
+    count = len(data.splits["train"])
+    size, full = sizes(data.cameras.size), None if data.full_sizes is None else sizes(data.full_sizes)
+    reduced = f", reduced from {full}" if full and full != size else ""
+    return f"Learning from {count:,} photograph{'' if count == 1 else 's'}{aside}, {size} pixels{reduced}"
+
+
+def sizes(of: Int[Tensor, "photograph 2"]) -> str:
+    """One size, or the smallest and the largest."""
+    some = sorted({(int(w), int(h)) for w, h in of.tolist()}, key=lambda size: size[0] * size[1])
+    told = [f"{width}x{height}" for width, height in some]
+    return told[0] if len(told) == 1 else f"{told[0]} to {told[-1]}"
+
+
+def learner(name: str, method: Any) -> str:
+    """A method's name and how large it is: Gaussians, or numbers that it learns."""
+    if can(method, HasGaussians):
+        return f"{name}, {len(method.gaussians()):,} Gaussians"
+    return f"{name}, {sum(x.numel() for x in method.parameters() if x.requires_grad):,} numbers to learn"
+
+
+def machine(device: torch.device) -> str:
+    """A device; on a CPU how many threads compute."""
+    if device.type == "cuda":
+        return f"on {torch.cuda.get_device_name(device)} ({device})"
+    return f"on the CPU with {threads.told()}"
+
+
+def how_long(budget: Budget, step: int, seconds: float) -> str:
+    """What is left of a budget. How long steps take is only known once some are done."""
+    if budget.steps is None:
+        return f"for {lasting(budget.total - seconds)}"
+    done = f", {step:,} of them done" if step else ""
+    return f"for {budget}{done}; how long they take is told once a few are done"

@@ -1,0 +1,173 @@
+"""What a person sees of training: a bar on a terminal, plain lines elsewhere, on stderr."""
+
+from __future__ import annotations
+
+import math
+import sys
+import time
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+from rich.console import RenderableType
+from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn
+from rich.text import Text
+
+from ..datasets.dataset import Dataset
+from ..method import Lesson, Method
+from ..run.budget import Budget
+from ..system.console import console, is_live
+from ..system.progress import clock, short
+from .announce import how_long, learner, learnt_from, machine
+
+REFRESH = 0.5  # seconds between looks at a bar
+FIRST = 3.0  # seconds to the first line with a time left
+LINES = 10.0, 60.0  # seconds between lines where there is no terminal: at least, and later at most
+SHARE = 0.1  # of the time so far that passes between lines, within these limits
+MEMORY = 0.8  # share of the smoothed PSNR that another value leaves
+TOLD_OTHERWISE = {"mse", "rays", "samples", "visible_samples"}  # statistics, as PSNR and by the second
+NAMES = {"gaussians": "Gaussians"}  # of statistics, for people
+
+
+class Bar(Progress):
+    """A progress bar with a line of figures below it."""
+
+    figures = ""
+
+    def get_renderables(self) -> Iterable[RenderableType]:
+        yield self.make_tasks_table(self.tasks)
+        if self.figures:
+            yield Text(f"  {self.figures}", style="dim")
+
+
+class TrainingDisplay:
+    """What is learnt from, then how far training has come, how large a method has grown, and the time that is left.
+
+    PSNR is that of the photographs learnt from, smoothed; it says little of held-out ones.
+    """
+
+    def __init__(self, show: bool = True):
+        self.console = console(True)
+        self.show, self.terminal = show, is_live()
+        columns = (
+            SpinnerColumn(),
+            TextColumn("{task.description}", "bold", markup=False),
+            BarColumn(24),
+            TextColumn("{task.fields[told]}", markup=False),
+        )
+        self.bar = Bar(*columns, console=self.console, refresh_per_second=1 / REFRESH)
+        self.task = self.bar.add_task("Starting", total=1.0, told="")
+        self.psnr: float | None = None  # smoothed
+        self._begun: tuple[int, float] | None = None  # step and seconds at which this sitting began
+        self._seen: tuple[int, float] | None = None  # step and seconds at the last look
+        self._count = 0  # of what was learnt from, since then
+        self._unit = ""  # what these are
+        self._loss: float | None = None
+        self._next = 0.0
+
+    @property
+    def _live(self) -> bool:
+        return self.show and self.terminal
+
+    def __enter__(self) -> TrainingDisplay:
+        if self._live:
+            self.bar.start()
+        return self
+
+    def __exit__(self, *fault: object) -> None:
+        if self._live:
+            self.bar.stop()
+
+    @contextmanager
+    def aside(self) -> Iterator[None]:
+        """Inside this block the bar makes room for that of a stage ahead of the first step."""
+        if not self._live:
+            yield
+            return
+        self.bar.live.transient = True
+        self.bar.stop()
+        yield
+        self.bar.live.transient = False
+        self.bar.start()
+
+    def begin(self, data: Dataset) -> None:
+        """What there is to learn from, and that kernels are compiled before anything is learnt."""
+        self._line(learnt_from(data))
+        self.bar.update(self.task, description="Compiling kernels")
+        if not self.terminal:
+            self._line("Compiling kernels, which takes long the first time only")
+
+    def ready(self, name: str, method: Method, budget: Budget, step: int, seconds: float) -> None:
+        """What begins to learn, on which machine, for how long."""
+        self._line(f"{learner(name, method)}, {machine(method.device)}, {how_long(budget, step, seconds)}")
+        self.bar.update(self.task, description="Training", completed=budget.progress(step, seconds))
+        self._begun = self._seen = step, seconds
+        self._next = time.perf_counter() + (REFRESH if self._live else FIRST)
+
+    @property
+    def due(self) -> bool:
+        """Whether the next step's figures are to be shown."""
+        return time.perf_counter() >= self._next
+
+    def update(self, step: int, seconds: float, budget: Budget, batch: Lesson, row: dict[str, Any]) -> None:
+        """Note a step and what it learnt from. row: its figures, empty for most steps."""
+        self._count += len(batch)
+        self._unit = batch.unit
+        if not row:
+            return
+        if "psnr" in row:
+            now = row["psnr"]
+            self.psnr = now if self.psnr is None else MEMORY * self.psnr + (1 - MEMORY) * now
+        self._loss = row.get("loss")
+        if self.due:
+            self._look(step, seconds, budget, row["statistics"])
+            least, most = LINES
+            self._next = time.perf_counter() + (REFRESH if self._live else min(max(SHARE * seconds, least), most))
+
+    def _quality(self) -> list[str]:
+        """The PSNR of what was learnt from; the loss, of methods that have none."""
+        if self.psnr is not None:
+            return [f"PSNR of training photographs {self.psnr:.2f} dB"]
+        return [] if self._loss is None else [f"loss {short(self._loss)}"]
+
+    def _look(self, step: int, seconds: float, budget: Budget, statistics: dict[str, float]) -> None:
+        assert self._begun is not None and self._seen is not None
+        parts = [f"step {step:,}", *sizes(statistics), *self._quality()]
+        if seconds > self._seen[1]:
+            rate = 1 / (seconds - self._seen[1])
+            if "samples" in statistics:
+                parts.append(f"{short(statistics['samples'] * (step - self._seen[0]) * rate)} samples/s")
+            parts.append(f"{short(self._count * rate)} {self._unit}/s")
+        self._seen, self._count = (step, seconds), 0
+        left = time_left(budget, step, seconds, self._begun)
+        self._show(budget.progress(step, seconds), f"about {clock(left)} left", parts)
+
+    def done(self, step: int, seconds: float, progress: float) -> None:
+        """The last word."""
+        self._show(progress, f"{clock(seconds)} trained", [f"step {step:,}", *self._quality()])
+
+    def _show(self, progress: float, time: str, parts: list[str]) -> None:
+        share, self.bar.figures = f"{100 * progress:3.0f} %", " · ".join(parts)
+        self.bar.update(self.task, completed=progress, told=f"{share} · {time}")
+        if not self.terminal:
+            self._line(" · ".join([f"{share}  {time}", *parts]))
+
+    def _line(self, line: str) -> None:
+        """A line that stays; on a terminal, above the bar."""
+        if self._live:
+            self.console.print(line, soft_wrap=True)
+        elif self.show:
+            print(line, file=sys.stderr, flush=True)
+
+
+def sizes(statistics: dict[str, float]) -> list[str]:
+    """What a method says of itself: whole numbers as counts, others as they are."""
+    told = {NAMES.get(name, name): value for name, value in statistics.items() if name not in TOLD_OTHERWISE}
+    return [f"{x:,.0f} {name}" if x == int(x) else f"{name} {short(x)}" for name, x in told.items() if math.isfinite(x)]
+
+
+def time_left(budget: Budget, step: int, seconds: float, begun: tuple[int, float]) -> float:
+    """Seconds of training to come: what is left of them, or of steps that go on as they went in this sitting."""
+    if budget.steps is None:
+        return max(budget.total - seconds, 0.0)
+    return (budget.total - step) * (seconds - begun[1]) / max(step - begun[0], 1)

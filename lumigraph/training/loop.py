@@ -1,0 +1,328 @@
+"""fit(): the loop that every method is trained by."""
+
+from __future__ import annotations
+
+import contextlib
+import copy
+import math
+import time
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any, Protocol, runtime_checkable
+
+import torch
+from torch import Tensor
+
+from .. import methods
+from ..datasets.dataset import Dataset, check_kind
+from ..errors import LumigraphError
+from ..figures import save_picture
+from ..method import Lesson, Method
+from ..run import Run, State, check_memory
+from ..run.budget import Budget
+from ..system.memory import peak_memory
+from ..system.signals import Interrupt
+from .display import TrainingDisplay
+from .verdict import shares_seen
+
+FIRST_SAVE = 10.0  # seconds of training; a fault or a kill in the first minute should not cost all of it
+PREVIEWS = (0.01, 0.03, 0.1, 0.3, 1.0)  # shares of the budget at which a view is kept
+PREVIEW_SIZE = 256  # pixels along the longer side
+DARKEST_ERROR = 1e-10  # mean squared error below which the PSNR stays 100 dB
+SMALL = 1 << 16  # gradients up to this many numbers are looked at in every step, larger ones in every logged step
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """How training ended.
+
+    finished: whether the budget is spent
+    signal:   number of the signal that stopped it, if one did
+    saving_seconds: spent on checkpoints and previews, beside the training's seconds
+    """
+
+    state: State
+    finished: bool
+    signal: int | None = None
+    saving_seconds: float = 0.0
+
+
+@runtime_checkable
+class Watch(Protocol):
+    """Somebody who looks on while a method learns, from other threads: the viewer. It may hold training up between
+    steps, which does not count as training, and changes nothing of what is learnt."""
+
+    @property
+    def asked(self) -> bool:
+        """Whether it wants to be given way before the next step. Asked before each step, so it must be quick."""
+
+    def give_way(self, stopping: Callable[[], object]) -> None:
+        """Render, in eval mode; return at once where stopping() is true."""
+
+    def note(self, step: int, progress: float, row: dict[str, Any]) -> None:
+        """So many steps are done. row: the line of metrics.jsonl, empty for most steps."""
+
+
+def fit(
+    method: Method,
+    data: Dataset,
+    run: Run | None = None,
+    *,
+    steps: int | None = None,
+    seconds: float | None = None,
+    budget: Budget | None = None,
+    seed: int = 0,
+    pause_at: int | None = None,
+    save_every: float = 60.0,
+    log_every: int = 10,
+    show: bool = True,
+    watch: Watch | None = None,
+    rehearsal: bool = True,
+) -> Outcome:
+    """Train a method on a dataset until its steps are done or its seconds are spent.
+
+    run:        where the state is kept; training goes on from the state it holds. None keeps nothing
+    steps, seconds: the whole budget, earlier sittings included; exactly one of them, or
+    budget:     one that says more, such as that of a run that was extended
+    seed:       of all random choices
+    pause_at:   stop at this step as if interrupted; the schedule still follows the whole budget
+    save_every: seconds of training between states
+    watch:      who looks on meanwhile
+    rehearsal:  whether a step on a copy compiles all kernels ahead of the clock; tests that time nothing do without
+    Seconds count what training needs; compiling kernels ahead of it, saving, and giving way to who looks on are
+    counted apart.
+    Ctrl-C and SIGTERM end the step at hand, save and return; a second one breaks off.
+    Raises LumigraphError for a dataset of another kind than the method learns from, for a run that another process
+    trains, and when a loss or gradient is not finite, with the last good state saved.
+    """
+    budget = budget or Budget(steps, seconds)
+    check_kind(methods.name_of(method), method.learns_from, type(data), data.source)
+    check_memory(type(method), method.frame, method.config, method.device, learning=True)
+    with run.held() if run else contextlib.nullcontext(), Interrupt() as interrupt, TrainingDisplay(show) as display:
+        fresh, state = not (run and run.has_state), run.restore_weights(method) if run else State()
+        display.begin(data)
+        compile_seconds = state.compile_seconds + (rehearse(method, data, state.step) if rehearsal else 0.0)
+        optimizers, generator = method.optimizers(), torch.Generator().manual_seed(seed)
+        if run:
+            run.restore_training(optimizers, generator)
+            run.forget_after(state.step)
+        method.train()
+        share_seen, passes, losses = shares_seen(data), state.passes, list[float]()
+        clock, step, watched = Clock(state.seconds), state.step, 0.0
+        if fresh:
+            with display.aside():
+                method.begin(data, budget.seconds or math.inf)
+        display.ready(methods.name_of(method), method, budget, step, clock.seconds)
+        next_save = clock.seconds + min(FIRST_SAVE, save_every)
+
+        def spent(seconds: float | None = None) -> float:
+            now = clock.seconds if seconds is None else seconds
+            return 1.0 if method.complete else budget.progress(step, now)
+
+        previews = Previews(run, method, data, spent())
+
+        def save() -> State:
+            if not finite(method.parameters()):
+                refuse("a parameter is not finite")
+            memory = max(state.peak_memory, peak_memory(method.device))
+            now = State(step, clock.seconds, compile_seconds, memory, passes)
+            with clock.paused():
+                previews.take(step, spent(now.seconds))
+                if run:
+                    run.save(now, method, optimizers, generator)
+            return now
+
+        def refuse(fault: str) -> None:
+            raise LumigraphError(stop(fault, step, run, method, save))
+
+        while (progress := spent()) < 1 and step != pause_at and not interrupt.signal:
+            if watch and watch.asked:
+                watched += give_way(watch, method, clock, interrupt)
+                continue
+            logged = (step + 1) % log_every == 0
+            set_learning_rate(optimizers, method.learning_rates(step, progress))
+            method.before_step(step, progress)
+            batch = method.batch(data, generator)
+            terms = method.step(batch, step, Descent(method, optimizers, batch, step, logged, refuse))
+            method.after_step(step)
+            step += 1
+            passes += share_seen(batch)
+            losses.append(sum(value.item() for value in terms.values()))
+            row = record(step, clock.seconds, terms, method, losses, passes) if logged or display.due else {}
+            display.update(step, clock.seconds, budget, batch, row)
+            if watch:
+                watch.note(step, progress, row)
+            if logged:
+                losses.clear()
+            if run and logged:
+                run.log(row | {"learning_rate": [g["lr"] for o in optimizers for g in o.param_groups if "lr" in g]})
+            if clock.seconds >= next_save and spent() < 1:  # the last save comes after
+                save()
+                next_save = clock.seconds + save_every
+            elif previews.due(progress):
+                with clock.paused():
+                    previews.take(step, progress)
+
+        final = save()
+        finished = spent(final.seconds) >= 1
+        display.done(step, final.seconds, spent(final.seconds))
+    method.eval()
+    return Outcome(final, finished, interrupt.signal, clock.pauses - watched)
+
+
+class Descent:
+    """The trainer's part of one step, which `Method.step` is handed as `descend`: gradients of the summed terms, a look
+    whether they are finite, and the optimizers' step.
+
+    thorough: look at all gradients, see `find_fault`
+    refuse:   told what is not finite; it raises
+    """
+
+    def __init__(
+        self,
+        method: Method,
+        optimizers: Sequence[torch.optim.Optimizer],
+        batch: Lesson,
+        step: int,
+        thorough: bool,
+        refuse: Callable[[str], None],
+    ):
+        self.method, self.optimizers, self.batch, self.step = method, optimizers, batch, step
+        self.thorough, self.refuse = thorough, refuse
+
+    def __call__(self, terms: dict[str, Tensor], optimizers: Sequence[torch.optim.Optimizer] | None = None) -> None:
+        """One step downhill, by some of the optimizers or by all."""
+        chosen = self.optimizers if optimizers is None else optimizers
+        for optimizer in chosen:
+            optimizer.zero_grad(set_to_none=True)
+        torch.stack(list(terms.values())).sum().backward()
+        if fault := find_fault(self.method, terms, self.batch, self.step, self.thorough):
+            self.refuse(fault)
+        for optimizer in chosen:
+            optimizer.step()
+
+
+def record(
+    step: int, seconds: float, terms: dict[str, Tensor], method: Method, losses: Sequence[float], passes: float
+) -> dict[str, Any]:
+    """A line of metrics.jsonl: the loss and its terms, the method's figures, and the PSNR of what the step learnt from
+    where the method reports a squared error of colours; the mean loss since the line before, and how often everything
+    was learnt from by now."""
+    own = {name: value.item() for name, value in terms.items()}
+    statistics = {name: float(value) for name, value in method.statistics().items()}
+    row: dict[str, Any] = {"step": step, "seconds": round(seconds, 4)}
+    if own:
+        row |= {"loss": sum(own.values()), "mean_loss": sum(losses) / len(losses), "passes": round(passes, 6)}
+    if "mse" in statistics:
+        row["psnr"] = -10 * math.log10(max(statistics["mse"], DARKEST_ERROR))
+    return row | {"terms": own, "statistics": statistics}
+
+
+def set_learning_rate(optimizers: Iterable[torch.optim.Optimizer], rates: dict[str, float]) -> None:
+    """Set the learning rates of groups of parameters by their names; see `Method.learning_rates`."""
+    for optimizer in optimizers:
+        for group in optimizer.param_groups:
+            own = rates.get(group.get("name", ""))
+            if own is not None:
+                group["lr"] = own * group.get("scale", 1.0)
+
+
+class Clock:
+    """Seconds of training. It runs from the moment it is made, except during pauses."""
+
+    def __init__(self, seconds: float = 0.0):
+        self._begin, self.pauses = time.perf_counter() - seconds, 0.0
+
+    @property
+    def seconds(self) -> float:
+        return time.perf_counter() - self._begin
+
+    @contextlib.contextmanager
+    def paused(self) -> Iterator[None]:
+        begin = time.perf_counter()
+        yield
+        pause = time.perf_counter() - begin
+        self._begin, self.pauses = self._begin + pause, self.pauses + pause
+
+
+class Previews:
+    """One view as it comes to be: that of the dataset's preview camera, small. None where it has no such camera."""
+
+    def __init__(self, run: Run | None, method: Method, data: Dataset, progress: float):
+        camera = data.preview() if run else None
+        self.camera = camera and camera.resized(min(1.0, PREVIEW_SIZE / int(camera.size.max())))
+        self.run, self.method = run, method
+        self.next = [share for share in PREVIEWS if share > progress] if camera else []
+
+    def due(self, progress: float) -> bool:
+        return bool(self.next) and progress >= self.next[0]
+
+    def take(self, step: int, progress: float) -> None:
+        """Render and keep the view if it is due."""
+        if not self.run or self.camera is None or not self.due(progress):
+            return
+        self.next = [share for share in self.next if share > progress]
+        self.method.eval()
+        save_picture(self.run.folder / "previews" / f"{step:06d}.png", self.method.render(self.camera).rgb, ours=True)
+        self.method.train()
+
+
+def give_way(watch: Watch, method: Method, clock: Clock, interrupt: Interrupt) -> float:
+    """Let somebody look, who has asked. Returns the seconds it took."""
+    before = clock.pauses
+    with clock.paused():
+        method.eval()
+        watch.give_way(lambda: interrupt.signal)
+        method.train()
+    return clock.pauses - before
+
+
+def rehearse(method: Method, data: Dataset, step: int) -> float:
+    """One step on a copy, so that all kernels are compiled before the clock starts. Returns the seconds it took."""
+    begin = time.perf_counter()
+    double = copy.deepcopy(method).train()
+    optimizers = double.optimizers()
+    if step == 0:
+        double.compile_begin()
+    set_learning_rate(optimizers, double.learning_rates(step, 0.0))
+    double.before_step(step, 0.0)
+    batch = double.batch(data, torch.Generator().manual_seed(0))
+    double.step(batch, step, Descent(double, optimizers, batch, step, False, lambda fault: None))
+    double.after_step(step)
+    return time.perf_counter() - begin
+
+
+def find_fault(method: Method, terms: dict[str, Tensor], batch: Lesson, step: int, thorough: bool) -> str | None:
+    """The loss term that is not finite, or whose gradient is not; None if all is well.
+
+    thorough: look at all gradients. Small ones, which everything flows through, are always looked at.
+    """
+    for name, value in terms.items():
+        if not math.isfinite(value.item()):
+            return f"the loss term {name!r} is {value.item()}"
+    named = [(n, p) for n, p in method.named_parameters() if p.grad is not None]
+    if finite(p.grad for _, p in named if p.grad is not None and (thorough or p.numel() <= SMALL)):
+        return None
+    again = method.loss(batch, step) if type(method).step is Method.step else {}
+    for term, value in again.items():  # one at a time
+        gradients = torch.autograd.grad(value, [p for _, p in named], retain_graph=True, allow_unused=True)
+        for (parameter, _), gradient in zip(named, gradients, strict=True):
+            if gradient is not None and not finite([gradient]):
+                return f"the gradient of the loss term {term!r} in {parameter!r} is not finite"
+    return "the gradient of the summed loss is not finite"
+
+
+def finite(tensors: Iterable[Tensor]) -> bool:
+    """Whether every number is finite. Their sum tells: it reads each once, and passes NaN and infinity on."""
+    sums = [x.detach().sum(dtype=torch.float32) for x in tensors if x.is_floating_point()]
+    return not sums or math.isfinite(torch.stack(sums).sum().item())
+
+
+def stop(fault: str, step: int, run: Run | None, method: Method, save) -> str:
+    """Keep the last good state, and say in one sentence what happened and where that state is."""
+    if run is None:
+        return f"Training stopped at step {step} because {fault}; try a lower learning rate"
+    if finite(method.parameters()):
+        save()
+    kept = f"the state after step {run.state.step} is kept" if run.has_state else "no state had been saved yet"
+    return f"Training stopped at step {step} because {fault}; {kept} in {run.folder}; try a lower learning rate"

@@ -1,0 +1,82 @@
+"""Verdict: what training has come to, measured: how often everything was seen, and whether it still got better."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ..camera import Camera
+from ..datasets.alignment import Moves, moves
+from ..datasets.dataset import Dataset
+from ..datasets.scene import Photograph, Scene
+from ..method import Lesson, Method
+
+STRETCHES = 4, 30  # at least and at most, that the second half of training is divided into; fewer tell nothing
+FALLING = 0.05  # share of the loss, over the second half, from which on it still falls
+DEVIATIONS = 2.0  # of its own error that a fall must exceed
+
+
+def shares_seen(data: Dataset) -> Callable[[Lesson], float]:
+    """A function that tells how much of what there is to learn from one lesson shows: 1 for all of it once, 0 where
+    there is no end of it."""
+    photographs, pixels = len(data.splits["train"]), data.pixels("train") if isinstance(data, Scene) else math.inf
+    return lambda lesson: 1 / photographs if isinstance(lesson, Photograph) else len(lesson) / pixels
+
+
+@dataclass(frozen=True)
+class Trend:
+    """How the loss moved over the second half of training.
+
+    fall:  from the half's beginning to its end, as a share of the loss; negative where it rose
+    error: one standard deviation of that
+    """
+
+    fall: float
+    error: float
+
+    @property
+    def falling(self) -> bool:
+        return self.fall > max(FALLING, DEVIATIONS * self.error)
+
+
+def loss_trend(rows: Sequence[dict[str, Any]], by_photograph: bool) -> Trend | None:
+    """How the loss moved, by the lines of metrics.jsonl; None where they are too few to tell.
+
+    A straight line through its logarithm, by least squares; the scatter around it tells the error. Some photographs are
+    harder than others: where a step learns from one (by_photograph), points on the line are means over at least a whole
+    pass, in which each photograph has its turn once, so that only what was learnt is left.
+    """
+    found = [row for row in rows if "mean_loss" in row]
+    half = [row for row in found if row["step"] > found[-1]["step"] / 2]
+    least, most = STRETCHES
+    passes = int(half[-1]["passes"] - half[0]["passes"]) if half and by_photograph else most
+    stretches = min(len(half), passes, most)
+    if stretches < least:
+        return None
+    parts = np.array_split(np.array([(row["step"], row["mean_loss"]) for row in half], np.float64), stretches)
+    step, loss = np.array([part.mean(0) for part in parts]).T
+    if not (loss > 0).all():
+        return None
+    log, offset, length = np.log(loss), step - step.mean(), half[-1]["step"] - half[0]["step"]
+    slope = (offset @ log) / (offset @ offset)
+    scatter = log - log.mean() - slope * offset
+    deviation = math.sqrt((scatter @ scatter) / (stretches - 2) / (offset @ offset))
+    return Trend(1 - math.exp(slope * length), deviation * length)
+
+
+def cameras_moved(method: Method, cameras: Camera) -> Moves | None:
+    """How far a method has moved the cameras that it learnt from, each against all of them; None where it learns no
+    poses. cameras: those of training photographs as they were given"""
+    refined = method.refined(cameras)
+    return None if refined is cameras else moves(cameras, refined, method.frame)
+
+
+def last_psnr(rows: Sequence[dict[str, Any]]) -> float | None:
+    """The PSNR of training photographs in dB, its mean over the last quarter of training; None where there is none."""
+    found = [(row["step"], row["psnr"]) for row in rows if "psnr" in row]
+    last = [psnr for step, psnr in found if step > 3 / 4 * found[-1][0]]
+    return sum(last) / len(last) if last else None

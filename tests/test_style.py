@@ -1,0 +1,206 @@
+"""Counts of what the house has too much of. Each is at most its ceiling, and a ceiling may only be lowered."""
+
+from __future__ import annotations
+
+import ast
+import functools
+import re
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+
+import pytest
+from budgets import budget
+from conftest import PACKAGE, module_name
+from test_house import imported
+
+pytestmark = budget("house")
+
+ROOT = PACKAGE.parent
+Sources = dict[str, str]  # module names, and the text of each
+parsed = functools.cache(ast.parse)
+RIDDLES = {"what", "whatever", "that", "which", "those", "whether", "of", "as", "how", "whose", "where"}
+TO_BE_WRITTEN = {"lumigraph/methods/soft_colours.py"}  # by the reader of CONTRIBUTING.md
+
+
+@pytest.fixture(scope="module")
+def house() -> Sources:
+    return {module_name(path): path.read_text(encoding="utf-8") for path in sorted(PACKAGE.rglob("*.py"))}
+
+
+def at_most(ceiling: int, found: list[str]) -> None:
+    """Fail with the number and the places. Who lowers the number lowers the ceiling."""
+    assert len(found) <= ceiling, "\n".join([f"{len(found)}, and at most {ceiling} may be:", *found])
+
+
+# Docstrings name the thing (STYLE.md, rule 1)
+
+
+def public(tree: ast.Module) -> Iterator[tuple[str, ast.Module | ast.ClassDef | ast.FunctionDef]]:
+    """A module, its public classes and functions and their public methods, each with its name."""
+    yield "", tree
+    ahead = [(node.name, node) for node in tree.body if isinstance(node, ast.ClassDef | ast.FunctionDef)]
+    for name, node in ahead:
+        if not node.name.startswith("_"):
+            yield name, node
+            if isinstance(node, ast.ClassDef):
+                ahead += [(f"{name}.{inner.name}", inner) for inner in node.body if isinstance(inner, ast.FunctionDef)]
+
+
+def riddles(sources: Sources) -> list[str]:
+    """Docstrings that begin with a word of RIDDLES."""
+    found = []
+    for module, source in sources.items():
+        for name, node in public(parsed(source)):
+            first = re.match(r"\w*", ast.get_docstring(node) or "")
+            if first and first[0].lower() in RIDDLES:
+                found.append(f"{module}.{name}: {first[0]} ...".replace(".:", ":"))
+    return found
+
+
+def test_docstrings_name_the_thing(house):
+    at_most(677, riddles(house))
+
+
+@pytest.mark.parametrize(
+    "source",
+    [
+        '"""What a ray is."""',
+        '"""How: by this."""',
+        'class Ray:\n    """Those that meet."""',
+        'def ray():\n    """Whether it meets."""',
+        'class Ray:\n    @property\n    def end(self):\n        """Where it ends."""',
+    ],
+)
+def test_a_riddle_is_noticed(source):
+    assert len(riddles({"lumigraph.camera.rays": source})) == 1
+    assert riddles({"lumigraph.camera.rays": re.sub('"""[A-Z]', '"""Rays w', source)}) == []
+    assert riddles({"lumigraph.camera.rays": re.sub("(def|class) ", r"\1 _", source)}) == [] or source.startswith('"')
+
+
+# A class name stands once
+
+
+def namesakes(sources: Sources) -> list[str]:
+    """Public classes of one name in several modules, but for Config, which every method has."""
+    places: dict[str, list[str]] = {}
+    for module, source in sources.items():
+        for node in ast.walk(parsed(source)):
+            if isinstance(node, ast.ClassDef) and node.name != "Config" and not node.name.startswith("_"):
+                places.setdefault(node.name, []).append(module)
+    return [f"{name}: {', '.join(modules)}" for name, modules in sorted(places.items()) if len(modules) > 1]
+
+
+def test_a_class_name_stands_once(house):
+    at_most(35, namesakes(house))
+
+
+def test_a_namesake_is_noticed():
+    one, other = "class Ray:\n    pass\nclass Config:\n    pass", "def f():\n    class Ray:\n        pass"
+    assert namesakes({"a": one, "b": "class Rays:\n    pass\nclass Config:\n    pass"}) == []
+    assert namesakes({"a": one, "b": other}) == ["Ray: a, b"]
+
+
+# A component serves two methods or rooms
+
+
+def users(sources: Sources) -> dict[str, set[str]]:
+    """Methods and rooms that import each component, directly or by way of other components."""
+
+    def user(module: str) -> str:
+        parts = module.split(".")
+        return ".".join(parts[1:3] if parts[1:2] == ["methods"] else parts[1:2])
+
+    importers: dict[str, set[str]] = {module: set() for module in sources if module.startswith("lumigraph.components.")}
+    packages = {module.rpartition(".")[0] for module in sources}
+    for module, source in sources.items():
+        for name in imported(source, module, module in packages):
+            target = name if name in importers else name.rpartition(".")[0]
+            if target in importers and target != module:
+                importers[target].add(module)
+    found = {}
+    for component in importers:
+        reached, ahead = {component}, [component]
+        while ahead:
+            fresh = importers.get(ahead.pop(), set()) - reached
+            reached |= fresh
+            ahead += fresh
+        found[component] = {user(module) for module in reached if module not in importers} - {"components", ""}
+    return {name: some for name, some in found.items() if name not in packages}
+
+
+def test_a_component_serves_two(house):
+    lonely = {name: found for name, found in users(house).items() if len(found) < 2}
+    at_most(39, [f"{name}: {', '.join(found) or 'nobody'}" for name, found in sorted(lonely.items())])
+
+
+def test_a_component_of_one_method_is_noticed():
+    made = {
+        "components.fields": "",
+        "components.fields.grid": "",
+        "components.fields.hash": "from .grid import Grid",
+        "components.fields.factors": "from . import grid",
+        "methods.ngp": "from ..components.fields.hash import Hash",
+        "methods.vm": "from ..components.fields import factors",
+        "export.mesh": "import lumigraph.components.fields.factors",
+        "export.film": "import lumigraph.components.fields.hash",
+        "methods.paper": "",
+        "methods.paper.one": "from ...components.fields.late import Late",
+        "methods.paper.two": "from ...components.fields.late import Late",
+        "components.fields.late": "",
+    }
+    found = users({f"lumigraph.{name}": source for name, source in made.items()})
+    assert {name.rpartition(".")[2]: some for name, some in found.items()} == {
+        "grid": {"methods.ngp", "methods.vm", "export"},
+        "hash": {"methods.ngp", "export"},
+        "factors": {"methods.vm", "export"},
+        "late": {"methods.paper"},
+    }
+
+
+# Configs hold, none inherits
+
+
+def heirs(sources: Sources) -> list[str]:
+    """Configs with a base class."""
+    nodes = [(module, node) for module, source in sources.items() for node in ast.walk(parsed(source))]
+    return [
+        f"{module}.{node.name}({', '.join(map(ast.unparse, node.bases))})"
+        for module, node in nodes
+        if isinstance(node, ast.ClassDef) and node.name.endswith(("Config", "Numbers")) and node.bases
+    ]
+
+
+def test_no_config_inherits(house):
+    at_most(11, heirs(house))
+
+
+def test_a_config_that_inherits_is_noticed():
+    assert heirs({"a": "class Config:\n    pass\nclass NGP(RayMethod):\n    Config = Config"}) == []
+    assert heirs({"a": "class Config(HashNumbers, b.C):\n    pass"}) == ["a.Config(HashNumbers, b.C)"]
+
+
+# Documents name files that are there
+
+
+def lost(text: str, files: Iterable[Path]) -> list[str]:
+    """Paths of Python files in back-ticks that no file ends with."""
+    there = {"/".join(path.parts[-count:]) for path in files for count in range(1, len(path.parts) + 1)}
+    spans = re.findall(r"`([^`\n]+)`", re.sub(r"(?ms)^```.*?^```", "", text))
+    named = [match[0] for span in spans if (match := re.match(r"[\w./-]+\.py\b", span))]
+    return [path for path in named if path not in there and path not in TO_BE_WRITTEN]
+
+
+def test_documents_name_files_that_are_there():
+    folders = (PACKAGE, ROOT / "tests", ROOT / "benchmarks", ROOT / "web")
+    files = [path.relative_to(ROOT) for folder in folders for path in folder.rglob("*.py")]
+    documents = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
+    at_most(0, [f"{x.relative_to(ROOT)}: {path}" for x in documents for path in lost(x.read_text("utf-8"), files)])
+
+
+def test_a_lost_file_is_noticed():
+    files = [Path("lumigraph/metrics/lpips.py"), Path("tests/tiny.py")]
+    fine = "`metrics/lpips.py`, `lumigraph/metrics/lpips.py: Lpips`, `<x>.py`, [`x`](a.py) `tiny.py`\n```\n`a.py`\n```"
+    assert lost(fine, files) == []
+    assert lost("`lumigraph/lpips.py`, `pips.py` and `lumigraph/metrics/x.py: X`", files) == [
+        *("lumigraph/lpips.py", "pips.py", "lumigraph/metrics/x.py")
+    ]
