@@ -10,7 +10,7 @@ from ...components.fields.taken_over import TakenOver
 from ...errors import LumigraphError
 from ...gaussians import Gaussians
 from ...method.capabilities import HasGaussians, can
-from .initial_cloud import nearest_distance
+from .initialization import nearest_distance
 
 INITIAL_OPACITY = 0.8
 INITIAL_BANDS = 2  # of harmonics, fitted to what cameras see; their directions are too few for more
