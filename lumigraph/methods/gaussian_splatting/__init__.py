@@ -94,9 +94,9 @@ class GaussianSplatting(Method):
         self.cloud.antialiased = c.filters.antialiased
         self.appearance = SplatAppearance(frame, c.photographs) if c.photographs.appearance != "no" else None
         self.few_views = FewViews(c.sparse.depth_weight) if c.sparse.few_views else None
-        self.density_control: DensityControl = AdaptiveDensity(c.refine, c.adaptive, count)
-        if c.strategy == "mcmc":
-            self.density_control = MarkovChain(c.refine, c.mcmc)
+        self.density_control: DensityControl = (
+            MarkovChain(c.refine, c.mcmc) if c.strategy == "mcmc" else AdaptiveDensity(c.refine, c.adaptive, count)
+        )
         self.mip_filter = MipFilter(count) if c.filters.filter_3d else None
         self.tidying = Tidying()
         self.robust_mask = RobustMask(c.distractors) if c.distractors.robust != "no" else None
