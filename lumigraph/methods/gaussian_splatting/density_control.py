@@ -56,7 +56,7 @@ class DensityControl(Addition, ABC):
         self.initial_count.fill_(len(method.cloud))
 
     def due(self, step: int, progress: float) -> bool:
-        """Whether the cloud may change after this step; asked once a step."""
+        """True if the cloud may change after this step; called once a step."""
         ended = self.schedule.due(step, progress)
         return ended and intervals(step, progress, self.refining.refine_from, self.refining.refine_from_share) >= 1
 

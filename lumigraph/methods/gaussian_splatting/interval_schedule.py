@@ -39,7 +39,7 @@ class IntervalSchedule(nn.Module):
         self.register_buffer("over", torch.tensor(-1))
 
     def due(self, step: int, progress: float) -> bool:
-        """Whether an interval has ended since the last call."""
+        """True if an interval has ended since the last call."""
         over = int(intervals(step, progress, self.steps, self.share))
         ended = over > int(self.over) >= 0
         self.over.fill_(over)

@@ -48,7 +48,7 @@ class RobustMask(Addition):
         self.register_buffer("histogram", torch.zeros(BINS))
 
     def is_active(self, method: Any) -> bool:
-        """Whether pixels are left out: always, or with the setting auto where photographs differ."""
+        """True if pixels are left out: always, or with the setting auto where photographs differ."""
         return self.numbers.robust == "yes" or (method.appearance is not None and method.appearance.is_active)
 
     def mask(self, method: Any, step: Step) -> None:
