@@ -5,7 +5,6 @@ import torch
 
 from lumigraph.camera.rays import Rays
 from lumigraph.components.fields.voxels import VoxelGrid, corners
-from lumigraph.components.training.smoothness import variation
 from lumigraph.datasets.scene import Forward, Frame
 from lumigraph.methods.dvgo import DVGO
 from lumigraph.volume import weights_of
@@ -27,7 +26,7 @@ def test_only_what_samples_touch_is_smoothed(generator):
     assert x == y == 2 * (z - 1) + 1
     grid.values.data = torch.randn(grid.values.shape, generator=generator)
     sample = torch.tensor([[0.01, -0.99, 0.3]])
-    variation(grid, sample, 5, generator).backward()
+    grid.variation(sample, 5, generator).backward()
     touched = (grid.values.grad != 0).any(-1)
     away = (corners(grid.box, grid.shape) - sample).abs() >= 2 / (grid.size - 1)
     assert 0 < int(touched.sum()) <= 4 and not (touched & away.any(-1)).any()
@@ -38,7 +37,7 @@ def test_a_plane_varies_as_it_rises(generator):
     grid.values.data = 3 * corners(grid.box, grid.shape)[:, :1]
     inside = torch.rand(50, 3, generator=generator) - 0.5
     rise = 3 * 2 / (grid.shape[0] - 1)
-    torch.testing.assert_close(variation(grid, inside, 200, generator), torch.tensor(rise), atol=1e-4, rtol=1e-4)
+    torch.testing.assert_close(grid.variation(inside, 200, generator), torch.tensor(rise), atol=1e-4, rtol=1e-4)
 
 
 def test_what_no_photograph_has_shown_yet_is_no_fog():

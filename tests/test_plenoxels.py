@@ -7,12 +7,12 @@ import tiny
 import torch
 
 from lumigraph import kernels
-from lumigraph.components.fields.sparse_voxels import SparseVoxels
 from lumigraph.components.training.lazy_rmsprop import LazyRMSprop
 from lumigraph.components.training.sparsity import cauchy
 from lumigraph.errors import LumigraphError
 from lumigraph.kernels import Nodes
 from lumigraph.methods.plenoxels import Config, Plenoxels, undecided
+from lumigraph.methods.plenoxels.sparse_voxels import SparseVoxels
 
 
 def random(*shape: int, seed: int = 0) -> torch.Tensor:

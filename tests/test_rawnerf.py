@@ -13,13 +13,13 @@ from lumigraph.capture import open_scene
 from lumigraph.capture.numbers import kind_of, read_numbers
 from lumigraph.color.srgb import linear_from_srgb, srgb_from_linear
 from lumigraph.components.fields.development import decoded, encoded, exposed, toned, white
-from lumigraph.components.sampling.thin_lens import through_lens
 from lumigraph.datasets.scene import Batch
 from lumigraph.evaluation import evaluate
 from lumigraph.evaluation.light import in_light
 from lumigraph.export.exr import exr
 from lumigraph.export.film import film
 from lumigraph.methods.rawnerf import RawNeRF, layers_of
+from lumigraph.methods.rawnerf.thin_lens import through_lens
 from lumigraph.training import fit
 
 

@@ -12,13 +12,13 @@ import torch
 from budgets import budget
 
 from lumigraph.components.training.fog import thickness_before
-from lumigraph.components.training.patch_flow import SIDE, PatchFlow, photographed
 from lumigraph.components.training.unseen_views import patches, roughness, unseen_cameras
 from lumigraph.files.ranges import changed
 from lumigraph.geometry import nearest_to_lines, unit
 from lumigraph.methods.instant_ngp import Config as NgpConfig
 from lumigraph.methods.instant_ngp import InstantNGP
 from lumigraph.methods.regnerf import RegNeRF
+from lumigraph.methods.regnerf.patch_flow import SIDE, PatchFlow, photographed
 from lumigraph.run import build
 
 pytestmark = budget("methods")
@@ -112,7 +112,7 @@ def test_the_flow_is_a_density():
 
 
 def test_it_tells_photographs_from_noise(monkeypatch):
-    from lumigraph.components.training import patch_flow
+    from lumigraph.methods.regnerf import patch_flow
 
     monkeypatch.setattr(patch_flow, "PATCHES", 1024)
     flow, scene = PatchFlow(), tiny.scene()
@@ -124,7 +124,7 @@ def test_it_tells_photographs_from_noise(monkeypatch):
 
 
 def test_a_flow_stops_when_its_seconds_are_over(monkeypatch):
-    from lumigraph.components.training import patch_flow
+    from lumigraph.methods.regnerf import patch_flow
 
     monkeypatch.setattr(patch_flow, "PATCHES", 256)
     short, long = PatchFlow(), PatchFlow()

@@ -11,10 +11,10 @@ import torch
 from budgets import budget
 
 from lumigraph import kernels
-from lumigraph.components.fields.factorised import FactorGrid, nodes_in
 from lumigraph.datasets.scene import Forward, Frame
 from lumigraph.kernels.factor_grid import Factors
 from lumigraph.methods.tensorf import UPSAMPLINGS, TensoRF
+from lumigraph.methods.tensorf.factor_grid import FactorGrid, nodes_in
 
 pytestmark = budget("methods")
 

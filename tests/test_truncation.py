@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 import torch
 
-from lumigraph.components.fields.factorised import FactorGrid
-from lumigraph.components.fields.truncation import decomposed, truncate
+from lumigraph.methods.tensorf.factor_grid import FactorGrid
+from lumigraph.methods.tensorf.truncation import decomposed, truncate
 
 
 def seen(grid: FactorGrid, summed: bool) -> torch.Tensor:

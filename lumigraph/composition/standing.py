@@ -53,7 +53,7 @@ def frame_around(lead: Frame, others: Sequence[tuple[Frame, Similarity, Box | No
     for frame, place, box in others:
         interest = box or Box(*frame.bounds)
         corners.append(interest.moved(place).corners.float())
-        all_of_it = interest if box or frame.reach == 1 else Box((-frame.reach,) * 3, (frame.reach,) * 3)
+        all_of_it = interest if box or not frame.is_open else Box((-frame.reach,) * 3, (frame.reach,) * 3)
         farthest = max(farthest, float(all_of_it.moved(place).corners.abs().max()))
     points = torch.cat(corners)
     lower, upper = ((x, y, z) for x, y, z in (points.amin(0).tolist(), points.amax(0).tolist()))

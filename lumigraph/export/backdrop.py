@@ -39,7 +39,7 @@ def backdrop(method: Method, cameras: Camera) -> Backdrop | None:
     `None` for an object, and for a scene that is not opaque: its background belongs to the picture.
     """
     frame = method.frame
-    if frame.has_alpha or frame.reach == 1:
+    if frame.has_alpha or not frame.is_open:
         return None
     colours, heights, opacities, places = [], [], [], []
     for i in evenly(range(len(cameras)), VIEWS):

@@ -72,7 +72,7 @@ def extract_mesh(
     Raises LumigraphError where nothing is solid, and for numbers that make no sense.
     """
     method.eval()
-    closed = method.frame.reach == 1 if closed is None else closed
+    closed = not method.frame.is_open if closed is None else closed
     limits = meshed_box(method.frame, extent) if crop is None else within_reach(method.frame, crop)
     holds = limits.holds if crop is None else lambda points: limits.holds(points) & crop.holds(points)
     grid = make_grid(limits, cell)
@@ -107,7 +107,7 @@ def extract_mesh(
 def meshed_box(frame: Frame, times: float | None) -> Box:
     """The frame's box of interest, larger or smaller about its middle, within the cube that holds everything."""
     low, high = torch.tensor(frame.bounds)
-    half = 0.5 * (high - low) * ((1.0 if frame.reach == 1 else OPEN_BOX) if times is None else times)
+    half = 0.5 * (high - low) * ((1.0 if not frame.is_open else OPEN_BOX) if times is None else times)
     middle = 0.5 * (low + high)
     return upright(torch.stack([middle - half, middle + half]).clamp(-frame.reach, frame.reach))
 

@@ -103,7 +103,7 @@ def opening_of_scene(
     target = pivot(around, position, forward)
     distance = float((position - target).norm())
     elevation = math.degrees(float(around.polar[:, 1].min()))
-    alone = frame.reach == 1
+    alone = not frame.is_open
     low, high = (torch.tensor(corner, dtype=torch.double) for corner in frame.bounds)
     coloured = behind if background is None else None
     return Opening(

@@ -24,7 +24,6 @@ from ..components.sampling.spaces import NDC, Space, space_of
 from ..components.training.lazy_adam import LazyAdam
 from ..components.training.photometric import backdrop, residuals
 from ..components.training.schedules import falling
-from ..components.training.smoothness import variation
 from ..datasets.scene import Batch, Frame, Scene
 from ..exchange.packing import Stored, most_important
 from ..files.ranges import Layers, LearningRate, NonNegative, PositiveShare, Seed, Share, Steps, Width, between
@@ -243,7 +242,7 @@ class DVGO(FieldMethod):
             weights = {"tv_density": c.tv_density_weight, "tv_feature": c.tv_feature_weight}
             for grid, (name, weight) in zip(self.network.grids, weights.items(), strict=True):
                 if weight:
-                    terms[name] = c.tv_interval * weight * variation(grid, samples.features, MAX_SMOOTHED, generator)
+                    terms[name] = c.tv_interval * weight * grid.variation(samples.features, MAX_SMOOTHED, generator)
         return terms
 
     def optimizers(self) -> list[torch.optim.Optimizer]:

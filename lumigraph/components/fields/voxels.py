@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import lru_cache
 from typing import ClassVar
 
 import torch
@@ -100,3 +101,24 @@ class VoxelGrid(nn.Module):
     def replace(self, values: Float[Tensor, "corner channel"], optimizer: torch.optim.Optimizer | None = None) -> None:
         """Other values, of which there may be another number, as a new parameter; its moments begin at zero."""
         exchange(self, "values", values, optimizer)
+
+    def variation(
+        self, coordinates: Float[Tensor, "sample 3"], count: int, generator: torch.Generator
+    ) -> Float[Tensor, ""]:
+        """Total variation at the voxels of some samples, drawn at random; see `kernels.total_variation`.
+
+        Only values that a step touches anyway get a gradient: an optimizer that scales gradients by their size would
+        move the others as far for smoothness alone.
+        count: samples to draw, of which one may come more than once
+        """
+        drawn = torch.randint(len(coordinates), (count,), generator=generator).to(coordinates.device)
+        places = (coordinates[drawn] - self.box[0]) / (self.box[1] - self.box[0])
+        x, y, z = (places.clamp(0, 1) * (self.size - 1)).long().unbind(-1)
+        chosen = (x * self.size[1] + y) * self.size[2] + z
+        return kernels.total_variation(chosen, all_nodes(self.shape, str(chosen.device)), self.values)
+
+
+@lru_cache(maxsize=2)  # of this stage's grid, and of another one's
+def all_nodes(shape: tuple[int, int, int], device: str) -> kernels.Nodes:
+    """All nodes of a dense grid."""
+    return kernels.Nodes.all(shape).to(device)

@@ -173,7 +173,7 @@ def seen_places(camera: Camera, frame: Frame) -> tuple[Rays, Float[Tensor, "ray 
     x, y = ((torch.arange(PLACES, device=camera.pose.device) + 0.5) * n / PLACES for n in (width, height))
     rays = camera.rays(torch.cartesian_prod(x, y).to(camera.pose))
     share = ((torch.arange(PLACES, device=camera.pose.device) + 0.5) / PLACES).to(camera.pose)
-    if frame.reach > 1:
+    if frame.is_open:
         t = frame.near * (2 * frame.reach / frame.near) ** share
         return rays, t.expand(len(rays), -1)
     enter, leave = rays.through_box(rays.origins.new_tensor(frame.bounds))

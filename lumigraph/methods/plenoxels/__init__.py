@@ -10,27 +10,27 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from ..camera import Camera
-from ..components.fields.sparse_voxels import Cells, Part, SparseVoxels
-from ..components.fields.taken_over import logit, taken_over
-from ..components.sampling.importance import importance
-from ..components.sampling.occupancy_sampler import GridSchedule, OccupancyNumbers, OccupancySampler
-from ..components.sampling.proposal_sampler import ProposalNumbers
-from ..components.sampling.samplers import sampler_for
-from ..components.sampling.spaces import NDC, Space, space_of
-from ..components.training.exposure import Exposure, Setting
-from ..components.training.lazy_rmsprop import LazyRMSprop
-from ..components.training.photometric import backdrop, residuals
-from ..components.training.schedules import falling
-from ..components.training.sparsity import cauchy
-from ..datasets.scene import Batch, Frame, Scene
-from ..errors import LumigraphError
-from ..exchange.packing import Stored, most_important
-from ..files.ranges import BatchSize, LearningRate, NonNegative, Positive, PositiveShare, Seed, Share, Steps, between
-from ..kernels import total_variation
-from ..kernels.harmonic_grid import BANDS
-from ..method import Field, FieldMethod
-from ..volume import composite, weights_of
+from ...camera import Camera
+from ...components.fields.taken_over import logit, taken_over
+from ...components.sampling.importance import importance
+from ...components.sampling.occupancy_sampler import GridSchedule, OccupancyNumbers, OccupancySampler
+from ...components.sampling.proposal_sampler import ProposalNumbers
+from ...components.sampling.samplers import sampler_for
+from ...components.sampling.spaces import NDC, Space, space_of
+from ...components.training.exposure import Exposure, Setting
+from ...components.training.lazy_rmsprop import LazyRMSprop
+from ...components.training.photometric import backdrop, residuals
+from ...components.training.schedules import falling
+from ...components.training.sparsity import cauchy
+from ...datasets.scene import Batch, Frame, Scene
+from ...errors import LumigraphError
+from ...exchange.packing import Stored, most_important
+from ...files.ranges import BatchSize, LearningRate, NonNegative, Positive, PositiveShare, Seed, Share, Steps, between
+from ...kernels import total_variation
+from ...kernels.harmonic_grid import BANDS
+from ...method import Field, FieldMethod
+from ...volume import composite, weights_of
+from .sparse_voxels import Cells, Part, SparseVoxels
 
 Resolution = Annotated[int, between(4, 1024)]
 DensityRate = Annotated[float, between(1e-6, 1e4)]

@@ -14,12 +14,12 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
-from ..camera import Camera
-from ..camera.rays import Rays, Rendering
-from ..components.fields.activations import truncated_exp
-from ..components.fields.development import CONTROLS, decoded, exposed, toned
-from ..components.fields.hash_field import CPU_TABLE, TINY_TABLE, HashField, HashNumbers
-from ..components.sampling.occupancy_sampler import (
+from ...camera import Camera
+from ...camera.rays import Rays, Rendering
+from ...components.fields.activations import truncated_exp
+from ...components.fields.development import CONTROLS, decoded, exposed, toned
+from ...components.fields.hash_field import CPU_TABLE, TINY_TABLE, HashField, HashNumbers
+from ...components.sampling.occupancy_sampler import (
     CPU_OCCUPANCY,
     CPU_STEPS,
     TINY_OCCUPANCY,
@@ -27,19 +27,19 @@ from ..components.sampling.occupancy_sampler import (
     OccupancyNumbers,
     StepNumbers,
 )
-from ..components.sampling.proposal_sampler import ProposalNumbers
-from ..components.sampling.samplers import sampler_for
-from ..components.sampling.spaces import space_of
-from ..components.sampling.thin_lens import through_lens
-from ..components.training.fog import evened
-from ..components.training.pose_refinement import PoseNumbers, poses_for
-from ..components.training.schedules import held
-from ..datasets.scene import Batch, Frame, Scene
-from ..errors import LumigraphWarning
-from ..files.ranges import LearningRate, NonNegative, Positive, Seed, Width
-from ..method import FieldMethod
-from ..method.controls import Control
-from ..volume import composite
+from ...components.sampling.proposal_sampler import ProposalNumbers
+from ...components.sampling.samplers import sampler_for
+from ...components.sampling.spaces import space_of
+from ...components.training.fog import evened
+from ...components.training.pose_refinement import PoseNumbers, poses_for
+from ...components.training.schedules import held
+from ...datasets.scene import Batch, Frame, Scene
+from ...errors import LumigraphWarning
+from ...files.ranges import LearningRate, NonNegative, Positive, Seed, Width
+from ...method import FieldMethod
+from ...method.controls import Control
+from ...volume import composite
+from .thin_lens import through_lens
 
 
 @dataclass(frozen=True)

@@ -13,28 +13,28 @@ from typing import Annotated, Any, Literal
 import torch
 from torch import Tensor
 
-from ..camera.rays import Look, Rays, Rendering
-from ..components.fields.coordinate_field import NetworkNumbers
-from ..components.fields.frustum_field import FrustumField
-from ..components.fields.hash_field import CPU_TABLE, HashField, HashNumbers
-from ..components.sampling.cone_sampler import ConeSampler
-from ..components.sampling.hierarchical_sampler import RayNumbers
-from ..components.sampling.occupancy_mask import MaskNumbers
-from ..components.sampling.occupancy_sampler import CPU_STEPS, MIN_RESOLUTION, OccupancyNumbers, StepNumbers
-from ..components.sampling.proposal_sampler import ProposalNumbers
-from ..components.sampling.samplers import sampler_for
-from ..components.sampling.spaces import space_of
-from ..components.training.coarse_to_fine import BandSchedule, joining_of
-from ..components.training.fog import evened, thickness_before
-from ..components.training.patch_flow import SIDE, PatchFlow
-from ..components.training.photometric import backdrop, huber, residuals
-from ..components.training.pose_refinement import PoseNumbers, poses_for
-from ..components.training.schedules import falling, held
-from ..components.training.unseen_views import patches, roughness, unseen_cameras
-from ..datasets.scene import Batch, Frame, Scene
-from ..files.ranges import LearningRate, NonNegative, PositiveShare, Seed, Share, Steps, Width, between
-from ..method import FieldMethod
-from ..volume import composite
+from ...camera.rays import Look, Rays, Rendering
+from ...components.fields.coordinate_field import NetworkNumbers
+from ...components.fields.frustum_field import FrustumField
+from ...components.fields.hash_field import CPU_TABLE, HashField, HashNumbers
+from ...components.sampling.cone_sampler import ConeSampler
+from ...components.sampling.hierarchical_sampler import RayNumbers
+from ...components.sampling.occupancy_mask import MaskNumbers
+from ...components.sampling.occupancy_sampler import CPU_STEPS, MIN_RESOLUTION, OccupancyNumbers, StepNumbers
+from ...components.sampling.proposal_sampler import ProposalNumbers
+from ...components.sampling.samplers import sampler_for
+from ...components.sampling.spaces import space_of
+from ...components.training.coarse_to_fine import BandSchedule, joining_of
+from ...components.training.fog import evened, thickness_before
+from ...components.training.photometric import backdrop, huber, residuals
+from ...components.training.pose_refinement import PoseNumbers, poses_for
+from ...components.training.schedules import falling, held
+from ...components.training.unseen_views import patches, roughness, unseen_cameras
+from ...datasets.scene import Batch, Frame, Scene
+from ...files.ranges import LearningRate, NonNegative, PositiveShare, Seed, Share, Steps, Width, between
+from ...method import FieldMethod
+from ...volume import composite
+from .patch_flow import SIDE, PatchFlow
 
 
 @dataclass(frozen=True)

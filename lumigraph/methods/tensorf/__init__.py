@@ -11,29 +11,29 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from ..camera import Camera
-from ..components.fields.factorised import FactorGrid, nodes_in
-from ..components.fields.mlp import MLP
-from ..components.fields.taken_over import taken_over
-from ..components.fields.truncation import truncate
-from ..components.sampling.importance import importance
-from ..components.sampling.occupancy_sampler import GridSchedule, OccupancyNumbers, OccupancySampler, Stage
-from ..components.sampling.proposal_sampler import ProposalNumbers
-from ..components.sampling.samplers import sampler_for
-from ..components.sampling.spaces import Space, space_of
-from ..components.training.distillation import distil
-from ..components.training.exchange import exchange
-from ..components.training.lazy_adam import LazyAdam
-from ..components.training.photometric import backdrop, residuals
-from ..components.training.schedules import falling
-from ..datasets.scene import Batch, Frame, Scene
-from ..errors import LumigraphError
-from ..exchange.packing import Stored, most_important
-from ..files.ranges import BatchSize, LearningRate, NonNegative, Positive, Seed, Share, Steps, Width, between
-from ..kernels import factor_grid, spherical_harmonics
-from ..kernels.factor_grid import Factors
-from ..method import Field, FieldMethod
-from ..volume import composite
+from ...camera import Camera
+from ...components.fields.mlp import MLP
+from ...components.fields.taken_over import taken_over
+from ...components.sampling.importance import importance
+from ...components.sampling.occupancy_sampler import GridSchedule, OccupancyNumbers, OccupancySampler, Stage
+from ...components.sampling.proposal_sampler import ProposalNumbers
+from ...components.sampling.samplers import sampler_for
+from ...components.sampling.spaces import Space, space_of
+from ...components.training.distillation import distil
+from ...components.training.exchange import exchange
+from ...components.training.lazy_adam import LazyAdam
+from ...components.training.photometric import backdrop, residuals
+from ...components.training.schedules import falling
+from ...datasets.scene import Batch, Frame, Scene
+from ...errors import LumigraphError
+from ...exchange.packing import Stored, most_important
+from ...files.ranges import BatchSize, LearningRate, NonNegative, Positive, Seed, Share, Steps, Width, between
+from ...kernels import factor_grid, spherical_harmonics
+from ...kernels.factor_grid import Factors
+from ...method import Field, FieldMethod
+from ...volume import composite
+from .factor_grid import FactorGrid, nodes_in
+from .truncation import truncate
 
 Resolution = Annotated[int, between(4, 2048)]  # nodes per axis of a cube with as many nodes
 Components = Annotated[int, between(1, 1024)]  # of each factor

@@ -12,10 +12,10 @@ from torch import Tensor, nn
 from torch.nn.functional import embedding
 
 from ... import kernels
+from ...components.training.exchange import exchange
 from ...kernels import Nodes
 from ...kernels.harmonic_grid import COEFFICIENTS
 from ...kernels.sparse_grid.cpu import CHUNK, corners
-from ..training.exchange import exchange
 
 Cells = tuple[int, int, int]  # of a grid, along each axis
 SHARE = 0.05  # of a fine grid's nodes that are not pruned, about
