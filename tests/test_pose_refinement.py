@@ -25,6 +25,7 @@ from lumigraph.components.training.pose_refinement import PoseRefinement, seen_p
 from lumigraph.datasets.alignment import aligning, moves
 from lumigraph.datasets.images import ImageStore
 from lumigraph.evaluation.held_out_poses import HeldOutPoses, held_out_poses, pose_scores
+from lumigraph.files.ranges import changed
 from lumigraph.gaussians.splatting import splat, view_of
 from lumigraph.geometry import Similarity
 from lumigraph.method.capabilities import RefinesPoses, can
@@ -37,7 +38,7 @@ SMALL = {"nerf": {"position_frequencies": 3, "bfloat16": False}, "mip-nerf": {"b
 
 def refining(name: str, **config):
     kind = methods.find(name)
-    return build(kind, tiny.scene().frame, replace(kind.smallest(), refine_cameras=True, **config), CPU, 0)
+    return build(kind, tiny.scene().frame, changed(kind.smallest(), refine_cameras=True, **config), CPU, 0)
 
 
 def slopes(value, twist: torch.nn.Parameter, image: int, step: float) -> torch.Tensor:
@@ -165,7 +166,7 @@ def test_waves_and_levels_are_weighted_in_their_order():
 def test_a_method_that_refines_nothing_has_no_weights_and_one_rate():
     plain = build(methods.find("nerf"), tiny.scene().frame, methods.find("nerf").smallest(), CPU, 0)
     assert plain.poses is None and isinstance(plain.learning_rate(0, 0.5), float)
-    rates = [refining("nerf").learning_rate(0, progress)["poses"] for progress in (0.0, 0.2, 1.0)]
+    rates = [refining("nerf").learning_rates(0, progress)["poses"] for progress in (0.0, 0.2, 1.0)]
     assert rates[0] < 0.05 * rates[1] and rates[2] < 0.1 * rates[1]
 
 
@@ -203,7 +204,9 @@ def test_moves_are_those_of_single_cameras():
     moved = cameras_moved(method, cameras)
     assert moved.turned.argmax() == 5 and 2.4 < moved.largest[0] < 3.01 and moved.median[0] < 0.5
     assert moved.shifted.argmax() == 5 and 1.2 < moved.largest[1] < 2.05
-    plain = build(methods.find("instant-ngp"), method.frame, methods.find("instant-ngp").Config(levels=2), CPU, 0)
+    plain = build(
+        methods.find("instant-ngp"), method.frame, changed(methods.find("instant-ngp").Config(), levels=2), CPU, 0
+    )
     assert cameras_moved(plain, cameras) is None and held_out_poses(plain, tiny.scene()) is None
 
 
@@ -230,7 +233,7 @@ def test_a_held_out_photograph_is_found_on_itself():
     """A cloud's own pictures, one of them said to be taken from 1.5 degrees and 1 % away; the cloud stays as it is."""
     scene = tiny.made(8, 32, 40.0)
     kind = methods.find("gaussian-splatting")
-    config = replace(kind.smallest(), refine_cameras=True, sh_degree=0)
+    config = changed(kind.smallest(), refine_cameras=True, sh_degree=0)
     method = build(kind, scene.frame, config, CPU, 0).eval()
     cloud = random_cloud(scene.frame, 100, 0, torch.Generator().manual_seed(0))
     method.cloud.replace(replace(cloud, means=0.6 * cloud.means, opacities=cloud.opacities + 4))
