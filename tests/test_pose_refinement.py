@@ -155,7 +155,7 @@ def test_waves_and_levels_are_weighted_in_their_order():
     assert (weighted[:, 15:] == 0).all()
     method = refining("instant-ngp")
     method.network.table.data.uniform_(0.1, 1, generator=torch.Generator().manual_seed(0))
-    width = method.config.features_per_level
+    width = method.config.table.features_per_level
     method.before_step(0, 0.0)
     coarse = method.network.encode(points - 0.5)
     assert (coarse[:, :width] != 0).all() and (coarse[:, width:] == 0).all()
