@@ -155,7 +155,7 @@ def test_waves_and_levels_are_weighted_in_their_order():
     assert (weighted[:, 15:] == 0).all()
     method = refining("instant-ngp")
     method.network.table.data.uniform_(0.1, 1, generator=torch.Generator().manual_seed(0))
-    width = method.config.features_per_level
+    width = method.config.table.features_per_level
     method.before_step(0, 0.0)
     coarse = method.network.encode(points - 0.5)
     assert (coarse[:, :width] != 0).all() and (coarse[:, width:] == 0).all()
@@ -166,7 +166,7 @@ def test_waves_and_levels_are_weighted_in_their_order():
 def test_a_method_that_refines_nothing_has_no_weights_and_one_rate():
     plain = build(methods.find("nerf"), tiny.scene().frame, methods.find("nerf").smallest(), CPU, 0)
     assert plain.poses is None and isinstance(plain.learning_rate(0, 0.5), float)
-    rates = [refining("nerf").learning_rate(0, progress)["poses"] for progress in (0.0, 0.2, 1.0)]
+    rates = [refining("nerf").learning_rates(0, progress)["poses"] for progress in (0.0, 0.2, 1.0)]
     assert rates[0] < 0.05 * rates[1] and rates[2] < 0.1 * rates[1]
 
 
@@ -204,7 +204,9 @@ def test_moves_are_those_of_single_cameras():
     moved = cameras_moved(method, cameras)
     assert moved.turned.argmax() == 5 and 2.4 < moved.largest[0] < 3.01 and moved.median[0] < 0.5
     assert moved.shifted.argmax() == 5 and 1.2 < moved.largest[1] < 2.05
-    plain = build(methods.find("instant-ngp"), method.frame, methods.find("instant-ngp").Config(levels=2), CPU, 0)
+    plain = build(
+        methods.find("instant-ngp"), method.frame, changed(methods.find("instant-ngp").Config(), levels=2), CPU, 0
+    )
     assert cameras_moved(plain, cameras) is None and held_out_poses(plain, tiny.scene()) is None
 
 

@@ -154,8 +154,11 @@ class CoordinateField(Field):
         directions: Float[Tensor, "point 3"],
         code: Float[Tensor, "point code"] | None = None,
     ) -> Float[Tensor, "point 3"]:
-        if isinstance(features, tuple):
+        if self.joint:
+            assert isinstance(features, tuple)
             return self.colours_at(features, torch.arange(len(directions), device=directions.device), directions)[1]
+        if isinstance(features, tuple):  # of a pass: with the encoding of each ray's direction
+            return in_chunks(lambda *x: (self._coloured(*x),), *features, code)[0]
         return in_chunks(lambda *x: (self._seen(*x),), features, directions, code)[0]
 
     def density(self, points: Float[Tensor, "point 3"], code: Tensor | None = None) -> Float[Tensor, " point"]:
@@ -176,5 +179,7 @@ class CoordinateField(Field):
         return density * self.space.stretch(points), rgb
 
     def _seen(self, feature: Tensor, directions: Tensor, *code: Tensor) -> Float[Tensor, "point 3"]:
-        view = torch.cat([self.encode_direction(directions), *code], -1)
-        return self.activated(self.network.seen(feature, view))
+        return self._coloured(feature, self.encode_direction(directions), *code)
+
+    def _coloured(self, feature: Tensor, view: Tensor, *code: Tensor) -> Float[Tensor, "point 3"]:
+        return self.activated(self.network.seen(feature, torch.cat([view, *code], -1)))

@@ -13,7 +13,7 @@ from .hash_field import side_by_side
 from .mlp import MLP
 
 
-class Sky(Part):
+class SkyField(Part):
     """Colours behind everything (as in Rematas 2022, beside the code).
 
     Photographs do not agree on the weather. Without a sky, a transient head would explain all of it, and nothing would
@@ -32,6 +32,6 @@ class Sky(Part):
         return self.network(side_by_side(harmonics, *codes)).sigmoid()
 
 
-def sky_for(frame: Frame, wanted: bool, bands: int, code: int, hidden_width: int) -> Sky | None:
+def sky_for(frame: Frame, wanted: bool, bands: int, code: int, hidden_width: int) -> SkyField | None:
     """A sky where a scene without bounds shows one, and it is wanted."""
-    return Sky(bands, code, hidden_width) if wanted and frame.is_open and not frame.has_alpha else None
+    return SkyField(bands, code, hidden_width) if wanted and frame.is_open and not frame.has_alpha else None

@@ -118,7 +118,8 @@ class HierarchicalSampler(Sampler):
         there = self.empty.may_hold(places[0], radius)
         where = there if lit is None else lit if there is None else lit & there
         if not field.joint:
-            density, features = field.features_at(*places)
+            density, feature = field.features_at(*places)
+            features = feature, field.encode_direction(rays.directions)[ray]
         elif colours:
             density, rgb = field.colours_at(places, ray, rays.directions, where, generator)
         else:

@@ -43,14 +43,14 @@ class TransientHead(nn.Module):
         self.layers = nn.Sequential(*hidden, Dense(widths[-1], 5, False, exact))
 
     def forward(
-        self, features: Tensor, code: Float[Tensor, "sample code"], stretch: Float[Tensor, " sample"]
+        self, features: tuple[Tensor, ...], code: Float[Tensor, "sample code"], stretch: Float[Tensor, " sample"]
     ) -> Transient:
         """stretch: coordinates in a scene unit"""
 
         def answer(feature: Tensor, code: Tensor) -> tuple[Tensor]:
             return (self.layers(torch.cat([feature, code.to(feature.dtype)], -1)).float(),)
 
-        (raw,) = in_chunks(answer, features, code)
+        (raw,) = in_chunks(answer, features[0], code)
         return Transient(softplus(raw[:, 0]) * stretch, raw[:, 1:4].sigmoid(), softplus(raw[:, 4]))
 
 
