@@ -24,11 +24,11 @@ from lumigraph.benchmark.cell import Cell, Settings
 from lumigraph.benchmark.conduct import conduct
 from lumigraph.benchmark.results import read_rows
 from lumigraph.benchmark.table import size, table
+from lumigraph.budget import Budget
 from lumigraph.commands.benches.cells import located
 from lumigraph.figures.charts import standalone
 from lumigraph.files import read_json, scene_name, write_bytes, write_json
 from lumigraph.run import Run
-from lumigraph.run.budget import Budget
 
 KINDS = {"dvgo": "dense", "plenoxels": "sparse", "tensorf": "factorised", "instant-ngp": "hashed"}
 

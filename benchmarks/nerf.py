@@ -23,7 +23,8 @@ from torch import Tensor, nn
 from lumigraph.capture import open_scene
 from lumigraph.components.fields import dense
 from lumigraph.components.fields.coordinate_network import CoordinateNetwork
-from lumigraph.components.sampling.occupancy_mask import OccupancyMask
+from lumigraph.components.sampling.hierarchical_sampler import RayNumbers
+from lumigraph.components.sampling.occupancy_mask import MaskNumbers, OccupancyMask
 from lumigraph.datasets.scene import Scene
 from lumigraph.errors import LumigraphError
 from lumigraph.files import write_json
@@ -72,10 +73,10 @@ def speed(options: Options) -> dict[str, float | str]:
     device, scene = torch.device(options.device), open_scene(options.source, downscale=None)
     result: dict[str, float | str] = {"processor": processor(device), "device": str(device)}
     for name in ("ours", "plain"):
-        method = build(NeRF, scene.frame, Config(rays_per_step=RAYS), device, 0)
+        method = build(NeRF, scene.frame, Config(rays=RayNumbers(rays_per_step=RAYS)), device, 0)
         whole = mock.patch.multiple(dense, CHUNK_CPU=1 << 40, CHUNK_GPU=1 << 40)
         if name == "plain":
-            for network in (method.coarse, method.fine):
+            for network in (method.network.coarse, method.network):
                 plain(network)
             PlainLayer.type_of_products = lambda self, x: torch.float32  # type: ignore[attr-defined]
             whole.start()
@@ -118,20 +119,21 @@ def frame_seconds(method: NeRF, scene: Scene) -> float:
 def skipping(options: Options) -> dict[str, float | str]:
     run = Run(options.source)
     method = run.method(torch.device(options.device))
-    if not isinstance(method, NeRF) or method.empty:
+    if not isinstance(method, NeRF) or method.sampler.empty.cells:
         raise LumigraphError(
             f"{run.folder} is no run of nerf that learnt without a grid, and what a grid rules out is never learnt; "
             f"train one with --preset laptop --occupancy-resolution 0"
         )
-    cameras, grid = run.cameras()["test"], OccupancyMask(CELLS, Config.occupancy_threshold).to(method.device)
+    cameras, grid = run.cameras()["test"], OccupancyMask(CELLS, MaskNumbers.occupancy_threshold).to(method.device)
+    whole = method.sampler.empty
     for seed in range(LOOKS):
         grid.grid.update(method.density, grid.thickness, torch.Generator().manual_seed(seed), decay=1.0)
     chosen = torch.linspace(0, len(cameras) - 1, options.views).long().tolist()
     decibels, seconds = [], {"with the grid": 0.0, "without": 0.0}
     for i in chosen:
         seen = []
-        for name, empty in zip(seconds, (grid, None), strict=True):
-            method.empty = empty
+        for name, empty in zip(seconds, (grid, whole), strict=True):
+            method.sampler.empty = empty
             begin = time.perf_counter()
             seen.append(method.render(cameras[i]).rgb.clamp(0, 1))
             synchronize(method.device)

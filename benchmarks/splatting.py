@@ -22,6 +22,7 @@ from rich.table import Table
 from lumigraph import kernels, methods
 from lumigraph.capture import open_scene
 from lumigraph.files import write_json
+from lumigraph.files.ranges import changed
 from lumigraph.gaussians import Gaussians, splatting
 from lumigraph.run import build
 from lumigraph.run.splat_file import SplatFile
@@ -64,9 +65,9 @@ def steps(options: Options, device: torch.device) -> list[dict]:
         "half_resolution_until": 0.0,
         "max_gaussians": 2 * max(options.sizes),
     }
-    config = dataclasses.replace(kind.preset(device), **numbers)
+    config = changed(kind.preset(device), **numbers)
     method = build(kind, scene.frame, config, device, 0)
-    (optimizer,), generator = method.optimizers(), torch.Generator().manual_seed(0)
+    optimizers, generator = method.optimizers(), torch.Generator().manual_seed(0)
     method.begin(scene)
     width, height = scene.cameras.size[0].tolist()
     table = Table("Gaussians", *PARTS, "all", title=f"A step at {width} x {height}: median milliseconds")
@@ -79,11 +80,13 @@ def steps(options: Options, device: torch.device) -> list[dict]:
         batch = method.batch(scene, generator)
         marks.append(clock(device))
         loss = torch.stack(list(method.loss(batch, step).values())).sum()
-        optimizer.zero_grad(set_to_none=True)
+        for optimizer in optimizers:
+            optimizer.zero_grad(set_to_none=True)
         marks.append(clock(device))
         loss.backward()
         marks.append(clock(device))
-        optimizer.step()
+        for optimizer in optimizers:
+            optimizer.step()
         marks.append(clock(device))
         method.after_step(step)
         marks.append(clock(device))

@@ -17,9 +17,9 @@ from lumigraph.benchmark.conduct import Patience, conduct
 from lumigraph.benchmark.curves import over_views
 from lumigraph.benchmark.pictures import draw_charts
 from lumigraph.benchmark.published import FEW
+from lumigraph.budget import Budget
 from lumigraph.commands.benches.views import BenchViews
 from lumigraph.commands.cli import main
-from lumigraph.run.budget import Budget
 
 pytestmark = budget("runs")
 

@@ -21,10 +21,10 @@ from lumigraph.benchmark.conduct import Patience, conduct
 from lumigraph.benchmark.launch import launch, reason
 from lumigraph.benchmark.pictures import draw_charts
 from lumigraph.benchmark.published import FIGURES, published
+from lumigraph.budget import Budget
 from lumigraph.commands.cli import main
 from lumigraph.errors import LumigraphError
 from lumigraph.run import Run
-from lumigraph.run.budget import Budget
 
 pytestmark = budget("runs", 20)
 

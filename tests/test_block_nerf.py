@@ -15,19 +15,20 @@ from budgets import budget
 
 from lumigraph.camera.rays import Rays, Samples
 from lumigraph.components.fields.appearance import Appearance
-from lumigraph.components.fields.visibility import Visibility, transmittance
 from lumigraph.components.sampling.spaces import space_of
-from lumigraph.components.training.moving import CELLS, Moving
 from lumigraph.composition import Placed
 from lumigraph.datasets.images import ImageStore
 from lumigraph.datasets.scene import Frame, Scene
 from lumigraph.errors import LumigraphError
 from lumigraph.evaluation import evaluate
 from lumigraph.evaluation.halves import judged_by_halves, left_half
+from lumigraph.files.ranges import changed
 from lumigraph.geometry import Similarity
 from lumigraph.large import InBlocks, Mixing, Nearby, align_appearance
 from lumigraph.large.weights import inverse_distance, seeing, shares
 from lumigraph.methods.block_nerf import BlockNeRF
+from lumigraph.methods.block_nerf.moving import CELLS, Moving
+from lumigraph.methods.block_nerf.visibility import Visibility, transmittance
 from lumigraph.run import build
 from lumigraph.training import fit
 
@@ -42,7 +43,7 @@ NETWORK = {
 
 
 def made(scene: Scene, **options) -> BlockNeRF:
-    return build(BlockNeRF, scene.frame, replace(BlockNeRF.smallest(), **options), torch.device("cpu"), 0)
+    return build(BlockNeRF, scene.frame, changed(BlockNeRF.smallest(), **options), torch.device("cpu"), 0)
 
 
 def stops(image: int) -> int:
@@ -128,7 +129,7 @@ def test_visibility_is_learnt_beside_the_field_and_changes_nothing_of_it(lit):
     fit(other, scene, steps=5, show=False, rehearsal=False)
     again = made(scene, samples_per_step=1 << 13, **STILL)
     fit(again, scene, steps=5, show=False, rehearsal=False)
-    assert torch.equal(other.network.scene.table, again.network.scene.table)
+    assert torch.equal(other.network.table, again.network.table)
     assert torch.equal(other.visibility(rays.origins, rays.directions), torch.ones(len(rays)))
 
 
@@ -217,9 +218,9 @@ def test_what_errs_in_one_photograph_alone_teaches_nothing():
     error = 0.02 + 0.02 * torch.rand(200_000, generator=random) + 0.5 * patch + 0.05 * (image == 2)
     moving.note(image, place, error)
     assert moving.weights(image, place).all()  # not judged yet
-    moving.before_step(100, 0.1)
+    moving.before_step(None, 100, 0.1)
     assert moving.weights(image, place).all()
-    moving.before_step(100, 0.5)
+    moving.before_step(None, 100, 0.5)
     counted = moving.weights(image, place) > 0
     assert not counted[patch].any() and counted[image != 1].all()
     assert counted[(image == 1) & (place > 0.2 + 2 / CELLS).any(-1)].all()
@@ -343,14 +344,14 @@ def test_controls_are_passed_on_and_exposures_are_made_one(exposed):
     for block, told in ((method, 0.5), (brighter, -0.5)):
         expected = Placed(block.given(exposure=told), HERE).rendering(camera)
         index = int(block is brighter)
-        torch.testing.assert_close(both.parts[index].rendering(camera).rgb, expected.rgb)
+        torch.testing.assert_close(both.blocks[index].rendering(camera).rgb, expected.rgb)
     assert all(x.render(camera).rgb.isfinite().all() for x in near)
     more, most = (both.given(exposure=x) for x in (0.5, 1.5))
-    assert more.parts[0].method.told["exposure"] == pytest.approx(1)
-    assert most.parts[0].method.told["exposure"] == pytest.approx(1)  # no more than it learnt from
+    assert more.blocks[0].method.told["exposure"] == pytest.approx(1)
+    assert most.blocks[0].method.told["exposure"] == pytest.approx(1)  # no more than it learnt from
     shot = scene.photograph(0)
     taken = both.given(shot)
-    assert taken.parts[0].method.told["exposure"] == pytest.approx(1 - stops(0), abs=1e-4)
+    assert taken.blocks[0].method.told["exposure"] == pytest.approx(1 - stops(0), abs=1e-4)
     with pytest.raises(LumigraphError, match="does not learn"):
         both.batch(scene, torch.Generator())
     with pytest.raises(LumigraphError, match="as many centres"):

@@ -22,6 +22,7 @@ from proofs import kept
 from safetensors.torch import load_file
 from streets import crossing_streets, write_street
 
+from lumigraph.budget import Budget
 from lumigraph.capture import Places, open_scene, places_of, read_capture
 from lumigraph.commands.cli import main
 from lumigraph.errors import LumigraphError, LumigraphWarning
@@ -30,7 +31,6 @@ from lumigraph.large.on_ray import Workers
 from lumigraph.large.plan import Plan, Task
 from lumigraph.methods import find
 from lumigraph.run import Run, open_any
-from lumigraph.run.budget import Budget
 from lumigraph.run.splat_file import SplatFile
 from lumigraph.training import fit
 
@@ -254,7 +254,7 @@ def test_blocks_are_shown_in_one_light_and_known_ones_keep_theirs(street, tmp_pa
     assert training.finish(folder).appearance == first and (folder / "blocks.json").read_bytes() == before
     assert training.finish(folder, again=["1"]).appearance["0"] == first["0"]
     opened = BlockRun(folder)
-    shown = [part.method.shown_in.code.tolist() for part in opened.method().parts]
+    shown = [part.method.shown_in.code.tolist() for part in opened.method().blocks]
     assert shown == [pytest.approx(Plan.read(folder / "blocks.json").appearance[name]) for name in "01"]
 
 

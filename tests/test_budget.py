@@ -10,12 +10,11 @@ import torch
 from budgets import budget
 
 from lumigraph import methods
+from lumigraph.budget import QUALITIES, REJOIN, Budget, Effort, lasting
 from lumigraph.commands.cli import main
 from lumigraph.errors import LumigraphError
 from lumigraph.evaluation import evaluate
-from lumigraph.method.quality import QUALITIES, Effort
 from lumigraph.run import Run, build
-from lumigraph.run.budget import REJOIN, Budget, lasting
 from lumigraph.training import fit
 
 pytestmark = budget("runs", 8)

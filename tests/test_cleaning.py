@@ -150,7 +150,7 @@ def test_the_moments_of_those_left_stay_with_them(cloud_run):
     keep = torch.rand(len(method.cloud), generator=generator) < 0.5
     method.prune(keep)
     assert torch.equal(optimizer.state[method.cloud.means]["mean"], moments[keep])
-    assert len(method.density_control.pulls) == int(keep.sum()) == len(method.gaussians())
+    assert len(method.density_control.positional_gradient_sum) == int(keep.sum()) == len(method.gaussians())
 
 
 def test_exports_of_a_part_hold_as_many_as_another_reader_counts(cloud_run, tmp_path, capsys):

@@ -62,8 +62,8 @@ STEPS, PAUSES, LATER = 24, (5, 18), 48
 SHOWN = 4  # the camera whose picture is looked at, a held-out one
 DEVICES = ["cpu", *(["cuda"] if torch.cuda.is_available() else [])]
 NAMES = methods.available()  # tiny adds the tests' own
-HOME = Path(lumigraph.methods.__file__).parent
-OWN = [name for name in NAMES if any(HOME.glob(f"{name.replace('-', '_')}{end}") for end in (".py", "/__init__.py"))]
+METHODS = {path.stem for path in Path(lumigraph.methods.__file__).parent.iterdir()}  # files and folders
+OWN = [name for name in NAMES if name.replace("-", "_") in METHODS]
 # Of lenses: the house's, not those of other tests; a batch of several kinds is of no kind of its own.
 KINDS = sorted(name for name, kind in Lens.kinds.items() if kind.__module__ == Lens.__module__ and name != "mixed")
 DOCS = Path(__file__).parent.parent / "docs" / "methods"

@@ -16,7 +16,6 @@ from lumigraph import methods
 from lumigraph.camera import ring
 from lumigraph.camera.rays import Look, Samples
 from lumigraph.commands.cli import main
-from lumigraph.components.clouds.at_surfaces import facing
 from lumigraph.components.fields.taken_over import OfDepthMaps, OfField, logit, taken_over
 from lumigraph.components.sampling.spaces import space_of
 from lumigraph.datasets.scene import Frame
@@ -28,6 +27,7 @@ from lumigraph.geometry import to_matrix, unit
 from lumigraph.kernels import spherical_harmonics
 from lumigraph.method import RayMethod
 from lumigraph.method.capabilities import FromField, HasField, can
+from lumigraph.methods.gaussian_splatting.surfaces import rotation_to_normal
 from lumigraph.metrics import psnr
 from lumigraph.run import Run, build, open_any
 from lumigraph.run.converted import Converted
@@ -125,7 +125,7 @@ def test_surfaces_are_where_cameras_see_them(known):
     assert len(seen) > 500 and (seen.points.norm(dim=-1) - RADIUS).abs().median() < 0.05
     along = (unit(seen.points) * seen.normals).sum(-1).abs()
     assert along.median() > 0.9
-    turned = to_matrix(facing(seen.normals))[:, :, 2]
+    turned = to_matrix(rotation_to_normal(seen.normals))[:, :, 2]
     torch.testing.assert_close((turned * seen.normals).sum(-1).abs(), torch.ones(len(seen)))
 
 

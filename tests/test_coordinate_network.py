@@ -27,8 +27,8 @@ def parameters(module: torch.nn.Module) -> int:
 def test_the_network_is_the_papers():
     """Mildenhall 2020, figure 7: 60 and 24 numbers in, eight layers, the input again after the fifth."""
     nerf = NeRF(Frame(), Config())
-    assert parameters(nerf.fine) == parameters(nerf.coarse) == 593_924
-    shapes = [tuple(p.shape) for p in nerf.fine.parameters() if p.ndim == 2]
+    assert parameters(nerf.network.network) == parameters(nerf.network.coarse.network) == 593_924
+    shapes = [tuple(p.shape) for p in nerf.network.network.parameters() if p.ndim == 2]
     wide = [(256, 256)] * 4
     assert shapes == [(256, 60), *wide, (256, 316), *wide[:2], (1, 256), (256, 256), (128, 280), (3, 128)]
 

@@ -14,10 +14,11 @@ from torch.nn.functional import normalize
 
 from lumigraph.camera import Camera
 from lumigraph.camera.lens import Fisheye, OpenCV, Pinhole
-from lumigraph.components.clouds import dense_points, initial_cloud
+from lumigraph.components.clouds import dense_points
 from lumigraph.components.clouds.flat_view import flat_view
 from lumigraph.datasets.images import ImageStore
 from lumigraph.datasets.scene import Frame, Scene
+from lumigraph.methods.gaussian_splatting import initialization
 
 pytestmark = budget("methods", 8)
 
@@ -113,18 +114,18 @@ def test_one_photograph_alone_has_no_dense_points():
 
 def test_a_cloud_begins_at_known_points_dense_ones_and_far_out(generator, monkeypatch):
     scene = ball(alpha=False)
-    monkeypatch.setattr(initial_cloud, "dense_points", lambda scene, seconds: dense(alpha=False))
+    monkeypatch.setattr(initialization, "dense_points", lambda scene, seconds: dense(alpha=False))
     known = RADIUS * normalize(torch.randn(300, 3, generator=generator), dim=-1)
-    begun = initial_cloud.initial_cloud(replace(scene, points=known), "dense", 200, 2000, 1, generator)
+    begun = initialization.initial_cloud(replace(scene, points=known), "dense", 200, 2000, 1, generator)
     assert len(begun) == 667  # a third
     assert {tuple(p) for p in known.tolist()} <= {tuple(p) for p in begun.means.tolist()}
-    begun = initial_cloud.initial_cloud(scene, "dense", 200, 5000, 1, generator)
+    begun = initialization.initial_cloud(scene, "dense", 200, 5000, 1, generator)
     assert (begun.means[-40:].norm(dim=-1) > 1.7).all()  # a fifth of 200, outside the box
-    assert len(initial_cloud.initial_cloud(scene, "random", 200, 5000, 1, generator)) == 200
+    assert len(initialization.initial_cloud(scene, "random", 200, 5000, 1, generator)) == 200
 
 
 def test_the_same_photographs_give_the_same_cloud():
-    begun = initial_cloud.initial_cloud(ball(), "dense", 9, 300, 1, torch.Generator().manual_seed(3))
+    begun = initialization.initial_cloud(ball(), "dense", 9, 300, 1, torch.Generator().manual_seed(3))
     positions = dense().positions
     chosen = torch.randperm(len(positions), generator=torch.Generator().manual_seed(3))[:100]
     assert torch.equal(begun.means, positions[chosen])

@@ -8,24 +8,33 @@ import torch
 from budgets import budget
 from test_gaussians import NAMES, cloud
 
-from lumigraph.components.clouds.cloud import Cloud, CloudAdam
-from lumigraph.components.clouds.density_control import FAINT, AdaptiveDensity, MarkovChain, sample_by, shared_out
-from lumigraph.components.clouds.initial_cloud import initial_cloud, nearest_distance
-from lumigraph.components.clouds.smoothing import VARIANCE, sampling_interval, smoothed
+from lumigraph.methods.gaussian_splatting.adaptive import AdaptiveDensity, AdaptiveNumbers
+from lumigraph.methods.gaussian_splatting.cloud import Cloud, CloudAdam
+from lumigraph.methods.gaussian_splatting.density_control import PRUNE_OPACITY, RefineNumbers
+from lumigraph.methods.gaussian_splatting.initialization import initial_cloud, nearest_distance
+from lumigraph.methods.gaussian_splatting.mcmc import MarkovChain, McmcNumbers, sample_by, shared_out
+from lumigraph.methods.gaussian_splatting.mip_filter import FILTER_VARIANCE, convolved, sampling_interval
 
 pytestmark = budget("methods")
 
 
-def optimizer_of(some: Cloud, rate: float = 0.01) -> CloudAdam:
-    return CloudAdam([{"params": [getattr(some, name)], "lr": rate} for name in NAMES])
+def learn(some: Cloud, rate: float = 0.01) -> CloudAdam:
+    """An optimizer of a cloud, which took one step, so that every moment is there."""
+    some.optimizer = CloudAdam([{"params": [getattr(some, name)], "lr": rate} for name in NAMES])
+    stepped(some)
+    return some.optimizer
 
 
-def stepped(some: Cloud, optimizer: CloudAdam) -> None:
-    """One step, so that every moment is there."""
+def stepped(some: Cloud) -> None:
+    """Take one step."""
     for name in NAMES:
         getattr(some, name).grad = torch.ones_like(getattr(some, name))
-    optimizer.step()
-    optimizer.zero_grad()
+    some.optimizer.step()
+    some.optimizer.zero_grad()
+
+
+def adaptive(count: int, threshold: float) -> AdaptiveDensity:
+    return AdaptiveDensity(RefineNumbers(), AdaptiveNumbers(densify_grad_threshold=threshold), count)
 
 
 def test_where_everything_moves_it_is_adam(generator):
@@ -43,7 +52,7 @@ def test_where_everything_moves_it_is_adam(generator):
 @pytest.mark.parametrize("device", ["cpu", "as on a GPU"])
 def test_a_row_seen_now_and_then_goes_as_far_as_adam_would_take_it(device, monkeypatch):
     """A row with a gradient in every 20th step: the same as Adam, which moves it in all of them, in the end."""
-    from lumigraph.components.clouds import cloud as module
+    from lumigraph.methods.gaussian_splatting import cloud as module
 
     if device != "cpu":
 
@@ -74,14 +83,13 @@ def test_rows_without_gradient_stay_and_columns_have_their_own_rates(generator):
 
 def test_rebuilding_takes_moments_along(generator):
     some = Cloud(cloud(6))
-    optimizer = optimizer_of(some)
-    stepped(some, optimizer)
+    optimizer = learn(some)
     means, square = some.means.detach().clone(), optimizer.state[some.means]["square"].clone()
-    some.rebuild(optimizer, torch.tensor([5, 0, 0]), torch.tensor([False, False, True]))
+    some.rebuild(torch.tensor([5, 0, 0]), torch.tensor([False, False, True]))
     assert len(some) == 3 and torch.equal(some.means.detach(), means[[5, 0, 0]])
     assert torch.equal(optimizer.state[some.means]["square"][:2], square[[5, 0]])
     assert (optimizer.state[some.means]["square"][2] == 0).all()
-    stepped(some, optimizer)  # and it goes on moving what it now holds
+    stepped(some)  # and it goes on moving what it now holds
     assert not torch.equal(some.means.detach(), means[[5, 0, 0]])
 
 
@@ -89,14 +97,14 @@ def test_small_ones_are_cloned_large_ones_split_and_faint_ones_go(generator):
     some = Cloud(cloud(4))
     with torch.no_grad():
         some.log_scales[:] = torch.tensor([0.001, 0.5, 0.01, 0.01]).log()[:, None]
-        some.opacities[:] = torch.tensor([0.5, 0.5, 0.5, FAINT / 2]).logit()
+        some.opacities[:] = torch.tensor([0.5, 0.5, 0.5, PRUNE_OPACITY / 2]).logit()
     before = some.gaussians().means.detach().clone()
-    optimizer, control = optimizer_of(some, rate=0.0), AdaptiveDensity(4, grad_threshold=0.5)
-    stepped(some, optimizer)
-    pull = torch.tensor([[1.0, 0.0], [0.0, 1.0], [0.1, 0.1], [9.0, 9.0]])
-    control.note(pull, torch.ones(4, dtype=torch.bool), (2, 2))
-    assert not control.refine(some, optimizer, 1.0, 100, generator)
-    assert len(some) == 5 and len(control.pulls) == 5
+    control = adaptive(4, 0.5)
+    learn(some, rate=0.0)
+    gradient = torch.tensor([[1.0, 0.0], [0.0, 1.0], [0.1, 0.1], [9.0, 9.0]])
+    control.record(gradient, torch.ones(4, dtype=torch.bool), (2, 2))
+    assert not control.refine(some, 1.0, 100, generator)
+    assert len(some) == 5 and len(control.positional_gradient_sum) == 5
     means, scales = some.means.detach(), some.log_scales.detach().exp()[:, 0]
     assert torch.equal(means[0], before[0]) and torch.equal(means[3], before[0])  # the clone lies upon its original
     assert torch.equal(means[2], before[2])
@@ -108,22 +116,21 @@ def test_a_cloud_grows_no_further_than_it_may_and_says_so(generator):
     some = Cloud(cloud(10))
     with torch.no_grad():
         some.opacities[:] = 0.0
-    optimizer, control = optimizer_of(some), AdaptiveDensity(10, grad_threshold=0.5)
-    stepped(some, optimizer)
+    control = adaptive(10, 0.5)
+    learn(some)
     with torch.no_grad():
         some.log_scales[:] = -9.0
-    control.note(torch.arange(10.0)[:, None].repeat(1, 2), torch.ones(10, dtype=torch.bool), (2, 2))
+    control.record(torch.arange(10.0)[:, None].repeat(1, 2), torch.ones(10, dtype=torch.bool), (2, 2))
     strongest = some.means.detach()[[8, 9]].clone()
-    assert control.refine(some, optimizer, 1.0, 12, generator)
+    assert control.refine(some, 1.0, 12, generator)
     assert len(some) == 12 and torch.equal(some.means.detach()[10:], strongest)
 
 
 def test_opacity_is_reset_for_all_but_the_faint():
-    some, control = Cloud(cloud(20)), AdaptiveDensity(20, grad_threshold=1.0)
-    optimizer = optimizer_of(some)
-    stepped(some, optimizer)
-    control.reset_opacity(some, optimizer)
-    assert (some.opacities.sigmoid() <= 2 * FAINT + 1e-6).all()
+    some, control = Cloud(cloud(20)), adaptive(20, 1.0)
+    optimizer = learn(some)
+    control.reset_opacity(some)
+    assert (some.opacities.sigmoid() <= 2 * PRUNE_OPACITY + 1e-6).all()
     assert (optimizer.state[some.opacities]["mean"] == 0).all()
 
 
@@ -148,14 +155,13 @@ def test_copies_together_look_as_the_one_did(copies):
 def test_the_dead_move_to_the_living_and_new_ones_join(generator):
     some = Cloud(cloud(12))
     with torch.no_grad():
-        some.opacities[:] = torch.tensor([0.9] * 4 + [FAINT / 5] * 8).logit()
-    optimizer = optimizer_of(some, rate=0.0)
-    stepped(some, optimizer)
+        some.opacities[:] = torch.tensor([0.9] * 4 + [PRUNE_OPACITY / 5] * 8).logit()
+    learn(some, rate=0.0)
     living = some.means.detach()[:4].clone()
-    MarkovChain().refine(some, optimizer, 15, generator)
+    MarkovChain(RefineNumbers(), McmcNumbers()).refine(some, 15, generator)
     assert len(some) == 15
     distance = (some.means.detach()[:, None] - living).norm(dim=-1).amin(1)
-    assert (distance == 0).all() and (some.opacities.sigmoid() > FAINT).all()
+    assert (distance == 0).all() and (some.opacities.sigmoid() > PRUNE_OPACITY).all()
 
 
 def test_noise_moves_the_transparent_and_leaves_the_opaque(generator):
@@ -163,7 +169,7 @@ def test_noise_moves_the_transparent_and_leaves_the_opaque(generator):
     with torch.no_grad():
         some.opacities[:20], some.opacities[20:] = torch.tensor(0.9).logit(), torch.tensor(0.001).logit()
     before = some.means.detach().clone()
-    MarkovChain().explore(some, 1e-4, generator)
+    MarkovChain(RefineNumbers(), McmcNumbers()).explore(some, 1e-4, generator)
     moved = (some.means.detach() - before).norm(dim=-1)
     assert (moved[:20] == 0).all() and (moved[20:] > 0).all()
 
@@ -177,8 +183,8 @@ def test_sampling_follows_the_weights(generator):
 def test_a_filtered_cloud_keeps_its_light():
     """The 3-D filter convolves: wider, and fainter by as much (opacity times the root of the determinant stays)."""
     some = cloud(30)
-    wider = smoothed(some, torch.full((30,), 0.1))
-    torch.testing.assert_close((2 * wider.log_scales).exp(), (2 * some.log_scales).exp() + VARIANCE * 0.01)
+    wider = convolved(some, torch.full((30,), 0.1))
+    torch.testing.assert_close((2 * wider.log_scales).exp(), (2 * some.log_scales).exp() + FILTER_VARIANCE * 0.01)
     for a in (some, wider):
         a_light = a.opacities.sigmoid() * a.log_scales.sum(-1).exp()
         torch.testing.assert_close(a_light, some.opacities.sigmoid() * some.log_scales.sum(-1).exp(), rtol=1e-4, atol=0)

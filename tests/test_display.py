@@ -12,10 +12,10 @@ import torch
 from budgets import budget
 
 from lumigraph import methods
+from lumigraph.budget import Budget
 from lumigraph.capture import open_scene
 from lumigraph.datasets.scene import Batch
 from lumigraph.run import build
-from lumigraph.run.budget import Budget
 from lumigraph.system.console import console
 from lumigraph.training import fit
 from lumigraph.training.announce import how_long, learner, learnt_from, machine

@@ -17,7 +17,7 @@ from lumigraph.components.training.lazy_adam import LazyAdam
 from lumigraph.datasets.scene import Frame
 from lumigraph.evaluation import evaluate
 from lumigraph.explain.activation import fits
-from lumigraph.methods.dvgo import DVGO, shift_of
+from lumigraph.methods.dvgo import DVGO, point_error, shift_of
 from lumigraph.run import build
 from lumigraph.training import fit
 from lumigraph.volume import weights_of
@@ -77,7 +77,7 @@ def test_the_tight_box_has_a_voxel_around_what_is_inside():
 
 def test_what_was_dense_stays_as_dense_and_the_rest_begins_anew():
     made = method(Frame())
-    grid = made.density_grid
+    grid = made.network.density_grid
     places = corners(grid.box, grid.shape)
     grid.values.data[(places.abs() < 0.45).all(-1)] = 20.0
     middle, outside = torch.zeros(1, 3), torch.full((1, 3), 0.55)
@@ -85,7 +85,7 @@ def test_what_was_dense_stays_as_dense_and_the_rest_begins_anew():
     made._advance(1)
     torch.testing.assert_close(made.density(middle), before, rtol=1e-4, atol=0.0)
     assert float(grid.box.abs().max()) < 0.7
-    free = -math.log1p(-made.config.fine_alpha) / float(made.edge)
+    free = -math.log1p(-made.config.fine_alpha) / float(made.network.edge)
     assert made.density(outside).item() >= 0.99 * free
     assert made._stage_at(0.0) == 0 and made._stage_at(1.0) == 1 + made.config.doublings
 
@@ -100,8 +100,8 @@ def test_contracted_voxels_are_thinner_the_larger_they_are():
 def test_rates_are_shares_of_the_photographs_that_see_a_voxel(frame):
     scene = tiny.scene()
     made = method(replace(frame, image_count=len(scene.cameras)))
-    rates = made._views(replace(scene, frame=made.frame))
-    assert len(rates) == len(made.density_grid.values)
+    rates = made._view_share(replace(scene, frame=made.frame))
+    assert len(rates) == len(made.network.density_grid.values)
     assert 0 <= float(rates.min()) < float(rates.max()) <= 1
 
 
@@ -114,13 +114,12 @@ def test_a_row_learns_at_its_own_rate():
 
 
 def test_each_sample_answers_for_its_own_colour(generator):
-    made = method(Frame())
     samples = Samples.rows(torch.tensor([[1.0, 1.5], [2.0, 2.25]]), torch.tensor([2.0, 3.0]))
     density, rgb = torch.rand(4, generator=generator), torch.rand(4, 3, generator=generator)
     target = torch.rand(2, 3, generator=generator)
     off = (rgb - target.repeat_interleave(2, 0)).square().mean(-1)
     wanted = (weights_of(samples, density) * off).sum() / 2
-    torch.testing.assert_close(made._points(Look("samples", samples, density, rgb), target), wanted)
+    torch.testing.assert_close(point_error(Look("samples", samples, density, rgb), target), wanted)
 
 
 def test_it_learns_held_out_views():
@@ -128,5 +127,5 @@ def test_it_learns_held_out_views():
     made = method(scene.frame)
     before = evaluate(made, scene).psnr
     fit(made, scene, None, steps=40, show=False, rehearsal=False)
-    assert int(made.stage) == 1 + made.config.doublings
+    assert int(made.network.stage) == 1 + made.config.doublings
     assert evaluate(made, scene).psnr > before + 6

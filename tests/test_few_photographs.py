@@ -11,8 +11,8 @@ import torch
 from budgets import budget
 from test_gaussian_splatting import new
 
-from lumigraph.components.clouds.few_photographs import some_left_out, unseen_roughness
-from lumigraph.components.clouds.initial_cloud import round_gaussians
+from lumigraph.methods.gaussian_splatting.few_views import depth_roughness, drop_gaussians
+from lumigraph.methods.gaussian_splatting.initialization import round_gaussians
 from lumigraph.training import fit
 
 pytestmark = budget("methods")
@@ -33,7 +33,7 @@ def plates(count: int, spread: float = 0.0):
 def test_a_share_is_gone_and_the_others_make_up_for_it():
     cloud = plates(20_000)
     cloud.opacities.requires_grad_()
-    seen = some_left_out(cloud, 0.2, chance()).opacities.sigmoid()
+    seen = drop_gaussians(cloud, 0.2, chance()).opacities.sigmoid()
     there = seen > 1e-6
     assert float(there.float().mean()) == pytest.approx(0.8, abs=0.01)
     assert torch.allclose(seen[there], torch.tensor(0.5 / 0.8))
@@ -44,12 +44,12 @@ def test_a_share_is_gone_and_the_others_make_up_for_it():
 
 def test_nothing_is_left_out_at_first():
     cloud = plates(100)
-    assert torch.allclose(some_left_out(cloud, 0.0, chance()).opacities, cloud.opacities, atol=1e-6)
+    assert torch.allclose(drop_gaussians(cloud, 0.0, chance()).opacities, cloud.opacities, atol=1e-6)
 
 
 def test_what_is_opaque_stays_possible():
     cloud = replace(plates(100), opacities=torch.full((100,), 20.0))
-    seen = some_left_out(cloud, 0.2, chance()).opacities
+    seen = drop_gaussians(cloud, 0.2, chance()).opacities
     assert seen.isfinite().all() and float(seen.max()) < math.log(1000)
 
 
@@ -68,20 +68,20 @@ def test_a_wall_is_smoother_than_a_heap():
     """And the slope of roughness takes bumps away."""
     (flat, camera), (rough, _) = wall(0.0), wall(0.2)
     cameras = type(camera).cat([camera, camera])  # so that what is between them is seen from there too
-    smooth, heap = (float(unseen_roughness(x, cameras, 0.1, chance())) for x in (flat, rough))
+    smooth, heap = (float(depth_roughness(x, cameras, 0.1, chance())) for x in (flat, rough))
     assert smooth < 0.2 * heap
     means = rough.means.clone().requires_grad_()
-    before = unseen_roughness(replace(rough, means=means), cameras, 0.1, chance())
+    before = depth_roughness(replace(rough, means=means), cameras, 0.1, chance())
     before.backward()
     length = 0.05 * float(means.detach().std()) / float(means.grad.norm(dim=-1).max())
-    after = unseen_roughness(replace(rough, means=(means - length * means.grad).detach()), cameras, 0.1, chance())
+    after = depth_roughness(replace(rough, means=(means - length * means.grad).detach()), cameras, 0.1, chance())
     assert float(after) < float(before)
 
 
 def test_few_views_have_plain_colours_and_a_term_of_depth():
     method, _ = new(few_views=True, depth_weight=2.0)
     fit(method, tiny.scene(), steps=12, show=False, rehearsal=False)
-    assert method._bands == 1 and not method.cloud.harmonics[:, 1:].any()
+    assert method.bands == 1 and not method.cloud.harmonics[:, 1:].any()
     terms = method.loss(method.batch(tiny.scene(), chance()), 12)
     assert float(terms["depth"]) > 0
     terms["depth"].backward()

@@ -17,6 +17,7 @@ from lumigraph.errors import LumigraphError, LumigraphWarning
 from lumigraph.evaluation import evaluate
 from lumigraph.exchange import read_gaussians, write_gaussians
 from lumigraph.export.splats import export_splats
+from lumigraph.files.ranges import changed
 from lumigraph.gaussians.splatting import render
 from lumigraph.method.capabilities import HasGaussians, needs
 from lumigraph.metrics import psnr
@@ -39,7 +40,7 @@ GROWING = {
 def new(folder=None, **config):
     """A method that changes its cloud early and often, and a run for it."""
     kind, scene = methods.find("gaussian-splatting"), tiny.scene()
-    method = build(kind, scene.frame, kind.Config(**GROWING | config), torch.device("cpu"), 0)
+    method = build(kind, scene.frame, changed(kind.Config(), **GROWING | config), torch.device("cpu"), 0)
     return method, None if folder is None else Run.create(folder, method, scene)
 
 
@@ -102,7 +103,7 @@ def test_harmonics_rise_in_steps():
     raised = []
     for step, progress in [(0, 0.0), (999, 0.01), (1000, 0.01), (10, 0.3), (5000, 0.9)]:
         method.before_step(step, progress)
-        raised.append(method._bands)
+        raised.append(method.bands)
     assert raised == [1, 1, 2, 3, 4]
 
 

@@ -21,6 +21,7 @@ FLOORS: list[set[str]] = [
     {"errors"},
     {"system"},
     {"color", "files"},
+    {"budget"},
     {"geometry"},
     {"camera", "figures", "metrics"},
     {"kernels"},

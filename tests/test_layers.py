@@ -19,11 +19,11 @@ from lumigraph import synthetic as procedural
 from lumigraph.camera.lens import Pinhole
 from lumigraph.capture import READERS, assemble, multiscale, open_scene
 from lumigraph.capture.capture import Capture, Plane, Shot
-from lumigraph.capture.readers import LISTED, NAMES
 from lumigraph.color.blending import before, over
 from lumigraph.datasets.images import ImageStore, Layer, LayerSource, resized
 from lumigraph.datasets.scene import Photograph, Scene
 from lumigraph.errors import LumigraphError, LumigraphWarning
+from lumigraph.files.readers import LISTED, NAMES
 from lumigraph.synthetic import rendering
 
 WHERE = pytest.mark.parametrize("memory", [None, 0], ids=["memory", "file"])

@@ -14,6 +14,7 @@ from budgets import budget
 from lumigraph import methods
 from lumigraph.errors import LumigraphError
 from lumigraph.export.film import film
+from lumigraph.files.ranges import changed
 from lumigraph.run import build
 from lumigraph.run.needs import bytes_of
 from lumigraph.system import memory
@@ -24,7 +25,8 @@ pytestmark = budget("runs", 12)
 
 TAKE = """
 import torch
-from lumigraph import memory, methods
+from lumigraph import methods
+from lumigraph.system import memory
 from lumigraph.errors import LumigraphError
 from lumigraph.export.film import film
 from lumigraph.system.memory import peak_memory, want_of_memory
@@ -102,7 +104,7 @@ def test_what_memory_does_not_hold_is_told_before_it_is_made(name, monkeypatch):
     with pytest.raises(
         LumigraphError, match=rf"{name} .* would need .* GB of memory, and 0\.2 GB are free.* --{option} "
     ):
-        build(kind, tiny.scene().frame, kind.Config(**numbers), CPU, 0, learning=True)
+        build(kind, tiny.scene().frame, changed(kind.Config(), **numbers), CPU, 0, learning=True)
 
 
 def test_it_is_told_how_large_a_grid_would_fit(monkeypatch):

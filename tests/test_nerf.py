@@ -16,6 +16,7 @@ from lumigraph.datasets.images import ImageStore
 from lumigraph.datasets.scene import Forward, Frame, Scene
 from lumigraph.errors import LumigraphError
 from lumigraph.evaluation import evaluate
+from lumigraph.files.ranges import changed
 from lumigraph.method import RayMethod
 from lumigraph.methods import mip_nerf, nerf
 from lumigraph.metrics import psnr
@@ -39,7 +40,7 @@ KIND = pytest.mark.parametrize("kind", KINDS.values(), ids=KINDS)
 
 
 def method(kind: type[RayMethod], frame: Frame | None = None, **options) -> RayMethod:
-    config = kind.Config(**SMALL | QUICK | {"position_frequencies": 6} | options)
+    config = changed(kind.Config(), **SMALL | QUICK | {"position_frequencies": 6} | options)
     return build(kind, frame or tiny.scene().frame, config, torch.device("cpu"), 0)
 
 
@@ -96,9 +97,9 @@ def test_samples_go_where_the_first_look_found_something(kind):
             x = torch.atan2(sine, cosine) / (torch.pi if kind is nerf.NeRF else 1)
             return found(x) - 30 * (kind is mip_nerf.MipNeRF)
 
-    for name in ("fine", "coarse", "network"):
-        if hasattr(made, name):
-            setattr(made, name, Shell(1, 1, 2, 2))
+    for field in (made.network, made.network.coarse):
+        if field:
+            field.network = Shell(1, 1, 2, 2)
     middle = Rays(torch.tensor([[0.0, 0.0, -3.0]]), torch.tensor([[0.0, 0.0, 1.0]]), torch.tensor([1e-3]))
     _, fine = made.looks(middle)
     near = (fine.samples.t - 2.5).abs() < 0.15
@@ -112,13 +113,14 @@ def test_skipping_empty_space_keeps_the_picture(kind):
     made = method(kind, learning_rate=7e-3)
     fit(made, scene, steps=100, show=False, rehearsal=False)
     everywhere = made.render(camera).rgb
-    asked = made.statistics()["samples"]
-    made.empty = OccupancyMask(32, 1e-4)
+    rays = camera.rays(camera.pixels())
+    asked = made.sampler.sample(rays, made.network)[-1].evaluated
+    made.sampler.empty = empty = OccupancyMask(32, 1e-4)
     for seed in range(6):
-        made.empty.grid.update(made.density, 1e-4, torch.Generator().manual_seed(seed), decay=1.0)
-    assert 0 < made.empty.grid.share < 0.8
+        empty.grid.update(made.density, 1e-4, torch.Generator().manual_seed(seed), decay=1.0)
+    assert 0 < empty.grid.share < 0.8
     skipping = made.render(camera).rgb
-    assert made.statistics()["samples"] < 0.9 * asked
+    assert made.sampler.sample(rays, made.network)[-1].evaluated < 0.9 * asked
     assert psnr(skipping.clamp(0, 1), everywhere.clamp(0, 1)) > 40
 
 
@@ -174,9 +176,11 @@ def test_density_of_points_is_what_rays_integrate(kind):
     made = method(kind, frame).eval()
     look = made.looks(Rays(torch.zeros(1, 3), torch.tensor([[0.0, 0.0, 1.0]]), torch.tensor([1e-2])))[1]
     points = torch.stack([0 * look.samples.t_start, 0 * look.samples.t_start, look.samples.t_start], -1)
-    ratio = made.space.along(Rays(torch.zeros(1, 3), torch.tensor([[0.0, 0.0, 1.0]]), torch.ones(1)), look.samples)
+    ratio = made.network.space.along(
+        Rays(torch.zeros(1, 3), torch.tensor([[0.0, 0.0, 1.0]]), torch.ones(1)), look.samples
+    )
     if kind is nerf.NeRF:
-        raw = made._density_at(made.space.warp(points))
+        raw = made.network.density_at(made.network.space.warp(points))
         torch.testing.assert_close(look.density, raw * ratio, rtol=2e-2, atol=1e-4)
     assert made.density(points).shape == (len(points),) and (made.density(points) >= 0).all()
 
@@ -185,8 +189,8 @@ def test_mip_nerf_sees_less_detail_through_wider_cones():
     """The same point, seen from a wide cone and a narrow one: what the network is told has faded."""
     made = method(mip_nerf.MipNeRF)
     p, wide = torch.tensor([[0.3, 0.1, -0.2]]), torch.full((1, 3), 0.3)
-    narrow = made.encode_frustum(p, torch.zeros(1, 3)).abs()
-    faded = made.encode_frustum(p, wide).abs()
+    narrow = made.network.encode_position(p, torch.zeros(1, 3)).abs()
+    faded = made.network.encode_position(p, wide).abs()
     assert (faded <= narrow + 1e-6).all()
     assert float(faded[:, -6:].max()) < 1e-6 < float(narrow[:, -6:].max())
 

@@ -10,19 +10,19 @@ import tiny
 import torch
 from budgets import budget
 
-from lumigraph.camera.rays import Rays, Samples
+from lumigraph.camera.rays import Look, Rays, Samples
 from lumigraph.components.fields.appearance import PhotographCodes
 from lumigraph.components.fields.code_space import fitted
-from lumigraph.components.fields.coded_field import Places
-from lumigraph.components.fields.wild_field import Passing, with_passing
 from lumigraph.datasets.images import ImageStore
 from lumigraph.datasets.scene import Scene
 from lumigraph.errors import LumigraphError
 from lumigraph.evaluation import evaluate
 from lumigraph.evaluation.halves import judged_by_halves, left_half
+from lumigraph.files.ranges import changed
 from lumigraph.method.capabilities import HasDensity, HasField, HasLooks, can
 from lumigraph.method.controls import Control
 from lumigraph.methods.nerf_w import NeRFW
+from lumigraph.methods.nerf_w.transient import Transient, with_transient
 from lumigraph.run import build
 from lumigraph.training import fit
 from lumigraph.volume import composite
@@ -37,7 +37,7 @@ FIELDS = pytest.mark.parametrize("options", [{}, NETWORK], ids=["hash", "network
 
 
 def made(scene: Scene, **options) -> NeRFW:
-    return build(NeRFW, scene.frame, replace(NeRFW.smallest(), **options), torch.device("cpu"), 0)
+    return build(NeRFW, scene.frame, changed(NeRFW.smallest(), **options), torch.device("cpu"), 0)
 
 
 def dark(image: int) -> bool:
@@ -71,9 +71,7 @@ def test_passing_and_staying_have_alphas_of_their_own():
     still[2] = moving[2] = moving[7] = 0.0
     rgb, other = (torch.rand(12, 3, generator=random) for _ in range(2))
     beta, background = torch.rand(12, generator=random), torch.tensor([[0.2, 0.4, 0.6]])
-    nothing = torch.zeros(12, 1)
-    places = Places("all", samples, still, (nothing, nothing), nothing, torch.ones(12), 12)
-    seen = with_passing(places, rgb, Passing(moving, other, beta), background)
+    seen = with_transient(Look("all", samples, still, rgb), Transient(moving, other, beta), background)
     for ray in range(3):
         light, alone, colour, deviation = 1.0, 1.0, torch.zeros(3), 0.0
         for i in range(int(starts[ray]), int(starts[ray + 1])):
@@ -93,11 +91,11 @@ def test_the_loss_is_that_of_the_paper(options):
     batch = replace(method.batch(scene, torch.Generator().manual_seed(0)), alpha=None)
     terms = method.loss(batch, 0)
     index, c = batch.rays.image_index, method.config
-    *coarse, last = method.network.passes(batch.rays, method.random(0))
+    *coarse, last = method.sampler.sample(batch.rays, method.network, generator=method.random(0))
     ray = last.samples.ray_index
-    rgb = method.network.colour(last, method.appearance.codes[index][ray])
-    passing = method.network.passing(last, method.transient.codes[index][ray])
-    seen = with_passing(last, rgb, passing, method.background)
+    look = last.look(method.network, method.appearance.codes[index])
+    passing = method.transients(batch.rays, last, method.transient.codes[index])
+    seen = with_transient(look, passing, method.background)
     beta = c.beta_min + seen.extra["beta"]
     error = (seen.rgb - batch.rgb).square().sum(-1)
     density = [passing.density[ray == i].mean() for i in range(len(batch)) if (ray == i).any()]
@@ -106,7 +104,7 @@ def test_the_loss_is_that_of_the_paper(options):
     torch.testing.assert_close(terms["transient"], c.transient_weight * torch.stack(density).sum() / len(batch))
     assert set(terms) == {"colour", "uncertainty", "transient", *(places.name for places in coarse)}
     method.settling = True  # nobody passes yet
-    seen = composite(last.samples, last.density, rgb, method.background)
+    seen = composite(look.samples, look.density, look.rgb, method.background)
     alone = (seen.rgb - batch.rgb).square().sum(-1).mean() / (2 * c.beta_min**2)
     torch.testing.assert_close(method.loss(batch, 0)["colour"], alone)
 
@@ -117,7 +115,7 @@ def test_what_passes_is_never_in_the_static_picture(options):
     scene = two_lights()
     method = made(scene, **options)
     rays = scene.cameras[1].rays(scene.cameras[1].pixels())
-    passing = [*method.transient.parameters(), *method.network.transient.parameters()]
+    passing = [*method.transient.parameters(), *method.transient_head.parameters()]
     method.render_rays(rays, method.background).rgb.square().sum().backward()
     assert all(parameter.grad is None for parameter in passing)
     before = method.render(scene.cameras[1]).rgb
@@ -157,10 +155,10 @@ def test_the_light_of_a_photograph_is_found_on_its_left_half(taught):
     assert alone.psnr != average.psnr and halves.psnr > alone.psnr + 1
     shot = scene.photograph(0)
     found, again = (method.given(left_half(shot)) for _ in range(2))
-    assert torch.equal(found.found, again.found) and method.found is None
-    changed = shot.rgb.clone()
-    changed[:, tiny.SIZE // 2 :] = 0.5  # nothing of the right half tells
-    assert torch.equal(method.given(left_half(replace(shot, rgb=changed))).found, found.found)
+    assert torch.equal(found.appearance.found, again.appearance.found) and method.appearance.found is None
+    other = shot.rgb.clone()
+    other[:, tiny.SIZE // 2 :] = 0.5  # nothing of the right half tells
+    assert torch.equal(method.given(left_half(replace(shot, rgb=other))).appearance.found, found.appearance.found)
     assert torch.equal(found.given(appearance="average").render(shot.camera).rgb, method.render(shot.camera).rgb)
     blind = replace(shot, mask=torch.zeros(tiny.SIZE, tiny.SIZE, dtype=torch.bool))
     assert torch.equal(method.given(blind).render(shot.camera).rgb, method.render(shot.camera).rgb)
@@ -214,10 +212,10 @@ def test_skies_are_learnt_in_the_open_alone():
     method, generator = made(replace(scene, frame=wide)), torch.Generator().manual_seed(0)
     batch = replace(method.batch(scene, generator), alpha=None)
     codes = 0.5 * torch.randn(len(batch), 4, generator=generator)
-    sky = method.network.behind(batch.rays, codes, method.background)
+    sky = method.behind(batch.rays, codes, method.background)
     assert sky.shape == (len(batch), 3) and sky.std() > 0.01
-    assert not torch.equal(sky, method.network.behind(batch.rays, 2 * codes, method.background))
+    assert not torch.equal(sky, method.behind(batch.rays, 2 * codes, method.background))
     sum(method.loss(batch, 0).values()).backward()
-    assert all(weight.grad.any() for weight in method.network.sky.parameters())
+    assert all(weight.grad.any() for weight in method.sky.parameters())
     for other in (made(scene), made(replace(scene, frame=wide), own_skies=False)):
-        assert torch.equal(other.network.behind(batch.rays, codes, other.background), other.background)
+        assert torch.equal(other.behind(batch.rays, codes, other.background), other.background)

@@ -46,7 +46,7 @@ def test_what_no_photograph_has_shown_yet_is_no_fog():
     for frame in (FORWARD, Frame(reach=8.0, near=0.05)):
         for stage in (0, 1):
             method = DVGO(frame, DVGO.smallest())
-            method.stage.fill_(stage)
+            method.network.stage.fill_(stage)
             (look,) = method.looks(straight_ahead())
             assert float(weights_of(look.samples, look.density).sum()) < 0.1
 

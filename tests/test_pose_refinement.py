@@ -17,17 +17,18 @@ from lumigraph.camera.lens import Pinhole
 from lumigraph.capture import open_scene
 from lumigraph.capture.capture import Shot
 from lumigraph.capture.folds import about_fold
-from lumigraph.components.clouds.initial_cloud import random_cloud
-from lumigraph.components.clouds.seen_from import seen_from
 from lumigraph.components.fields.encodings import FrequencyEncoding
 from lumigraph.components.training.coarse_to_fine import BEGINS, ENDS, FIRST, band_weights
 from lumigraph.components.training.pose_refinement import PoseRefinement, seen_places
 from lumigraph.datasets.alignment import aligning, moves
 from lumigraph.datasets.images import ImageStore
 from lumigraph.evaluation.held_out_poses import HeldOutPoses, held_out_poses, pose_scores
+from lumigraph.files.ranges import changed
 from lumigraph.gaussians.splatting import splat, view_of
 from lumigraph.geometry import Similarity
 from lumigraph.method.capabilities import RefinesPoses, can
+from lumigraph.methods.gaussian_splatting.initialization import random_cloud
+from lumigraph.methods.gaussian_splatting.poses import seen_from
 from lumigraph.run import build
 from lumigraph.training.verdict import cameras_moved
 
@@ -37,7 +38,7 @@ SMALL = {"nerf": {"position_frequencies": 3, "bfloat16": False}, "mip-nerf": {"b
 
 def refining(name: str, **config):
     kind = methods.find(name)
-    return build(kind, tiny.scene().frame, replace(kind.smallest(), refine_cameras=True, **config), CPU, 0)
+    return build(kind, tiny.scene().frame, changed(kind.smallest(), refine_cameras=True, **config), CPU, 0)
 
 
 def slopes(value, twist: torch.nn.Parameter, image: int, step: float) -> torch.Tensor:
@@ -230,7 +231,7 @@ def test_a_held_out_photograph_is_found_on_itself():
     """A cloud's own pictures, one of them said to be taken from 1.5 degrees and 1 % away; the cloud stays as it is."""
     scene = tiny.made(8, 32, 40.0)
     kind = methods.find("gaussian-splatting")
-    config = replace(kind.smallest(), refine_cameras=True, sh_degree=0)
+    config = changed(kind.smallest(), refine_cameras=True, sh_degree=0)
     method = build(kind, scene.frame, config, CPU, 0).eval()
     cloud = random_cloud(scene.frame, 100, 0, torch.Generator().manual_seed(0))
     method.cloud.replace(replace(cloud, means=0.6 * cloud.means, opacities=cloud.opacities + 4))

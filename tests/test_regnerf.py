@@ -4,20 +4,20 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from types import SimpleNamespace
 
 import pytest
 import tiny
 import torch
 from budgets import budget
 
-from lumigraph.camera.rays import Samples
 from lumigraph.components.training.fog import thickness_before
 from lumigraph.components.training.patch_flow import SIDE, PatchFlow, photographed
 from lumigraph.components.training.unseen_views import patches, roughness, unseen_cameras
+from lumigraph.files.ranges import changed
 from lumigraph.geometry import nearest_to_lines, unit
 from lumigraph.methods.instant_ngp import Config as NgpConfig
 from lumigraph.methods.instant_ngp import InstantNGP
-from lumigraph.methods.mip_nerf import Config as MipConfig
 from lumigraph.methods.regnerf import RegNeRF
 from lumigraph.run import build
 
@@ -26,6 +26,14 @@ pytestmark = budget("methods")
 
 def chance(seed: int = 0) -> torch.Generator:
     return torch.Generator().manual_seed(seed)
+
+
+def of_table(config) -> NgpConfig:
+    """The numbers of RegNeRF's hash table as Instant-NGP has them."""
+    rates = {"learning_rate": config.table_learning_rate, "final_learning_rate": config.final_table_learning_rate}
+    parts = {name: getattr(config, name) for name in ("table", "occupancy", "steps", "proposals", "poses")}
+    losses = {"hash_weight_decay": config.hash_weight_decay, "huber_delta": config.huber_delta}
+    return NgpConfig(**parts, **rates, **losses, hidden_width=config.table_width, seed=config.seed)
 
 
 def test_the_point_nearest_to_lines():
@@ -129,7 +137,7 @@ def test_a_flow_stops_when_its_seconds_are_over(monkeypatch):
 @pytest.mark.parametrize("field", ["network", "hash"])
 def test_a_step_learns_from_patches_nobody_photographed(field):
     scene = tiny.scene()
-    config = replace(RegNeRF.smallest(), field=field, samples_per_step=2048, levels=4, log2_hashmap_size=11)
+    config = changed(RegNeRF.smallest(), field=field, samples_per_step=2048, levels=4, log2_hashmap_size=11)
     method = build(RegNeRF, scene.frame, config, torch.device("cpu"), 0)
     method.begin(scene)
     method.before_step(0, 0.0)
@@ -138,7 +146,7 @@ def test_a_step_learns_from_patches_nobody_photographed(field):
     terms = method.loss(batch, 0)
     assert {"smoothness", "likelihood"} <= terms.keys()
     (terms["smoothness"] + terms["likelihood"]).backward()
-    moved = [p for p in method.marcher.parameters() if p.grad is not None and p.grad.any()]
+    moved = [p for p in method.network.parameters() if p.grad is not None and p.grad.any()]
     assert moved and all(p.grad is None for p in method.flow.parameters())
 
 
@@ -146,22 +154,22 @@ def test_a_table_has_numbers_of_its_own():
     """It learns five times as fast as a network, the networks behind it are smaller, and a plain CPU has it unasked."""
     config = RegNeRF.preset(torch.device("cpu"))
     assert config.field == "hash" and RegNeRF.preset(torch.device("cuda")).field == "network"
-    table, network = config.numbers_of(NgpConfig), config.numbers_of(MipConfig)
+    table, network = of_table(config), config
     known = InstantNGP.preset(torch.device("cpu"))
     assert (table.learning_rate, table.hidden_width) == (known.learning_rate, known.hidden_width) == (2e-2, 32)
     assert (network.learning_rate, network.hidden_width) == (4e-3, 128)
-    assert (table.levels, table.samples_per_step) == (known.levels, known.samples_per_step)
     assert table == known  # all of them
-    assert table.depth_weight != config.depth_weight  # of plane sweeps; ours is of roughness
+    assert table.proposals.depth_weight != config.depth_weight  # of plane sweeps; ours is of roughness
 
 
 def test_what_plane_sweeps_found_counts_beside_what_is_smooth():
     """In the open a table has a term "depth" of its own."""
     scene = tiny.scene()
     frame = replace(scene.frame, reach=4.0, has_alpha=False)
-    config = replace(RegNeRF.smallest(), field="hash", samples_per_step=1024, levels=4, log2_hashmap_size=11)
+    config = changed(RegNeRF.smallest(), field="hash", samples_per_step=1024, levels=4, log2_hashmap_size=11)
     method = build(RegNeRF, frame, config, torch.device("cpu"), 0)
-    method.marcher.unbounded.begin_at(torch.tensor([[0.0, 0.0, 0.1]]).repeat(8, 1), scene.cameras.position[:8])
+    known = SimpleNamespace(points=torch.tensor([[0.0, 0.0, 0.1]]).repeat(8, 1), origins=scene.cameras.position[:8])
+    method.sampler.begin_from(SimpleNamespace(surface=known), chance())
     method.before_step(0, 0.0)
     terms = method.loss(method.batch(scene, chance()), 0)
     assert {"depth", "smoothness"} <= terms.keys() and float(terms["depth"].detach()) > 0
@@ -173,8 +181,8 @@ def test_samples_spread_from_the_middle():
     rays = scene.sample_rays(64, chance()).rays
     for progress, share in (0.0, 0.5), (1.0, 1.0):
         method.before_step(0, progress)
-        look = method.marcher.looks(rays, chance())[0]
-        near, far = method.marcher.space.interval(rays)
+        look = method.sampler.sample(rays, method.network, generator=chance())[0]
+        near, far = method.network.space.interval(rays)
         hit = far > near
         start = look.samples.t_start.view(64, -1)[:, 0]
         assert torch.allclose((start - near)[hit], ((1 - share) / 2 * (far - near))[hit], atol=1e-4)
@@ -184,9 +192,9 @@ def test_a_table_by_itself_learns_as_instant_ngp_does():
     """Without patches that nobody photographed both have the same loss, before an object and in the open."""
     scene, kept = tiny.scene(), dict(samples_per_step=1024, levels=4, log2_hashmap_size=11, max_resolution=32)
     for frame in scene.frame, replace(scene.frame, reach=4.0, has_alpha=False):
-        config = replace(RegNeRF.smallest(), field="hash", unseen_patches=0, likelihood_weight=0.0, **kept)
+        config = changed(RegNeRF.smallest(), field="hash", unseen_patches=0, likelihood_weight=0.0, **kept)
         method = build(RegNeRF, frame, config, torch.device("cpu"), 0)
-        known = build(InstantNGP, frame, config.numbers_of(NgpConfig), torch.device("cpu"), 0)
+        known = build(InstantNGP, frame, replace(of_table(config), exposure_correction="no"), torch.device("cpu"), 0)
         for one in method, known:
             one.before_step(0, 1.0)
         batch = method.batch(scene, chance())
@@ -196,33 +204,33 @@ def test_a_table_by_itself_learns_as_instant_ngp_does():
 def test_a_table_grows_finer_and_reaches_farther():
     """At first its coarsest level is there alone, and an object is sampled in the middle of each ray."""
     scene = tiny.scene()
-    config = replace(
+    config = changed(
         RegNeRF.smallest(), field="hash", coarse_to_fine=0.5, annealing=0.5, levels=4, log2_hashmap_size=11
     )
     method = build(RegNeRF, scene.frame, config, torch.device("cpu"), 0)
     rays, points = scene.sample_rays(64, chance()).rays, torch.rand(8, 3, generator=chance()) - 0.5
-    near, far = method.marcher.space.interval(rays)
+    near, far = method.network.space.interval(rays)
     for progress, share, levels in (0.0, 0.5, 1), (1.0, 1.0, 4):
         method.before_step(0, progress)
-        samples = method.marcher.look_to_learn(rays, chance())[0].samples
+        samples = method.sampler.sample(rays, method.network, generator=chance())[0].samples
         aside = ((samples.t - (0.5 * (near + far))[samples.ray_index]) / (far - near)[samples.ray_index]).abs()
         assert 0.35 * share < float(aside.max()) <= 0.5 * share
-        encoded = method.marcher._encoded(points).view(8, 4, -1)
+        encoded = method.network.encode(points).view(8, 4, -1)
         assert encoded.abs().amax((0, 2)).gt(0).tolist() == [i < levels for i in range(4)]
 
 
 def test_octaves_join_one_after_another():
     """At first the lowest quarter is there alone, in the end all; what was reached is kept with the weights."""
     scene, points = tiny.scene(), torch.rand(8, 3, generator=chance()) - 0.5
-    config = replace(RegNeRF.smallest(), coarse_to_fine=0.5, position_frequencies=8)
+    config = changed(RegNeRF.smallest(), coarse_to_fine=0.5, position_frequencies=8)
     method = build(RegNeRF, scene.frame, config, torch.device("cpu"), 0)
     for progress, octaves in (0.0, 2), (0.25, 5), (0.5, 8), (1.0, 8):
         method.before_step(0, progress)
-        encoded = method.marcher._encoded(points).view(8, 8, -1)
+        encoded = method.network.encode(points).view(8, 8, -1)
         assert encoded.abs().amax((0, 2)).gt(0).tolist() == [i < octaves for i in range(8)]
-    assert float(method.state_dict()["marcher.joined"]) == 1.0
+    assert float(method.state_dict()["bands.joined"]) == 1.0
     plain = build(RegNeRF, scene.frame, RegNeRF.smallest(), torch.device("cpu"), 0)
-    assert "marcher.joined" not in plain.state_dict()
+    assert "bands.joined" not in plain.state_dict()
 
 
 def test_thickness_before_cameras():
@@ -235,13 +243,13 @@ def test_thickness_before_cameras():
 def test_what_stands_before_cameras_costs():
     """A field of density one everywhere is as thick as the first share of a ray is long."""
     scene = tiny.scene()
-    config = replace(RegNeRF.smallest(), occlusion_weight=0.5, occlusion_range=0.25)
+    config = changed(RegNeRF.smallest(), occlusion_weight=0.5, occlusion_range=0.25)
     method = build(RegNeRF, scene.frame, config, torch.device("cpu"), 0)
     method.before_step(0, 1.0)
     rays = scene.sample_rays(64, chance()).rays
-    look = method.marcher.looks(rays, chance())[-1]
+    look = method.sampler.sample(rays, method.network, generator=chance())[-1].look(method.network)
     look = replace(look, density=torch.ones_like(look.density))
-    near, far = method.marcher.space.interval(rays)
+    near, far = method.network.space.interval(rays)
     within = look.samples.t_start.view(64, -1)[:, 0] - near  # the fine look begins somewhere in the first bin
     expected = (0.25 * (far - near) - within).clamp_min(0).mean()
     assert float(method._before_cameras(rays, look)) == pytest.approx(float(expected), rel=1e-3)
@@ -254,7 +262,7 @@ def test_the_network_learns_the_open_before_random_colours(random_backdrop, monk
 
     scene, asked = tiny.scene(), []
     frame = replace(scene.frame, reach=4.0, has_alpha=False)
-    config = replace(RegNeRF.smallest(), random_backdrop=random_backdrop)
+    config = changed(RegNeRF.smallest(), random_backdrop=random_backdrop)
     method = build(RegNeRF, frame, config, torch.device("cpu"), 0)
     real = regnerf.backdrop
     monkeypatch.setattr(regnerf, "backdrop", lambda *given, opaque: asked.append(opaque) or real(*given, opaque=opaque))

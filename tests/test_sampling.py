@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -110,7 +111,9 @@ def test_a_grid_that_looks_finds_what_is_there():
     def ball(x: torch.Tensor) -> torch.Tensor:
         return 10.0 * (x.norm(dim=-1) < 0.5)
 
+    network = SimpleNamespace(density_at=ball)
+    method = SimpleNamespace(network=network, random=lambda number: torch.Generator().manual_seed(~number))
     for step in range(0, 1600, 16):
-        empty.look(step, 0.5, ball, torch.Generator().manual_seed(step))
+        empty.before_step(method, step, 0.5)
     points = torch.tensor([[0.0, 0, 0], [0.3, 0.2, 0], [0.9, 0.9, 0.9], [-0.8, 0, 0]])
     assert empty.may_hold(points).tolist() == [True, True, False, False]

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import pytest
 import tiny
 import torch
 from budgets import budget
 
 from lumigraph import methods
-from lumigraph.components.clouds.density_control import AdaptiveDensity, MarkovChain
-from lumigraph.components.training.rhythm import Rhythm, haste
+from lumigraph.files.ranges import changed
+from lumigraph.methods.gaussian_splatting.adaptive import AdaptiveDensity
+from lumigraph.methods.gaussian_splatting.interval_schedule import IntervalSchedule, short_schedule_lr_scale
+from lumigraph.methods.gaussian_splatting.mcmc import MarkovChain
 from lumigraph.run import build
 from lumigraph.training import fit
 from lumigraph.training import loop as train
@@ -50,7 +50,7 @@ def new(**config):
     """A method with the numbers that it has on a CPU, but a cloud that is quick to learn."""
     kind, scene = methods.find("gaussian-splatting"), tiny.scene()
     numbers = {"initial_gaussians": 100, "max_gaussians": 1000, **config}
-    return build(kind, scene.frame, replace(kind.preset(torch.device("cpu")), **numbers), torch.device("cpu"), 0)
+    return build(kind, scene.frame, changed(kind.preset(torch.device("cpu")), **numbers), torch.device("cpu"), 0)
 
 
 @pytest.mark.filterwarnings("ignore:The cloud stops growing")
@@ -80,8 +80,8 @@ def test_resets_leave_time_to_recover(events):
 
 @pytest.mark.parametrize("budget, interval", [(PAPER, 100), (1000, 100), (600, 60), (60, 6)])
 def test_intervals_are_the_papers_or_a_share_of_the_budget(budget, interval):
-    rhythm = Rhythm(100, 1 / 10)
-    due = [step for step in range(1000) if rhythm.due(step, min(1.0, (step + 1e-3) / budget))]
+    schedule = IntervalSchedule(100, 1 / 10)
+    due = [step for step in range(1000) if schedule.due(step, min(1.0, (step + 1e-3) / budget))]
     assert due == [*range(interval, min(budget + 1, 1000), interval)]
 
 
@@ -89,25 +89,25 @@ def test_the_papers_steps_hold_for_the_papers_budget():
     """The cloud changes every 100 of 30 000 steps, from step 500 on, harmonics rise every 1000. Nothing hurries."""
     method = new()
     method.config = type(method.config)()
-    raised, changed = [], []
+    raised, due = [], []
     for step in range(4001):
         method.before_step(step, step / PAPER)
         if step % 1000 == 0:
-            raised.append(method._bands)
-        if method.due(step):
-            changed.append(step)
-    assert method.learning_rate(4000, 4000 / PAPER)["scales"] == method.config.scales_lr
-    assert raised == [1, 2, 3, 4, 4] and changed == [*range(500, 4001, 100)]
+            raised.append(method.bands)
+        if method.density_control.due(step, step / PAPER):
+            due.append(step)
+    assert method.learning_rates(4000, 4000 / PAPER)["scales"] == method.config.rates.scales_lr
+    assert raised == [1, 2, 3, 4, 4] and due == [*range(500, 4001, 100)]
 
 
 def test_counting_goes_on_where_a_run_was_stopped():
-    one, other = Rhythm(10, 1.0), Rhythm(10, 1.0)
+    one, other = IntervalSchedule(10, 1.0), IntervalSchedule(10, 1.0)
     assert not one.due(9, 0.0)
     other.load_state_dict(one.state_dict())
     assert other.due(10, 0.0) and not other.due(11, 0.0)
 
 
 def test_a_run_of_few_steps_hurries():
-    assert haste(0, 0.0, 2400, 4.0) == 1.0  # nothing is known yet
+    assert short_schedule_lr_scale(0, 0.0, 2400, 4.0) == 1.0  # nothing is known yet
     for steps, times in [(30_000, 1.0), (2400, 1.0), (600, 2.0), (150, 4.0), (15, 4.0)]:
-        assert haste(10, 10 / steps, 2400, 4.0) == pytest.approx(times)
+        assert short_schedule_lr_scale(10, 10 / steps, 2400, 4.0) == pytest.approx(times)

@@ -18,6 +18,7 @@ from lumigraph import methods
 from lumigraph.benchmark.cell import Cell, Settings
 from lumigraph.benchmark.conduct import conduct
 from lumigraph.benchmark.table import markdown
+from lumigraph.budget import Budget
 from lumigraph.commands.cli import main
 from lumigraph.datasets.shapes import Shapes
 from lumigraph.errors import LumigraphError
@@ -26,7 +27,6 @@ from lumigraph.evaluation.report import write_report
 from lumigraph.metrics import Score, named, scores_of
 from lumigraph.metrics.surfaces import chamfer_distance, intersection_over_union, normal_consistency
 from lumigraph.run import Run, build
-from lumigraph.run.budget import Budget
 from lumigraph.training import fit
 from lumigraph.viewer.training_panel import describe, measure_of
 

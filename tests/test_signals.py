@@ -169,7 +169,7 @@ def test_pycolmap_is_loaded_at_one_place():
         for path in PACKAGE.rglob("*.py")
         if any(line.strip() == "import pycolmap" for line in path.read_text("utf-8").splitlines())
     }
-    assert loading == {"library.py", "capture/motion/worker.py"}
+    assert loading == {"system/library.py", "capture/motion/worker.py"}
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="only Linux tells children that their parent has died")

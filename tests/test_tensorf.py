@@ -182,5 +182,5 @@ def test_other_factors_and_shading_learn(factors, shading):
             optimizer.step()
         method.after_step(step)
         losses.append(method.figures["mse"])
-    assert int(method.stage) == len(UPSAMPLINGS)
+    assert int(method.network.stage) == len(UPSAMPLINGS)
     assert sum(losses[-4:]) < 0.7 * sum(losses[:4])

@@ -85,7 +85,7 @@ def test_the_trainer_gives_groups_what_a_method_declares():
         {"params": [method.colour], "lr": 1.0, "scale": 0.5},
     ]
     (first, second) = (optimizer := torch.optim.SGD(groups)).param_groups
-    for declared, rates in [(None, [1.0, 1.0]), ({"means": 0.3}, [0.3, 1.0]), (0.2, [0.2, 0.1])]:
+    for declared, rates in [({}, [1.0, 1.0]), ({"means": 0.3}, [0.3, 1.0]), ({"means": 0.2, "": 0.2}, [0.2, 0.1])]:
         set_learning_rate([optimizer], declared)
         assert [first["lr"], second["lr"]] == pytest.approx(rates)
 

@@ -9,10 +9,10 @@ import torch
 from budgets import budget
 
 from lumigraph import methods
+from lumigraph.budget import Budget
 from lumigraph.commands.eval import beside_training
 from lumigraph.commands.outcome import advice, more_time, next_commands, photographed, seen
 from lumigraph.run import Run, build
-from lumigraph.run.budget import Budget
 from lumigraph.training import fit
 from lumigraph.training.verdict import Trend, last_psnr, loss_trend
 

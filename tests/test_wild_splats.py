@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -15,18 +16,33 @@ from test_nerf_w import two_lights
 
 from lumigraph import kernels
 from lumigraph.color.blending import over
-from lumigraph.components.clouds.tidying import CLOSE, GIANT, NEEDLE, before_a_lens, confined, nearest_camera
-from lumigraph.components.clouds.witnesses import FEWEST, MARKS, hold_back, marked, witnesses
-from lumigraph.components.fields.affine_colours import changed, changed_harmonics, found
-from lumigraph.components.fields.own_sky import backdrop_loss, harmonics, mean_skies, sky
 from lumigraph.components.training.lights import spread_of_light
-from lumigraph.components.training.trimming import BINS, KEPT, Trimming, inliers
 from lumigraph.datasets.images import ImageStore
 from lumigraph.datasets.scene import Photograph
 from lumigraph.errors import LumigraphError, LumigraphWarning
 from lumigraph.evaluation import evaluate
 from lumigraph.evaluation.halves import judged_by_halves, left_half
-from lumigraph.methods.gaussian_splatting import STOPS, GaussianSplatting
+from lumigraph.files.ranges import changed
+from lumigraph.methods.gaussian_splatting import GaussianSplatting
+from lumigraph.methods.gaussian_splatting.affine_colours import fit_colours, recoloured, recoloured_harmonics
+from lumigraph.methods.gaussian_splatting.appearance import MIN_SPREAD
+from lumigraph.methods.gaussian_splatting.robust_mask import BINS, INLIER_SHARE, RobustMask, RobustNumbers, inliers
+from lumigraph.methods.gaussian_splatting.sky import mean_skies, sky, sky_harmonics, sky_loss
+from lumigraph.methods.gaussian_splatting.tidying import (
+    MAX_ANISOTROPY,
+    MAX_SCALE,
+    NEAR_ZONE,
+    camera_distance,
+    clamped_scales,
+    near_camera,
+)
+from lumigraph.methods.gaussian_splatting.view_count import (
+    MIN_VIEWS,
+    VIEW_BITS,
+    view_count,
+    with_view,
+    zero_unobserved_sh,
+)
 from lumigraph.run import Run, build
 from lumigraph.training import fit
 
@@ -48,11 +64,11 @@ def test_harmonics_change_as_their_colours_do(generator):
     def colours(h):
         return 0.5 + torch.einsum("nk,nkc->nc", basis, h)
 
-    one, other = colours(harmonics), colours(changed_harmonics(harmonics, code()))
+    one, other = colours(harmonics), colours(recoloured_harmonics(harmonics, code()))
     matrix, offset = torch.eye(3) + code()[:9].view(3, 3), code()[9:]
     torch.testing.assert_close(other, one @ matrix.T + offset, atol=1e-5, rtol=1e-5)
-    torch.testing.assert_close(changed(one, torch.ones(5), code()), other, atol=1e-5, rtol=1e-5)
-    assert torch.equal(changed_harmonics(harmonics, torch.zeros(12))[:, 1:], harmonics[:, 1:])
+    torch.testing.assert_close(recoloured(one, torch.ones(5), code()), other, atol=1e-5, rtol=1e-5)
+    assert torch.equal(recoloured_harmonics(harmonics, torch.zeros(12))[:, 1:], harmonics[:, 1:])
 
 
 @pytest.fixture(scope="module")
@@ -68,7 +84,7 @@ def test_the_light_is_learnt_and_found_on_left_halves(taught):
     assert judged_by_halves(method) and not judged_by_halves(method.given(appearance="average"))
     average, halves = (evaluate(x, scene) for x in (method.given(appearance="average"), method))
     assert halves.psnr > average.psnr + 2, (halves.psnr, average.psnr)
-    assert not method.appearance.codes[scene.splits["test"]].any()
+    assert not method.appearance.codes.codes[scene.splits["test"]].any()
     shot = scene.photograph(0)
     blank = replace(shot, rgb=torch.where(left_half(shot).mask[..., None], shot.rgb, 0.5))
     found = method.given(left_half(shot)).render(shot.camera).rgb
@@ -94,13 +110,13 @@ def test_a_told_light_shows_in_pictures_and_in_the_cloud(taught):
 def test_the_light_of_a_picture_is_found(generator):
     """Where the photograph is the picture in some light, it is that light, although a tenth is hidden."""
     rgb, opacity = torch.rand(500, 3, generator=generator), torch.ones(500)
-    target = changed(rgb, opacity, code())
+    target = recoloured(rgb, opacity, code())
     target[:50] = 0.5
 
     at = rgb, opacity, target
-    torch.testing.assert_close(found(torch.zeros(12), *at), code(), atol=0.02, rtol=0)
+    torch.testing.assert_close(fit_colours(torch.zeros(12), *at), code(), atol=0.02, rtol=0)
     nothing = (x[:0] for x in at)
-    assert torch.equal(found(code(), *nothing), code())
+    assert torch.equal(fit_colours(code(), *nothing), code())
 
 
 def test_each_photograph_has_a_sky_of_its_own():
@@ -108,24 +124,24 @@ def test_each_photograph_has_a_sky_of_its_own():
     scene = tiny.scene()
     scene = replace(scene, frame=replace(scene.frame, reach=2.0, has_alpha=False))
     kind = GaussianSplatting
-    method = build(kind, scene.frame, replace(kind.smallest(), appearance="yes"), torch.device("cpu"), 0)
+    method = build(kind, scene.frame, changed(kind.smallest(), appearance="yes"), torch.device("cpu"), 0)
     even = mean_skies(scene)
     shown = sky(even[1], scene.cameras[1])
     assert torch.allclose(shown, scene.photograph(1).rgb.mean((0, 1)).expand_as(shown), atol=1e-5)
     assert not even[scene.splits["test"]].any()
     with torch.no_grad():
         method.cloud.opacities.fill_(-20)
-        method.appearance.codes[1, 12:] = torch.randn(27, generator=torch.Generator().manual_seed(0)) / 9
-        method.appearance.codes[1, 12] += 0.5 / 0.28209479
+        method.appearance.codes.codes[1, 12:] = torch.randn(27, generator=torch.Generator().manual_seed(0)) / 9
+        method.appearance.codes.codes[1, 12] += 0.5 / 0.28209479
     camera = scene.cameras[2]
-    weather = sky(method.appearance.codes[1, 12:].detach(), camera).clamp(0, 1)
+    weather = sky(method.appearance.codes.codes[1, 12:].detach(), camera).clamp(0, 1)
     assert weather.std() > 0.05
     assert torch.allclose(method.eval().given(appearance=1).render(camera).rgb, weather, atol=1e-4)
     below = torch.zeros(weather.shape[:2], dtype=torch.bool)
     below[:, : below.shape[1] // 2] = True
     shot = Photograph(camera, weather, None, below)
     with torch.no_grad():
-        method.appearance.codes[1, 12:] *= 0.5  # what the search begins with
+        method.appearance.codes.codes[1, 12:] *= 0.5  # what the search begins with
     found = method.given(shot).render(camera).rgb
     assert (found - weather).abs().mean() < 0.25 * (method.render(camera).rgb - weather).abs().mean()
 
@@ -137,12 +153,12 @@ def test_a_sky_learns_from_what_a_mask_leaves_out_where_nothing_stands():
     mask[:, : width // 2] = True
     opacity = torch.zeros(height, width, requires_grad=True)
     behind = (shot.rgb + 0.1).requires_grad_()
-    loss = backdrop_loss(behind, replace(shot, mask=mask), opacity)
+    loss = sky_loss(behind, replace(shot, mask=mask), opacity)
     assert float(loss) == pytest.approx(0.1 * float((~mask).float().mean()), rel=1e-4)
     loss.backward()
     assert opacity.grad is None and not behind.grad[mask].any() and (behind.grad[~mask] > 0).all()
-    assert float(backdrop_loss(behind, replace(shot, mask=mask), torch.ones(height, width))) == 0
-    assert float(backdrop_loss(behind, replace(shot, mask=None), opacity)) == 0
+    assert float(sky_loss(behind, replace(shot, mask=mask), torch.ones(height, width))) == 0
+    assert float(sky_loss(behind, replace(shot, mask=None), opacity)) == 0
 
 
 def test_a_sky_that_no_pixel_sees_stays_as_it_was(generator):
@@ -151,17 +167,17 @@ def test_a_sky_that_no_pixel_sees_stays_as_it_was(generator):
     rgb, opacity = torch.rand(500, 3, generator=generator), torch.ones(500)
     opacity[:5] = 0.5
 
-    rgb, behind = rgb * opacity[:, None], harmonics(tiny.scene().cameras[0]).view(-1, 9)[:500]
-    target = over(changed(rgb, opacity, start), opacity, behind @ start[12:].view(9, 3))
+    rgb, behind = rgb * opacity[:, None], sky_harmonics(tiny.scene().cameras[0]).view(-1, 9)[:500]
+    target = over(recoloured(rgb, opacity, start), opacity, behind @ start[12:].view(9, 3))
     target[:5] = torch.tensor([1.0, 0.0, 1.0])
-    told = found(start, rgb, opacity, target, behind)
+    told = fit_colours(start, rgb, opacity, target, behind)
     assert (told - start)[12:].abs().max() < 0.2
 
 
 def test_without_it_nothing_is_told():
     method, _ = new()
-    assert method.appearance is None and method.controls == ()
-    assert Photograph not in method.accepts and not judged_by_halves(method)
+    assert not method.appearance.is_active and method.controls == ()
+    assert Photograph not in method.takes and not judged_by_halves(method)
     with pytest.raises(LumigraphError, match="cannot be given a Photograph"):
         method.given(tiny.scene().photograph(0))
 
@@ -173,7 +189,8 @@ def test_resuming_is_exact(tmp_path):
     fit(b, tiny.scene(), broken, steps=40, pause_at=25, show=False, rehearsal=False)
     fit(broken.new_method(), tiny.scene(), Run(broken.folder), steps=40, show=False, rehearsal=False)
     expected, actual = straight.method().state_dict(), Run(broken.folder).method().state_dict()
-    assert expected["lights.codes"].any() and expected["trimming.counts"].any() and expected["cloud.marks"].any()
+    assert expected["appearance.codes.codes"].any() and expected["robust_mask.histogram"].any()
+    assert expected["cloud.view_bits"].any()
     for name in expected:
         assert torch.equal(expected[name], actual[name]), name
 
@@ -183,12 +200,12 @@ def test_photographs_of_one_light_are_told_from_others(generator):
     same, lit = tiny.scene(), two_lights()
     where = 0.6 * torch.nn.functional.normalize(torch.randn(1000, 3, generator=generator), dim=-1)
     assert spread_of_light(same) is None
-    assert spread_of_light(replace(same, points=where)) < STOPS / 2
-    assert spread_of_light(replace(lit, points=where)) > STOPS
+    assert spread_of_light(replace(same, points=where)) < MIN_SPREAD / 2
+    assert spread_of_light(replace(lit, points=where)) > MIN_SPREAD
     method, _ = new()
     with pytest.warns(LumigraphWarning, match="differ by"):
-        method._tell_apart(replace(lit, points=where))
-    assert method.appearance is not None and judged_by_halves(method)
+        method.appearance.begin(method, replace(lit, points=where), torch.inf)
+    assert method.appearance.is_active and judged_by_halves(method)
 
 
 # What moves
@@ -222,16 +239,16 @@ def test_inliers_are_those_of_the_paper(size, generator):
 
 
 def test_the_threshold_follows_the_errors(generator):
-    trimming, error = Trimming(), torch.rand(40, 50, generator=generator)
-    assert trimming(error).all()
-    trimming.note(error)
-    assert trimming.threshold == pytest.approx(float(error.quantile(KEPT)), abs=2 / BINS)
+    mask, error = RobustMask(RobustNumbers()), torch.rand(40, 50, generator=generator)
+    assert inliers(error, mask.threshold).all()
+    mask.record(error)
+    assert mask.threshold == pytest.approx(float(error.quantile(INLIER_SHARE)), abs=2 / BINS)
     for _ in range(200):
-        trimming.note(0.1 * error)
-    assert trimming.threshold == pytest.approx(float(0.1 * error.quantile(KEPT)), abs=2 / BINS)
+        mask.record(0.1 * error)
+    assert mask.threshold == pytest.approx(float(0.1 * error.quantile(INLIER_SHARE)), abs=2 / BINS)
     empty = torch.cat([0.1 * error, torch.zeros(400, 50)])  # pixels without an error say nothing
-    trimming.note(empty)
-    assert trimming.threshold == pytest.approx(float(0.1 * error.quantile(KEPT)), abs=2 / BINS)
+    mask.record(empty)
+    assert mask.threshold == pytest.approx(float(0.1 * error.quantile(INLIER_SHARE)), abs=2 / BINS)
 
 
 def test_what_passed_before_photographs_is_left_out():
@@ -254,22 +271,22 @@ def test_what_passed_before_photographs_is_left_out():
 # What few photographs see
 
 
-def test_witnesses_are_counted_as_sets(generator):
-    marks = torch.zeros(6, dtype=torch.int64)
+def test_views_are_counted_as_sets(generator):
+    bits = torch.zeros(6, dtype=torch.int64)
     sets = [set() for _ in range(6)]
     for image in (0, 3, 3, 40, 61, 62, 100):
         seen = torch.rand(6, generator=generator) < 0.5
-        marks = marked(marks, image, seen)
+        bits = with_view(bits, torch.tensor([image]), seen)
         for i in seen.nonzero()[:, 0].tolist():
-            sets[i].add(image % MARKS)
-    assert witnesses(marks).tolist() == [len(x) for x in sets]
-    assert witnesses(torch.tensor([(1 << MARKS) - 1])).tolist() == [MARKS]
+            sets[i].add(image % VIEW_BITS)
+    assert view_count(bits).tolist() == [len(x) for x in sets]
+    assert view_count(torch.tensor([(1 << VIEW_BITS) - 1])).tolist() == [VIEW_BITS]
 
 
-def test_few_witnesses_hold_harmonics_back(generator):
+def test_unobserved_harmonics_are_zero(generator):
     harmonics = torch.randn(4, 16, 3, generator=generator)
     before = harmonics.clone()
-    hold_back(harmonics, torch.tensor([0, FEWEST[1], FEWEST[4], 20]))
+    zero_unobserved_sh(harmonics, torch.tensor([0, MIN_VIEWS[1], MIN_VIEWS[4], 20]))
     kept = [1, 4, 16, 16]
     for row, count in enumerate(kept):
         assert torch.equal(harmonics[row, :count], before[row, :count]) and not harmonics[row, count:].any()
@@ -278,19 +295,19 @@ def test_few_witnesses_hold_harmonics_back(generator):
 def test_giants_and_needles_are_confined():
     some = cloud(4)
     sizes = torch.tensor([[5.0, 4.0, 0.1], [0.9, 0.01, 0.001], [0.008, 1e-5, 1e-5], [0.2, 0.1, 0.05]])
-    found = confined(replace(some, log_scales=sizes.log()), torch.full((4,), 2.0), 1.0).exp()
+    found = clamped_scales(replace(some, log_scales=sizes.log()), torch.full((4,), 2.0), 1.0).exp()
     expected = sizes.clone()
-    expected[0, :2] = 2 * GIANT
-    expected[1, 0] = NEEDLE * 0.01
+    expected[0, :2] = 2 * MAX_SCALE
+    expected[1, 0] = MAX_ANISOTROPY * 0.01
     torch.testing.assert_close(found, expected)
 
 
-def test_nothing_hangs_before_a_lens():
-    distance = torch.tensor([0.5, 1.5, 1.5, CLOSE + 0.1])
-    assert before_a_lens(distance, torch.tensor([9, 2, 3, 0]), 1.0).tolist() == [True, True, False, False]
+def test_nothing_hangs_near_camera():
+    distance = torch.tensor([0.5, 1.5, 1.5, NEAR_ZONE + 0.1])
+    assert near_camera(distance, torch.tensor([9, 2, 3, 0]), 1.0).tolist() == [True, True, False, False]
     positions, means = torch.randn(7, 3), torch.randn(5, 3)
     expected = (means[:, None] - positions).norm(dim=-1).amin(-1)
-    torch.testing.assert_close(nearest_camera(means, positions), expected)
+    torch.testing.assert_close(camera_distance(means, positions), expected)
 
 
 def test_a_sheet_before_a_training_camera_goes():
@@ -302,6 +319,8 @@ def test_a_sheet_before_a_training_camera_goes():
     with torch.no_grad():
         method.cloud.means[0] = camera.position[0] + 0.5 * scene.frame.near * camera.forward[0]
         before = len(method.cloud)
-        method._tidy(scene.cameras[scene.splits["train"]])
-    assert len(method.cloud) == before - 1 == len(method.cloud.marks) == len(method.density_control.pulls)
-    assert float(nearest_camera(method.cloud.means, scene.cameras.position).min()) > scene.frame.near
+        method.current = SimpleNamespace(due=True)
+        method.tidying.after_step(method, 1)
+    assert len(method.cloud) == before - 1 == len(method.cloud.view_bits)
+    assert len(method.cloud) == len(method.density_control.positional_gradient_sum)
+    assert float(camera_distance(method.cloud.means, scene.cameras.position).min()) > scene.frame.near

@@ -8,10 +8,10 @@ from pathlib import Path
 from typing import Any
 
 from .. import files
+from ..budget import Budget
 from ..capture import requested
 from ..errors import LumigraphError
 from ..run import Run
-from ..run.budget import Budget
 from ..run.inferred import Inferred
 from ..synthetic import is_category
 

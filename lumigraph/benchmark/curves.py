@@ -8,9 +8,9 @@ from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 from .. import methods
+from ..budget import Budget
 from ..figures.charts import COLOURS, Series
 from ..metrics import scores_of
-from ..run.budget import Budget
 from .cell import duration
 from .results import Row
 

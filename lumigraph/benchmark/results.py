@@ -10,10 +10,10 @@ from typing import Annotated, Any
 import msgspec
 
 from .. import files
+from ..budget import Budget
 from ..files.ranges import Lasted, Tally, typed
 from ..metrics import Score
 from ..run import Run
-from ..run.budget import Budget
 from ..run.measured import Protocol, View
 from .cell import Cell, Settings, train_command
 from .published import Published, published

@@ -17,6 +17,7 @@ from ..errors import LumigraphError
 from ..files import exists, expanded
 from ..files.names import natural
 from ..files.ranges import typed
+from ..files.readers import LISTED, NAMES
 from . import meshes, single_image
 from .assemble import Before as Before
 from .assemble import assemble as assemble
@@ -31,10 +32,16 @@ from .pictures import list_images
 from .places import Places as Places
 from .places import places_of as places_of
 from .raw import with_raw
-from .readers import LISTED, NAMES
 
 READERS: dict[str, ModuleType] = {n: import_module(f".{n.replace('-', '_')}", __package__) for n in NAMES}
 PROCEDURAL = "procedural:"
+
+
+def synthetic() -> Any:
+    """The room of procedural scenes, imported by name: it stands above this one."""
+    return import_module("..synthetic", __package__)
+
+
 KINDS: dict[str, type[Any]] = {kind.kind: kind for kind in (Scene, Shapes, Collection)}
 
 
@@ -66,9 +73,7 @@ def kind_of(source: str | Path, wanted: type[Any] | None = None) -> type[Any]:
     """
     path = expanded(source)
     if (request := requested(source)) is not None:
-        from . import procedural
-
-        return Collection if procedural.is_collection(request) else Scene
+        return Collection if synthetic().is_collection(request) else Scene
     if not exists(path):
         raise LumigraphError(f"{path} does not exist; check the path")
     if wanted is Collection and members_of(path):
@@ -84,9 +89,7 @@ def sources_of(collection: str | Path) -> dict[str, str]:
     """Source of each member of a collection for `open_dataset`, by its name."""
     if (request := requested(collection)) is None:
         return {name: str(place) for name, place in members_of(expanded(collection)).items()}
-    from . import procedural
-
-    return {name: f"{PROCEDURAL}{one}" for name, one in procedural.members_of(request).items()}
+    return {name: f"{PROCEDURAL}{one}" for name, one in synthetic().members_of(request).items()}
 
 
 def requested(source: str | Path) -> str | None:
@@ -153,9 +156,7 @@ def open_scene(
 def confirm(source: str | Path) -> None:
     """Raise LumigraphError where there is nothing at a source that could be learnt from, by whatever method."""
     if (request := requested(source)) is not None:
-        from . import procedural
-
-        procedural.confirm(request)
+        synthetic().confirm(request)
         return
     path = expanded(source)
     if path.is_dir() and not list_images(path) and not members_of(path):
@@ -165,9 +166,7 @@ def confirm(source: str | Path) -> None:
 def read_capture(source: str | Path, reader: str | None = None) -> Capture:
     """Photographs with poses as a reader finds them, without pixels. source, reader: as of `open_scene`"""
     if (request := requested(source)) is not None:
-        from . import procedural
-
-        return procedural.read(request)
+        return synthetic().read(request)
     path = expanded(source)
     return with_raw(with_masks(choose_reader(path, reader).read(path), path), path)
 

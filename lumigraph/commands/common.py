@@ -12,11 +12,10 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import tyro
 
 from .. import methods
-from ..capture.readers import LISTED, NAMES
+from ..budget import MEANS, Budget, Quality
 from ..errors import LumigraphError
 from ..files import scene_name as scene_name
-from ..method.quality import MEANS, Quality
-from ..run.budget import Budget
+from ..files.readers import LISTED, NAMES
 from ..system.console import console, dim
 from ..system.signals import exit_code as exit_code
 

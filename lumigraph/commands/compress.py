@@ -10,9 +10,9 @@ from typing import Annotated, Any
 
 from tyro.conf import Positional, arg
 
+from ..budget import Quality
 from ..errors import LumigraphError
 from ..files.ranges import Codes, Count, Decibels, Seconds, Steps
-from ..method.quality import Quality
 from ..system.console import console
 from .common import choose_device, needed, option, show, typed
 

@@ -8,9 +8,9 @@ from typing import Annotated, Any, Literal
 
 from tyro.conf import Positional, arg
 
+from ..budget import Quality
 from ..errors import LumigraphError
 from ..files.ranges import Count, Seconds, Seed, Steps
-from ..method.quality import Quality
 from ..system.console import console
 from .common import about_quality, choose_device, method_config, option, show, told_budget, typed
 from .compress import size

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
+from ..budget import Budget
 from ..files.ranges import Count, Seconds
-from ..run.budget import Budget
 from ..system.console import bold
 from .common import choose_device, exit_code, next_free, option, say, show, typed
 

@@ -6,6 +6,7 @@ from typing import Any
 
 from rich.tree import Tree
 
+from ..budget import Budget
 from ..datasets.alignment import Moves
 from ..datasets.dataset import Dataset
 from ..datasets.scene import Frame, Scene
@@ -18,7 +19,6 @@ from ..geometry.choice import evenly
 from ..large import BlockRun
 from ..metrics import scores_of
 from ..run import Run
-from ..run.budget import Budget
 from ..run.compressed import Compressed
 from ..run.converted import Converted
 from ..run.inferred import Inferred

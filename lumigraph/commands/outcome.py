@@ -5,10 +5,9 @@ from __future__ import annotations
 import math
 from typing import Any
 
+from ..budget import QUALITIES, Budget
 from ..datasets.scene import Scene
 from ..method import Method, RayMethod
-from ..method.quality import QUALITIES
-from ..run.budget import Budget
 from .common import say, show, typed
 
 TOTALS = (10.0, 30.0, 60.0, 180.0, 600.0, 1800.0, 3600.0, 7200.0)  # seconds that are suggested

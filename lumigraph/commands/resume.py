@@ -8,10 +8,9 @@ from typing import Annotated, Any
 
 from tyro.conf import Positional
 
+from ..budget import Budget, Quality
 from ..errors import LumigraphError
 from ..files.ranges import Port, Seconds, Steps
-from ..method.quality import Quality
-from ..run.budget import Budget
 from .common import choose_device, exit_code, needed, option, quality_budget, told_budget, typed
 
 

@@ -10,9 +10,8 @@ from typing import Annotated, Any, Literal
 from tyro.conf import Fixed, OmitArgPrefixes, Positional, Suppress
 
 from .. import methods
+from ..budget import Budget, Quality
 from ..files.ranges import Count, Downscale, Port, Scales, Seconds, Seed, Steps
-from ..method.quality import Quality
-from ..run.budget import Budget
 from .capture import posed
 from .common import (
     ReaderOption,

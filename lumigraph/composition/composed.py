@@ -52,7 +52,7 @@ class Composed(Method):
 
     def __init__(self, frame: Frame, parts: Sequence[Placed]):
         super().__init__(frame, None)
-        self.parts = tuple(parts)
+        self.pieces = tuple(parts)
         self.methods = nn.ModuleList(part.method for part in parts)  # so that they move to devices together
         self.eval()
 
@@ -60,7 +60,7 @@ class Composed(Method):
     def controls(self) -> tuple[Control, ...]:
         """What any part can be told; those that are about photographs only of the part that leads."""
         found: dict[str, Control] = {}
-        for part in self.parts:
+        for part in self.pieces:
             for control in part.method.controls:
                 if part.leads or not control.of_photographs:
                     found.setdefault(control.name, control)
@@ -70,12 +70,12 @@ class Composed(Method):
         """The same composition, each part told what it has a control for."""
         told = super().given(*evidence, **controls)
         assert isinstance(told, Composed)
-        told.parts = tuple(part.given(controls) for part in self.parts)
+        told.pieces = tuple(part.given(controls) for part in self.pieces)
         return told
 
     def refined(self, cameras: Camera) -> Camera:
         """Cameras as the part that leads sees them, whose they are."""
-        return next((part.refined(cameras) for part in self.parts if part.leads), cameras)
+        return next((part.refined(cameras) for part in self.pieces if part.leads), cameras)
 
     def batch(self, data: Any, generator: torch.Generator) -> NoReturn:
         raise LumigraphError("A composition does not learn; train its parts, each by itself")
@@ -86,7 +86,7 @@ class ComposedRays(Composed, RayMethod):
 
     def looks(self, rays: Rays) -> list[Look]:
         """The union of every part's last look."""
-        return [union([part.look(rays) for part in self.parts])]
+        return [union([part.look(rays) for part in self.pieces])]
 
 
 class ComposedField(ComposedRays):
@@ -94,7 +94,7 @@ class ComposedField(ComposedRays):
 
     def density(self, points: Float[Tensor, "point 3"]) -> Float[Tensor, " point"]:
         """Density per scene unit, the sum of the parts'."""
-        return torch.stack([part.density(points) for part in self.parts]).sum(0)
+        return torch.stack([part.density(points) for part in self.pieces]).sum(0)
 
 
 class ComposedCloud(Composed):
@@ -102,7 +102,7 @@ class ComposedCloud(Composed):
 
     def gaussians(self) -> Gaussians:
         """All parts' Gaussians, in the scene's frame."""
-        return joined([part.gaussians() for part in self.parts])
+        return joined([part.gaussians() for part in self.pieces])
 
     @torch.no_grad()
     def render(self, camera: Camera) -> Rendering:
@@ -120,7 +120,7 @@ class ComposedMixture(Composed):
         camera = camera.to(self.device)
         width, height = camera.size[0].tolist()
         rays = camera.rays(camera.pixels())
-        marching = [part for part in self.parts if can(part.method, HasLooks)]
+        marching = [part for part in self.pieces if can(part.method, HasLooks)]
         surfaces = self._surfaces(camera)
         seen = []
         for begin in range(0, len(rays), self.rays_per_chunk):
@@ -132,7 +132,7 @@ class ComposedMixture(Composed):
 
     def _surfaces(self, camera: Camera) -> list[tuple[Tensor, Tensor, Tensor]]:
         """Colour over black, depth and opacity of every pixel: of all clouds at once, and of each other part."""
-        rendered = [part for part in self.parts if not can(part.method, HasLooks)]
+        rendered = [part for part in self.pieces if not can(part.method, HasLooks)]
         clouds = [part.gaussians() for part in rendered if can(part.method, HasGaussians)]
         seen = [part.rendering(camera) for part in rendered if not can(part.method, HasGaussians)]
         if clouds:

@@ -14,13 +14,13 @@ from typing import Any
 from PIL import Image
 
 from .. import __version__, methods
+from ..budget import Budget
 from ..capture.pictures import readable
 from ..figures.charts import STYLE as CHARTS
 from ..figures.charts import Series, bar_chart, line_chart
 from ..files import claim, write_bytes
 from ..metrics import scores_of
 from ..run import Run
-from ..run.budget import Budget
 from ..system.progress import clock, short
 from ..training.verdict import cameras_moved
 

@@ -107,6 +107,14 @@ def changed(value: Any, **numbers: Any) -> Any:
     return replace(value, **numbers)
 
 
+def value_of(value: Any, name: str) -> Any:
+    """The number of a name, of a dataclass or one that it holds."""
+    if name in {field.name for field in fields(value)}:
+        return getattr(value, name)
+    inner = (getattr(value, field.name) for field in fields(value))
+    return value_of(next(x for x in inner if is_dataclass(x) and holds(x, name)), name)
+
+
 def holds(value: Any, name: str) -> bool:
     """Whether a dataclass, or one that it holds, has a field of a name."""
     found = fields(value)

@@ -35,7 +35,7 @@ class InBlocks(Method):
     """Several placed methods, each for a part of one large scene. Ready to render, and nothing else.
 
     frame:     the common frame, in which cameras, centres and radii are given
-    parts:     a block each: its method, on the device where it stays, and the way from its own frame to the common one,
+    blocks:    a block each: its method, on the device where it stays, and the way from its own frame to the common one,
                which is `frame.to_source.inverse @ part_frame.to_source`. None of them leads: cameras of the common
                frame belong to no block's photographs. `Nearby` opens them where a camera comes near; here each is
                asked once what it can be told
@@ -72,7 +72,7 @@ class InBlocks(Method):
         self.register_buffer("centres", centres.float(), persistent=False)
         self.register_buffer("radii", radii.float(), persistent=False)
         self.exposures = exposures
-        self.parts = parts.each(partial(exposed, exposure=self.usual))
+        self.blocks = parts.each(partial(exposed, exposure=self.usual))
         self.eval()
 
     # Being seen
@@ -82,7 +82,7 @@ class InBlocks(Method):
         camera = camera.to(self.device)
         weights = self.weights(camera)
         chosen = (weights >= LITTLE).nonzero()[:, 0]
-        seen = [self.parts[i].rendering(camera) for i in chosen.tolist()]
+        seen = [self.blocks[i].rendering(camera) for i in chosen.tolist()]
         if self.config.by in ("points", "visibility"):
             return mixed(seen, self._by_pixel(camera, chosen, weights[chosen], seen), self.frame)
         return mixed(seen, shares(weights[chosen]).expand(*seen[0].depth.shape, -1), self.frame)
@@ -97,7 +97,7 @@ class InBlocks(Method):
         chosen = (weights > 0).nonzero()[:, 0]
         if len(chosen) > 1:
             small = camera.resized(min(1.0, GLANCE / int(camera.size.max())))
-            sights = [saw(self.parts[i], small, self.parts[i].rendering(small)).mean() for i in chosen.tolist()]
+            sights = [saw(self.blocks[i], small, self.blocks[i].rendering(small)).mean() for i in chosen.tolist()]
             weights[chosen] *= seeing(torch.stack(sights), c.threshold)
         if c.by == "nearest":
             weights = nn.functional.one_hot(weights.argmax(), len(weights)).to(weights)
@@ -110,7 +110,7 @@ class InBlocks(Method):
         block saw; a block that has hardly a say in the picture has no more in its pixels."""
         c, entered = self.config, (weights / ENTERED).clamp(max=1)
         if c.by == "visibility":
-            found = [saw(self.parts[i], camera, x) for i, x in zip(chosen.tolist(), seen, strict=True)]
+            found = [saw(self.blocks[i], camera, x) for i, x in zip(chosen.tolist(), seen, strict=True)]
             return shares(torch.stack(found, -1).clamp_min(UNSEEN) * entered)
         rays = camera.rays(camera.pixels())
         far = 2 * self.frame.reach
@@ -130,7 +130,7 @@ class InBlocks(Method):
         density = torch.zeros_like(points[:, 0])
         for i in (weights > LITTLE).any(0).nonzero()[:, 0].tolist():
             here = (weights[:, i] > LITTLE).nonzero()[:, 0]
-            density = density.index_add(0, here, weights[here, i] * self.parts[i].density(points[here]))
+            density = density.index_add(0, here, weights[here, i] * self.blocks[i].density(points[here]))
         return density
 
     def _at(self, points: Float[Tensor, "point 3"]) -> Float[Tensor, "point block"]:
@@ -161,12 +161,12 @@ class InBlocks(Method):
         told = super().given(*(piece for piece in evidence if not isinstance(piece, self.accepts)), **controls)
         assert isinstance(told, InBlocks)
         passed = {name: value for name, value in told.told.items() if name != EXPOSURE and name in controls}
-        parts = self.parts.each(lambda part: part.given(passed))
+        parts = self.blocks.each(lambda part: part.given(passed))
         if EXPOSURE in controls and self.usual is not None:
             parts = parts.each(partial(exposed, exposure=self.usual + float(told.told[EXPOSURE])))
         for photograph in mine:
             parts = self._seen_in(photograph, parts)
-        told.parts = parts
+        told.blocks = parts
         return told
 
     def _seen_in(self, photograph: Photograph, parts: Nearby) -> Nearby:

@@ -58,7 +58,7 @@ class Asked:
         photographs, controls = True, dict[str, Control]()
         usual, ranges = list[float](), list[tuple[float, float]]()
         for part in parts:
-            photographs &= Photograph in part.method.accepts
+            photographs &= Photograph in part.method.takes
             for control in part.method.controls:
                 if not control.of_photographs and control.name != EXPOSURE:
                     controls.setdefault(control.name, control)

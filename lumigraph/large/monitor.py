@@ -18,8 +18,8 @@ from typing import Any
 from rich.progress import BarColumn, Progress, TextColumn
 
 from .. import files
+from ..budget import Budget
 from ..errors import LumigraphError
-from ..run.budget import Budget
 from ..system.console import console, is_live
 from ..system.progress import clock, tell
 from .plan import DONE

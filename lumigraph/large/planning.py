@@ -10,12 +10,12 @@ from typing import Any
 import torch
 
 from .. import files
+from ..budget import Budget
 from ..capture import Places, places_of, read_capture
 from ..errors import LumigraphError
 from ..figures import save_picture
 from ..files.plain import alike
 from ..run import check_new, processor
-from ..run.budget import Budget
 from ..run.folder import versions
 from .drawing import draw_plan
 from .layout import lay_out

@@ -61,7 +61,7 @@ def finish(folder: Path, again: Sequence[str] = ()) -> Plan:
     """
     opened = BlockRun(folder)
     first = opened.placed(opened.blocks[0]).method
-    if Appearance in first.accepts:
+    if Appearance in first.takes:
         return aligned(opened, again)
     if can(first, HasGaussians):
         write_gaussians(folder / CLOUD, opened.source_gaussians())

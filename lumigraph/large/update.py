@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 
 from .. import files
+from ..budget import Budget
 from ..capture import Places
 from ..errors import LumigraphError
 from ..files.locks import held
-from ..run.budget import Budget
 from .layout import Disc, members
 from .monitor import Watching
 from .plan import NAME, TASK, Block, Plan, Task, source_of

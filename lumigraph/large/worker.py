@@ -23,6 +23,7 @@ import numpy as np
 import torch
 
 from .. import files, methods
+from ..budget import Budget
 from ..capture import Before, open_dataset
 from ..datasets.scene import Scene
 from ..errors import LumigraphError
@@ -30,7 +31,6 @@ from ..files.locks import held
 from ..files.ranges import typed
 from ..method import Method
 from ..run import Run, build
-from ..run.budget import Budget
 from ..training import fit
 from .plan import DONE, Done, Task
 

@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from ..camera.rays import Look, Rays
+from ..camera.rays import Look, Rays, Rendering
 from ..datasets.scene import Batch, Scene
 from ..volume import composite
 from .field import Field
@@ -26,15 +26,35 @@ class FieldMethod(RayMethod, ABC):
 
     # Along rays
 
+    @property
+    def shown_code(self) -> Float[Tensor, "1 code"] | None:
+        """The code of pictures, by the settings; None without one."""
+        return None
+
     def code(self, rays: Rays) -> Float[Tensor, "#ray code"] | None:
         """The code that the field depends on, of each ray or one row for all; None without one."""
-        return None
+        return self.shown_code
 
     def looks(self, rays: Rays) -> list[Look]:
         """Density and colour along rays, one entry for each pass, the one that is composited last."""
+        return [self._look(each, rays) for each in self.sampler.sample(rays, self.network, self.code(rays))]
+
+    def render_rays(self, rays: Rays, background: Float[Tensor, "#ray 3"]) -> Rendering:
         code = self.code(rays)
-        found = [each.look(self.network, code) for each in self.sampler.sample(rays, self.network, code)]
-        return [replace(look, rgb=self.recoloured(look.rgb)) for look in found]
+        look = self._look(self.sampler.sample(rays, self.network, code)[-1], rays)
+        return composite(look.samples, look.density, look.rgb, self.behind(rays, code, background))
+
+    def _look(self, seen: Pass, rays: Rays) -> Look:
+        look = seen.look(self.network, self.code(rays))
+        return replace(look, rgb=self.recoloured(look.rgb))
+
+    def behind(
+        self, rays: Rays, code: Float[Tensor, "#ray code"] | None, background: Float[Tensor, "#ray 3"]
+    ) -> Float[Tensor, "#ray 3"]:
+        """Colours behind everything: the background, or a sky."""
+        for part in self.parts:
+            background = part.behind(rays, code, background)
+        return background
 
     def recoloured(self, rgb: Float[Tensor, "point 3"]) -> Float[Tensor, "point 3"]:
         """Colours of the field under the settings."""
@@ -53,7 +73,8 @@ class FieldMethod(RayMethod, ABC):
         self, points: Float[Tensor, "point 3"], directions: Float[Tensor, "point 3"]
     ) -> tuple[Float[Tensor, " point"], Float[Tensor, "point 3"]]:
         """Density per scene unit, and sRGB-encoded colour seen along unit directions."""
-        density, rgb = self.network(points, directions)
+        code = self.shown_code
+        density, rgb = self.network(points, directions, None if code is None else code.expand(len(points), -1))
         return density, self.recoloured(rgb)
 
     def density(self, points: Float[Tensor, "point 3"]) -> Float[Tensor, " point"]:
@@ -70,8 +91,16 @@ class FieldMethod(RayMethod, ABC):
 
     def learn(self, rays: Rays, generator: torch.Generator) -> tuple[list[Pass], dict[str, Tensor]]:
         """Passes along rays of photographs at random places, and the sampler's loss terms by name."""
+        return self.learn_along(self.moved(rays), generator)
+
+    def moved(self, rays: Rays) -> Rays:
+        """Rays of photographs with their learnt poses."""
         for part in self.parts:
             rays = part.moved(rays)
+        return rays
+
+    def learn_along(self, rays: Rays, generator: torch.Generator) -> tuple[list[Pass], dict[str, Tensor]]:
+        """Passes along rays at random places, and the sampler's loss terms by name."""
         passes = self.sampler.sample(rays, self.network, self.code(rays), generator)
         last = passes[-1]
         self.figures |= {"rays": len(rays), "samples": last.evaluated, "visible_samples": len(last.samples)}

@@ -13,6 +13,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from ..budget import BY_PHOTOGRAPH, Efforts, Quality
 from ..camera import Camera
 from ..camera.rays import Rays, Rendering
 from ..datasets.scene import Frame, Scene
@@ -20,7 +21,6 @@ from ..errors import LumigraphError
 from ..exchange.packing import Stored
 from .controls import Control, Value
 from .part import Part
-from .quality import BY_PHOTOGRAPH, Efforts, Quality
 
 
 @runtime_checkable
@@ -195,7 +195,8 @@ class Method(nn.Module, ABC):
     @property
     def takes(self) -> tuple[type, ...]:
         """The kinds of evidence that `given` takes now: those of the class, and of the parts as they were trained."""
-        return (*self.accepts, *(kind for part in self.parts for kind in part.accepts))
+        parts = (part for part in self.children() if isinstance(part, Part))
+        return (*self.accepts, *(kind for part in parts for kind in part.accepts))
 
     @property
     def evidence_views(self) -> int | None:
@@ -214,9 +215,9 @@ class Method(nn.Module, ABC):
         Raises LumigraphError for what this method cannot be told.
         """
         parts = {name: part for name, part in self.named_children() if isinstance(part, Part)}
-        chosen = [next((n for n, part in parts.items() if isinstance(piece, part.accepts)), None) for piece in evidence]
-        for piece, name in zip(evidence, chosen, strict=True):
-            if name is None:
+        chosen = [[n for n, part in parts.items() if isinstance(piece, part.accepts)] for piece in evidence]
+        for piece, names in zip(evidence, chosen, strict=True):
+            if not names:
                 kinds = " or ".join(kind.__name__ for kind in self.takes) or "nothing but its controls"
                 kind = type(piece).__name__
                 raise LumigraphError(f"{type(self).__name__} cannot be given a {kind}; it takes {kinds}")
@@ -230,8 +231,9 @@ class Method(nn.Module, ABC):
             told.__dict__[held] = dict(self.__dict__[held])
         told.figures = {}
         told.told = self.told | {name: known[name].checked(value) for name, value in controls.items()}
-        for piece, name in zip(evidence, chosen, strict=True):
-            told._modules[name] = parts[name].adapted(told, piece)
+        for piece, names in zip(evidence, chosen, strict=True):
+            for name in names:
+                told._modules[name] = told._modules[name].adapted(told, piece)  # type: ignore[union-attr, operator]
         return told
 
     def control(self, name: str) -> Value:

@@ -63,6 +63,12 @@ class Part(nn.Module):
         """Colours of a field under the method's settings."""
         return rgb
 
+    def behind(
+        self, rays: Rays, code: Float[Tensor, "#ray code"] | None, background: Float[Tensor, "#ray 3"]
+    ) -> Float[Tensor, "#ray 3"]:
+        """Colours behind everything: the background, or a sky."""
+        return background
+
     # Settings
 
     @property

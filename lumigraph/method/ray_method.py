@@ -9,13 +9,13 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from ..budget import BY_RAY, Efforts
 from ..camera import Camera
 from ..camera.rays import Rays, Rendering
 from ..datasets.scene import Batch, Scene
 from ..volume import composite
 from .capabilities import HasLooks, needs
 from .method import Method
-from .quality import BY_RAY, Efforts
 
 
 class RayMethod(Method):

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn.functional import embedding
 
@@ -31,6 +31,7 @@ class Pass:
     evaluated:  number of points at which density was evaluated
     scale:      applied to colours, to scale their gradients as those of density were
     proposals:  of a proposal sampler, for its loss
+    field:      that was evaluated; None for the one of the method
     """
 
     name: str
@@ -43,15 +44,22 @@ class Pass:
     evaluated: int = 0
     scale: Callable[[Tensor], Tensor] | None = None
     proposals: Any = None
+    field: Field | None = None
 
     def look(self, field: Field, code: Float[Tensor, "ray code"] | None = None) -> Look:
         """Density and colour of all samples. code: of each ray"""
         rgb = self.rgb
         if rgb is None:
-            rgb = field.colour(self.features, self.directions, self.code_of_samples(code))
+            rgb = (self.field or field).colour(self.features, self.directions, self.code_of_samples(code))
         if self.coloured is not None:
             rgb = rgb.new_zeros(len(self.samples), 3).index_copy(0, self.coloured, rgb)
         return Look(self.name, self.samples, self.density, self.scale(rgb) if self.scale else rgb)
+
+    def keep(self, mask: Bool[Tensor, " sample"]) -> Pass:
+        """The samples that a mask picks, of a pass all of whose samples get a colour later."""
+        features = tuple(x[mask] for x in self.features) if isinstance(self.features, tuple) else self.features[mask]
+        kept = {"density": self.density[mask], "features": features, "directions": self.directions[mask]}
+        return replace(self, samples=self.samples.keep(mask), **kept)
 
     def code_of_samples(self, code: Float[Tensor, "ray code"] | None) -> Float[Tensor, "coloured code"] | None:
         """The codes of rays, one for each sample that gets a colour."""

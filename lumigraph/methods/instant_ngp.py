@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 import torch
 from jaxtyping import Float
-from torch import Tensor, nn
+from torch import Tensor
 
 from ..camera import Camera
 from ..components.fields.hash_field import CPU_TABLE, TINY_TABLE, HashField, HashNumbers
@@ -26,7 +26,7 @@ from ..components.sampling.samplers import sampler_for
 from ..components.sampling.spaces import Box, space_of
 from ..components.training.distillation import distil
 from ..components.training.exposure import Exposure, Setting
-from ..components.training.photometric import backdrop, residuals
+from ..components.training.photometric import backdrop, huber, residuals
 from ..components.training.pose_refinement import PoseNumbers, poses_for
 from ..components.training.schedules import held
 from ..datasets.scene import Batch, Frame
@@ -141,8 +141,3 @@ class InstantNGP(FieldMethod):
         """Set the least important entries of the table to zero."""
         self.network.table[~most_important(importance["network.table"], 1 - share)] = 0.0
         return importance
-
-
-def huber(residual: Float[Tensor, "row 3"], delta: float) -> Float[Tensor, ""]:
-    """The mean of residuals' Huber loss, divided by delta, so that the linear part has slope 1."""
-    return nn.functional.huber_loss(residual, torch.zeros_like(residual), delta=delta) / delta

@@ -7,35 +7,47 @@ about, and patches such as no photograph has, say that the field explains each p
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import dataclass
 from typing import Annotated, Any, Literal
 
 import torch
-from jaxtyping import Float
 from torch import Tensor
 
-from ..camera import Camera
 from ..camera.rays import Look, Rays, Rendering
-from ..components.fields.hash_field import TABLE_ON_A_CPU, HashNumbers, check_levels
+from ..components.fields.coordinate_field import NetworkNumbers
+from ..components.fields.frustum_field import FrustumField
+from ..components.fields.hash_field import CPU_TABLE, HashField, HashNumbers
+from ..components.sampling.cone_sampler import ConeSampler
+from ..components.sampling.hierarchical_sampler import RayNumbers
+from ..components.sampling.occupancy_mask import MaskNumbers
+from ..components.sampling.occupancy_sampler import CPU_STEPS, MIN_RESOLUTION, OccupancyNumbers, StepNumbers
+from ..components.sampling.proposal_sampler import ProposalNumbers
+from ..components.sampling.samplers import sampler_for
+from ..components.sampling.spaces import space_of
+from ..components.training.coarse_to_fine import BandSchedule, joining_of
 from ..components.training.fog import evened, thickness_before
 from ..components.training.patch_flow import SIDE, PatchFlow
-from ..components.training.photometric import backdrop, residuals
+from ..components.training.photometric import backdrop, huber, residuals
+from ..components.training.pose_refinement import PoseNumbers, poses_for
+from ..components.training.schedules import falling, held
 from ..components.training.unseen_views import patches, roughness, unseen_cameras
 from ..datasets.scene import Batch, Frame, Scene
-from ..files.ranges import LearningRate, NonNegative, PositiveShare, Share, Steps, Width, between
-from ..method import RayMethod
+from ..files.ranges import LearningRate, NonNegative, PositiveShare, Seed, Share, Steps, Width, between
+from ..method import FieldMethod
 from ..volume import composite
-from .instant_ngp import Config as NgpConfig
-from .instant_ngp import InstantNGP, huber
-from .mip_nerf import Config as MipConfig
-from .mip_nerf import MipNeRF
 
 
 @dataclass(frozen=True)
-class Config(HashNumbers, MipConfig):
-    """The paper's numbers, with where it gives them, beside those of mip-NeRF's network, and Instant-NGP's of the hash
-    table, which are explained there; `RegNeRF.preset` says what a plain CPU does otherwise."""
+class Config:
+    """The paper's numbers, with where it gives them, beside those of mip-NeRF's network and of a hash table;
+    `RegNeRF.preset` gives those of a plain CPU."""
 
+    network: NetworkNumbers = NetworkNumbers(position_frequencies=16)
+    rays: RayNumbers = RayNumbers(128, 128)
+    mask: MaskNumbers = MaskNumbers()
+    poses: PoseNumbers = PoseNumbers()
+    table: HashNumbers = HashNumbers()
+    steps: StepNumbers = StepNumbers()
     field: Literal["network", "hash"] = "network"  # what is learnt: mip-NeRF's network, the paper's, or a hash table
     unseen_patches: Annotated[int, between(0, 4096)] = 64  # of 8 x 8 rays in a step; the paper has as many rays as seen
     depth_weight: NonNegative = 0.1  # of the roughness of depth in them, eq. 6
@@ -49,53 +61,40 @@ class Config(HashNumbers, MipConfig):
     random_backdrop: bool = True  # the network learns open captures before random colours, as a table always does
     annealing: Share = 0.01  # share of the budget in which samples spread from the middle of rays, eq. 10
     annealing_start: PositiveShare = 0.5  # p_s, share of each ray that is sampled at first, eq. 10
+    seed: Seed = 0
+    # Of the network.
+    hidden_width: Width = 256  # channels of a layer
+    resample_padding: NonNegative = 0.01  # weight that every frustum has at least
+    coarse_loss_weight: NonNegative = 0.1  # 0: the coarse pass only guides the fine one
     learning_rate: LearningRate = 2e-3
     final_learning_rate: LearningRate = 2e-5
+    warmup: Share = 0.0025  # share of the budget in which the learning rate grows
     # Of the hash table and its networks.
     table_learning_rate: LearningRate = 1e-2
     final_table_learning_rate: LearningRate = 1e-3
     table_width: Width = 64  # neurons per hidden layer
     samples_per_step: Annotated[int, between(64, 1 << 24)] = 1 << 18
-    steps_per_diagonal: Annotated[int, between(4, 16_384)] = 1024
-    cone_angle: Share = 1 / 256
     transmittance_threshold: Share = 1e-4
     table_occupancy_threshold: NonNegative = 0.05
     hash_weight_decay: NonNegative = 0.0
     huber_delta: PositiveShare = 0.1
-    sh_bands: Annotated[int, between(1, 4)] = 4
     sweep_weight: NonNegative = 0.03  # of what plane sweeps found in the open, at first; it falls to nothing
 
-    def check(self) -> None:
-        """Raises LumigraphError for numbers that contradict each other."""
-        check_levels(self)
+    @property
+    def occupancy(self) -> OccupancyNumbers:
+        """Numbers of the hash table's occupancy grid."""
+        cells = max(MIN_RESOLUTION, self.mask.occupancy_resolution)
+        return OccupancyNumbers(
+            self.samples_per_step, self.transmittance_threshold, cells, self.table_occupancy_threshold
+        )
 
-    def numbers_of(self, kind: type[Any]) -> Any:
-        """The numbers of the field, as its own method has them: a `MipConfig` or an `NgpConfig`."""
-        ours = {x.name: getattr(self, x.name) for x in fields(self)}
-        if kind is NgpConfig:  # a table learns faster than a network, and asks smaller networks
-            ours |= {name: ours[called] for name, called in OF_TABLE.items()}
-        return kind(**{x.name: ours[x.name] for x in fields(kind) if x.name in ours})
+    @property
+    def proposals(self) -> ProposalNumbers:
+        """Numbers of the hash table's samples in scenes without bounds."""
+        return ProposalNumbers(depth_weight=self.sweep_weight)
 
 
-OF_TABLE = {  # names of Instant-NGP's numbers, and what they are called beside a network's of the same name
-    "learning_rate": "table_learning_rate",
-    "final_learning_rate": "final_table_learning_rate",
-    "hidden_width": "table_width",
-    "occupancy_threshold": "table_occupancy_threshold",
-    "depth_weight": "sweep_weight",
-}
-TABLE: dict[str, Any] = {  # of a CPU, as Instant-NGP's preset has it
-    "table_learning_rate": 2e-2,
-    "table_width": 32,
-    **TABLE_ON_A_CPU,
-    "samples_per_step": 1 << 15,
-    "steps_per_diagonal": 384,
-    "cone_angle": 1 / 96,
-    "transmittance_threshold": 1e-3,
-    "table_occupancy_threshold": 0.15,
-    "hash_weight_decay": 0.3,
-    "huber_delta": 0.3,
-}
+DECAY_START = 0.3  # share of the budget before the table's learning rate falls
 FLOWING = 0.05  # of a budget of seconds: the share that learning what is likely may take
 STRIDES = (1, 2, 4)  # pixels between rays of a patch: what is smooth, and what looks like a photograph, is so in each
 
@@ -115,23 +114,31 @@ class Glimpses(Batch):
         return Glimpses(moved.rays, moved.rgb, moved.alpha, moved.extra, unseen)
 
 
-class RegNeRF(RayMethod):
-    """Mip-NeRF or Instant-NGP, which learns as ever from photographs, and is told off for what it shows elsewhere."""
+class RegNeRF(FieldMethod):
+    """Mip-NeRF's network or a hash table, with regularisation of patches at unobserved views."""
 
     Config = Config
 
     def __init__(self, frame: Frame, config: Any = None):
-        config = config or Config()
-        super().__init__(frame, config)
-        self.marcher: MipNeRF | InstantNGP
-        if config.field == "hash":
-            self.marcher = InstantNGP(frame, replace(config.numbers_of(NgpConfig), exposure_correction="no"))
+        c = config or Config()
+        super().__init__(frame, c)
+        space = space_of(frame)
+        self.poses = poses_for(frame, c.poses)
+        self.bands = BandSchedule(c.coarse_to_fine) if c.coarse_to_fine else None
+        joining = joining_of(self.poses, self.bands)
+        if c.field == "hash":
+            with torch.random.fork_rng(devices=[]):
+                torch.manual_seed(c.seed)
+                self.network = HashField(c.table, c.table_width, space, frame.reach, joining=joining)
+            self.sampler = sampler_for(frame, space, c.occupancy, c.proposals, steps=c.steps)
         else:
-            self.marcher = MipNeRF(frame, config.numbers_of(MipConfig))
+            self.network = FrustumField(c.network, c.hidden_width, space, joining=joining)
+            self.sampler = ConeSampler(
+                space, c.rays, c.mask, c.coarse_loss_weight > 0, resample_padding=c.resample_padding
+            )
         with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(config.seed)
-            self.flow = PatchFlow() if config.likelihood_weight else None
-        self.rays_per_chunk = self.marcher.rays_per_chunk
+            torch.manual_seed(c.seed)
+            self.flow = PatchFlow() if c.likelihood_weight else None
         self._progress = 0.0
 
     @classmethod
@@ -141,94 +148,100 @@ class RegNeRF(RayMethod):
         first some hundred steps takes a larger share of the fewer there are."""
         if device.type == "cuda":
             return Config()
-        own = asdict(MipNeRF.preset(device))
-        return Config(**own, field="hash", unseen_patches=8, annealing=0.25, depth_settling=0.25, **TABLE)
+        return Config(
+            field="hash",
+            unseen_patches=8,
+            annealing=0.25,
+            depth_settling=0.25,
+            network=NetworkNumbers(depth=6, skip_layer=3, position_frequencies=16),
+            rays=RayNumbers(32, 16, rays_per_step=1024),
+            mask=MaskNumbers(occupancy_resolution=128),
+            hidden_width=128,
+            learning_rate=4e-3,
+            final_learning_rate=2e-4,
+            coarse_loss_weight=0.0,
+            warmup=0.02,
+            table=CPU_TABLE,
+            steps=CPU_STEPS,
+            table_learning_rate=2e-2,
+            table_width=32,
+            samples_per_step=1 << 15,
+            transmittance_threshold=1e-3,
+            table_occupancy_threshold=0.15,
+            hash_weight_decay=0.3,
+            huber_delta=0.3,
+        )
 
     @classmethod
     def smallest(cls) -> Any:
         """Tiny networks and two patches: every part, within some twenty quick steps."""
-        return Config(**asdict(MipNeRF.smallest()), unseen_patches=2, flow_steps=8)
+        return Config(
+            network=NetworkNumbers(depth=3, skip_layer=2, position_frequencies=6),
+            rays=RayNumbers(16, 12, rays_per_step=192),
+            mask=MaskNumbers(occupancy_resolution=16),
+            hidden_width=32,
+            learning_rate=5e-3,
+            final_learning_rate=5e-4,
+            warmup=0.1,
+            unseen_patches=2,
+            flow_steps=8,
+        )
 
     @classmethod
     def further_bytes(cls, frame: Frame, config: Any, learning: bool) -> int:
-        if config.field == "hash":
-            return InstantNGP.further_bytes(frame, config.numbers_of(NgpConfig), learning)
-        return MipNeRF.further_bytes(frame, config.numbers_of(MipConfig), learning)
-
-    # Being seen
-
-    def density(self, points: Float[Tensor, "point 3"]) -> Float[Tensor, " point"]:
-        """Density per scene unit."""
-        return self.marcher.density(points)
-
-    def field(
-        self, points: Float[Tensor, "point 3"], directions: Float[Tensor, "point 3"]
-    ) -> tuple[Float[Tensor, " point"], Float[Tensor, "point 3"]]:
-        """Density per scene unit, and sRGB-encoded colour seen along unit directions."""
-        return self.marcher.field(points, directions)
-
-    def looks(self, rays: Rays) -> list[Look]:
-        return self.marcher.looks(rays)
-
-    def render_rays(self, rays: Rays, background: Float[Tensor, "#ray 3"]) -> Rendering:
-        return self.marcher.render_rays(rays, background)
+        c = config
+        if c.field == "hash":
+            grids = c.occupancy.further_bytes(frame, learning) + c.proposals.further_bytes(frame, learning)
+            return grids + c.table.activation_bytes(c.samples_per_step, c.table_width) * learning
+        masked = c.mask.occupancy_resolution > 0  # then the number of samples is not known beforehand
+        return 0 if masked else c.network.activation_bytes(c.rays.samples_per_step, c.hidden_width) * learning
 
     # Learning
 
-    def begin(self, scene: Scene, seconds: float = math.inf) -> None:
-        self.marcher.begin(scene, seconds)
+    def begin(self, data: Scene, seconds: float = math.inf) -> None:
+        super().begin(data, seconds)
         if self.flow:
-            self.flow.learn(scene, self.config.flow_steps, self.random(-1), FLOWING * seconds)
-
-    def rehearse_begin(self) -> None:
-        self.marcher.rehearse_begin()
-
-    def rays_in_a_step(self, data: Scene) -> float:
-        return self.marcher.rays_in_a_step(data)
+            self.flow.learn(data, self.config.flow_steps, self.random(-1), FLOWING * seconds)
 
     def batch(self, data: Scene, generator: torch.Generator) -> Glimpses:
-        seen, unseen = self.marcher.batch(data, generator), None
+        seen, unseen = super().batch(data, generator), None
         if count := self.config.unseen_patches:
             cameras = unseen_cameras(data.cameras[data.splits["train"]], count, generator)
             unseen = patches(cameras, SIDE, STRIDES, generator)
         return Glimpses(seen.rays, seen.rgb, seen.alpha, seen.extra, unseen).to(self.device)
 
+    @property
+    def pass_weights(self) -> dict[str, float]:
+        return {"coarse": self.config.coarse_loss_weight}
+
     def loss(self, batch: Any, step: int) -> dict[str, Tensor]:
-        generator, unseen = self.random(step), batch.unseen
-        rays = self.marcher.poses(batch.rays) if self.marcher.poses else batch.rays
+        c, generator, unseen = self.config, self.random(step), batch.unseen
+        rays = self.moved(batch.rays)
         rays = rays if unseen is None else joined(rays, unseen)
-        looks, terms = self._look(rays, generator)
-        table = isinstance(self.marcher, InstantNGP)
-        opaque = self.marcher.unbounded is not None if table else self.config.random_backdrop and self.frame.reach > 1
+        passes, terms = self.learn_along(rays, generator)
+        opaque = self.sampler.is_open if c.field == "hash" else c.random_backdrop and self.frame.is_open
         background = backdrop(batch, self.background, generator, opaque=opaque)
-        for look, weight in looks:
-            # Of a patch, the picture before the scene's own background is judged.
-            behind = background.expand(len(batch), 3)
-            if unseen is not None:
-                behind = torch.cat([behind, self.background.expand(len(unseen), 3)])
+        # Of a patch, the picture before the scene's own background is judged.
+        behind = background.expand(len(batch), 3)
+        if unseen is not None:
+            behind = torch.cat([behind, self.background.expand(len(unseen), 3)])
+        for each in passes:
+            if not (weight := self.pass_weights.get(each.name, 1.0)):
+                continue
+            look = each.look(self.network)
             places = evened(look.samples.t)[:, None]
             whole = composite(look.samples, look.density, look.rgb, behind, places=places)
             seen, rest = (part(whole, x) for x in (slice(len(batch)), slice(len(batch), None)))
             residual, self.figures["mse"] = residuals(seen, batch, background)
-            if table:
-                terms["huber"] = huber(residual, self.config.huber_delta)
-            elif weight:
+            if c.field == "hash":
+                terms["huber"] = huber(residual, c.huber_delta)
+            else:
                 terms[look.name] = weight * residual.square().mean()
         if unseen is not None:
             terms |= self._unlike(rest)
-        if self.config.occlusion_weight:
-            terms["occlusion"] = self.config.occlusion_weight * self._before_cameras(rays, looks[-1][0])
-        self.figures |= self.marcher.figures | {"mse": self.figures["mse"]}
+        if c.occlusion_weight:
+            terms["occlusion"] = c.occlusion_weight * self._before_cameras(rays, look)
         return terms
-
-    def _look(self, rays: Rays, generator: torch.Generator) -> tuple[list[tuple[Look, float]], dict[str, Tensor]]:
-        """A step's looks along rays with the weights of their colours, the one that counts last; and what else they
-        cost, by name."""
-        if isinstance(self.marcher, InstantNGP):
-            look, terms = self.marcher.look_to_learn(rays, generator)
-            return [(look, 1.0)], terms
-        weights = self.marcher.pass_weights
-        return [(look, weights.get(look.name, 1.0)) for look in self.marcher.looks(rays, generator)], {}
 
     def _unlike(self, seen: Rendering) -> dict[str, Tensor]:
         """What patches that nobody photographed cost: how rough their depth is, how unlikely their colours are."""
@@ -246,30 +259,30 @@ class RegNeRF(RayMethod):
 
     def _before_cameras(self, rays: Rays, look: Look) -> Tensor:
         """How thick what stands in the first share of each ray is, mean of all rays."""
-        space = self.marcher.space
+        space = self.network.space
         share = torch.full((len(rays), 1), self.config.occlusion_range, device=rays.origins.device)
         until = space.distance(share, rays, *space.interval(rays))[:, 0]
         return thickness_before(look.samples, look.density, until).mean()
 
     def optimizers(self) -> list[torch.optim.Optimizer]:
-        return self.marcher.optimizers()
+        c = self.config
+        if c.field == "hash":
+            own = self.network.optimizers_at(c.table_learning_rate, c.hash_weight_decay)
+        else:
+            own = [torch.optim.Adam(self.network.parameters(), c.learning_rate)]
+        return [*own, *super().optimizers()]
 
-    def learning_rate(self, step: int, progress: float) -> float | dict[str, float]:
-        return self.marcher.learning_rate(step, progress)
+    def learning_rate(self, step: int, progress: float) -> float:
+        c = self.config
+        if c.field == "hash":
+            return held(c.table_learning_rate, c.final_table_learning_rate, step, progress, DECAY_START)
+        return falling(c.learning_rate, c.final_learning_rate, progress, c.warmup)
 
     def before_step(self, step: int, progress: float) -> None:
         c, self._progress = self.config, progress
         grown = progress / c.annealing if progress < c.annealing else 1.0
-        self.marcher.sampled = max(grown, c.annealing_start)
-        if isinstance(self.marcher, InstantNGP):
-            self.marcher.joined = progress / c.coarse_to_fine if progress < c.coarse_to_fine else 1.0
-        self.marcher.before_step(step, progress)
-
-    def after_step(self, step: int) -> None:
-        self.marcher.after_step(step)
-
-    def refined(self, cameras: Camera) -> Camera:
-        return self.marcher.refined(cameras)
+        self.sampler.sampled_share = max(grown, c.annealing_start)
+        super().before_step(step, progress)
 
 
 def joined(first: Rays, second: Rays) -> Rays:

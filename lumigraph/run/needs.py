@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import is_dataclass, replace
 from typing import Any
 
 import torch
@@ -10,7 +10,7 @@ import torch
 from .. import methods
 from ..datasets.scene import Frame
 from ..errors import LumigraphError
-from ..files.ranges import hints, numbers
+from ..files.ranges import hints, numbers, value_of
 from ..method import Method
 from ..system.memory import ask_for, free_on
 
@@ -31,8 +31,8 @@ def check_memory(kind: type[Method], frame: Frame, config: Any, device: torch.de
         less = config
         while needed(less) > free_on(device) and (half := dict(halved(less))[name]) != less:
             less = half
-        fits = f"; {getattr(less, name):,} would fit" if needed(less) <= free_on(device) else ""
-        return f"give a smaller --{name.replace('_', '-')} than {getattr(config, name):,}{fits}"
+        fits = f"; {value_of(less, name):,} would fit" if needed(less) <= free_on(device) else ""
+        return f"give a smaller --{name.replace('_', '-')} than {value_of(config, name):,}{fits}"
 
     ask_for(needed(config), device, f"{methods.name_of(kind)} with these numbers", remedy)
 
@@ -60,6 +60,9 @@ def halved(config: Any) -> list[tuple[str, Any]]:
     """A Config with each of its whole numbers at half its value, or at the least that its range allows, by name."""
     found = []
     for name, kind in hints(config.__class__).items():
+        if is_dataclass(inner := getattr(config, name)):
+            found += [(number, replace(config, **{name: less})) for number, less in halved(inner)]
+            continue
         ranges = [range for number, range in numbers(kind) if number is int and range is not None]
         if ranges and isinstance(value := getattr(config, name), int):
             found.append((name, replace(config, **{name: max(value // 2, int(ranges[0].ge or 0))})))

@@ -7,13 +7,13 @@ from pathlib import Path
 from typing import Annotated, Any
 
 from .. import files
+from ..budget import Budget
 from ..capture import Part
 from ..datasets.scene import Frame, Scene
 from ..errors import LumigraphError
 from ..files.plain import alike
 from ..files.ranges import Count, Downscale, Name, Scales, Tally, between, typed
 from ..method import Method
-from .budget import Budget
 
 FORMAT = "lumigraph run 1"
 

@@ -11,6 +11,7 @@ from ..camera import Camera, ring
 from ..datasets.scene import Frame
 from ..errors import LumigraphError
 from ..exchange import read_gaussians
+from ..files.ranges import changed
 from ..gaussians import Gaussians
 from ..geometry import Similarity
 from ..method import Method
@@ -35,7 +36,8 @@ class SplatFile(Opened):
     def method(self, device: torch.device | str = "cpu") -> Method:
         """The cloud, ready to render."""
         kind = methods.find("gaussian-splatting")
-        method = kind(self.frame, kind.Config(sh_degree=self.gaussians.degree, antialiased=self.gaussians.antialiased))
+        cloud = self.gaussians
+        method = kind(self.frame, changed(kind.Config(), sh_degree=cloud.degree, antialiased=cloud.antialiased))
         method.cloud.replace(self._in_scene)
         return method.to(device).eval()
 

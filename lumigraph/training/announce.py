@@ -8,10 +8,10 @@ import torch
 from jaxtyping import Int
 from torch import Tensor
 
+from ..budget import Budget, lasting
 from ..datasets.dataset import Dataset
 from ..datasets.scene import Scene
 from ..method.capabilities import HasGaussians, can
-from ..run.budget import Budget, lasting
 from ..system import threads
 
 

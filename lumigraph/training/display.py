@@ -13,9 +13,9 @@ from rich.console import RenderableType
 from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn
 from rich.text import Text
 
+from ..budget import Budget
 from ..datasets.dataset import Dataset
 from ..method import Lesson, Method
-from ..run.budget import Budget
 from ..system.console import console, is_live
 from ..system.progress import clock, short
 from .announce import how_long, learner, learnt_from, machine

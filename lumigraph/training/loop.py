@@ -14,12 +14,12 @@ import torch
 from torch import Tensor
 
 from .. import methods
+from ..budget import Budget
 from ..datasets.dataset import Dataset, check_kind
 from ..errors import LumigraphError
 from ..figures import save_picture
 from ..method import Lesson, Method
 from ..run import Run, State, check_memory
-from ..run.budget import Budget
 from ..system.memory import peak_memory
 from ..system.signals import Interrupt
 from .display import TrainingDisplay

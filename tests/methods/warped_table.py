@@ -1,4 +1,4 @@
-"""Warped table: a hash field under a warp that depends on time, sampled by proposals. For tests of fields and samplers."""
+"""Warped table: a hash field under a warp that depends on time, sampled by proposals. For tests of fields."""
 
 from dataclasses import dataclass
 

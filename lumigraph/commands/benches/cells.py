@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 from ... import methods
+from ...budget import Budget
 from ...errors import LumigraphError
 from ...files.ranges import Count, Downscale, Scales, Seed
-from ...run.budget import Budget
 from ..capture import posed
 from ..common import ReaderOption, choose_device, needed, option, say, show
 from ..train import DEFAULT_SECONDS

@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 from ... import methods
+from ...budget import Budget
 from ...errors import LumigraphError
 from ...files.ranges import Count, Seconds, Steps
-from ...run.budget import Budget
 from ..common import needed, option, say, scene_name
 from .cells import Cells, budgets, place_of
 

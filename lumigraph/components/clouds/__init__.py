@@ -1,1 +1,1 @@
-"""Clouds of Gaussians that learn: where they begin, how they grow, how they are smoothed."""
+"""Points and flat views of photographs with known cameras."""

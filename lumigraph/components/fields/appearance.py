@@ -5,20 +5,29 @@ Generative latent optimisation (Bojanowski 2018), as Martin-Brualla 2021, sectio
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Annotated, Any
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
 from ...datasets.scene import Batch, Photograph
+from ...errors import LumigraphError
+from ...files.ranges import between
+from ...method import Part
 from ...method.controls import Control, blend
+from ...volume import composite, weights_of
 from .code_space import axes_of, fitted
 
+CodeWidth = Annotated[int, between(1, 1024)]  # numbers of a photograph's code
+APPEARANCE = "The photograph, by number or name, in whose light and colours the scene is shown; or the average of all."
 AVERAGE = "average"  # the choice of the mean of all learnt codes
 FIT_STEPS, FIT_RATE = 100, 0.1  # the rate in deviations of the learnt codes
 FIT_PRIOR = 2e-5  # of squared error, for a deviation from the average
+FIT_WEIGHT = 5e-3  # weight in its pixel above which a sample counts
 FIT_LEAST = 0.03  # deviation also where none of the codes differ; those of trained blocks differ by 0.07 on average
 
 
@@ -44,7 +53,7 @@ class Patches:
     size: int
 
 
-class PhotographCodes(nn.Module):
+class PhotographCodes(Part):
     """Numbers of each photograph, zero at first; photographs that were not trained on keep zeros.
 
     image_count: photographs of the scene, held-out ones included
@@ -102,6 +111,73 @@ class PhotographCodes(nn.Module):
     def _of(self, choice: str) -> Float[Tensor, " width"]:
         known = choice != AVERAGE and bool(self.codes[int(choice)].any())
         return self.codes[int(choice)] if known else self.average
+
+
+class AppearanceCodes(PhotographCodes):
+    """Appearance of each photograph, chosen by the control `appearance` or found for evidence. The field's code begins
+    with it.
+
+    evidence: kinds of evidence that an appearance is found for
+    pixels:   of a photograph that are compared
+    found:    appearance of the evidence
+    """
+
+    found: Tensor | None = None
+
+    def __init__(self, image_count: int, width: int, evidence: tuple[type, ...] = (Photograph,), pixels: int = 1024):
+        super().__init__(image_count, width)
+        self.evidence, self.pixels = evidence, pixels
+
+    @property
+    def controls(self) -> tuple[Control, ...]:
+        return (self.control("appearance", APPEARANCE),)
+
+    @property
+    def accepts(self) -> tuple[type, ...]:
+        return self.evidence
+
+    def shown(self, method: Any) -> Float[Tensor, " width"]:
+        """The code of the settings, else of the evidence, else the average."""
+        if self.found is not None and "appearance" not in method.told:
+            return self.found
+        return self.told(str(method.control("appearance")))
+
+    def adapted(self, method: Any, evidence: Photograph | Patches | Appearance) -> AppearanceCodes:
+        """The part with the appearance in which the scene looks most like a photograph, by the pixels that are to be
+        trusted (Martin-Brualla 2021, section 5), or like patches of pictures; or with a given one."""
+        adapted = copy.copy(self)
+        adapted.found = self._matched(method, evidence)
+        method.told.pop("appearance", None)
+        return adapted
+
+    @torch.no_grad()
+    def _matched(self, method: Any, evidence: Photograph | Patches | Appearance) -> Float[Tensor, " width"]:
+        """The appearance of a piece of evidence; as shown, where no pixel is to be trusted."""
+        start = self.shown(method)
+        if isinstance(evidence, Appearance):
+            if evidence.code.shape != start.shape:
+                raise LumigraphError(
+                    f"An appearance of {len(evidence.code)} numbers does not fit a block whose photographs have "
+                    f"{len(start)}; give it one that was aligned with this block"
+                )
+            return evidence.code.to(start)
+        size = evidence.size if isinstance(evidence, Patches) else 1
+        batch = evidence.batch if isinstance(evidence, Patches) else drawn(evidence, self.pixels, method.random(0))
+        batch = batch.to(start.device)
+        if not len(batch):
+            return start
+        background, rest = method.background, method.shown_code[:, len(start) :]
+        target = batch.before(background)
+        last = method.sampler.sample(batch.rays, method.network)[-1]
+        last = last.keep(weights_of(last.samples, last.density) > FIT_WEIGHT)
+
+        def error(appearance: Tensor) -> Tensor:
+            code = torch.cat([appearance[None], rest], -1)
+            look, behind = last.look(method.network, code), method.behind(batch.rays, code, background)
+            residual = composite(look.samples, look.density, look.rgb, behind).rgb - target
+            return residual.view(-1, size, 3).mean(1).square().sum(-1).mean()
+
+        return self.fitted(start, error)
 
 
 def drawn(photograph: Photograph, count: int, generator: torch.Generator) -> Batch:

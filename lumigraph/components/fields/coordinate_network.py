@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
@@ -65,10 +63,3 @@ class CoordinateNetwork(nn.Module):
     def _trunk(self, position: Encoded) -> Float[Tensor, "sample width"]:
         position = position.to(self.feature.type_of_products(position))
         return self.after(torch.cat([position, self.before(position)], -1))
-
-
-def bytes_kept(config: Any) -> int:
-    """Bytes of activations that a step keeps for its gradients at least; 0 where a grid says what is empty, for then
-    nobody knows beforehand how much is not."""
-    samples = config.rays_per_step * (config.coarse_samples + config.fine_samples)
-    return 0 if config.occupancy_resolution else 2 * samples * config.depth * config.hidden_width

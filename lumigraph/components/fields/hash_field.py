@@ -23,6 +23,7 @@ from .mlp import MLP
 OPEN_RATE = (
     0.5  # of the table's learning rate, that of networks in the open: at all of it one seed in three never learns a hue
 )
+CODES_RATE = 0.25  # of the learning rate, that of codes beside a hash table
 OPEN_RESOLUTION = 2  # factor on max_resolution where coordinates are contracted: the box of interest is half as wide
 
 Joining = Callable[[int], Tensor | None]  # weights of so many levels or octaves; None where all count fully
@@ -148,13 +149,19 @@ class HashField(Field):
         """sRGB-encoded colour of the colour network's output."""
         return raw.sigmoid()
 
-    def optimizers_at(self, learning_rate: float, weight_decay: float = 0.0) -> list[torch.optim.Optimizer]:
-        """Adam for the table, whose rows are updated where they were looked up, and for the networks (section 4)."""
+    def optimizers_at(
+        self, learning_rate: float, weight_decay: float = 0.0, scale: float | None = None, groups: Any = ()
+    ) -> list[torch.optim.Optimizer]:
+        """Adam for the table, whose rows are updated where they were looked up, and for the networks (section 4).
+
+        scale:  share of the learning rate that the networks learn at; None for 1, or OPEN_RATE in the open
+        groups: further groups of parameters
+        """
         common: dict[str, Any] = {"lr": learning_rate, "betas": (0.9, 0.99), "eps": 1e-15}
         networks = [*self.density_network.parameters(), *self.colour_network.parameters()]
-        group = {"params": networks, "scale": OPEN_RATE if self.space.is_open else 1.0}
+        group = {"params": networks, "scale": scale or (OPEN_RATE if self.space.is_open else 1.0)}
         table = LazyAdam([self.table], weight_decay=0.0 if self.space.is_open else weight_decay, **common)
-        return [table, torch.optim.Adam([group], foreach=True, **common)]
+        return [table, torch.optim.Adam([group, *groups], foreach=True, **common)]
 
     def storage(self) -> dict[str, Stored]:
         """The table as whole numbers, the networks as halves."""

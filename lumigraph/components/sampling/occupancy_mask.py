@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
 
 import torch
 from jaxtyping import Bool, Float
-from torch import Tensor, nn
+from torch import Tensor
 from torch.nn.functional import max_pool3d
 
 from ...datasets.scene import Scene
+from ...files.ranges import Cells, NonNegative
+from ...method import Part
 from .carving import visual_hull
 from .occupancy import OccupancyGrid
+from .spaces import Space
 
 BEGINS = 0.1  # share of the budget before the grid rules anything out: a young network is thin everywhere
 EVERY, DECAY = 16, 0.95  # steps between looks at the grid, and what it remembers of the last one
@@ -19,7 +23,15 @@ LOOKS = 1 << 15  # at the grid, each time
 PROBES = 0.02  # share of all cells looked at again at random, in case something has grown there
 
 
-class OccupancyMask(nn.Module):
+@dataclass(frozen=True)
+class MaskNumbers:
+    """A Config's numbers of the mask of empty space."""
+
+    occupancy_resolution: Cells = 0  # cells per axis of a grid of where to sample; 0 samples everywhere
+    occupancy_threshold: NonNegative = 0.01  # optical thickness across a cell below which it is empty
+
+
+class OccupancyMask(Part):
     """A grid over the cube of coordinates, [-1, 1]^3, that remembers where a network found something.
 
     cells:     along each axis; the hull of an object may make them finer. 0: no grid, something may be anywhere
@@ -32,27 +44,27 @@ class OccupancyMask(nn.Module):
         super().__init__()
         self.cells, self.thickness = cells, thickness
         if cells:
-            self.grid = OccupancyGrid(1.0, cells)
+            self.grid = OccupancyGrid(1.0, self.cells)
             self.register_buffer("known", torch.tensor(False))
             self._coarser: tuple[Tensor, dict[int, Tensor]] = self.grid.occupied, {}
 
-    def begin(self, scene: Scene) -> None:
-        """Mark as empty for good the cells that photographs of an object see through."""
-        if self.cells and scene.images.has_alpha and scene.frame.reach <= 1:
-            self.grid.rule_out(visual_hull(scene, self.cells)[None])
+    def begin(self, method: Any, data: Scene, seconds: float) -> None:
+        """Mark as empty for good the cells that photographs of an object see through, unless poses are learnt:
+        silhouettes seen from wrong poses would carve what is there."""
+        if self.cells and data.images.has_alpha and not data.frame.is_open and not method.moves_cameras:
+            self.grid.rule_out(visual_hull(data, self.cells)[None])
 
-    def look(
-        self,
-        step: int,
-        progress: float,
-        density_at: Callable[[Float[Tensor, "point 3"]], Float[Tensor, " point"]],
-        generator: torch.Generator,
-    ) -> None:
-        """Update the grid every EVERY steps, ahead of a training step. density_at: per unit of the coordinates."""
+    def begin_from(self, teacher: Any, space: Space, chance: torch.Generator) -> None:
+        """Mark as empty for good the cells in which a teacher holds nothing."""
+        if self.cells:
+            self.grid.rule_out(teacher.occupied(space, self.cells, self.thickness, chance)[None])
+
+    def before_step(self, method: Any, step: int, progress: float) -> None:
+        """Update the grid every EVERY steps, by the density of the method's `CoordinateField`."""
         if not self.cells or progress < BEGINS or step % EVERY:
             return
         share, looks = (PROBES, LOOKS) if self.known else (1.0, None)  # everywhere for once
-        self.grid.update(density_at, self.thickness, generator, DECAY, share, looks)
+        self.grid.update(method.network.density_at, self.thickness, method.random(~step), DECAY, share, looks)
         self.known.fill_(True)
 
     def may_hold(

@@ -16,6 +16,7 @@ from ..sampling.spaces import Space
 from .schedules import held
 
 STEPS = 240
+POINTS_PER_RAY = 8  # of a step of a coordinate network: as many points are learnt from
 POOL = 16  # times as many places as a step learns from: the teacher is asked about these alone
 CELL = 1 / 16  # of the coordinates: a length over which densities are compared by what they stop
 CLEAR = 1 / 2  # the same where the teacher holds nothing: a little fog there is much along a ray

@@ -71,8 +71,8 @@ class Exposure(Part):
 
     @property
     def controls(self) -> tuple[Control, ...]:
-        """Brightness in stops, and the photograph whose exposure they count from. By default they count from the scene as
-        it was learnt, which is arbitrary: a gain that all photographs share can be the scene's own."""
+        """Brightness in stops, and the photograph whose exposure they count from. By default they count from the scene
+        as it was learnt, which is arbitrary: a gain that all photographs share can be the scene's own."""
         if not bool(self.differ):
             return ()
         photographs = tuple(str(i) for i in range(len(self.log_gain)))

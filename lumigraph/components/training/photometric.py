@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 from jaxtyping import Float
 from torch import Tensor
+from torch.nn.functional import huber_loss
 
 from ...camera.rays import Rendering
 from ...datasets.scene import Batch
@@ -47,3 +48,8 @@ def residuals(
         lacking = (batch.alpha - rendering.opacity)[:, None]
         residual = torch.cat([residual, residual + lacking * (1 - 2 * background)])
     return residual, mse
+
+
+def huber(residual: Float[Tensor, "row 3"], delta: float) -> Float[Tensor, ""]:
+    """The mean of residuals' Huber loss, divided by delta, so that the linear part has slope 1."""
+    return huber_loss(residual, torch.zeros_like(residual), delta=delta) / delta

@@ -11,13 +11,13 @@ import torch
 from torch import Tensor
 
 from ... import files
+from ...budget import Budget
 from ...errors import LumigraphError
 from ...evaluation import evaluate
 from ...geometry.choice import evenly
 from ...method import Method
 from ...method.capabilities import CanCompress, needs
 from ...run import Run, check_new
-from ...run.budget import Budget
 from ...run.checkpoint import Checkpoints
 from ...run.compressed import Compressed, bytes_in
 from ...system.progress import track

@@ -12,14 +12,13 @@ from typing import Any
 import torch
 
 from ... import files, methods
+from ...budget import Budget, Quality
 from ...camera import Camera
 from ...datasets.scene import Scene
 from ...errors import LumigraphError, LumigraphWarning
 from ...method import Method
 from ...method.capabilities import FromField, RefinesPoses, can, needs
-from ...method.quality import Quality
 from ...run import Opened, Run, State, build, check_new
-from ...run.budget import Budget
 from ...run.converted import Begun, Converted, Held, LearntFrom
 from ...system.signals import go_on_unless
 from ...training import fit

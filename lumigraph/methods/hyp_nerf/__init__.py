@@ -11,6 +11,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from ...budget import Effort, Efforts
 from ...camera import Camera
 from ...camera.rays import Look, Rays, Rendering
 from ...components.fields.code_space import fitted
@@ -41,7 +42,6 @@ from ...files.ranges import (
 from ...geometry import look_at
 from ...method import Method, RayMethod
 from ...method.controls import Control, Value, blend
-from ...method.quality import Effort, Efforts
 from ...volume import composite
 from .hash_instance import HashInstance, HashShape
 from .hypernetwork import HyperNetwork

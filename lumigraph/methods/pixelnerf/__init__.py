@@ -12,6 +12,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import softplus
 
+from ...budget import Effort, Efforts
 from ...camera import Camera
 from ...camera.rays import Look, Rays, Samples
 from ...capture.fewer import spread_out
@@ -40,7 +41,6 @@ from ...files.ranges import (
 )
 from ...method import Method, RayMethod
 from ...method.controls import Control, Value
-from ...method.quality import Effort, Efforts
 from ...volume import composite, weights_of
 from .picture_encoder import STRIDE, PictureEncoder
 from .picture_lookup import look_up

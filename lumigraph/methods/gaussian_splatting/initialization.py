@@ -1,4 +1,4 @@
-"""Where a cloud begins: at the points that structure from motion found and plane sweeps add, or at random."""
+"""Initial cloud: Gaussians at points of structure from motion and of plane sweeps, or at random."""
 
 from __future__ import annotations
 
@@ -9,32 +9,32 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from ...components.clouds.dense_points import dense_points
+from ...components.sampling.carving import visual_hull
 from ...datasets.scene import Frame, Scene
 from ...gaussians import Gaussians
 from ...kernels.spherical_harmonics import K00
-from ..sampling.carving import visual_hull
-from .dense_points import dense_points
 
 Initialization = Literal["dense", "sparse", "random"]
 
-OPACITY = 0.1  # of each Gaussian at first (Kerbl 2023; the original release)
+INITIAL_OPACITY = 0.1  # Kerbl 2023; the original release
 HULL_CELLS = 64  # along an axis
 NEIGHBOURS = 3
-FEW = 100  # points that are too few to begin at
-CROWD = 1 / 3  # of all Gaussians that may be: how many points a cloud begins with at most, as each makes steps slower
-BACKDROP = 0.2  # of the random Gaussians: how many lie far out behind dense points, where nothing else is known
+MIN_DENSE_POINTS = 100
+MAX_DENSE_SHARE = 1 / 3  # of the cap: points that plane sweeps fill up to, as each makes steps slower
+BACKDROP_SHARE = 0.2  # of the random Gaussians: how many lie far out behind dense points, where nothing else is known
 
 
 def initial_cloud(
     scene: Scene,
     initialization: Initialization,
     count: int,
-    most: int,
+    max_count: int,
     degree: int,
     generator: torch.Generator,
     seconds: float = math.inf,
 ) -> Gaussians:
-    """A cloud of at most `most` Gaussians at the points that are known, or where there are none, `count` random ones.
+    """At most `max_count` Gaussians at the points that are known, or where there are none, `count` random ones.
 
     initialization: "dense" adds to the scene's sparse points those that plane sweeps find, "sparse" takes the sparse
                     points as they are, "random" takes neither
@@ -43,22 +43,22 @@ def initial_cloud(
     """
     means, colours = torch.zeros(0, 3), torch.zeros(0, 3)
     if initialization != "random":
-        means, colours = sparse_points(scene, most, generator)
-    if initialization == "dense" and len(means) < (crowd := math.ceil(CROWD * most)):
-        means, colours = with_dense_points(scene, means, colours, count, crowd, generator, seconds)
+        means, colours = sparse_points(scene, max_count, generator)
+    if initialization == "dense" and len(means) < (dense_count := math.ceil(MAX_DENSE_SHARE * max_count)):
+        means, colours = with_dense_points(scene, means, colours, count, dense_count, generator, seconds)
     if len(means) < 2:
-        means = random_points(scene, min(count, most), generator)
+        means = random_points(scene, min(count, max_count), generator)
         colours = torch.rand(len(means), 3, generator=generator)
     return round_gaussians(means, colours, degree)
 
 
-def sparse_points(scene: Scene, most: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-    """Places and colours of the scene's own points, those within reach, at most so many; maybe none."""
+def sparse_points(scene: Scene, max_count: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+    """Positions and colours of the scene's own points within reach, at most `max_count`; maybe none."""
     if scene.points is None or len(scene.points) < 2:
         return torch.zeros(0, 3), torch.zeros(0, 3)
     inside = (scene.points.abs().amax(-1) <= scene.frame.reach) & scene.points.isfinite().all(-1)
     chosen = inside.nonzero()[:, 0]
-    chosen = chosen[torch.randperm(len(chosen), generator=generator)[:most]]
+    chosen = chosen[torch.randperm(len(chosen), generator=generator)[:max_count]]
     colours = torch.full((len(scene.points), 3), 0.5)
     if scene.point_colours is not None:
         colours = scene.point_colours.float() / 255
@@ -70,19 +70,19 @@ def with_dense_points(
     means: Tensor,
     colours: Tensor,
     count: int,
-    most: int,
+    max_count: int,
     generator: torch.Generator,
     seconds: float,
 ) -> tuple[Tensor, Tensor]:
     """Sparse points and dense ones; without sparse ones also some far out, where sweeps find nothing that agrees."""
     found = dense_points(scene, seconds)
     inside = (found.positions.abs().amax(-1) <= scene.frame.reach).nonzero()[:, 0]
-    if len(inside) < FEW:
+    if len(inside) < MIN_DENSE_POINTS:
         return means, colours
     far = torch.zeros(0, 3)
-    if not len(means) and scene.frame.reach > 1:
-        far = backdrop(scene.frame, min(int(BACKDROP * count), most // 2), generator)
-    chosen = inside[torch.randperm(len(inside), generator=generator)[: most - len(means) - len(far)]]
+    if not len(means) and scene.frame.is_open:
+        far = backdrop(scene.frame, min(int(BACKDROP_SHARE * count), max_count // 2), generator)
+    chosen = inside[torch.randperm(len(inside), generator=generator)[: max_count - len(means) - len(far)]]
     guessed = torch.rand(len(far), 3, generator=generator)
     return torch.cat([means, found.positions[chosen], far]), torch.cat([colours, found.colours[chosen], guessed])
 
@@ -102,7 +102,7 @@ def random_cloud(frame: Frame, count: int, degree: int, generator: torch.Generat
 
 
 def random_points(scene: Scene, count: int, generator: torch.Generator) -> Float[Tensor, "point 3"]:
-    if not scene.images.has_alpha or scene.frame.reach > 1:
+    if not scene.images.has_alpha or scene.frame.is_open:
         return points_in_box(scene.frame, count, generator)
     cells = visual_hull(scene, HULL_CELLS).nonzero()
     chosen = cells[torch.randint(len(cells), (count,), generator=generator)]
@@ -124,7 +124,7 @@ def round_gaussians(means: Float[Tensor, "gaussian 3"], colours: Float[Tensor, "
         means,
         torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(count, 1),
         scales.log()[:, None].repeat(1, 3),
-        torch.full((count,), OPACITY).logit(),
+        torch.full((count,), INITIAL_OPACITY).logit(),
         harmonics,
     )
 

@@ -4,21 +4,24 @@ from __future__ import annotations
 
 import torch
 from jaxtyping import Float
-from torch import Tensor, nn
+from torch import Tensor
 
 from ... import kernels
 from ...camera.rays import Rays, Samples
-from ..sampling.spaces import Space
-from ..training.fog import evened
-from .encodings import FrequencyEncoding
-from .hash_field import side_by_side
-from .mlp import MLP
+from ...components.fields.encodings import FrequencyEncoding
+from ...components.fields.hash_field import side_by_side
+from ...components.fields.mlp import MLP
+from ...components.sampling.spaces import Space
+from ...components.training.fog import evened
+from ...components.training.schedules import falling
+from ...method import Part
 
 BANDS = 3  # of spherical harmonics: from which side, and no more than that
+LEARNING_RATES = 5e-3, 5e-4  # at first and in the end
 HORIZON = 0.99  # of evened distances, where rays that do not end are asked about last
 
 
-class Visibility(nn.Module):
+class Visibility(Part):
     """f_v(x, d) in [0, 1]: how much of what is at x a photograph that looks along d sees (Tancik 2022, section 4.2).
 
     It is learnt from the transmittance of a field along the rays of photographs. The field itself learns nothing of it.
@@ -49,6 +52,12 @@ class Visibility(nn.Module):
             t = s / (1 - s)
             light = transmittance(samples, density, t)
         return (self(rays.at(t).detach(), rays.directions.detach()) - light).square().mean()
+
+    def optimizers(self) -> list[torch.optim.Optimizer]:
+        return [torch.optim.Adam([{"params": [*self.parameters()], "name": "visibility"}], LEARNING_RATES[0])]
+
+    def learning_rates(self, step: int, progress: float) -> dict[str, float]:
+        return {"visibility": falling(*LEARNING_RATES, progress)}
 
 
 def transmittance(

@@ -7,10 +7,14 @@ cells of each.
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 from jaxtyping import Float, Int
-from torch import Tensor, nn
+from torch import Tensor
 from torch.nn import functional
+
+from ...method import Part
 
 CELLS = 32  # along each side of a photograph
 BEGINS, EVERY = 0.2, 100  # share of the budget before anything is judged, and steps between judgements
@@ -19,7 +23,7 @@ STILL = 0.9  # share of cells that may always teach
 MUCH = 2.5  # times the median error of its photograph, below which a cell teaches in any case
 
 
-class Moving(nn.Module):
+class Moving(Part):
     """Remembers how much each part of each photograph errs, and says which are to be learnt from.
 
     error: mean absolute error of each cell lately; 0 where nothing is known yet
@@ -60,7 +64,7 @@ class Moving(nn.Module):
         usual = torch.where(known, around, torch.nan).flatten(1).nanmedian(1).values[:, None, None]
         self.still.copy_((around <= most) | (around <= MUCH * usual) | ~known)
 
-    def before_step(self, step: int, progress: float) -> None:
+    def before_step(self, method: Any, step: int, progress: float) -> None:
         if progress >= BEGINS and step % EVERY == 0:
             self.judge()
 

@@ -2,26 +2,33 @@
 
 from __future__ import annotations
 
+import copy
+from typing import Any
+
 import torch
 from jaxtyping import Float, Int
-from torch import Tensor, nn
+from torch import Tensor
 
+from ...components.fields.encodings import FrequencyEncoding
+from ...datasets.scene import Photograph, Scene
+from ...method import Part
 from ...method.controls import Control
-from .encodings import FrequencyEncoding
 
 FULL = 8.0  # stops that count as 1, so that the longest wave rises all the way from four below the usual to four above
 SAME = 0.01  # stops within which all photographs count as exposed alike
 
 
-class Exposures(nn.Module):
+class Exposures(Part):
     """The log exposure of each photograph, in stops from the usual one, as waves (section 4.2.3).
 
     usual: log2 of the median exposure of the photographs that are learnt from; 0 where none is known
     stops: of each photograph from there, 0 where it is not known
     known: whether it is
     span:  the least and the most that is learnt from
+    taken: stops of a photograph that was given as evidence
     """
 
+    taken: float | None = None
     usual: Tensor
     stops: Tensor
     known: Tensor
@@ -36,9 +43,10 @@ class Exposures(nn.Module):
         self.register_buffer("known", torch.zeros(image_count, dtype=torch.bool))
         self.register_buffer("span", torch.zeros(2))
 
-    def begin(self, exposure: Float[Tensor, " image"], train: Int[Tensor, " some"]) -> None:
-        """exposure: as `Scene.about` has it, NaN where not known; train: the photographs that are learnt from"""
-        stops = exposure.to(self.stops).log2()
+    def begin(self, method: Any, data: Scene, seconds: float) -> None:
+        if "exposure" not in data.about:
+            return
+        stops, train = data.about["exposure"].to(self.stops).log2(), data.splits["train"]  # NaN where not known
         known = stops.isfinite()
         learnt = stops[train][known[train]]
         if not len(learnt):
@@ -63,16 +71,29 @@ class Exposures(nn.Module):
         """Of one photograph, from the usual; None where it is not known."""
         return float(self.stops[image]) if self.known[image] else None
 
+    # Settings
+
     @property
-    def control(self) -> Control | None:
-        """Exposure within what was learnt from; None where all photographs were exposed alike."""
+    def controls(self) -> tuple[Control, ...]:
+        """Exposure within what was learnt from; none where all photographs were exposed alike."""
         least, most = self.span.tolist()
         if most - least < SAME:
-            return None
-        return Control(
-            "exposure",
-            0.0,
-            (least, most),
-            unit="stops",
-            about="As if photographed with so much more or less exposure than usual, within what was photographed.",
-        )
+            return ()
+        about = "As if photographed with so much more or less exposure than usual, within what was photographed."
+        return (Control("exposure", 0.0, (least, most), unit="stops", about=about),)
+
+    def shown(self, method: Any) -> Float[Tensor, " width"]:
+        """The code of the settings, else of the evidence, else of the usual exposure."""
+        stops = method.told.get("exposure", 0.0 if self.taken is None else self.taken)
+        return self.encoded(self.usual.new_tensor([float(stops)]))[0]
+
+    @property
+    def accepts(self) -> tuple[type, ...]:
+        """Photographs, where exposures are known."""
+        return () if self.usual_stops is None else (Photograph,)
+
+    def adapted(self, method: Any, evidence: Photograph) -> Exposures:
+        """The part with the exposure of a photograph, where its camera's `image_index` tells."""
+        adapted, image = copy.copy(self), evidence.camera.image_index
+        adapted.taken = None if image is None else self.stops_of(int(image[0]))
+        return adapted

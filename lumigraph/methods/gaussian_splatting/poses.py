@@ -1,4 +1,4 @@
-"""A cloud as a camera sees it whose pose is learnt: the pose's gradient, by way of the Gaussians."""
+"""Pose refinement through a cloud: the pose's gradient, by way of the Gaussians."""
 
 from __future__ import annotations
 
@@ -8,16 +8,16 @@ import torch
 from torch import Tensor
 
 from ...camera import Camera
+from ...components.training.pose_refinement import PoseRefinement
 from ...gaussians import Gaussians
 from ...geometry import multiply, rotated
-from ..training.pose_refinement import PoseRefinement
 
 
 def seen_from(poses: PoseRefinement, cloud: Gaussians, camera: Camera) -> tuple[Gaussians, Camera]:
-    """The same cloud, and the refined camera of one photograph, so that a picture of the one through the other has a
-    gradient in `poses`.
+    """The cloud and the refined camera of one photograph, so that a picture of the one through the other has a gradient
+    in `poses`.
 
-    The projection knows gradients of Gaussians and none of cameras. To move a camera one way is to move the cloud the
+    The projection has gradients in Gaussians and none in cameras. To move a camera one way is to move the cloud the
     other: with the camera's rotation exp(omega) and shift s as they are, and R = exp(omega) exp(omega_0)^T, which is
     the identity for omega = omega_0 and yet has a gradient,
 

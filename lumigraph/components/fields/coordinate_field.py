@@ -1,0 +1,180 @@
+"""A field in the weights of a coordinate network (Mildenhall et al. 2020)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor, nn
+
+from ...files.ranges import Depth, Layers, Octaves
+from ...method import Field
+from ..sampling.spaces import Space
+from .coordinate_network import CoordinateNetwork
+from .dense import in_chunks
+from .encodings import FrequencyEncoding
+from .hash_field import Joining
+
+Places = tuple[Tensor, ...]  # what is encoded: coordinates of points, or means and variances of frustums
+Activation = Callable[[Tensor], Tensor]
+
+
+@dataclass(frozen=True)
+class NetworkNumbers:
+    """A Config's numbers of a coordinate network; the paper's (Mildenhall 2020)."""
+
+    depth: Depth = 8  # hidden layers before density, appendix A
+    skip_layer: Layers = 5  # the layer whose activation the input joins again, figure 7
+    position_frequencies: Octaves = 10  # L, octaves of positions, section 5.1
+    direction_frequencies: Octaves = 4  # L, octaves of directions, section 5.1
+    bfloat16: bool = True  # multiply in bfloat16 where the machine is fast at it
+
+    def activation_bytes(self, samples: int, hidden_width: int) -> int:
+        """Lower bound of the bytes of activations that a step of so many samples keeps for its gradients."""
+        return 2 * samples * self.depth * hidden_width
+
+
+class CoordinateField(Field):
+    """Density from position; colour from position, direction and a code (Mildenhall 2020, figure 7).
+
+    Without a code, density and colour are evaluated together, a cacheful of samples at a time. With one, features of
+    all samples are kept, so that colours under several codes need one evaluation.
+
+    numbers, hidden_width: of the network
+    space:      whose coordinates the network takes
+    code:       width of a code that colour depends on beside the direction, such as an appearance embedding
+    joining:    weights of the octaves, where they join from coarse to fine; None where all count fully
+    keep_input: whether the input itself joins its octaves
+    activation: density per unit of the coordinates from the network's output
+    noise:      deviation of noise that is added to the output for density in training
+    coarse:     field of the coarse pass; None for this one
+    """
+
+    coarse: CoordinateField | None
+
+    def __init__(
+        self,
+        numbers: NetworkNumbers,
+        hidden_width: int,
+        space: Space,
+        code: int = 0,
+        joining: Joining | None = None,
+        keep_input: bool = False,
+        activation: Activation = torch.relu,
+        noise: float = 0.0,
+        coarse: CoordinateField | None = None,
+    ):
+        super().__init__()
+        self.numbers, self.space, self.joining = numbers, space, joining
+        self.activation, self.noise, self.coarse = activation, noise, coarse
+        self.joint = not code  # type: ignore[misc]  # of an instance
+        self.encode_position, self.encode_direction = self.encodings(keep_input)
+        inputs = self.encode_position.width, self.encode_direction.width + code
+        shape = numbers.depth, hidden_width, numbers.skip_layer
+        self.network = CoordinateNetwork(*inputs, *shape, exact=not numbers.bfloat16)  # type: ignore[arg-type]
+
+    def encodings(self, keep_input: bool) -> tuple[nn.Module, FrequencyEncoding]:
+        """Encodings of places and of directions."""
+        n = self.numbers
+        return (
+            FrequencyEncoding(3, n.position_frequencies, keep_input),
+            FrequencyEncoding(3, n.direction_frequencies, keep_input),
+        )
+
+    def encode(self, coordinates: Float[Tensor, "place 3"]) -> Float[Tensor, "place width"]:
+        """The network's input at places."""
+        return self.encode_position(coordinates, self.octave_weights())
+
+    def octave_weights(self) -> Float[Tensor, " octave"] | None:
+        """Weights of the octaves that have joined; None where all count fully."""
+        return self.joining(self.numbers.position_frequencies) if self.joining else None
+
+    def activated(self, raw: Float[Tensor, "place 3"]) -> Float[Tensor, "place 3"]:
+        """sRGB-encoded colour of the network's output."""
+        return raw.sigmoid()
+
+    # At places on rays: density per unit of the coordinates
+
+    def density_at(
+        self, *places: Tensor, where: Bool[Tensor, " place"] | None = None, generator: torch.Generator | None = None
+    ) -> Float[Tensor, " place"]:
+        """Density alone. where: places that are evaluated; zero elsewhere. generator: of the noise in training"""
+        return in_chunks(
+            lambda *x: (self._dense(self.network.density(self.encode(*x)), generator),), *places, where=where
+        )[0]
+
+    def colours_at(
+        self,
+        places: Places,
+        ray: Int[Tensor, " place"],
+        directions: Float[Tensor, "ray 3"],
+        where: Bool[Tensor, " place"] | None = None,
+        generator: torch.Generator | None = None,
+    ) -> tuple[Float[Tensor, " place"], Float[Tensor, "place 3"]]:
+        """Density and colour, of a field without a code. ray: of each place"""
+        views = self.encode_direction(directions)
+
+        def answer(ray: Tensor, *places: Tensor) -> tuple[Tensor, Tensor]:
+            raw, rgb = self.network(self.encode(*places), views[ray])
+            return self._dense(raw, generator), self.activated(rgb)
+
+        return in_chunks(answer, ray, *places, where=where)  # type: ignore[return-value]
+
+    def features_at(self, *places: Tensor) -> tuple[Float[Tensor, " place"], Float[Tensor, "place width"]]:
+        """Density and features for `colour`, of a field with a code."""
+
+        def answer(*places: Tensor) -> tuple[Tensor, Tensor]:
+            raw, feature = self.network.geometry(self.encode(*places))
+            return self.activation(raw), feature
+
+        return in_chunks(answer, *places)  # type: ignore[return-value]
+
+    def _dense(self, raw: Float[Tensor, " place"], generator: torch.Generator | None) -> Float[Tensor, " place"]:
+        if self.noise and generator is not None:
+            raw = raw + self.noise * torch.randn(len(raw), generator=generator).to(raw.device)
+        return self.activation(raw)
+
+    # At points
+
+    def geometry(
+        self, points: Float[Tensor, "point 3"], code: Tensor | None = None
+    ) -> tuple[Float[Tensor, " point"], Tensor | Places]:
+        """Density per scene unit; features, without a code the places themselves."""
+        coordinates = self.space.warp(points)
+        if self.joint:
+            return self.density(points), (coordinates,)
+        density, features = self.features_at(coordinates)
+        return density * self.space.stretch(points), features
+
+    def colour(
+        self,
+        features: Tensor | Places,
+        directions: Float[Tensor, "point 3"],
+        code: Float[Tensor, "point code"] | None = None,
+    ) -> Float[Tensor, "point 3"]:
+        if isinstance(features, tuple):
+            return self.colours_at(features, torch.arange(len(directions), device=directions.device), directions)[1]
+        return in_chunks(lambda *x: (self._seen(*x),), features, directions, code)[0]
+
+    def density(self, points: Float[Tensor, "point 3"], code: Tensor | None = None) -> Float[Tensor, " point"]:
+        return self.density_at(self.space.warp(points)) * self.space.stretch(points)
+
+    def forward(
+        self,
+        points: Float[Tensor, "point 3"],
+        directions: Float[Tensor, "point 3"],
+        code: Float[Tensor, "point code"] | None = None,
+    ) -> tuple[Float[Tensor, " point"], Float[Tensor, "point 3"]]:
+        def answer(x: Tensor, *seen: Tensor) -> tuple[Tensor, Tensor]:
+            raw, feature = self.network.geometry(self.encode(x))
+            return self.activation(raw), self._seen(feature, *seen)
+
+        given = (directions,) if code is None else (directions, code)
+        density, rgb = in_chunks(answer, self.space.warp(points), *given)
+        return density * self.space.stretch(points), rgb
+
+    def _seen(self, feature: Tensor, directions: Tensor, *code: Tensor) -> Float[Tensor, "point 3"]:
+        view = torch.cat([self.encode_direction(directions), *code], -1)
+        return self.activated(self.network.seen(feature, view))

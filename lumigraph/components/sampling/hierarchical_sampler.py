@@ -1,0 +1,131 @@
+"""Hierarchical sampler: samples evenly along each ray, then more where those found density (Mildenhall 2020, 5.2)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from ...camera.rays import Rays, Samples
+from ...files.ranges import BatchSize, RaySamples
+from ...method import Pass, Sampler
+from ...volume import weights_of
+from ..fields.coordinate_field import CoordinateField, Places
+from .occupancy_mask import MaskNumbers, OccupancyMask
+from .sampling import inverse_transform, midpoints, stratified
+from .spaces import Space
+
+RAYS_WITH_FEATURES = 1024  # rays that are rendered at once where the features of all their samples are kept
+
+
+@dataclass(frozen=True)
+class RayNumbers:
+    """A Config's numbers of rays and of the samples of their two passes; the paper's (Mildenhall 2020)."""
+
+    coarse_samples: RaySamples = 64  # samples of a ray in the first pass, appendix A
+    fine_samples: RaySamples = 128  # further samples, drawn where the first pass found density, appendix A
+    rays_per_step: BatchSize = 4096  # section 5.3
+
+    @property
+    def samples_per_step(self) -> int:
+        """Number of samples of both passes."""
+        return self.rays_per_step * (self.coarse_samples + self.fine_samples)
+
+
+class HierarchicalSampler(Sampler):
+    """Two passes of a `CoordinateField`: a coarse one, and a fine one of the coarse samples and more.
+
+    mask:                    of empty space, where the field is not evaluated
+    learns_coarse:           whether colours of the coarse pass are learnt from; otherwise it only guides the fine pass
+    transmittance_threshold: at which a ray terminates, by the coarse pass; 0: never
+    """
+
+    def __init__(
+        self,
+        space: Space,
+        numbers: RayNumbers,
+        mask: MaskNumbers = MaskNumbers(),
+        learns_coarse: bool = True,
+        transmittance_threshold: float = 0.0,
+    ):
+        super().__init__()
+        self.space, self.numbers, self.learns_coarse = space, numbers, learns_coarse
+        self.transmittance_threshold = transmittance_threshold
+        self.empty = OccupancyMask(mask.occupancy_resolution, mask.occupancy_threshold)
+
+    @property
+    def batch_size(self) -> int:
+        return self.numbers.rays_per_step
+
+    @property
+    def expected_rays(self) -> float:
+        return self.numbers.rays_per_step
+
+    def sample(
+        self, rays: Rays, field: Any, code: Tensor | None = None, generator: torch.Generator | None = None
+    ) -> list[Pass]:
+        learns = generator is not None and self.learns_coarse
+        shares = self.coarse_shares(rays, generator)
+        with torch.set_grad_enabled(torch.is_grad_enabled() and learns):
+            coarse = self._pass("coarse", field.coarse or field, rays, shares, None, generator, colours=learns)
+            weights = weights_of(coarse.samples, coarse.density).view(len(rays), -1).detach()
+        fine = self._pass("fine", field, rays, *self.fine_shares(shares, weights, generator), generator)
+        if generator is not None:
+            self.evaluated = fine.evaluated
+        return [coarse, fine]
+
+    def coarse_shares(self, rays: Rays, generator: torch.Generator | None) -> Float[Tensor, "ray place"]:
+        """Places of the first pass, shares of the way along each ray."""
+        return stratified(len(rays), self.numbers.coarse_samples, generator, rays.origins.device)
+
+    def fine_shares(
+        self, shares: Tensor, weights: Float[Tensor, "ray sample"], generator: torch.Generator | None
+    ) -> tuple[Tensor, Bool[Tensor, " all_samples"] | None]:
+        """Places of the second pass, and the samples that light reaches; None for all."""
+        again = stratified(len(shares), self.numbers.fine_samples, generator, shares.device)
+        again = inverse_transform(midpoints(shares), weights[:, 1:-1], again)
+        both, order = torch.cat([shares, again], -1).sort(-1)
+        if not self.transmittance_threshold:
+            return both, None
+        lit = weights.cumsum(-1) - weights <= 1 - self.transmittance_threshold
+        lit = torch.cat([lit, torch.ones_like(again, dtype=torch.bool)], -1)
+        return both, lit.gather(-1, order).flatten()
+
+    def places(self, shares: Tensor, rays: Rays) -> tuple[Samples, Places, Tensor | None]:
+        """Samples from each place to the next (eq. 3), what the field encodes of them, and their radius."""
+        with torch.no_grad():  # the places of samples depend on no pose
+            near, far = self.space.interval(rays)
+            t = self.space.distance(shares, rays, near, far)
+        points = rays.origins[:, None] + t[..., None] * rays.directions[:, None]
+        return Samples.rows(t, far), (self.space.warp(points.flatten(0, 1)),), None
+
+    def _pass(
+        self,
+        name: str,
+        field: CoordinateField,
+        rays: Rays,
+        shares: Tensor,
+        lit: Bool[Tensor, " all_samples"] | None = None,
+        generator: torch.Generator | None = None,
+        colours: bool = True,
+    ) -> Pass:
+        """A field at places along rays. colours: evaluate them at once, of a field without a code"""
+        samples, places, radius = self.places(shares, rays)
+        ray, features, rgb = samples.ray_index, places, None
+        there = self.empty.may_hold(places[0], radius)
+        where = there if lit is None else lit if there is None else lit & there
+        if not field.joint:
+            density, features = field.features_at(*places)
+        elif colours:
+            density, rgb = field.colours_at(places, ray, rays.directions, where, generator)
+        else:
+            density = field.density_at(*places, where=where, generator=generator)
+        density = density * self.space.along(rays, samples)
+        count = len(samples) if where is None else int(where.sum())
+        return Pass(name, samples, density, features, rays.directions[ray], None, rgb, count, field=field)
+
+    def begin_from(self, teacher: Any, chance: torch.Generator) -> None:
+        self.empty.begin_from(teacher, self.space, chance)

@@ -1,0 +1,245 @@
+"""Block-NeRF: one block of a city, in the light of each photograph (Tancik et al. 2022, arXiv 2202.05263).
+
+The field of one block learns from any scene. `large.compositing` makes one picture of many.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Annotated, Any, Literal
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+from torch.nn.functional import huber_loss
+
+from ...components.fields.appearance import Appearance, AppearanceCodes, CodeWidth, Patches
+from ...components.fields.coordinate_field import NetworkNumbers
+from ...components.fields.frustum_field import FrustumField
+from ...components.fields.hash_field import CODES_RATE, CPU_TABLE, OPEN_RATE, TINY_TABLE, HashField, HashNumbers
+from ...components.fields.sky import sky_for
+from ...components.sampling.cone_sampler import ConeSampler
+from ...components.sampling.hierarchical_sampler import RAYS_WITH_FEATURES, RayNumbers
+from ...components.sampling.occupancy_sampler import (
+    CPU_OCCUPANCY,
+    CPU_STEPS,
+    TINY_OCCUPANCY,
+    TINY_STEPS,
+    OccupancyNumbers,
+    StepNumbers,
+)
+from ...components.sampling.proposal_sampler import ProposalNumbers
+from ...components.sampling.samplers import sampler_for
+from ...components.sampling.spaces import space_of
+from ...components.training.photometric import backdrop
+from ...components.training.pose_refinement import PoseNumbers, poses_for
+from ...components.training.schedules import held
+from ...datasets.scene import Batch, Frame, Photograph, Scene
+from ...files.ranges import Layers, LearningRate, NonNegative, Octaves, PositiveShare, Seed, Width, between
+from ...method import FieldMethod
+from ...volume import composite
+from .exposures import Exposures
+from .moving import Moving
+from .visibility import Visibility
+
+
+@dataclass(frozen=True)
+class Config:
+    """The paper's numbers, with where it gives them; `BlockNeRF.preset` gives those of a plain CPU."""
+
+    network: NetworkNumbers = NetworkNumbers(position_frequencies=16)  # mip-NeRF's
+    rays: RayNumbers = RayNumbers(128, 128)  # mip-NeRF's
+    table: HashNumbers = HashNumbers()
+    occupancy: OccupancyNumbers = OccupancyNumbers()
+    steps: StepNumbers = StepNumbers()
+    proposals: ProposalNumbers = ProposalNumbers()
+    poses: PoseNumbers = PoseNumbers(match_photographs=False)  # section 4.2.2
+    field: Literal["hash", "network"] = "network"  # what holds the block: a hash table, or the paper's Mip-NeRF
+    appearance: bool = True  # a code for each photograph, section 4.2.1
+    appearance_code: CodeWidth = 32  # its numbers
+    exposure: bool = True  # log exposure as input, where photographs say theirs, section 4.2.3
+    exposure_frequencies: Octaves = 4  # its octaves, section 4.2.3
+    visibility: bool = True  # learn which places were seen, section 4.2.5
+    visibility_frequencies: Octaves = 6  # octaves of places
+    visibility_layers: Layers = 4  # hidden layers: a network much smaller than the field
+    visibility_width: Width = 128  # their channels
+    residual_masks: bool = False  # leave out parts of photographs that no other agrees with, beside the masks given
+    huber_delta: PositiveShare = 1.0  # residual at which the loss turns from square to linear; 1: never
+    own_skies: bool = True  # of the hash table in the open: behind everything a sky that depends on the codes
+    hidden_width: Width = 512  # channels of a layer
+    learning_rate: LearningRate = 1e-3
+    final_learning_rate: LearningRate = 1e-5  # at the end of the budget
+    decay_start: Annotated[float, between(0, 0.99)] = 0.0  # share of the budget before the learning rate falls
+    resample_padding: NonNegative = 0.01  # of the network: weight that every frustum has at least
+    coarse_loss_weight: NonNegative = 0.1  # of the network; 0: the coarse pass only guides the fine one
+    seed: Seed = 0
+
+
+FIT_PIXELS = 2048  # pixels of a photograph that its appearance is found from
+
+
+class BlockNeRF(FieldMethod):
+    """Colours that depend on a photograph's appearance and exposure, and a network that knows what was seen."""
+
+    Config = Config
+    in_blocks = True
+
+    def __init__(self, frame: Frame, config: Any = None):
+        c = config or Config()
+        super().__init__(frame, c)
+        space, photographs, self.sky = space_of(frame), frame.image_count, None
+        self.poses = poses_for(frame, c.poses)
+        # Exposures come first: the appearance of a photograph is found in its exposure.
+        self.exposures = Exposures(photographs, c.exposure_frequencies) if c.exposure else None
+        evidence = Photograph, Patches, Appearance
+        codes = photographs, c.appearance_code, evidence, FIT_PIXELS
+        self.appearance = AppearanceCodes(*codes) if c.appearance else None
+        self.moving = Moving(photographs) if c.residual_masks else None
+        code = (c.appearance_code if c.appearance else 0) + (self.exposures.width if self.exposures else 0)
+        joining = self.poses.weights if self.poses else None
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(c.seed)
+            if c.field == "hash":
+                self.network = HashField(c.table, c.hidden_width, space, frame.reach, code, joining)
+                self.sky = sky_for(frame, c.own_skies, c.table.sh_bands, code, c.hidden_width)
+                self.sampler = sampler_for(frame, space, c.occupancy, c.proposals, steps=c.steps)
+            else:
+                self.network = FrustumField(c.network, c.hidden_width, space, code=code, joining=joining, padding=0.0)
+                learns_coarse, padding = c.coarse_loss_weight > 0, c.resample_padding
+                self.sampler = ConeSampler(space, c.rays, learns_coarse=learns_coarse, resample_padding=padding)
+                self.sampler.rays_per_chunk = RAYS_WITH_FEATURES
+            shape = c.visibility_frequencies, c.visibility_layers, c.visibility_width
+            self.sight = Visibility(space, *shape) if c.visibility else None
+
+    @classmethod
+    def preset(cls, device: torch.device) -> Any:
+        """On a GPU the paper's networks. On a CPU a hash table with Instant-NGP's numbers there."""
+        if device.type == "cuda":
+            return Config()
+        return Config(
+            field="hash",
+            table=CPU_TABLE,
+            occupancy=CPU_OCCUPANCY,
+            steps=CPU_STEPS,
+            visibility_layers=2,
+            visibility_width=64,
+            huber_delta=0.3,
+            hidden_width=32,
+            learning_rate=2e-2,
+            final_learning_rate=1e-3,
+            decay_start=0.3,
+        )
+
+    @classmethod
+    def smallest(cls) -> Any:
+        """A tiny table with tiny networks, every part of it, within some twenty quick steps."""
+        return Config(
+            field="hash",
+            table=TINY_TABLE,
+            occupancy=TINY_OCCUPANCY,
+            steps=TINY_STEPS,
+            poses=PoseNumbers(refine_cameras=True, match_photographs=False),
+            appearance_code=4,
+            exposure_frequencies=2,
+            visibility_frequencies=3,
+            visibility_layers=1,
+            visibility_width=16,
+            residual_masks=True,
+            hidden_width=16,
+            learning_rate=2e-2,
+            final_learning_rate=1e-3,
+        )
+
+    @classmethod
+    def further_bytes(cls, frame: Frame, config: Any, learning: bool) -> int:
+        c = config
+        if c.field == "network":
+            return c.network.activation_bytes(c.rays.samples_per_step, c.hidden_width) * learning
+        activations = c.table.activation_bytes(c.occupancy.samples_per_step, c.hidden_width)
+        return super().further_bytes(frame, config, learning) + activations * learning
+
+    # Learning
+
+    def batch(self, data: Scene, generator: torch.Generator) -> Batch:
+        places = self.moving is not None
+        return data.sample_rays(self.sampler.batch_size, generator, places=places).to(self.device)
+
+    @property
+    def pass_weights(self) -> dict[str, float]:
+        return {"coarse": self.config.coarse_loss_weight}
+
+    def loss(self, batch: Batch, step: int) -> dict[str, Tensor]:
+        """The error of every pass's colours, and of the visibility network along the last pass's rays."""
+        c, generator, rays = self.config, self.random(step), self.moved(batch.rays)
+        assert rays.image_index is not None
+        codes = self.codes(rays.image_index)
+        background = backdrop(batch, self.background, generator, opaque=self.frame.is_open)
+        target = batch.before(background)
+        behind = self.behind(rays, codes, background)
+        passes, terms = self.learn_along(rays, generator)
+        counted = self._counted(batch)
+        for each in passes:
+            if weight := self.pass_weights.get(each.name, 1.0):
+                look = each.look(self.network, codes)
+                residual = composite(look.samples, look.density, look.rgb, behind).rgb - target
+                error = huber_loss(residual, torch.zeros_like(residual), reduction="none", delta=c.huber_delta)
+                terms[each.name] = weight * (counted * error.mean(-1)).mean() / c.huber_delta
+        if self.sight:
+            terms["visibility"] = self.sight.error(rays, look.samples, look.density.detach(), generator)
+        if self.moving:
+            self.moving.note(rays.image_index, batch.extra["place"], residual.detach().abs().mean(-1))
+        self.figures |= {"mse": float(residual.detach().square().mean())}
+        return terms
+
+    def _counted(self, batch: Batch) -> Float[Tensor, " ray"]:
+        """1 for rays that teach, 0 for those that see what moved."""
+        if self.moving is None or batch.rays.image_index is None:
+            return torch.ones_like(batch.rays.radius)
+        weights = self.moving.weights(batch.rays.image_index, batch.extra["place"])
+        self.figures["left_out"] = float(1 - weights.mean())
+        return weights
+
+    def optimizers(self) -> list[torch.optim.Optimizer]:
+        rate, codes = self.config.learning_rate, [self.appearance.codes] if self.appearance else []
+        if self.config.field == "hash":
+            groups = [{"params": codes, "scale": CODES_RATE}]
+            groups += [{"params": [*self.sky.parameters()], "scale": OPEN_RATE}] if self.sky else []
+            own = self.network.optimizers_at(rate, scale=OPEN_RATE, groups=groups)
+        else:
+            own = [torch.optim.Adam([*self.network.parameters(), *codes], rate)]
+        return [*own, *super().optimizers()]
+
+    def learning_rate(self, step: int, progress: float) -> float:
+        c = self.config
+        return held(c.learning_rate, c.final_learning_rate, step, progress, c.decay_start)
+
+    def codes(self, image: Int[Tensor, " ray"]) -> Float[Tensor, "ray code"]:
+        """The code of each ray's photograph: appearance, then exposure."""
+        nothing = torch.zeros(len(image), 0, device=self.device)
+        return torch.cat([nothing, *(part(image) for part in (self.appearance, self.exposures) if part)], -1)
+
+    # Rendering
+
+    @property
+    def shown_code(self) -> Float[Tensor, "1 code"]:
+        nothing = torch.zeros(0, device=self.device)
+        return torch.cat([nothing, *(x.shown(self) for x in (self.appearance, self.exposures) if x)])[None]
+
+    @property
+    def shown_in(self) -> Appearance:
+        """The appearance of pictures: of the settings, else of the evidence, else the average. Empty where none was
+        learnt."""
+        return Appearance(self.appearance.shown(self) if self.appearance else torch.zeros(0, device=self.device))
+
+    @property
+    def usual_exposure(self) -> float | None:
+        """log2 of the median exposure of the photographs that it learnt from; None where that is not known."""
+        return self.exposures.usual_stops if self.exposures else None
+
+    @torch.no_grad()
+    def visibility(
+        self, points: Float[Tensor, "point 3"], directions: Float[Tensor, "point 3"]
+    ) -> Float[Tensor, " point"]:
+        """Share of each place, seen along a unit direction, that the block's photographs saw (section 4.2.5); 1 where
+        that was not learnt."""
+        return self.sight(points, directions) if self.sight else torch.ones_like(points[:, 0])

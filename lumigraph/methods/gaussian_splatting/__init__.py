@@ -1,0 +1,295 @@
+"""3D Gaussian Splatting: a scene as a cloud of soft, coloured ellipsoids (Kerbl et al. 2023, arXiv 2308.04079)."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import Annotated, Any, Literal
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from ... import kernels
+from ...camera import Camera
+from ...camera.rays import Rendering
+from ...color.blending import over
+from ...components.clouds.dense_points import compile_sweep
+from ...components.fields.taken_over import taken_over
+from ...components.training.pose_refinement import PoseNumbers, poses_for
+from ...datasets.scene import Frame, Photograph, Scene
+from ...files.ranges import CloudSize, PositiveShare, Seed, Share, Steps, between
+from ...gaussians import Gaussians
+from ...gaussians.splatting import render, splat, view_of
+from ...method import Method
+from .adaptive import AdaptiveDensity, AdaptiveNumbers
+from .addition import Addition, Step
+from .appearance import AppearanceNumbers, SplatAppearance
+from .cloud import Cloud, RateNumbers
+from .compression import picture_share, thinned
+from .density_control import DensityControl, RefineNumbers
+from .few_views import FewViewNumbers, FewViews
+from .initialization import Initialization, initial_cloud, random_cloud
+from .interval_schedule import intervals
+from .mcmc import MarkovChain, McmcNumbers
+from .mip_filter import MipFilter, MipNumbers
+from .poses import seen_from
+from .robust_mask import RobustMask, RobustNumbers
+from .surfaces import cloud_of, surface_cloud
+from .tidying import Tidying
+
+
+@dataclass(frozen=True)
+class Config:
+    """The paper's numbers, with where it gives them; those without a section are the authors' release's."""
+
+    sh_degree: Annotated[int, between(0, 3)] = 3  # degree of the spherical harmonics, section 5.1
+    sh_degree_interval: Steps = 1000  # steps, section 7.1; or the share below of the budget, if that is sooner
+    sh_degree_interval_share: PositiveShare = 1 / 8  # share of the budget
+    ssim_weight: Share = 0.2  # share of D-SSIM in the loss, eq. 7
+    initialization: Initialization = "sparse"  # points of structure from motion, "dense" with plane sweeps' beside them
+    initial_gaussians: CloudSize = 100_000  # at random places, where nothing else is known, section 7.1
+    half_resolution_until: Share = 0.0  # share of the budget at half size; the first quarter of it at a quarter
+    transmittance_threshold: Share = 1e-4  # transmittance at which a pixel is finished, appendix C
+    strategy: Literal["adaptive", "mcmc"] = "adaptive"  # density control: section 5, or Kheradmand 2024
+    rates: RateNumbers = RateNumbers()
+    refine: RefineNumbers = RefineNumbers()
+    adaptive: AdaptiveNumbers = AdaptiveNumbers()
+    mcmc: McmcNumbers = McmcNumbers()
+    filters: MipNumbers = MipNumbers()
+    poses: PoseNumbers = PoseNumbers(pose_learning_rate=5e-3)
+    photographs: AppearanceNumbers = AppearanceNumbers()
+    distractors: RobustNumbers = RobustNumbers()
+    sparse: FewViewNumbers = FewViewNumbers()
+    seed: Seed = 0
+
+
+BLACK = 0.0, 0.0, 0.0
+SWEEP_SHARE = 0.08  # share of a budget of seconds that plane sweeps may take
+NEAR_PLANE_SCALE = 0.1  # of the scene's near distance; Gaussians before the near plane get no gradient
+MIN_PIXELS = 64  # along the shorter side of a photograph that is reduced
+COARSE_UNTIL = 0.5  # share of the budget with plain colours, and by default half size, where poses are refined
+PLACEHOLDER_COUNT = 1000  # random Gaussians before training at most
+MAX_TEACHER_SHARE = 0.5  # of the cap, with which a cloud begins on the surfaces of a teacher
+
+
+class GaussianSplatting(Method):
+    """A cloud of Gaussians that learns from one photograph a step; `density_control` changes their number.
+
+    cameras:  of the photographs that are learnt from; None before training
+    progress: share of the budget spent
+    bands:    of the harmonics in use
+    current:  the step between `loss` and `after_step`
+    drawn:    number of photographs that were learnt from
+    """
+
+    Config = Config
+    drawn: Tensor
+
+    def __init__(self, frame: Frame, config: Any = None):
+        c = config or Config()
+        super().__init__(frame, c)
+        count = min(PLACEHOLDER_COUNT, c.refine.max_gaussians)
+        self.cloud = Cloud(random_cloud(frame, count, c.sh_degree, self.random(0)), c.rates)
+        self.cloud.antialiased = c.filters.antialiased
+        self.appearance = SplatAppearance(frame, c.photographs) if c.photographs.appearance != "no" else None
+        self.few_views = FewViews(c.sparse.depth_weight) if c.sparse.few_views else None
+        self.density_control: DensityControl = (
+            MarkovChain(c.refine, c.mcmc) if c.strategy == "mcmc" else AdaptiveDensity(c.refine, c.adaptive, count)
+        )
+        self.mip_filter = MipFilter(count) if c.filters.filter_3d else None
+        self.tidying = Tidying()
+        self.robust_mask = RobustMask(c.distractors) if c.distractors.robust != "no" else None
+        self.poses = poses_for(frame, c.poses)
+        self.register_buffer("drawn", torch.tensor(0))
+        self.cameras: Camera | None = None
+        self.progress, self.bands = 1.0, c.sh_degree + 1
+        self.current: Step | None = None
+
+    @property
+    def additions(self) -> list[Addition]:
+        return [part for part in self.children() if isinstance(part, Addition)]
+
+    @property
+    def near_plane(self) -> float:
+        """Near plane for rasterization."""
+        return NEAR_PLANE_SCALE * self.frame.near
+
+    @classmethod
+    def preset(cls, device: torch.device) -> Any:
+        """On a GPU the paper's numbers; on a CPU a smaller cloud that begins dense: it learns more in the time."""
+        if device.type == "cuda":
+            return Config()
+        return Config(
+            initialization="dense",
+            initial_gaussians=20_000,
+            half_resolution_until=0.7,
+            rates=RateNumbers(most_haste=4.0),
+            refine=RefineNumbers(max_gaussians=120_000),
+            mcmc=McmcNumbers(joining_per_step=120.0),
+        )
+
+    @classmethod
+    def smallest(cls) -> Any:
+        """Some hundred Gaussians that are refined, reset and given harmonics within some twenty quick steps."""
+        return Config(
+            sh_degree=2,
+            sh_degree_interval=4,
+            initial_gaussians=200,
+            refine=RefineNumbers(max_gaussians=300, refine_every=4, refine_from=4, refine_until=0.8),
+            adaptive=AdaptiveNumbers(densify_grad_threshold=1e-6, opacity_reset_interval=5),
+            poses=PoseNumbers(refine_cameras=True, pose_learning_rate=5e-3),
+            photographs=AppearanceNumbers(appearance="no"),
+        )
+
+    # Initialisation
+
+    def compile_begin(self) -> None:
+        super().compile_begin()
+        if self.config.initialization == "dense":
+            compile_sweep()
+
+    def begin(self, data: Scene, seconds: float = math.inf) -> None:
+        c, cap = self.config, self.density_control.max_count(self.cloud)
+        counts = min(c.initial_gaussians, cap), cap
+        found = initial_cloud(data, c.initialization, *counts, c.sh_degree, self.random(1), SWEEP_SHARE * seconds)
+        self.begin_with(found, data.cameras[data.splits["train"]])
+        super().begin(data, seconds)
+
+    @torch.no_grad()
+    def from_field(self, teacher: Any, cameras: Camera) -> None:
+        """Gaussians on the teacher's surfaces; a cloud is taken as it is."""
+        degree, cap = self.config.sh_degree, self.density_control.max_count(self.cloud)
+        found = cloud_of(teacher, cap, degree)
+        if found is None:
+            count = max(2, math.ceil(MAX_TEACHER_SHARE * cap))
+            found = surface_cloud(taken_over(teacher, cameras), count, degree, self.random(3))
+        self.begin_with(found, cameras)
+
+    def begin_with(self, gaussians: Gaussians, cameras: Camera) -> None:
+        """Begin with a cloud, to be learnt from photographs of these cameras."""
+        self.cloud.replace(gaussians)
+        self.cloud.set_extent(cameras)
+        self.cameras = cameras
+        for part in self.additions:
+            part.begin_cloud(self)
+
+    # Optimisation (section 5)
+
+    def before_step(self, step: int, progress: float) -> None:
+        """Harmonics join band by band (section 7.1), but not while they would explain wrong poses or depth away."""
+        super().before_step(step, progress)
+        c, self.progress = self.config, progress
+        joined = intervals(step, progress, c.sh_degree_interval, c.sh_degree_interval_share)
+        coarse = self.moves_cameras and progress < COARSE_UNTIL
+        plain = coarse or any(part.base_colours for part in self.additions)
+        self.bands = 1 if plain else 1 + min(int(joined), c.sh_degree)
+
+    def batch(self, data: Scene, generator: torch.Generator) -> Photograph:
+        """The next photograph: each once in a random order, then in another."""
+        train = data.splits["train"]
+        if self.cameras is None:  # in a run that was resumed
+            self.cameras = data.cameras[train]
+        turn, place = divmod(int(self.drawn), len(train))
+        self.drawn += 1
+        order = torch.randperm(len(train), generator=self.random(1_000_000 + turn))
+        photograph = data.photograph(int(train[order[place]]))
+        return photograph.reduced(self.reduction(min(photograph.rgb.shape[:2]))).to(self.device)
+
+    def reduction(self, shorter: int) -> int:
+        """Factor by which photographs are smaller now. shorter: pixels along the shorter side"""
+        half = self.config.half_resolution_until or COARSE_UNTIL * self.moves_cameras
+        wanted = 4 if self.progress < half / 4 else 2 if self.progress < half else 1
+        return max(1, min(wanted, shorter // MIN_PIXELS))
+
+    def loss(self, batch: Photograph, step: int) -> dict[str, Tensor]:
+        """The absolute error and D-SSIM of a picture (eq. 7), and the terms of additions."""
+        c, cloud = self.config, self.filtered()
+        now = self.current = Step(batch, self.random(~step), cloud, cloud, batch.camera)
+        for part in self.additions:
+            part.before_raster(self, now)
+        if self.poses:
+            now.cloud, now.camera = seen_from(self.poses, now.cloud, now.camera)
+        now.picture = splat(now.cloud, view_of(now.camera, self.near_plane), self.bands, c.transmittance_threshold)
+        now.rgb, now.background = now.picture.rgb, self.background[0]
+        if now.picture.centres.requires_grad:
+            now.picture.centres.retain_grad()  # density control follows it
+        if batch.alpha is not None:  # a random colour behind everything, so that only opacity can imitate opacity
+            now.background = torch.rand(3, generator=now.chance).to(self.device)
+        now.target = batch.before(now.background)
+        for part in self.additions:
+            part.after_raster(self, now)
+        if now.background.any():
+            now.rgb = over(now.rgb, now.picture.opacity, now.background)
+        if batch.mask is not None:
+            now.target = torch.where(batch.mask[..., None], now.target, now.rgb.detach())
+        now.residual = (now.rgb - now.target).detach()
+        for part in self.additions:
+            part.mask(self, now)
+        now.terms["l1"] = (1 - c.ssim_weight) * (now.rgb - now.target).abs().mean()
+        now.terms["ssim"] = c.ssim_weight * (1 - kernels.ssim(now.rgb, now.target))
+        for part in self.additions:
+            part.regularize(self, now)
+        return now.terms
+
+    @torch.no_grad()
+    def after_step(self, step: int) -> None:
+        now = self.current
+        assert now is not None and now.picture.centres.grad is not None
+        now.due = self.density_control.due(step, self.progress)
+        if now.camera.image_index is not None:
+            self.cloud.record_view(now.camera.image_index, now.picture.centres.grad.ne(0).any(-1))
+        super().after_step(step)
+        self.figures = {"mse": float(now.residual.square().mean()), "gaussians": len(self.cloud)}
+        self.current = None
+
+    @torch.no_grad()
+    def prune(self, keep: Bool[Tensor, " gaussian"]) -> None:
+        """Leave the Gaussians of a mask, with their moments in the optimizer."""
+        self.cloud.prune(keep)
+        for part in self.additions:
+            part.prune(keep)
+
+    # Rendering (section 6)
+
+    def filtered(self) -> Gaussians:
+        """The cloud as it is rasterized, in no photograph's appearance."""
+        cloud = self.cloud.gaussians()
+        for part in self.additions:
+            cloud = part.filtered(cloud)
+        return cloud
+
+    def gaussians(self) -> Gaussians:
+        """The cloud in the scene's frame, under the settings."""
+        cloud = self.filtered()
+        for part in self.additions:
+            cloud = part.recoloured_cloud(self, cloud)
+        return cloud
+
+    def rasterized(self, camera: Camera) -> Rendering:
+        """Rendering over black, in no photograph's appearance."""
+        return render(self.filtered(), camera, BLACK, self.near_plane)
+
+    def render(self, camera: Camera) -> Rendering:
+        camera = camera.to(self.device)
+        seen, background = self.rasterized(camera), self.background[0]
+        for part in self.additions:
+            rgb, background = part.shown(self, seen, camera, background)
+            seen = replace(seen, rgb=rgb)
+        return replace(seen, rgb=over(seen.rgb, seen.opacity, background))
+
+    # Compression
+
+    def importance(self, camera: Camera) -> dict[str, Float[Tensor, " row"]]:
+        """Gain of one picture's brightness where a Gaussian alone gets brighter."""
+        return {"cloud.harmonics": picture_share(self.gaussians(), camera.to(self.device), self.near_plane)}
+
+    @torch.no_grad()
+    def thin(self, importance: dict[str, Float[Tensor, " row"]], share: float) -> dict[str, Float[Tensor, " kept"]]:
+        """Remove the least important Gaussians."""
+        weights = importance["cloud.harmonics"]
+        cloud, kept = thinned(self.cloud.gaussians(), weights, share)
+        self.cloud.replace(cloud)
+        for part in self.additions:
+            part.prune(kept)
+        return {"cloud.harmonics": weights[kept]}

@@ -1,0 +1,138 @@
+"""Adaptive density control: clone, split and prune (Kerbl 2023, section 5)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from ...exchange.packing import Stored
+from ...files.ranges import NonNegative, Steps
+from ...geometry import to_matrix
+from .cloud import Cloud
+from .density_control import PRUNE_OPACITY, DensityControl, RefineNumbers
+
+MAX_CLONED_SCALE = 0.01  # deviation, of the extent, up to which a Gaussian is cloned and not split
+SPLIT_FACTOR = 1.6  # by which the halves of a split Gaussian are smaller, section 5.2
+RECOVERY_INTERVALS = 3  # opacity_reset_intervals that must follow a reset, or the pictures stay dim
+NEARLY_FULL = 0.99  # of the cap
+
+
+@dataclass(frozen=True)
+class AdaptiveNumbers:
+    """A Config's numbers of the strategy adaptive."""
+
+    densify_grad_threshold: NonNegative = 2e-4  # gradient of a centre that asks for more Gaussians, section 5.2
+    opacity_reset_interval: Steps = 3000  # steps, section 5.2
+
+
+class AdaptiveDensity(DensityControl):
+    """Clone small Gaussians with a large gradient, split large ones, prune faint ones.
+
+    The gradient is the mean length of the loss's gradient in a footprint's centre, in half pictures.
+    positional_gradient_sum: of these lengths since the last change
+    visible_count:           number of steps since then in which each Gaussian was visible
+    """
+
+    grows: ClassVar[tuple[str, ...]] = ("positional_gradient_sum", "visible_count")
+    positional_gradient_sum: Tensor
+    visible_count: Tensor
+
+    def __init__(self, refine: RefineNumbers, numbers: AdaptiveNumbers, count: int):
+        super().__init__(refine)
+        self.numbers = numbers
+        for name in self.grows:
+            self.register_buffer(name, torch.zeros(count))
+
+    def begin_cloud(self, method: Any) -> None:
+        super().begin_cloud(method)
+        self.forget(len(method.cloud))
+
+    def forget(self, count: int) -> None:
+        """Set the sums to zero, for a cloud of `count` Gaussians."""
+        for name in self.grows:
+            setattr(self, name, getattr(self, name).new_zeros(count))
+
+    def prune(self, keep: Bool[Tensor, " gaussian"] | Int[Tensor, " kept"]) -> None:
+        for name in self.grows:
+            setattr(self, name, getattr(self, name)[keep])
+
+    def storage(self) -> dict[str, Stored]:
+        return dict.fromkeys(self.grows, Stored("nothing"))
+
+    @torch.no_grad()
+    def after_step(self, method: Any, step: int) -> None:
+        progress, cloud, picture = method.progress, method.cloud, method.current.picture
+        if progress >= self.refining.refine_until:
+            return
+        height, width = picture.opacity.shape
+        self.record(picture.centres.grad, picture.opacities > 0, (width, height))
+        if method.current.due:
+            cap = self.current_cap(cloud, progress)
+            full = self.refine(cloud, float(cloud.extent), cap, method.random(step))
+            if full and len(cloud) >= NEARLY_FULL * self.max_count(cloud):
+                self.warn_full(cloud)
+        every, full_size = self.numbers.opacity_reset_interval, progress >= method.config.half_resolution_until
+        left = step / max(progress, 1e-6) - step
+        if step and step % every == 0 and full_size and left >= RECOVERY_INTERVALS * every:
+            self.reset_opacity(cloud)
+
+    def current_cap(self, cloud: Cloud, progress: float) -> int:
+        """Cap at this share of the budget: it rises evenly until `refine_until`, so that early steps are quick."""
+        first, cap = int(self.initial_count), self.max_count(cloud)
+        share = min(1.0, progress / self.refining.refine_until)
+        return min(cap, int(first + share * max(cap - first, 0)))
+
+    @torch.no_grad()
+    def record(
+        self, gradient: Float[Tensor, "gaussian 2"], visible: Bool[Tensor, " gaussian"], size: tuple[int, int]
+    ) -> None:
+        """Add one step's gradient in the footprints' centres, given per pixel."""
+        half = gradient.new_tensor(size) / 2
+        self.positional_gradient_sum += (gradient * half).norm(dim=-1)
+        self.visible_count += visible
+
+    @torch.no_grad()
+    def refine(self, cloud: Cloud, extent: float, cap: int, generator: torch.Generator) -> bool:
+        """Clone, split and prune. Returns whether the cap kept Gaussians from being cloned or split."""
+        gradient = self.positional_gradient_sum / self.visible_count.clamp_min(1)
+        wanted = (gradient > self.numbers.densify_grad_threshold).nonzero()[:, 0]
+        faint = cloud.opacities.sigmoid() < PRUNE_OPACITY
+        wanted = wanted[~faint[wanted]]
+        room = max(cap - int((~faint).sum()), 0)
+        full = len(wanted) > room
+        if full:  # the largest gradients first
+            wanted = wanted[gradient[wanted].argsort(descending=True)[:room]].sort().values
+        large = cloud.log_scales[wanted].exp().amax(-1) > MAX_CLONED_SCALE * extent
+        kept = (~faint).nonzero()[:, 0]
+        source = torch.cat([kept, wanted])
+        fresh = torch.arange(len(source), device=source.device) >= len(kept)
+        halves = torch.zeros(len(cloud), dtype=torch.bool, device=source.device)
+        halves[wanted[large]] = True
+        split = halves[source]  # the original of a split is the other half
+        cloud.rebuild(source, fresh | split)
+        scatter(cloud, split, generator)
+        self.forget(len(cloud))
+        return full
+
+    @torch.no_grad()
+    def reset_opacity(self, cloud: Cloud) -> None:
+        """Clamp opacities to twice the pruning threshold (section 5.2); those that the photographs need grow again."""
+        cloud.opacities.clamp_(max=float(torch.tensor(2 * PRUNE_OPACITY).logit()))
+        assert cloud.optimizer is not None
+        state = cloud.optimizer.state[cloud.opacities]
+        for moment in ("mean", "square"):
+            state[moment].zero_()
+        state["last"].fill_(float(state["step"]))
+
+
+@torch.no_grad()
+def scatter(cloud: Cloud, split: Bool[Tensor, " gaussian"], generator: torch.Generator) -> None:
+    """Move the two halves of each split Gaussian to random places within it, 1.6 times smaller (section 5.2)."""
+    some = cloud.gaussians()[split]
+    offset = torch.randn(len(some), 3, generator=generator).to(some.means.device) * some.log_scales.exp()
+    cloud.means[split] += (to_matrix(some.quaternions) @ offset[:, :, None])[:, :, 0]
+    cloud.log_scales[split] -= float(torch.tensor(SPLIT_FACTOR).log())

@@ -1,0 +1,95 @@
+"""Addition: a part of splatting, with hooks between the cloud and the loss; Step, which it changes there."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from ...camera import Camera
+from ...camera.rays import Rendering
+from ...datasets.scene import Photograph
+from ...gaussians import Gaussians
+from ...gaussians.splatting import Splatted
+from ...method import Part
+
+
+@dataclass
+class Step:
+    """One training step on its way from the cloud to the loss.
+
+    chance:     random numbers of this step
+    whole:      the cloud that is learnt, with filters
+    cloud:      the cloud that is rasterized
+    camera:     of the photograph, with its learnt pose
+    picture:    rasterized, over black
+    rgb:        the picture in the photograph's appearance; in front of the background once `after_raster` is over
+    background: behind everything, one colour or one for each pixel
+    target:     colours that the loss compares with
+    residual:   rgb - target before pixels are left out
+    due:        whether density control is due after this step
+    """
+
+    photograph: Photograph
+    chance: torch.Generator
+    whole: Gaussians
+    cloud: Gaussians
+    camera: Camera
+    picture: Splatted = field(init=False)
+    rgb: Float[Tensor, "height width 3"] = field(init=False)
+    background: Float[Tensor, "... 3"] = field(init=False)
+    target: Float[Tensor, "height width 3"] = field(init=False)
+    residual: Float[Tensor, "height width 3"] = field(init=False)
+    terms: dict[str, Tensor] = field(default_factory=dict)
+    due: bool = False
+
+
+class Addition(Part):
+    """A part that changes how a cloud is learnt or shown. All hooks do nothing by default, and are visited in the order
+    in which parts were assigned. `method` is the GaussianSplatting that holds the part.
+
+    base_colours: whether it keeps harmonics beyond the first at zero
+    """
+
+    base_colours: bool = False
+
+    # The cloud
+
+    def begin_cloud(self, method: Any) -> None:
+        """Follow a new cloud."""
+
+    def prune(self, keep: Bool[Tensor, " gaussian"] | Int[Tensor, " kept"]) -> None:
+        """Follow a cloud of which the Gaussians of a mask, or of indices, are left."""
+
+    def filtered(self, cloud: Gaussians) -> Gaussians:
+        """The cloud as it is rasterized, in training and rendering."""
+        return cloud
+
+    # A training step
+
+    def before_raster(self, method: Any, step: Step) -> None:
+        """Change the cloud that a step rasterizes."""
+
+    def after_raster(self, method: Any, step: Step) -> None:
+        """Change the colours and the background of a step."""
+
+    def mask(self, method: Any, step: Step) -> None:
+        """Leave pixels out: their target becomes their own colour."""
+
+    def regularize(self, method: Any, step: Step) -> None:
+        """Add terms to the loss."""
+
+    # Rendering
+
+    def shown(
+        self, method: Any, seen: Rendering, camera: Camera, background: Float[Tensor, "... 3"]
+    ) -> tuple[Float[Tensor, "height width 3"], Float[Tensor, "... 3"]]:
+        """Colours over black and the background, under the method's settings."""
+        return seen.rgb, background
+
+    def recoloured_cloud(self, method: Any, cloud: Gaussians) -> Gaussians:
+        """A cloud whose colours are those of the method's settings."""
+        return cloud

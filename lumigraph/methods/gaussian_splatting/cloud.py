@@ -1,0 +1,225 @@
+"""Cloud: the Gaussians as parameters whose number changes in training; CloudAdam, their optimizer."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Annotated, ClassVar
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from numba import njit, prange
+from torch import Tensor, nn
+
+from ...camera import Camera
+from ...components.training.exchange import exchange
+from ...components.training.row_optimizer import RowOptimizer, adam_moments, adam_rate
+from ...components.training.schedules import falling
+from ...exchange.packing import Stored
+from ...files.ranges import LearningRate, between
+from ...gaussians import Gaussians
+from ...method import Part
+from .interval_schedule import short_schedule_lr_scale
+from .view_count import view_count, with_view
+
+NAMES = ("means", "quaternions", "log_scales", "opacities", "harmonics")
+FULL_SCHEDULE = 2400  # steps from which on the rates of scales and harmonics are not scaled
+REST_BANDS_SCALE = 1 / 20  # of the harmonics' learning rate, beyond the first band
+
+
+@dataclass(frozen=True)
+class RateNumbers:
+    """A Config's learning rates, those of the authors' release."""
+
+    means_lr: LearningRate = 1.6e-4  # learning rate of centres, times the extent of the cameras
+    final_means_lr: LearningRate = 1.6e-6  # at the end of the budget
+    sh_lr: LearningRate = 2.5e-3  # learning rate of harmonics; a twentieth of it beyond the first band
+    opacities_lr: LearningRate = 0.05  # learning rate of opacities
+    scales_lr: LearningRate = 5e-3  # learning rate of scales
+    quaternions_lr: LearningRate = 1e-3  # learning rate of rotations
+    most_haste: Annotated[float, between(1, 1000)] = 1.0  # times the rates of scales and harmonics, in short runs
+
+
+class Cloud(Part):
+    """The tensors of `Gaussians` as parameters.
+
+    view_bits: a bit for each photograph in which a Gaussian was visible, see `view_count`
+    extent:    of the cameras, in scene units
+    optimizer: updates the parameters, and follows where these change in size; None before training
+    """
+
+    grows: ClassVar[tuple[str, ...]] = (*NAMES, "view_bits")  # a saved one may be of another size
+
+    means: nn.Parameter
+    quaternions: nn.Parameter
+    log_scales: nn.Parameter
+    opacities: nn.Parameter
+    harmonics: nn.Parameter
+    view_bits: Tensor
+    extent: Tensor
+    optimizer: CloudAdam | None = None
+
+    def __init__(self, gaussians: Gaussians, rates: RateNumbers = RateNumbers()):
+        super().__init__()
+        self.rates = rates
+        self.antialiased = gaussians.antialiased
+        for name in NAMES:
+            setattr(self, name, nn.Parameter(getattr(gaussians, name).clone()))
+        self.register_buffer("view_bits", torch.zeros(len(gaussians), dtype=torch.int64))
+        self.register_buffer("extent", torch.tensor(1.0))
+
+    def __len__(self) -> int:
+        return len(self.means)
+
+    def gaussians(self) -> Gaussians:
+        """The cloud; gradients flow back into the parameters."""
+        return Gaussians(**{name: getattr(self, name) for name in NAMES}, antialiased=self.antialiased)
+
+    def set_extent(self, cameras: Camera) -> None:
+        """Set the extent: 1.1 times the radius of the cameras around their mean."""
+        positions = cameras.position
+        self.extent.fill_(1.1 * float((positions - positions.mean(0)).norm(dim=-1).max()))
+
+    def optimizers(self) -> list[torch.optim.Optimizer]:
+        c = self.rates
+        columns = [1.0] * 3 + [REST_BANDS_SCALE] * (3 * self.harmonics.shape[1] - 3)
+        groups = [
+            {"name": "means", "params": [self.means], "lr": c.means_lr},
+            {"params": [self.quaternions], "lr": c.quaternions_lr},
+            {"name": "scales", "params": [self.log_scales], "lr": c.scales_lr},
+            {"params": [self.opacities], "lr": c.opacities_lr},
+            {"name": "harmonics", "params": [self.harmonics], "lr": c.sh_lr, "columns": columns},
+        ]
+        self.optimizer = CloudAdam(groups)
+        return [self.optimizer]
+
+    def learning_rates(self, step: int, progress: float) -> dict[str, float]:
+        """Exponential decay of the means' rate (section 7.1), in extents of the cameras; the others are constant, but
+        higher for scales and harmonics in short runs."""
+        c = self.rates
+        scale = short_schedule_lr_scale(step, progress, FULL_SCHEDULE, c.most_haste)
+        means = float(self.extent) * falling(c.means_lr, c.final_means_lr, progress)
+        return {"means": means, "scales": scale * c.scales_lr, "harmonics": scale * c.sh_lr}
+
+    @torch.no_grad()
+    def replace(self, gaussians: Gaussians) -> None:
+        """Put another cloud in this one's place, with fresh moments."""
+        for name in NAMES:
+            exchange(self, name, getattr(gaussians, name).detach().clone(), self.optimizer)
+        self.view_bits = self.view_bits.new_zeros(len(gaussians))
+
+    @torch.no_grad()
+    def rebuild(self, source: Int[Tensor, " new"], fresh: Bool[Tensor, " new"]) -> None:
+        """Make Gaussian i a copy of source[i]; the optimizer's moments of the fresh ones are zero.
+
+        One operation for all that density control does: a clone is a number twice, a pruned one a number left out.
+        """
+        assert self.optimizer is not None
+        for name in NAMES:
+            old = getattr(self, name)
+            state = self.optimizer.state.get(old, {})
+            if state:
+                for moment in ("mean", "square", "last"):
+                    state[moment] = state[moment][source]
+                    state[moment][fresh] = state["step"] if moment == "last" else 0
+            exchange(self, name, old.data[source], self.optimizer, state)
+        self.view_bits = self.view_bits[source]
+
+    def prune(self, keep: Bool[Tensor, " gaussian"]) -> None:
+        """Leave the Gaussians of a mask, with their moments."""
+        source = keep.nonzero()[:, 0]
+        self.rebuild(source, torch.zeros_like(source, dtype=torch.bool))
+
+    def record_view(self, image_index: Int[Tensor, " 1"], visible: Bool[Tensor, " gaussian"]) -> None:
+        """Record the Gaussians that were visible in a photograph."""
+        self.view_bits = with_view(self.view_bits, image_index, visible)
+
+    @property
+    def view_count(self) -> Int[Tensor, " gaussian"]:
+        """Number of photographs in which each Gaussian was visible."""
+        return view_count(self.view_bits)
+
+    def storage(self) -> dict[str, Stored]:
+        """Positions need the most bits; harmonics beyond the plain colour go by a codebook."""
+        scaled = dict.fromkeys(("quaternions", "log_scales", "opacities"), Stored("scaled"))
+        harmonics = Stored("coded", plain=3)
+        return {"means": Stored("scaled", 16), **scaled, "harmonics": harmonics, "view_bits": Stored("nothing")}
+
+
+class CloudAdam(RowOptimizer):
+    """Adam (Kingma and Ba 2015) that passes over a row while its whole gradient is exactly zero, and catches up later.
+
+    Most Gaussians are not on most pictures. Adam would still move them, by what is left of their momentum, for steps
+    after each time they were seen; to leave that out (as LazyAdam does) makes those that few photographs show ten times
+    slower. Here a row that comes back after n steps has its moments decayed n times, and goes at once as far as its
+    momentum will carry it in the n steps that it is likely to stay away: (1 - b1^n) / (1 - b1) times a step.
+    Each group holds one parameter (row, ...); its "columns", if given, multiply the rate of each column.
+    """
+
+    def __init__(self, groups, betas: tuple[float, float] = (0.9, 0.999), eps: float = 1e-15):
+        super().__init__(groups, {"lr": 0.0, "betas": betas, "eps": eps, "columns": None})
+
+    def moments(self, p):
+        return adam_moments(p) | {"last": torch.zeros(len(p), device=p.device)}  # step at which each row was moved
+
+    def update(self, p, grad, state, group):
+        state["step"] += 1
+        (b1, b2), t = group["betas"], float(state["step"])
+        width = math.prod(p.shape[1:])
+        rates = adam_rate(group, t) * torch.tensor(group["columns"] or [1.0] * width, device=p.device)
+        given = p, grad.contiguous(), state["mean"], state["square"]
+        values, grad, mean, square = (x.detach().view(-1, width) for x in given)
+        if p.is_cuda:
+            _rows(values, grad, mean, square, state["last"], rates, t, b1, b2, group["eps"])
+        else:
+            tensors = values, grad, mean, square, state["last"], rates
+            _rows_cpu(*(x.numpy() for x in tensors), np.float32(t), _powers(b1), _powers(b2), np.float32(group["eps"]))
+
+
+@lru_cache
+def _powers(base: float, count: int = 1 << 14) -> np.ndarray:
+    """A table of base^n for n from 0, quicker to read than a power; after its last entry a moment is nothing."""
+    return (base ** np.arange(count)).astype(np.float32)
+
+
+def _rows(
+    p: Float[Tensor, "row column"],
+    grad: Float[Tensor, "row column"],
+    mean: Float[Tensor, "row column"],
+    square: Float[Tensor, "row column"],
+    last: Float[Tensor, " row"],
+    rates: Float[Tensor, " column"],
+    t: float,
+    b1: float,
+    b2: float,
+    eps: float,
+) -> None:
+    touched = (grad != 0).any(-1, keepdim=True)
+    kept1, kept2 = b1 ** (t - last)[:, None], b2 ** (t - last)[:, None]
+    mean.copy_(torch.where(touched, kept1 * mean + (1 - b1) * grad, mean))
+    square.copy_(torch.where(touched, kept2 * square + (1 - b2) * grad * grad, square))
+    far = rates * (1 - kept1) / (1 - b1)
+    p.copy_(torch.where(touched, p - far * mean / (square.sqrt() + eps), p))
+    last.copy_(torch.where(touched[:, 0], t, last))
+
+
+@njit(parallel=True, fastmath=True, cache=True)
+def _rows_cpu(p, grad, mean, square, last, rates, t, powers1, powers2, eps):
+    one, width = np.float32(1), p.shape[1]
+    b1, b2 = powers1[1], powers2[1]
+    for i in prange(len(p)):
+        size = np.float32(0)
+        for j in range(width):
+            size += abs(grad[i, j])
+        if size > 0:
+            away = min(np.int64(t - last[i]), len(powers1) - 1)
+            kept1, kept2 = powers1[away], powers2[away]
+            far = (one - kept1) / (one - b1)
+            last[i] = t
+            for j in range(width):
+                g = grad[i, j]
+                mean[i, j] = kept1 * mean[i, j] + (one - b1) * g
+                square[i, j] = kept2 * square[i, j] + (one - b2) * g * g
+                p[i, j] -= far * rates[j] * mean[i, j] / (np.sqrt(square[i, j]) + eps)

@@ -1,0 +1,73 @@
+"""Density control: a strategy that changes the number and the places of Gaussians after steps."""
+
+from __future__ import annotations
+
+import warnings
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from ...errors import LumigraphWarning
+from ...files.ranges import CloudSize, PositiveShare, Share, Steps
+from ...system.memory import room_for
+from .addition import Addition
+from .cloud import Cloud
+from .interval_schedule import IntervalSchedule, intervals
+
+PRUNE_OPACITY = 0.005  # below which a Gaussian is pruned or relocated (Kerbl 2023 and Kheradmand 2024)
+BYTES_PER_GAUSSIAN = 4096  # lower bound while it learns: itself, its gradient and moments, its share of a picture
+
+
+@dataclass(frozen=True)
+class RefineNumbers:
+    """A Config's numbers of when a strategy changes the cloud."""
+
+    max_gaussians: CloudSize = 1_000_000  # cap of the cloud's size
+    refine_every: Steps = 100  # steps between changes of the cloud, section 5.2; or the share, if that is sooner
+    refine_every_share: PositiveShare = 0.1  # share of the budget
+    refine_from: Steps = 500  # step; or the share of the budget, if that is sooner
+    refine_from_share: PositiveShare = 0.15  # share of the budget
+    refine_until: Share = 0.5  # share of the budget; section 7.1: 15 000 of 30 000 steps
+
+
+class DensityControl(Addition, ABC):
+    """A strategy; it may `rebuild` the cloud after a step, and keeps in buffers what a resume needs.
+
+    initial_count: number of Gaussians at first
+    """
+
+    initial_count: Tensor
+
+    def __init__(self, refine: RefineNumbers):
+        super().__init__()
+        self.refining = refine
+        self.schedule = IntervalSchedule(refine.refine_every, refine.refine_every_share)
+        self.register_buffer("initial_count", torch.tensor(0))
+        self.warned = False
+
+    @abstractmethod
+    def after_step(self, method: Any, step: int) -> None:
+        """Change the cloud where that is due."""
+
+    def begin_cloud(self, method: Any) -> None:
+        self.initial_count.fill_(len(method.cloud))
+
+    def due(self, step: int, progress: float) -> bool:
+        """True if the cloud may change after this step; called once a step."""
+        ended = self.schedule.due(step, progress)
+        return ended and intervals(step, progress, self.refining.refine_from, self.refining.refine_from_share) >= 1
+
+    def max_count(self, cloud: Cloud) -> int:
+        """Cap on the number of Gaussians: `max_gaussians`, or as many as fit into free memory."""
+        return min(self.refining.max_gaussians, len(cloud) + room_for(BYTES_PER_GAUSSIAN, cloud.means.device))
+
+    def warn_full(self, cloud: Cloud) -> None:
+        """Warn, once, that the cloud has reached its cap."""
+        if not self.warned:
+            self.warned = True
+            by_option = len(cloud) >= 0.95 * self.refining.max_gaussians
+            why = "--max-gaussians says so" if by_option else "memory is short"
+            warnings.warn(f"The cloud stops growing at {len(cloud):,} Gaussians, for {why}", LumigraphWarning, 2)

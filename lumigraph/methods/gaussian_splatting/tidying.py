@@ -1,0 +1,70 @@
+"""Tidying: prune Gaussians close to a camera, clamp scale and anisotropy, zero unobserved harmonics."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from ...gaussians import Gaussians
+from .addition import Addition
+from .view_count import zero_unobserved_sh
+
+NEAR_ZONE = 2.5  # times the frame's near distance: up to there a Gaussian needs MIN_NEAR_VIEWS
+MIN_NEAR_VIEWS = 3  # view count of a Gaussian in the near zone
+MAX_SCALE = 0.5  # deviation, of the distance to the nearest camera
+MAX_ANISOTROPY = 20.0  # ratio of the largest to the second deviation
+MIN_ELONGATED_SCALE = 0.01  # deviation, of the cameras' extent, up to which anisotropy is not clamped
+GAUSSIANS_PER_CHUNK = 1 << 14  # whose distances to all cameras are held at a time
+PASSES_BEFORE_PRUNING = 2  # times that each photograph is learnt from before Gaussians are pruned
+
+
+class Tidying(Addition):
+    """Rules on Gaussians that few photographs determine; it has no options."""
+
+    @torch.no_grad()
+    def after_step(self, method: Any, step: int) -> None:
+        cloud, cameras = method.cloud, method.cameras
+        if method.current.due:
+            distance = camera_distance(cloud.means, method.refined(cameras).position.to(cloud.means.device))
+            near = near_camera(distance, cloud.view_count, method.frame.near)
+            if int(method.drawn) >= PASSES_BEFORE_PRUNING * len(cameras) and near.any() and not near.all():
+                method.prune(~near)
+                distance = distance[~near]
+            cloud.log_scales.copy_(clamped_scales(cloud.gaussians(), distance, float(cloud.extent)))
+        if method.bands > 1:
+            zero_unobserved_sh(cloud.harmonics, cloud.view_count)
+
+
+def camera_distance(
+    means: Float[Tensor, "gaussian 3"], positions: Float[Tensor, "camera 3"]
+) -> Float[Tensor, " gaussian"]:
+    """Distance of each centre to the nearest camera, in scene units, in any direction."""
+    return torch.cat([torch.cdist(some, positions).amin(-1) for some in means.split(GAUSSIANS_PER_CHUNK)])
+
+
+def near_camera(
+    distance: Float[Tensor, " gaussian"], view_count: Int[Tensor, " gaussian"], near: float
+) -> Bool[Tensor, " gaussian"]:
+    """Gaussians too close to a camera: within the near distance, or in the near zone with a low view count.
+
+    distance: to the nearest camera
+    near:     distance within which nothing is, `Frame.near`
+    """
+    return (distance < near) | ((distance < NEAR_ZONE * near) & (view_count < MIN_NEAR_VIEWS))
+
+
+def clamped_scales(
+    gaussians: Gaussians, distance: Float[Tensor, " gaussian"], extent: float
+) -> Float[Tensor, "gaussian 3"]:
+    """Log scales with the largest deviation at most MAX_SCALE times the distance to the nearest camera, and at most
+    MAX_ANISOTROPY times the second, unless it is short.
+
+    extent: of the cameras, in scene units
+    """
+    log_scales = gaussians.log_scales
+    second = log_scales.sort(-1).values[:, 1].exp()
+    longest = torch.minimum(MAX_SCALE * distance, (MAX_ANISOTROPY * second).clamp_min(MIN_ELONGATED_SCALE * extent))
+    return torch.minimum(log_scales, longest.clamp_min(1e-12).log()[:, None])

@@ -1,0 +1,230 @@
+"""NeRF-W: a scene from photographs in other light, with passers-by (Martin-Brualla et al. 2021, arXiv 2008.02268)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Annotated, Any, Literal
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.nn.functional import softplus
+
+from ...camera.rays import Rays, Rendering, Samples
+from ...components.fields.appearance import AVERAGE, AppearanceCodes, CodeWidth, PhotographCodes
+from ...components.fields.coordinate_field import CoordinateField, NetworkNumbers
+from ...components.fields.hash_field import CODES_RATE, CPU_TABLE, OPEN_RATE, TINY_TABLE, HashNumbers
+from ...components.fields.sky import sky_for
+from ...components.sampling.hierarchical_sampler import RAYS_WITH_FEATURES, HierarchicalSampler, RayNumbers
+from ...components.sampling.occupancy_sampler import (
+    CPU_OCCUPANCY,
+    CPU_STEPS,
+    TINY_OCCUPANCY,
+    TINY_STEPS,
+    OccupancyNumbers,
+    StepNumbers,
+)
+from ...components.sampling.proposal_sampler import ProposalNumbers
+from ...components.sampling.samplers import sampler_for
+from ...components.sampling.spaces import space_of
+from ...components.training.photometric import backdrop
+from ...components.training.schedules import held
+from ...datasets.scene import Batch, Frame
+from ...files.ranges import Layers, LearningRate, NonNegative, PositiveShare, Seed, Share, Width, between
+from ...method import FieldMethod, Pass
+from ...method.controls import Control
+from ...volume import composite
+from .transient import EncodedHashField, HashTransientHead, Transient, TransientHead, with_transient
+
+
+@dataclass(frozen=True)
+class Config:
+    """The paper's numbers, with where it gives them; `NeRFW.preset` gives those of a plain CPU."""
+
+    network: NetworkNumbers = NetworkNumbers(position_frequencies=15)  # supplement
+    rays: RayNumbers = RayNumbers(64, 64, rays_per_step=2048)  # supplement
+    table: HashNumbers = HashNumbers()
+    occupancy: OccupancyNumbers = OccupancyNumbers()
+    steps: StepNumbers = StepNumbers()
+    proposals: ProposalNumbers = ProposalNumbers()
+    field: Literal["hash", "network"] = "network"  # what holds the scene: a hash table, or the paper's networks
+    appearance_code: CodeWidth = 48  # n^(a), numbers to a photograph, section 5
+    transient_code: CodeWidth = 16  # n^(tau), section 5
+    transient_layers: Layers = 4  # hidden layers of the transient head, supplement
+    transient_width: Width = 128  # their channels, supplement
+    beta_min: PositiveShare = 0.03  # least deviation of a colour, section 5
+    transient_weight: NonNegative = 0.01  # lambda_u, of the mean transient density, section 5
+    transient_start: Share = 0.0  # share of the budget before which the static scene learns alone
+    own_skies: bool = True  # of the hash table in the open: behind everything a sky that depends on the appearance
+    hidden_width: Width = 256  # channels of a layer, supplement
+    learning_rate: LearningRate = 5e-4
+    final_learning_rate: LearningRate = 5e-5  # at the end of the budget
+    decay_start: Annotated[float, between(0, 0.99)] = 0.0  # share of the budget before the learning rate falls
+    seed: Seed = 0
+
+
+HIDDEN, SHOWN = "hidden", "shown"
+
+
+class NeRFW(FieldMethod):
+    """A static scene whose colours depend on the appearance of a photograph, and a transient of each photograph."""
+
+    Config = Config
+    appearance: AppearanceCodes
+
+    def __init__(self, frame: Frame, config: Any = None):
+        c = config or Config()
+        super().__init__(frame, c)
+        space, code, hidden = space_of(frame), c.appearance_code, [c.transient_width] * c.transient_layers
+        self.sky = None
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(c.seed)
+            if c.field == "hash":
+                self.network = EncodedHashField(c.table, c.hidden_width, space, frame.reach, code)
+                self.sky = sky_for(frame, c.own_skies, c.table.sh_bands, code, c.hidden_width)
+                encoded = c.table.levels * c.table.features_per_level
+                self.transient_head = HashTransientHead(encoded + c.transient_code, *hidden)
+                self.sampler = sampler_for(frame, space, c.occupancy, c.proposals, steps=c.steps)
+            else:
+                shape, options = (c.network, c.hidden_width, space, code), {"keep_input": True, "activation": softplus}
+                coarse = CoordinateField(*shape, **options)
+                self.network = CoordinateField(*shape, **options, coarse=coarse)
+                exact = not c.network.bfloat16
+                self.transient_head = TransientHead(c.hidden_width + c.transient_code, *hidden, exact=exact)
+                self.sampler = HierarchicalSampler(space, c.rays)
+                self.sampler.rays_per_chunk = RAYS_WITH_FEATURES
+        self.appearance = AppearanceCodes(frame.image_count, code)
+        self.transient = PhotographCodes(frame.image_count, c.transient_code)
+        self.settling = False  # whether the static scene learns alone
+
+    @classmethod
+    def preset(cls, device: torch.device) -> Any:
+        """On a GPU the paper's networks and numbers. On a CPU a hash table with Instant-NGP's numbers there."""
+        if device.type == "cuda":
+            return Config()
+        return Config(
+            field="hash",
+            table=CPU_TABLE,
+            occupancy=CPU_OCCUPANCY,
+            steps=CPU_STEPS,
+            transient_layers=2,
+            transient_width=32,
+            beta_min=0.1,
+            transient_start=0.1,
+            hidden_width=32,
+            learning_rate=2e-2,
+            final_learning_rate=1e-3,
+            decay_start=0.3,
+        )
+
+    @classmethod
+    def smallest(cls) -> Any:
+        """A tiny table with tiny networks and a grid of three sizes, within some twenty quick steps."""
+        return Config(
+            field="hash",
+            table=TINY_TABLE,
+            occupancy=TINY_OCCUPANCY,
+            steps=TINY_STEPS,
+            appearance_code=4,
+            transient_code=4,
+            transient_layers=1,
+            transient_width=16,
+            hidden_width=16,
+            learning_rate=2e-2,
+            final_learning_rate=1e-3,
+        )
+
+    @classmethod
+    def further_bytes(cls, frame: Frame, config: Any, learning: bool) -> int:
+        c = config
+        if c.field == "network":
+            return c.network.activation_bytes(c.rays.samples_per_step, c.hidden_width) * learning
+        activations = c.table.activation_bytes(c.occupancy.samples_per_step, c.hidden_width)
+        return super().further_bytes(frame, config, learning) + activations * learning
+
+    # Learning
+
+    def loss(self, batch: Batch, step: int) -> dict[str, Tensor]:
+        """Equations 13 and 14: the last pass with the transient, the coarse one without it and without uncertainty."""
+        c, rays, generator = self.config, batch.rays, self.random(step)
+        assert rays.image_index is not None
+        background = backdrop(batch, self.background, generator)
+        target = batch.before(background)
+        appearance, transient = self.appearance(rays.image_index), self.transient(rays.image_index)
+        background = self.behind(rays, appearance, background)
+        (*coarse, last), further = self.learn(rays, generator)
+        terms = {}
+        for each in coarse:
+            look = each.look(self.network, appearance)
+            seen = composite(look.samples, look.density, look.rgb, background)
+            terms[each.name] = 0.5 * squared(seen.rgb - target).mean()
+        look = last.look(self.network, appearance)
+        if self.settling:
+            seen = composite(look.samples, look.density, look.rgb, background)
+            beta = torch.full_like(target[:, 0], c.beta_min)
+        else:
+            passing = self.transients(rays, last, transient)
+            seen = with_transient(look, passing, background)
+            beta = c.beta_min + seen.extra["beta"]
+            terms["uncertainty"] = (beta / c.beta_min).log().mean()
+            terms["transient"] = c.transient_weight * mean_along(last.samples, passing.density)
+        error = squared(seen.rgb - target)
+        terms["colour"] = (error / (2 * beta.square())).mean()
+        certain = 1 / (2 * c.beta_min**2)  # largest weight of an error, to which the other terms are relative
+        terms |= {name: certain * term for name, term in further.items()}
+        self.figures |= {"mse": float(error.detach().mean()) / 3, "beta": float(beta.detach().mean())}
+        return terms
+
+    def transients(self, rays: Rays, seen: Pass, code: Float[Tensor, "#ray code"]) -> Transient:
+        """The transient at a pass's samples. code: transient codes"""
+        codes = seen.code_of_samples(code)
+        assert codes is not None
+        return self.transient_head(seen.features, codes, self.network.space.along(rays, seen.samples))
+
+    def optimizers(self) -> list[torch.optim.Optimizer]:
+        rate, codes = self.config.learning_rate, [self.appearance.codes, self.transient.codes]
+        others = [*self.transient_head.parameters(), *(self.sky.parameters() if self.sky else [])]
+        if self.config.field == "hash":
+            groups = [{"params": others, "scale": OPEN_RATE}, {"params": codes, "scale": CODES_RATE}]
+            own = self.network.optimizers_at(rate, scale=OPEN_RATE, groups=groups)
+        else:
+            own = [torch.optim.Adam([*self.network.parameters(), *others, *codes], rate, eps=1e-7)]
+        return [*own, *super().optimizers()]
+
+    def learning_rate(self, step: int, progress: float) -> float:
+        c = self.config
+        return held(c.learning_rate, c.final_learning_rate, step, progress, c.decay_start)
+
+    def before_step(self, step: int, progress: float) -> None:
+        self.settling = progress < self.config.transient_start
+        super().before_step(step, progress)
+
+    # Rendering
+
+    @property
+    def shown_code(self) -> Float[Tensor, "1 code"]:
+        return self.appearance.shown(self)[None]
+
+    def render_rays(self, rays: Rays, background: Float[Tensor, "#ray 3"]) -> Rendering:
+        if self.control("transient") == HIDDEN:
+            return super().render_rays(rays, background)
+        code, last = self.shown_code, self.sampler.sample(rays, self.network)[-1]
+        transient = self.transient.told(str(self.told.get("appearance", AVERAGE)))
+        passing, background = self.transients(rays, last, transient[None]), self.behind(rays, code, background)
+        seen = with_transient(last.look(self.network, code), passing, background)
+        return replace(seen, rgb=seen.rgb.clamp(0, 1))
+
+    @property
+    def controls(self) -> tuple[Control, ...]:
+        about = "Whether the transient of the photograph that appearance names, such as passers-by, is shown too."
+        return *super().controls, Control("transient", HIDDEN, choices=(HIDDEN, SHOWN), about=about)
+
+
+def squared(residual: Float[Tensor, "ray 3"]) -> Float[Tensor, " ray"]:
+    return residual.square().sum(-1)
+
+
+def mean_along(samples: Samples, values: Float[Tensor, " sample"]) -> Float[Tensor, ""]:
+    """The mean over each ray's samples, averaged over all rays; 0 counts for a ray that has none."""
+    counts = samples.ray_starts.diff()
+    return (values / counts[samples.ray_index]).sum() / len(counts)
