@@ -200,6 +200,13 @@ def test_help_on_a_method_names_its_numbers(capsys):
     assert "--learning-rate" in told and "decays to a tenth" in told and "voxel-grid options" in told.lower()
 
 
+def test_a_group_of_numbers_hides_no_option_of_train(capsys):
+    """Instant-NGP's Config holds `steps`, of rays."""
+    with pytest.raises(SystemExit):
+        main(["train", "instant-ngp", "--help"])
+    assert "--steps N" in capsys.readouterr().out
+
+
 def test_help_does_not_wait_for_pytorch():
     script = "import sys; from lumigraph.commands.cli import main; main(['methods']); sys.exit('torch' in sys.modules)"
     begin = time.perf_counter()

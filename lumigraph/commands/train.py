@@ -136,7 +136,7 @@ def with_options_of(name: str, arguments: Sequence[str], command: type = Train) 
 def derived(base: type, config: type, extra: dict[str, tuple[Any, Any]]) -> type[Any]:
     """A dataclass of options with further ones, annotation and default by name. Options that a method's Config has too
     are hidden, for the Config's are asked for."""
-    names = {x.name for x in dataclasses.fields(config)}
+    names = {x.name for x in dataclasses.fields(config) if not dataclasses.is_dataclass(x.default)}  # --steps stays
     hidden = {x.name: (Annotated[Any, Fixed, Suppress], x.default) for x in dataclasses.fields(base) if x.name in names}
     options = [(name, kind, dataclasses.field(default=default)) for name, (kind, default) in (hidden | extra).items()]
     made = dataclasses.make_dataclass(base.__name__, options, bases=(base,), frozen=True)

@@ -105,7 +105,7 @@ class Evidence:
 
 
 @dataclass(frozen=True)
-class Lesson:
+class InstanceLesson:
     """Members by number with what is known of each; and a part of a photograph of the last, for the denoiser."""
 
     unit: ClassVar[str] = "rays"
@@ -241,7 +241,7 @@ class HypNeRF(RayMethod):
     def steps_per_pass(self, data: Collection) -> float:
         return len(data.splits["train"]) / self.config.members_per_step
 
-    def batch(self, data: Collection, generator: torch.Generator) -> Lesson:  # type: ignore[override]
+    def batch(self, data: Collection, generator: torch.Generator) -> InstanceLesson:  # type: ignore[override]
         """Random members, and rays through random photographs of each."""
         c, members, evidence = self.config, list[int](), list[Evidence]()
         for _ in range(c.members_per_step):
@@ -255,7 +255,7 @@ class HypNeRF(RayMethod):
             background = torch.tensor([scene.frame.background], device=self.device)
             evidence.append(Evidence(batch, self._cells_of_member(number, scene), background))
         rays, picture = patch(photographs[0], scene.frame, generator)  # the last one's
-        return Lesson(members, evidence, rays.to(self.device), picture.to(self.device))
+        return InstanceLesson(members, evidence, rays.to(self.device), picture.to(self.device))
 
     def _cells_of_member(self, number: int, scene: Scene) -> OccupancyGrid:
         if number not in self._cells:
@@ -273,7 +273,7 @@ class HypNeRF(RayMethod):
             cells.rule_out(visual_hull(scene, n, n)[None])
         return cells.to(self.device)
 
-    def loss(self, batch: Lesson, step: int) -> dict[str, Tensor]:  # type: ignore[override]
+    def loss(self, batch: InstanceLesson, step: int) -> dict[str, Tensor]:  # type: ignore[override]
         """The squared error of colours of all members (eq. 2), density where nothing is, and the denoiser's error."""
         generator, share = self.random(step), 1 / len(batch.members)
         codes = self.codes(torch.tensor(batch.members, device=self.device))
@@ -306,7 +306,7 @@ class HypNeRF(RayMethod):
             terms["empty"] = self.config.empty_weight * torch.log1p(EMPTY_LENGTH * density).sum() / len(points)
         return terms
 
-    def _denoiser_error(self, batch: Lesson, instance: HashInstance) -> Tensor:
+    def _denoiser_error(self, batch: InstanceLesson, instance: HashInstance) -> Tensor:
         """Of a denoised rendering, beside the photograph."""
         last = batch.evidence[-1]
         with torch.no_grad():

@@ -109,7 +109,7 @@ class Sources:
 
 
 @dataclass(frozen=True)
-class Lesson:
+class SourceLesson:
     """Of several scenes, in order: the photographs that are looked at, and rays through others."""
 
     unit: ClassVar[str] = "rays"
@@ -209,11 +209,11 @@ class PixelNeRF(RayMethod):
     def steps_per_pass(self, data: Collection) -> float:
         return len(data.splits["train"]) / self.config.members_per_step
 
-    def batch(self, data: Collection, generator: torch.Generator) -> Lesson:  # type: ignore[override]
+    def batch(self, data: Collection, generator: torch.Generator) -> SourceLesson:  # type: ignore[override]
         """Random members; of each as many random photographs to look at, and rays through some others."""
         c = self.config
         views = 1 + chance(c.source_views, generator)
-        lesson = Lesson([], [], [])
+        lesson = SourceLesson([], [], [])
         for _ in range(c.members_per_step):
             scene = photographed(data.sample_member(generator)[1], "pixelnerf")
             there = scene.splits["train"]
@@ -226,7 +226,7 @@ class PixelNeRF(RayMethod):
             lesson.frames.append(scene.frame)
         return lesson
 
-    def loss(self, batch: Lesson, step: int) -> dict[str, Tensor]:  # type: ignore[override]
+    def loss(self, batch: SourceLesson, step: int) -> dict[str, Tensor]:  # type: ignore[override]
         """The squared error of both looks, over all members (section 4.2)."""
         terms: dict[str, Tensor] = {}
         generator, share = self.random(step), 1 / len(batch.batches)
@@ -310,7 +310,7 @@ class PixelNeRF(RayMethod):
                 self._sources = self._prepared(features[:count], cameras[slice(count)].to(self.device), self.frame)
         return self._sources
 
-    def _seen(self, lesson: Lesson) -> list[Sources]:
+    def _seen(self, lesson: SourceLesson) -> list[Sources]:
         """What the encoder finds in the photographs of each scene, of all at once."""
         both = zip(lesson.sources, lesson.frames, strict=True)
         pictures = [photograph.before(frame.background) for photographs, frame in both for photograph in photographs]

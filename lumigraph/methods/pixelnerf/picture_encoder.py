@@ -48,7 +48,7 @@ class PictureEncoder(nn.Module):
         for i, (width, count, stride) in enumerate(zip(widths[1:], blocks, strides, strict=True), 1):
             if not pool and i == 1:
                 stride = 2  # the stage makes up for the pooling: features are as coarse, and found with more care
-            stage = [Block(width if j else before, width, 1 if j else stride, frozen) for j in range(count)]
+            stage = [EncoderBlock(width if j else before, width, 1 if j else stride, frozen) for j in range(count)]
             setattr(self, f"layer{i}", nn.Sequential(*stage))
             before = width
 
@@ -76,7 +76,7 @@ class PictureEncoder(nn.Module):
         self.load_state_dict({name: found[name] for name in own})
 
 
-class Block(nn.Module):
+class EncoderBlock(nn.Module):
     """Two convolutions beside a shortcut (He 2016, figure 2)."""
 
     def __init__(self, inputs: int, width: int, stride: int, frozen: bool):

@@ -17,7 +17,7 @@ from ...components.training.lazy_adam import LazyAdam
 from ...method import Field
 
 
-class HarmonicField(Field):
+class SphericalHarmonicsField(Field):
     """Density per scene unit; features are harmonics before the sigmoid, colours next to each other."""
 
     def colour(
@@ -32,7 +32,7 @@ class HarmonicField(Field):
         return (basis[:, :, None] * harmonics).sum(1).sigmoid()
 
 
-class Teacher(HarmonicField):
+class Teacher(SphericalHarmonicsField):
     """A field that learns from photographs before it is baked. bands: of spherical harmonics"""
 
     @abstractmethod

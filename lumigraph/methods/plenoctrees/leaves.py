@@ -17,10 +17,10 @@ from ...exchange.packing import Stored
 from ...kernels.octree_cells import Crossed, Tree, code_of, levels_of
 from ...kernels.octree_cells.reference import leaves
 from ...system.memory import free_on, gigabytes
-from .harmonic_field import HarmonicField
+from .harmonic_field import SphericalHarmonicsField
 
 
-class Leaves(HarmonicField):
+class Leaves(SphericalHarmonicsField):
     """The table of an octree's leaves. What a leaf holds is the same everywhere inside of it (Yu 2021, section 4).
 
     codes:     of the leaves, rising in memory as they lie in space (see `kernels.Tree`)

@@ -9,6 +9,7 @@ from jaxtyping import Float, Int, UInt8
 from torch import Tensor, nn
 
 from ... import kernels
+from ...camera.rays import Rays, Samples
 from ...components.sampling.spaces import Contraction
 from ...exchange.baked import Atlas
 from ...kernels.block_march import ALPHA, CHANNELS
