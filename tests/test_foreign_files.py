@@ -17,7 +17,7 @@ from listing import names
 from PIL import Image
 
 from lumigraph import files, methods
-from lumigraph.capture.motion.folder import WRITTEN, claim_results, copy_photographs
+from lumigraph.capture.motion.folder import WRITTEN_FILES, claim_results, copy_photographs
 from lumigraph.capture.photos import Photo
 from lumigraph.capture.photos.track import untracked
 from lumigraph.commands.cli import COMMANDS, main
@@ -264,7 +264,7 @@ def test_a_capture_clears_away_its_own_alone(tmp_path):
     copy_photographs(given[:1], scene / "images", untracked)
     assert names(scene / "images") == ["a.jpg", "mine.jpg"]
     claim_results(scene)
-    for name in WRITTEN:
+    for name in WRITTEN_FILES:
         (scene / name).write_text("precious")
         with pytest.raises(LumigraphError, match="is there already"):
             claim_results(scene)
