@@ -44,7 +44,7 @@ def weights_of(samples: Samples, density: Float[Tensor, " sample"], stop: float 
     return kernels.composite(tau, tau[:, None], samples.ray_starts, stop)[2]
 
 
-STRETCH = 8  # samples of a ray that are asked about at first; each time after that, twice as many
+FIRST_STRETCH = 8  # samples per ray in the first query; each further query has twice as many
 
 
 @torch.no_grad()
@@ -58,7 +58,7 @@ def visible(
     """
     begin, end = samples.ray_starts[:-1], samples.ray_starts[1:]
     light, tau = torch.ones(len(begin), device=begin.device), torch.zeros_like(samples.t_start)
-    stretch = STRETCH
+    stretch = FIRST_STRETCH
     while len(going := ((begin < end) & (light >= stop)).nonzero()[:, 0]):
         begin, end, light = begin[going], end[going], light[going]
         starts = packed((end - begin).clamp(max=stretch))

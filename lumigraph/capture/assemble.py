@@ -18,7 +18,7 @@ from ..datasets.images import ImageSource, ImageStore, in_parallel, load
 from ..datasets.scene import Forward, Frame, Scene
 from ..errors import LumigraphError, LumigraphWarning
 from ..files.names import counted, natural
-from ..geometry import RIGID
+from ..geometry import RIGID_TOLERANCE
 from ..system.progress import counting
 from .beside import make_about, make_layers
 from .capture import Capture, Shot
@@ -147,8 +147,8 @@ def checked_pose(shot: Shot, source: str) -> Float[np.ndarray, "3 4"]:
     if not np.isfinite(shot.pose).all():
         fault = "holds NaN or infinite numbers"
     elif np.abs(shot.pose[:, 3]).max() > MAX_COORDINATE:
-        fault = f"is {np.abs(shot.pose[:, 3]).max():.3g} units from the origin, and {FARTHEST:g} are the most"
-    elif np.abs(axes.T @ axes - np.eye(3)).max() > RIGID:
+        fault = f"is {np.abs(shot.pose[:, 3]).max():.3g} units from the origin, and {MAX_COORDINATE:g} are the most"
+    elif np.abs(axes.T @ axes - np.eye(3)).max() > RIGID_TOLERANCE:
         fault = "is not rigid, for its axes are not of unit length and at right angles"
     elif np.linalg.det(axes) < 0:
         fault = "is mirrored"
@@ -172,7 +172,9 @@ def without_stray_points(capture: Capture) -> tuple[Capture, list[str]]:
         sightings=None if capture.sightings is None else capture.sightings[near],
     )
     stray = counted(int((~near).sum()), "point")
-    return kept, [f"{capture.source} has {stray} that are not finite or {FARTHEST:g} units away; using the others"]
+    return kept, [
+        f"{capture.source} has {stray} that are not finite or {MAX_COORDINATE:g} units away; using the others"
+    ]
 
 
 def fitted_lens(shot: Shot, chosen: Chosen) -> Lens:
@@ -286,11 +288,11 @@ def within_reach(lens: Lens, size: tuple[int, int]) -> np.ndarray | None:
 def about_missing(capture: Capture) -> str:
     """One sentence with the names of all missing files."""
     names = sorted(capture.missing, key=natural)
-    more = f" and {len(names) - NAMED} more" if len(names) > MAX_NAMES else ""
+    more = f" and {len(names) - MAX_NAMES} more" if len(names) > MAX_NAMES else ""
     verb = "does" if len(names) == 1 else "do"
     return (
         f"{capture.source} lists {counted(len(names), 'file')} that {verb} not exist; using the other "
-        f"{len(capture.shots)} photographs without {', '.join(names[:NAMED])}{more}"
+        f"{len(capture.shots)} photographs without {', '.join(names[:MAX_NAMES])}{more}"
     )
 
 

@@ -75,8 +75,8 @@ def read_shape(path: Path, name: str) -> Shape:
     made = joined(meshes) if meshes else cloud(clouds[0])
     if not (np.abs(made.vertices) <= MAX_COORDINATE).all() or not np.ptp(made.vertices, 0).max() > ZERO_EXTENT:
         raise LumigraphError(
-            f"{path} has points that are not finite or farther than {FARTHEST:g} units, or all in one place; name "
-            "another file"
+            f"{path} has points that are not finite or farther than {MAX_COORDINATE:g} units, or all in one place; "
+            "name another file"
         )
     return normalised(
         name, made, None if meshes else normals_of(path), None if path.suffix.lower() in Z_UP_SUFFIXES else Y_UP

@@ -30,7 +30,7 @@ def recognises(folder: Path) -> bool:
 
 def poses(folder: Path) -> Iterator[Path]:
     """Files of poses, in the folder and in those of its sequences."""
-    for pattern in (f"frame-*{POSE}", f"seq-*/frame-*{POSE}"):
+    for pattern in (f"frame-*{POSE_SUFFIX}", f"seq-*/frame-*{POSE_SUFFIX}"):
         yield from sorted(folder.glob(pattern))
 
 

@@ -43,7 +43,7 @@ def read(path: Path, downscale: int | None = None) -> Capture:
     size = width, height = reduced(whole, downscale or math.ceil(max(whole) / DEFAULT_MAX_SIDE))
     if min(size) < MIN_SIDE:
         raise LumigraphError(
-            f"{path} is {width}x{height} pixels to learn from, and {SMALLEST_SIDE} a side are the least; "
+            f"{path} is {width}x{height} pixels to learn from, and {MIN_SIDE} a side are the least; "
             f"name a larger picture{' or a smaller --downscale' if size != whole else ''}"
         )
     pixels = read_image(path, True, size)

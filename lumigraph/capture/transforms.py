@@ -197,7 +197,7 @@ def fact(value: Any, name: str, where: str) -> np.ndarray:
     except (ValueError, TypeError, OverflowError) as fault:
         raise LumigraphError(f'{where} has "{name}", which is no number and no array of them; correct it') from fault
     if numbers.size > MAX_FACT_NUMBERS:
-        raise LumigraphError(f'{where} has "{name}" of {numbers.size} numbers; {LARGEST_FACT} are the most')
+        raise LumigraphError(f'{where} has "{name}" of {numbers.size} numbers; {MAX_FACT_NUMBERS} are the most')
     return numbers
 
 

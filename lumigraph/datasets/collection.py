@@ -18,7 +18,7 @@ from ..files.names import natural
 from .dataset import Dataset, splits_of
 from .scene import Frame
 
-KEPT = 256  # members at most that stay open, those that were asked for last
+MAX_OPEN = 256  # members that stay open, the most recently used
 
 
 @dataclass(frozen=True)
@@ -60,7 +60,7 @@ class Collection:
         """A member by its name. Raises LumigraphError where it cannot be opened."""
         found = self._opened.pop(name, None) or self.openers[name]()
         self._opened[name] = found  # the latest last
-        while len(self._opened) > KEPT:
+        while len(self._opened) > MAX_OPEN:
             del self._opened[next(iter(self._opened))]
         return found
 

@@ -20,7 +20,7 @@ from ..errors import LumigraphError
 from ..files.ranges import Coordinate, Point, Row, Share, between, typed
 from ..geometry import Similarity, is_similarity
 from ..geometry import Vector as Vector
-from .images import UNNAMED, ImageStore, Layer, cosines, resized
+from .images import UNKNOWN_INDEX, ImageStore, Layer, cosines, resized
 
 # How values of a layer are reduced, by its name (see `resized`); all others are picked, not averaged.
 AVERAGED = {
@@ -208,7 +208,7 @@ def smaller(values: Shaped[Tensor, "height width *channels"], factor: int, encod
     height, width = values.shape[:2]
     stored = values.cpu().numpy()
     per_pixel = stored.reshape(height, width, -1)
-    known = ~np.isnan(per_pixel).any(-1) if values.is_floating_point() else (per_pixel != UNNAMED).any(-1)
+    known = ~np.isnan(per_pixel).any(-1) if values.is_floating_point() else (per_pixel != UNKNOWN_INDEX).any(-1)
     return torch.from_numpy(resized(stored, (width // factor, height // factor), encoding, known)).to(values.device)
 
 

@@ -30,9 +30,9 @@ from .partials import partial
 from .partials import remove as remove
 from .ranges import typed
 
-HERE, EXCHANGE = -100, 2  # AT_FDCWD, RENAME_EXCHANGE
-NUMBERS = re.compile(r"\[[-+.eE\d,\s]*\]")
-DEEPEST = 100  # levels that JSON may nest; whoever walks through it again has room for them
+AT_FDCWD, RENAME_EXCHANGE = -100, 2  # Linux's AT_FDCWD, RENAME_EXCHANGE
+NUMBER_LIST = re.compile(r"\[[-+.eE\d,\s]*\]")
+MAX_JSON_DEPTH = 100  # nesting levels of JSON; a recursive walk has room for them
 BUT_BRACKETS = bytes(set(range(256)) - set(b"[]{}"))
 
 Seen = tuple[int, ...]  # by which a file is known to be the same, unchanged
@@ -154,7 +154,7 @@ def exchange(new: Path, place: Path) -> None:
 def swapped(one: Path, other: Path) -> bool:
     """Let two paths change places in one step; False where the system has no such call (Linux has `renameat2`)."""
     call = getattr(ctypes.CDLL(None), "renameat2", None) if sys.platform == "linux" else None
-    return call is not None and call(HERE, os.fsencode(one), HERE, os.fsencode(other), EXCHANGE) == 0
+    return call is not None and call(AT_FDCWD, os.fsencode(one), AT_FDCWD, os.fsencode(other), RENAME_EXCHANGE) == 0
 
 
 def place_now(path: Path, ask: Callable[[], None]) -> Path:
@@ -207,7 +207,7 @@ def write_bytes(path: Path, data: bytes, kind: Kind = "file", ours: bool = False
 def write_json(path: Path, value: Any, kind: Kind = "file", ours: bool = False) -> None:
     """JSON for programs and people: indented, but rows of numbers stay rows."""
     text = json.dumps(value, indent=2, ensure_ascii=False, allow_nan=False)
-    text = NUMBERS.sub(lambda match: " ".join(match[0].split()).replace("[ ", "[").replace(" ]", "]"), text)
+    text = NUMBER_LIST.sub(lambda match: " ".join(match[0].split()).replace("[ ", "[").replace(" ]", "]"), text)
     write_bytes(path, text.encode() + b"\n", kind, ours)
 
 
@@ -224,8 +224,8 @@ def read_json(path: Path, kind: Any = Any) -> Any:
 def from_json(data: bytes, where: Path | str) -> Any:
     """Plain values of JSON. where: what to name in a LumigraphError; see `read_json`."""
     nesting = accumulate(1 if bracket in b"[{" else -1 for bracket in data.translate(None, BUT_BRACKETS))
-    if max(nesting, default=0) > DEEPEST:
-        raise LumigraphError(f"{where} nests deeper than {DEEPEST} levels, as no sound file does; restore it")
+    if max(nesting, default=0) > MAX_JSON_DEPTH:
+        raise LumigraphError(f"{where} nests deeper than {MAX_JSON_DEPTH} levels, as no sound file does; restore it")
     try:
         return msgspec.json.decode(data)
     except (ValueError, RecursionError) as error:

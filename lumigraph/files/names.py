@@ -6,7 +6,7 @@ import difflib
 import re
 from collections.abc import Sequence
 
-DIGITS = 20  # more than any number in a file's name has: nanoseconds since 1970 have 19
+MAX_DIGITS = 20  # more than any number in a file's name has: nanoseconds since 1970 have 19
 
 
 def natural(name: str) -> tuple[str, str]:
@@ -14,7 +14,7 @@ def natural(name: str) -> tuple[str, str]:
 
     Names whose numbers have the same number of digits keep the order that `sorted` gives them.
     """
-    return re.sub("[0-9]+", lambda number: number[0].zfill(DIGITS), name), name
+    return re.sub("[0-9]+", lambda number: number[0].zfill(MAX_DIGITS), name), name
 
 
 def counted(number: int, noun: str) -> str:

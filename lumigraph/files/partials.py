@@ -15,7 +15,7 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 
-FORM = re.compile(r"\.lumigraph-[0-9a-f]{16}\.partial")
+PARTIAL_NAME = re.compile(r"\.lumigraph-[0-9a-f]{16}\.partial")
 
 _swept: set[tuple[int, Path]] = set()  # processes and folders
 
@@ -43,7 +43,7 @@ def sweep(folder: Path) -> None:
     if (os.getpid(), folder.absolute()) in _swept:
         return
     _swept.add((os.getpid(), folder.absolute()))
-    for name in filter(FORM.fullmatch, os.listdir(folder)):
+    for name in filter(PARTIAL_NAME.fullmatch, os.listdir(folder)):
         lock = locked(folder / name)
         if lock is not None:
             remove(folder / name)

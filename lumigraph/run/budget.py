@@ -12,7 +12,7 @@ from ..files.ranges import Lasted, Seconds, Share, Steps, typed
 
 # Where schedules go on, at the earliest, once a run is extended. Coarse beginnings (small photographs, few cells,
 # warm-up) lie before it in every method, and are not repeated on what has become fine.
-REJOIN = 0.3
+REJOIN_PROGRESS = 0.3
 
 
 @dataclass(frozen=True)
@@ -58,7 +58,7 @@ class Budget:
         """
         if (to.steps, to.seconds) == (self.steps, self.seconds):
             return replace(self, quality=to.quality or self.quality)
-        share = min(self.progress(step, seconds), REJOIN)
+        share = min(self.progress(step, seconds), REJOIN_PROGRESS)
         return to if to.progress(step, seconds) >= share else replace(to, joined=(to.spent(step, seconds), share))
 
     def to_json(self) -> dict[str, Any]:

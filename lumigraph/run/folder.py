@@ -31,15 +31,15 @@ from ..datasets.dataset import Dataset
 from ..datasets.scene import Frame, Scene
 from ..errors import LumigraphError
 from ..files import marks
-from ..files.locks import NAME as LOCK
+from ..files.locks import LOCK_FILE as LOCK
 from ..files.locks import check_place, held
-from ..files.marks import NAME as RECORD
-from ..files.partials import FORM
+from ..files.marks import LOCK_FILE as RECORD
+from ..files.partials import PARTIAL_NAME
 from ..files.plain import understood
 from ..files.ranges import check
 from ..method import Method
 from . import cameras
-from .checkpoint import PACKED, Checkpoints, State
+from .checkpoint import PACKED_FILE, Checkpoints, State
 from .measured import read_rows
 from .needs import check_memory
 from .opened import Trained
@@ -238,7 +238,7 @@ class Run(Trained):
     @property
     def compressed(self) -> bool:
         """Whether it was made by `lumigraph compress`, so that it cannot go on learning."""
-        return self.has_state and self._checkpoints.weights.name == PACKED
+        return self.has_state and self._checkpoints.weights.name == PACKED_FILE
 
     @property
     def model_bytes(self) -> int:
@@ -328,7 +328,7 @@ def check_new(folder: Path) -> None:
 
 def is_leftover(path: Path) -> bool:
     """Whether something in a folder is of a run that was killed before it had begun."""
-    return path.name in (LOCK, RECORD) or FORM.fullmatch(path.name) is not None or marks.is_ours(path, "file")
+    return path.name in (LOCK, RECORD) or PARTIAL_NAME.fullmatch(path.name) is not None or marks.is_ours(path, "file")
 
 
 def versions() -> dict[str, str]:

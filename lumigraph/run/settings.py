@@ -15,7 +15,7 @@ from ..files.ranges import Count, Downscale, Name, Scales, Tally, between, typed
 from ..method import Method
 from .budget import Budget
 
-FORMAT = "lumigraph run 1"
+RUN_FORMAT = "lumigraph run 1"
 
 
 @dataclass(frozen=True)
@@ -72,7 +72,7 @@ class Settings:
     def read(file: Path) -> Settings:
         """What a config.json says. Raises LumigraphError, naming the file, where it is none of ours or damaged."""
         said = files.read_json(file)
-        if not isinstance(said, dict) or said.get("format") != FORMAT:
+        if not isinstance(said, dict) or said.get("format") != RUN_FORMAT:
             raise LumigraphError(f"{file} was not written by this version of Lumigraph; open it with the one that did")
         settings = typed(Settings, said, file)
         frame = Frame.from_json(said["frame"], f"{file}: frame")
@@ -88,7 +88,7 @@ class Settings:
         """What config.json says, under the same names."""
         own: dict[str, Any] = {x.name: getattr(self, x.name) for x in fields(self) if x.name != "said"}
         parts = {"frame": self.frame.to_json(), "scene": self.scene.to_json()}
-        return {"format": FORMAT} | self.said | own | parts
+        return {"format": RUN_FORMAT} | self.said | own | parts
 
     def with_budget(self, **budget: Any) -> Settings:
         """The same with another budget."""

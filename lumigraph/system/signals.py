@@ -13,9 +13,9 @@ from collections.abc import Callable, Iterator
 from types import FrameType
 from typing import Any
 
-NUMBERS = (signal.SIGINT, signal.SIGTERM)
-AGAIN = 0.5  # seconds between reminders
-ROOM = 1024  # bytes; no system's struct sigaction is as large
+HANDLED_SIGNALS = (signal.SIGINT, signal.SIGTERM)
+REMINDER_SECONDS = 0.5  # between reminders
+SIGACTION_BYTES = 1024  # no system's struct sigaction is as large
 
 
 class Stopped(KeyboardInterrupt):
@@ -99,7 +99,7 @@ class listening:  # noqa: N801
             raise Stopped(number, self)
 
     def _remind(self, number: int) -> None:
-        while not self._heeded.wait(AGAIN):
+        while not self._heeded.wait(REMINDER_SECONDS):
             self._reminding = True
             if sys.platform == "win32":
                 _thread.interrupt_main(number)
@@ -143,7 +143,7 @@ class Handlers:
 
     def set(self) -> None:
         if threading.current_thread() is threading.main_thread():
-            self._before = {number: signal.signal(number, self.hear) for number in NUMBERS}
+            self._before = {number: signal.signal(number, self.hear) for number in HANDLED_SIGNALS}
 
     def restore(self) -> None:
         for number, handler in self._before.items():
@@ -160,7 +160,7 @@ def untouched() -> Iterator[None]:
     if os.name == "nt":
         yield
         return
-    system, before = ctypes.CDLL(None), ctypes.create_string_buffer(ROOM)
+    system, before = ctypes.CDLL(None), ctypes.create_string_buffer(SIGACTION_BYTES)
     system.sigaction(signal.SIGTERM, None, before)
     try:
         yield

@@ -280,8 +280,8 @@ def about_exposure(photos: Sequence[Photo], in_order: bool) -> list[str]:
     if not found:
         return []
     return [
-        f"exposure jumps by more than {STOPS:g} stops at {listed(found)}; lock the exposure, or leave these out, for "
-        f"colours will not agree"
+        f"exposure jumps by more than {MAX_EXPOSURE_STOPS:g} stops at {listed(found)}; lock the exposure, or "
+        f"leave these out, for colours will not agree"
     ]
 
 
@@ -310,5 +310,5 @@ def about_jumps(names: Sequence[str], leaps: Sequence[tuple[int, float]]) -> lis
 
 def listed(names: Mapping[str, str] | Sequence[str]) -> str:
     found = list(names)
-    rest = f" and {len(found) - NAMED} more" if len(found) > MAX_NAMES else ""
+    rest = f" and {len(found) - MAX_NAMES} more" if len(found) > MAX_NAMES else ""
     return ", ".join(found[:MAX_NAMES]) + rest

@@ -110,7 +110,7 @@ def taken_in(sources: Sequence[Path], work: Path, options: Options, track: Track
     photos = [photo for photo in intake.photos if photo.name not in intake.duplicates]
     if len(photos) < MIN_VIEWS:
         raise LumigraphError(
-            f"{intake.source} has {counted(len(photos), 'photograph')} that can be used, and {FEWEST} are the "
+            f"{intake.source} has {counted(len(photos), 'photograph')} that can be used, and {MIN_VIEWS} are the "
             f"least{also_unreadable(intake)}; take some from other places"
         )
     return intake, photos
@@ -120,7 +120,7 @@ def check(options: Options) -> None:
     if options.max_size < 200:
         raise LumigraphError(f"--max-size {options.max_size} leaves no details to find; give at least 200 pixels")
     if options.frames is not None and options.frames < MIN_VIEWS:
-        raise LumigraphError(f"--frames {options.frames} are too few to tell depth from; give at least {FEWEST}")
+        raise LumigraphError(f"--frames {options.frames} are too few to tell depth from; give at least {MIN_VIEWS}")
 
 
 def with_safe_names(intake: Intake) -> Intake:
@@ -305,7 +305,7 @@ class Reconstruction:
                 found = unfolded
                 told.append(
                     f"parts of the place look alike and the model folded, so it was made again from the nearest "
-                    f"{NEIGHBOURS} neighbours of each photograph alone; look at capture.png"
+                    f"{SEQUENTIAL_NEIGHBOURS} neighbours of each photograph alone; look at capture.png"
                 )
         return found, told
 

@@ -101,7 +101,7 @@ def needed(about: About, name: str, path: Path):
     value = getattr(about, name)
     if value is None:
         raise LumigraphError(
-            f'{path.parent / LISTING} does not say the {name} of {path.name}; add it there, or to "all"'
+            f'{path.parent / LISTING_FILE} does not say the {name} of {path.name}; add it there, or to "all"'
         )
     return value
 
@@ -121,7 +121,7 @@ def size_of(path: Path, about: About) -> tuple[int, int]:
     if there != 2 * width * height:
         raise LumigraphError(
             f"{path} has {there:,} bytes, and {width}x{height} pixels of 16 bits are {2 * width * height:,}; "
-            f"restore it, or correct {path.parent / LISTING}"
+            f"restore it, or correct {path.parent / LISTING_FILE}"
         )
     return width, height
 

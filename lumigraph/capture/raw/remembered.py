@@ -85,7 +85,7 @@ def with_its_raw(shot: Shot, developed: Developed) -> Shot:
     path = Path(developed.file)
     if not exists(path):
         raise LumigraphError(
-            f"{path}, from which {shot.name} was developed, does not exist; bring it back, or delete {REMEMBERED} "
+            f"{path}, from which {shot.name} was developed, does not exist; bring it back, or delete {RAW_FILE} "
             f"to do without raw light"
         )
     photo = open_raw(path)

@@ -20,7 +20,9 @@ from ..training.lazy_adam import LazyAdam
 from .activations import truncated_exp
 from .mlp import MLP
 
-OPEN_RATE = 0.5  # XXX
+OPEN_RATE = (
+    0.5  # of the table's learning rate, that of networks in the open: at all of it one seed in three never learns a hue
+)
 OPEN_RESOLUTION = 2  # factor on max_resolution where coordinates are contracted: the box of interest is half as wide
 
 Joining = Callable[[int], Tensor | None]  # weights of so many levels or octaves; None where all count fully

@@ -13,7 +13,7 @@ from ...method.capabilities import FromField, HasDensity, HasField, HasGaussians
 from ...run import Opened
 
 Way = Literal["field", "gaussians", "depth", "pictures"]
-SPATIAL = FromField, HasField, HasDensity, HasLooks, HasGaussians  # what holds a scene can do one of these
+SPATIAL_CAPABILITIES = FromField, HasField, HasDensity, HasLooks, HasGaussians  # one of them is needed
 
 
 def way(teacher: type[Method], student: type[Method]) -> Way | None:
@@ -26,7 +26,7 @@ def way(teacher: type[Method], student: type[Method]) -> Way | None:
         if can(teacher, HasGaussians) and can(student, HasGaussians):
             return "gaussians"
         return "field" if can(teacher, HasField) else "depth"
-    return "pictures" if any(can(student, capability) for capability in SPATIAL) else None
+    return "pictures" if any(can(student, capability) for capability in SPATIAL_CAPABILITIES) else None
 
 
 def ways() -> dict[str, dict[str, Way | None]]:
@@ -43,7 +43,7 @@ def check(source: Opened, student: type[Method]) -> None:
     if source.frame.times is not None:
         raise LumigraphError(f"{source.path} is of a scene that moves, and what is converted stands still")
     check_kind(name, student.learns_from, Scene, str(source.path), methods.learning_from(Scene))
-    if not any(can(student, capability) for capability in SPATIAL):
+    if not any(can(student, capability) for capability in SPATIAL_CAPABILITIES):
         raise LumigraphError(
             f"{name} holds pictures, and no scene in space; `lumigraph convert --list` says what goes into what"
         )
