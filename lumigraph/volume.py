@@ -51,7 +51,7 @@ FIRST_STRETCH = 8  # samples per ray in the first query; each further query has 
 def visible(
     samples: Samples, thickness_of: Callable[[Int[Tensor, " asked"]], Float[Tensor, " asked"]], stop: float
 ) -> Bool[Tensor, " sample"]:
-    """Which samples light reaches, asking about few others: front to back, a stretch of each ray at a time.
+    """Mask of samples that light reaches, with few queries: front to back, a stretch of each ray at a time.
 
     thickness_of: optical thickness of the samples of these numbers
     stop:         transmittance below which a ray is spent, as in `composite`
@@ -72,5 +72,5 @@ def visible(
 
 
 def packed(counts: Int[Tensor, " ray"]) -> Int[Tensor, " ray_plus_one"]:
-    """Where each ray's samples begin, when they lie end to end."""
+    """Start offset of each ray's samples in a packed list."""
     return torch.nn.functional.pad(counts.cumsum(0), (1, 0))

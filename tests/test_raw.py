@@ -46,12 +46,12 @@ def test_a_mosaic_becomes_the_picture_that_it_was_made_of(tmp_path, name, patter
     folder = raws.write_mosaics(tmp_path, {name: raws.mosaic_of(rgb, pattern)}, {name: 0.5}, pattern=pattern)
     assert is_raw(folder / name) and not is_raw(folder / "mosaics.json")
     photo = open_raw(folder / name)
-    assert photo.size == (48, 32) and photo.exposure == 0.5 and photo.gains == raws.WHITE_BALANCE
+    assert photo.size == (48, 32) and photo.exposure == 0.5 and photo.gains == raws.GAINS
     assert np.abs(photo.developed(1.0)[2:-2, 2:-2] - bytes_of(rgb)[2:-2, 2:-2]).max() <= 1
 
 
 def test_noise_below_black_stays(tmp_path):
-    numbers = np.array([[raws.BLACK_LEVEL - 30, raws.BLACK_LEVEL, raws.WHITE_LEVEL, 65_535]] * 4, np.uint16)
+    numbers = np.array([[raws.BLACK - 30, raws.BLACK, raws.WHITE, 65_535]] * 4, np.uint16)
     light = open_raw(raws.write_mosaics(tmp_path, {"a.png": numbers}) / "a.png").read()
     np.testing.assert_allclose(light[0, :3], [-30 / 12_000, 0, 1], atol=1e-7)
     assert light.dtype == np.float32 and light[0, 3] > 5
@@ -93,7 +93,7 @@ def test_a_dng_is_read_through_rawpy(dng):
     photo = open_raw(dng)
     assert photo.size == (48, 32) and photo.pattern == ((0, 1), (1, 2))
     assert photo.exposure == pytest.approx(1 / 30 / 2.8**2, rel=1e-4)
-    np.testing.assert_allclose(photo.gains, raws.WHITE_BALANCE, rtol=1e-3)
+    np.testing.assert_allclose(photo.gains, raws.GAINS, rtol=1e-3)
     numbers = raws.mosaic_of(raws.gradient())
     np.testing.assert_allclose(photo.read(), (numbers - 500.0) / 12_000, atol=1e-6)
     assert np.abs(photo.developed(1.0)[2:-2, 2:-2] - bytes_of(raws.gradient())[2:-2, 2:-2]).max() <= 1
@@ -200,7 +200,7 @@ def test_a_scene_has_the_light_of_its_raw_files(tmp_path):
     np.testing.assert_allclose(shot.extra["mosaic"].numpy(), (numbers - 500.0) / 12_000, atol=1e-6)
     assert shot.extra["filter"][:2, :2].tolist() == [[0, 1], [1, 2]] and scene.layers["filter"].names[2] == "blue"
     assert scene.about["exposure"].tolist() == [1.0, 0.5, 0.25, 1.0] and scene.about["brightness"].tolist() == [2.0] * 4
-    np.testing.assert_allclose(scene.about["white_balance"][0], raws.WHITE_BALANCE)
+    np.testing.assert_allclose(scene.about["white_balance"][0], raws.GAINS)
     batch = scene.sample_rays(64, torch.Generator().manual_seed(0), layers=("mosaic", "filter"))
     assert batch.extra["mosaic"].shape == (64,) and set(batch.extra["filter"].tolist()) == {0, 1, 2}
 

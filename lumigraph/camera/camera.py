@@ -56,7 +56,7 @@ class Camera:
 
     @property
     def forward(self) -> Float[Tensor, "camera 3"]:
-        """Where each camera looks, unit length."""
+        """Viewing direction of each camera, unit length."""
         return self.pose[:, :, 2]
 
     def pixels(self) -> Float[Tensor, "pixel 2"]:

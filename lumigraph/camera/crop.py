@@ -21,7 +21,7 @@ class Crop(ABC):
 
     @abstractmethod
     def holds(self, points: Float[Tensor, "*point 3"], tolerance: float = 0.0) -> Bool[Tensor, "*point"]:
-        """Whether each point lies inside, or outside by no more than a tolerance, a share of the size."""
+        """True for points inside, or outside by at most a tolerance (a share of the size)."""
 
     @abstractmethod
     def through(self, rays: Rays) -> tuple[Float[Tensor, " ray"], Float[Tensor, " ray"]]:
@@ -98,7 +98,7 @@ class Sphere(Crop):
         return (points - torch.tensor(self.middle).to(points)).norm(dim=-1) <= (1 + tolerance) * self.radius
 
     def through(self, rays: Rays) -> tuple[Float[Tensor, " ray"], Float[Tensor, " ray"]]:
-        """Where |o + t d - m| = r: t = b ± sqrt(r^2 - a^2), where b is how far along m is nearest, and a how near."""
+        """Solve |o + t d - m| = r: t = b ± sqrt(r^2 - a^2), where b is how far along m is nearest, and a how near."""
         away = torch.tensor(self.middle).to(rays.origins) - rays.origins
         nearest = (away * rays.directions).sum(-1)
         beside = (away - nearest[:, None] * rays.directions).square().sum(-1)

@@ -18,7 +18,7 @@ HOLD_OUT = 8  # every so many members by name, the first one among them, as with
 
 @runtime_checkable
 class Dataset(Protocol):
-    """What the trainer, the run and the evaluation ask of all that can be learnt from.
+    """Interface of training data for the trainer, the run and the evaluation.
 
     kind:     what it holds, in a user's words: "photographs", "shapes", "a collection"
     source:   the path that it came from, or "procedural:<name>"

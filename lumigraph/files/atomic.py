@@ -158,7 +158,7 @@ def swapped(one: Path, other: Path) -> bool:
 
 
 def place_now(path: Path, ask: Callable[[], None]) -> Path:
-    """Where to put what has been made: where it was to go, or beside it if somebody else has been there meanwhile."""
+    """Destination of a finished output: the requested path, or one beside it if it has been taken meanwhile."""
     try:
         ask()
         return path
@@ -173,7 +173,7 @@ def tell_if_moved(wanted: Path, place: Path) -> None:
 
 
 def seen(path: Path) -> Seen | None:
-    """What lies at a path, links as such; None if nothing does."""
+    """Status of a path without following links; None if it does not exist."""
     try:
         about = os.lstat(path)
     except (FileNotFoundError, NotADirectoryError):
@@ -212,7 +212,7 @@ def write_json(path: Path, value: Any, kind: Kind = "file", ours: bool = False) 
 
 
 def read_json(path: Path, kind: Any = Any) -> Any:
-    """What a file of JSON says, as a value of a kind (see `ranges.typed`); as it stands there if none is named.
+    """Read JSON as a value of a type (see `ranges.typed`), or unchecked if no type is given.
 
     Raises LumigraphError, naming the file, if it is missing, is no JSON (NaN, infinity and numbers of hundreds of
     digits are none either), nests deeper than anything sound does, or does not hold what the kind says.
@@ -236,7 +236,7 @@ def from_json(data: bytes, where: Path | str) -> Any:
 
 
 def is_file(path: Path) -> bool:
-    """Whether a file lies there; none does under a name that the system takes for no name."""
+    """True if the path is a file; False for a name that the system rejects."""
     try:
         return path.is_file()
     except (OSError, ValueError):
@@ -244,7 +244,7 @@ def is_file(path: Path) -> bool:
 
 
 def exists(path: Path) -> bool:
-    """Whether something lies there; nothing does under a name that the system takes for no name."""
+    """True if the path exists; False for a name that the system rejects."""
     try:
         return path.exists()
     except (OSError, ValueError):

@@ -29,7 +29,7 @@ _ours: set[Path] = set()  # held by this process
 
 @dataclass(frozen=True)
 class Holder:
-    """What the file says."""
+    """Contents of a lock file."""
 
     process: int
     host: str
@@ -70,7 +70,7 @@ def check_place(folder: Path) -> None:
 
 
 def is_lock(place: Path) -> bool:
-    """Whether a lock's file may be put there: nothing is, or one that somebody holds or has left behind."""
+    """True if the path is free for a lock file: it does not exist, or is a held or abandoned lock file."""
     if not os.path.lexists(place):
         return True
     if place.is_symlink() or not place.is_file():
@@ -104,7 +104,7 @@ def is_still(place: Path, file: TextIO) -> bool:
 
 
 def lock(file: TextIO) -> bool:
-    """Whether an open file could be locked. Where the file system knows no locks, it could."""
+    """Try to lock an open file; True if it succeeds or the file system has no locks."""
     try:
         if sys.platform == "win32":
             import msvcrt

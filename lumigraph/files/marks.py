@@ -1,4 +1,4 @@
-"""What Lumigraph wrote into a folder, so that it knows its own again: lines of JSON in a file `.lumigraph` there.
+"""Records of files that Lumigraph wrote into a folder: lines of JSON in a file `.lumigraph` there.
 
 Each line is a file: its name, what kind of thing it is, its bytes and their SHA-256. A file is ours if a line says so
 and nobody has changed it since. Why here, rather than
@@ -47,12 +47,12 @@ def note_folder(folder: Path, kind: Kind) -> None:
 
 
 def is_ours(path: Path, kind: Kind) -> bool:
-    """Whether a file is one of this kind that Lumigraph wrote, and is as it was then. Links never are."""
+    """True if Lumigraph wrote this file as this kind and it is unchanged. False for links."""
     return is_among(known(path.parent, kind), path)
 
 
 def is_whole(folder: Path, kind: Kind) -> bool:
-    """Whether Lumigraph wrote a folder as one thing of this kind; see `foreign_in` for what it holds now."""
+    """True if Lumigraph wrote a folder as a whole of this kind; see `foreign_in` for later additions."""
     return WHOLE_FOLDER in known(folder, kind)
 
 
@@ -80,7 +80,7 @@ def sum_of(path: Path) -> Sum:
 
 
 def known(folder: Path, kind: Kind) -> dict[str, set[Sum]]:
-    """What a folder's record says of this kind, by name; nothing where there is none, or somebody else's."""
+    """Recorded files of this kind, by name; empty without a valid record."""
     sums: dict[str, set[Sum]] = defaultdict(set)
     for line in (folder / MARKS_FILE).read_bytes().splitlines() if is_record(folder / MARKS_FILE) else []:
         try:
@@ -93,7 +93,7 @@ def known(folder: Path, kind: Kind) -> dict[str, set[Sum]]:
 
 
 def is_record(path: Path) -> bool:
-    """Whether a path is a record that Lumigraph began."""
+    """True if a path is a record created by Lumigraph."""
     try:
         if not stat.S_ISREG(os.lstat(path).st_mode):
             return False

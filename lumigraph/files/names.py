@@ -10,7 +10,7 @@ MAX_DIGITS = 20  # more than any number in a file's name has: nanoseconds since 
 
 
 def natural(name: str) -> tuple[str, str]:
-    """What to sort names by so that numbers in them count as numbers: 1, 2, 10.
+    """Sort key by which numbers in names are ordered by value: 1, 2, 10.
 
     Names whose numbers have the same number of digits keep the order that `sorted` gives them.
     """

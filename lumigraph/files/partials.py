@@ -1,4 +1,4 @@
-"""What is still being written: names that nobody else has, in the folder where it will lie, and what a kill left of it.
+"""Partial files: unique names in the destination folder, and removal of leftovers of killed processes.
 
 A process holds a lock on whatever it is writing, and the system drops the lock when the process ends, even killed. So
 what has such a name and no lock is a leftover of ours, and goes when somebody writes into the folder again. Where the

@@ -187,7 +187,7 @@ def _nearer_difference(
 
 
 def is_similarity(matrix: Tensor) -> bool:
-    """Whether a tensor is a 4 x 4 matrix that moves, turns and scales, up to rounding, and does not mirror."""
+    """True for a 4 x 4 similarity matrix (translation, rotation, scale; no reflection), up to rounding."""
     if matrix.shape != (4, 4) or not matrix.isfinite().all() or matrix[3].tolist() != [0.0, 0.0, 0.0, 1.0]:
         return False
     linear, one = matrix[:3, :3], torch.eye(3, dtype=torch.float64)

@@ -41,7 +41,7 @@ class Budget:
         return self.seconds if self.steps is None else self.steps  # type: ignore[return-value]
 
     def spent(self, step: int, seconds: float) -> float:
-        """How much is spent, in its own unit."""
+        """Amount used so far, in the budget's unit."""
         return seconds if self.steps is None else step
 
     def progress(self, step: int, seconds: float) -> float:
@@ -62,13 +62,13 @@ class Budget:
         return to if to.progress(step, seconds) >= share else replace(to, joined=(to.spent(step, seconds), share))
 
     def to_json(self) -> dict[str, Any]:
-        """As a run says it: {"seconds": 60.0}, {"steps": 500, "quality": "draft"}."""
+        """JSON of a run's file: {"seconds": 60.0}, {"steps": 500, "quality": "draft"}."""
         said = {x.name: getattr(self, x.name) for x in fields(self) if getattr(self, x.name) is not None}
         return said | ({"joined": list(self.joined)} if self.joined else {})
 
     @staticmethod
     def from_json(said: dict[str, Any], where: Path | str = "a run's budget") -> Budget:
-        """What a run says. Raises LumigraphError, naming `where`, for a run that says nothing, or no budget."""
+        """Read a budget from a run's JSON. Raises LumigraphError, naming `where`, if it is missing or invalid."""
         return typed(Budget, said, where)
 
     def __str__(self) -> str:
@@ -79,7 +79,7 @@ class Budget:
 
 
 def lasting(seconds: float) -> str:
-    """How long, for people: 0.5 is "0.5 s", 90 "90 s", 600 "10 min", 5400 "1 h 30 min"."""
+    """Duration as text: 0.5 is "0.5 s", 90 "90 s", 600 "10 min", 5400 "1 h 30 min"."""
     if seconds < 120:
         return f"{seconds:.3g} s"
     hours, minutes = divmod(round(seconds / 60), 60)

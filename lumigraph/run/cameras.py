@@ -21,7 +21,7 @@ MAX_PIXELS = 10**9  # of one picture
 
 @dataclass(frozen=True)
 class Cameras:
-    """What the file says: a row for each camera, and by split the numbers of its rows. lens: see `Lens.to_json`."""
+    """Contents of the file: one row per camera, and row numbers by split. lens: see `Lens.to_json`."""
 
     names: list[str]
     splits: dict[str, list[int]]
@@ -44,7 +44,7 @@ def to_json(scene: Scene) -> dict[str, Any]:
 
 
 def read(path: Path) -> Cameras:
-    """What the file says. Raises LumigraphError, naming it, where its rows do not fit together."""
+    """Read the file. Raises LumigraphError, naming it, if its rows are inconsistent."""
     said = read_json(path, Cameras)
     count = len(said.pose)
     rows = {"names": len(said.names), "size": len(said.size), "time": count if said.time is None else len(said.time)}

@@ -40,7 +40,7 @@ CHECKPOINT_NAME = re.compile(r"\d+")
 
 @dataclass(frozen=True)
 class State:
-    """How far training has come: completed steps, and seconds that they took; compilation is counted apart.
+    """Progress of training: completed steps and their seconds; compilation is counted separately.
 
     peak_memory: bytes at most, see `memory.peak_memory`; 0 if unknown
     passes:      how often everything was learnt from, on average, see `verdict.shares_seen`; 0 if unknown
@@ -90,7 +90,7 @@ class Checkpoints:
         self.folder = run / "checkpoints"
 
     def __bool__(self) -> bool:
-        """Whether there is a complete state."""
+        """True if there is a complete checkpoint."""
         return bool(self._all())
 
     @property
@@ -104,7 +104,7 @@ class Checkpoints:
 
     @property
     def state(self) -> State:
-        """How far the latest complete state has come."""
+        """Progress of the latest complete checkpoint."""
         about = self._about(self.latest)
         return State(**{field.name: getattr(about, field.name) for field in fields(State)})
 
@@ -263,7 +263,7 @@ def checksum(data: bytes) -> Sum:
 
 
 def is_state(path: Path) -> bool:
-    """Whether a folder is a state or a part of one, and holds nothing that somebody else has put there."""
+    """True if a folder is a complete or partial checkpoint and contains no foreign files."""
     if not CHECKPOINT_NAME.fullmatch(path.name) or path.is_symlink() or not path.is_dir():
         return False
     return all(

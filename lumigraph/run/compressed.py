@@ -45,7 +45,7 @@ class Compressed:
 
     @property
     def times(self) -> float:
-        """How many times smaller the model is."""
+        """Compression ratio of the model."""
         return self.bytes_before / max(self.bytes_after, 1)
 
     def write(self, folder: Path) -> None:
@@ -53,7 +53,7 @@ class Compressed:
 
     @staticmethod
     def read(folder: Path) -> Compressed | None:
-        """What a run's folder says; None where it was not compressed. Raises LumigraphError for what is damaged."""
+        """Read the record of a compressed run; None for other runs. Raises LumigraphError for a damaged record."""
         return files.read_json(folder / COMPRESS_FILE, Compressed) if files.is_file(folder / COMPRESS_FILE) else None
 
 

@@ -33,7 +33,7 @@ class Begun:
 
     @staticmethod
     def of(settings: Settings, file: Path) -> Begun | None:
-        """What settings say; None of a run that was trained from its beginning. file: to name what is damaged in it"""
+        """Read from settings; None for a run that was trained from scratch. file: to name what is damaged in it"""
         told = settings.said.get("converted")
         return None if told is None else typed(Begun, told, f"{file}: converted")
 
@@ -82,5 +82,5 @@ class Converted:
 
     @staticmethod
     def read(folder: Path) -> Converted | None:
-        """What a run's folder says; None where it was not converted. Raises LumigraphError for what is damaged."""
+        """Read the record of a converted run; None for other runs. Raises LumigraphError for a damaged record."""
         return files.read_json(folder / CONVERT_FILE, Converted) if files.is_file(folder / CONVERT_FILE) else None

@@ -1,4 +1,4 @@
-"""How much memory a method will need: told by its Config before anything is made."""
+"""Estimate the memory of a method from its Config, before allocation."""
 
 from __future__ import annotations
 

@@ -53,7 +53,7 @@ def frame_of(gaussians: Gaussians) -> Frame:
 
 
 def upright_similarity(gaussians: Gaussians) -> Similarity:
-    """What brings most of the visible cloud into [-1, 1]^3, standing upright."""
+    """Similarity that moves most of the visible cloud into [-1, 1]^3, upright."""
     means = gaussians.means.double().cpu()
     solid = means[gaussians.opacities.sigmoid().cpu() > 0.1]
     means = (solid if len(solid) > 10 else means) @ UPRIGHT_ROTATION.T

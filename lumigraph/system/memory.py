@@ -49,7 +49,7 @@ def peak_memory(device: torch.device) -> int:
 
 
 def room_for(size: int, device: torch.device) -> int:
-    """How many more things of so many bytes may be made on a device; very many where the system does not say."""
+    """Number of further objects of a size in bytes that fit on a device; very large if free memory is unknown."""
     return int((1 - SPARED_SHARE) * free_on(device)) // size
 
 

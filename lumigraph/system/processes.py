@@ -22,7 +22,7 @@ def start(command: Sequence[str], ends_by: int = signal.SIGTERM, **options: Any)
 
 
 def tied(number: int) -> Any:
-    """What the child does between fork and exec, where it must not load anything."""
+    """Set-up of the child between fork and exec, where it must not load modules."""
     prctl, parent = ctypes.CDLL(None).prctl, os.getpid()
 
     def tie() -> None:

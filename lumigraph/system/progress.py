@@ -96,7 +96,7 @@ class Stage:
                 bar.update(task, completed=self.count)
 
     def line(self) -> str:
-        """What a log says: how many, which share, how long still."""
+        """Line of a log: count, share, remaining time."""
         if self.total is None:
             return f"{self.description}: {clock(self.seconds)} so far"
         told = f"{self.description}: {self.count} of {self.total}"

@@ -32,7 +32,7 @@ def number_of(stopped: KeyboardInterrupt) -> int:
 
 
 def exit_code(number: int | None) -> int:
-    """As shells count: 130 after Ctrl-C, 143 after SIGTERM, 0 without a signal."""
+    """Exit code as in shells: 130 after Ctrl-C, 143 after SIGTERM, 0 without a signal."""
     return 0 if number is None else 128 + number
 
 
@@ -107,7 +107,7 @@ class listening:  # noqa: N801
                 signal.pthread_kill(threading.main_thread().ident or 0, number)
 
     def _is_loading(self, frame: FrameType | None) -> bool:
-        """Whether a module is being loaded inside the block."""
+        """True while a module is being loaded inside the block."""
         while frame is not None and frame is not self._home:
             if frame.f_code.co_filename.startswith("<frozen importlib"):
                 return True

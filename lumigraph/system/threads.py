@@ -129,7 +129,7 @@ def crowd(leave: threading.Event) -> None:
 
 
 def told() -> str:
-    """How many threads share the work; and the load of the last minute, where it is more than the processors can do."""
+    """Describe the number of threads, and the load of the last minute if it exceeds the processors."""
     import torch
 
     count = torch.get_num_threads()
@@ -139,5 +139,5 @@ def told() -> str:
 
 
 def processors() -> int:
-    """How many this process may use."""
+    """Number of processors available to this process."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

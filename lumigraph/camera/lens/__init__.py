@@ -37,21 +37,21 @@ NO_INDEX = torch.empty(0, dtype=torch.int64)
 
 @dataclass(frozen=True)
 class Named:
-    """Of a lens in a file, what all kinds have."""
+    """Fields of a lens in a file that all kinds share."""
 
     kind: str
 
 
 @dataclass(frozen=True)
 class MixedParts:
-    """Of lenses of several kinds in a file; see `Mixed`."""
+    """Fields of lenses of several kinds in a file; see `Mixed`."""
 
     parts: list[Any]
     part: list[Tally]
 
 
 class Lens(ABC):
-    """What all lenses have in common. Subclasses are frozen dataclasses of tensors with leading axis camera.
+    """Base class of lenses. Subclasses are frozen dataclasses of tensors with leading axis camera.
 
     In every method `index` names the camera of each pixel or point; None means camera 0 for all.
     """
@@ -81,7 +81,7 @@ class Lens(ABC):
     def origins(
         self, pixels: Float[Tensor, "ray 2"], index: Int[Tensor, " ray"] | None = None
     ) -> Float[Tensor, "ray 3"] | None:
-        """Where rays begin in the camera's frame, in scene units; None where all begin at the camera's centre."""
+        """Origins of rays in the camera's frame, in scene units; None where all begin at the camera's centre."""
         return None
 
     def solid_angle(
@@ -90,7 +90,7 @@ class Lens(ABC):
         directions: Float[Tensor, "ray 3"],
         index: Int[Tensor, " ray"] | None = None,
     ) -> Float[Tensor, " ray"]:
-        """What each pixel covers of the unit sphere, in steradians. `directions` are those that `unproject` gave."""
+        """Solid angle of each pixel, in steradians. `directions` are those that `unproject` gave."""
         half_x, half_y = 0.5 * torch.eye(2, dtype=pixels.dtype, device=pixels.device)
         across = self.unproject(pixels + half_x, index) - self.unproject(pixels - half_x, index)
         down = self.unproject(pixels + half_y, index) - self.unproject(pixels - half_y, index)
@@ -124,7 +124,7 @@ class Lens(ABC):
 
     @staticmethod
     def from_json(data: Any, where: Any = "a lens") -> Lens:
-        """What a file says of the lenses of its cameras. Raises LumigraphError, naming `where`, for what are none."""
+        """Read the lenses of cameras from a file's JSON. Raises LumigraphError, naming `where`, for what are none."""
         kind = Lens.kinds.get(typed(Named, data, where).kind)
         if kind is None:
             raise LumigraphError(f"{where} has a lens of kind {data['kind']!r}; there are {', '.join(Lens.kinds)}")
@@ -149,7 +149,7 @@ class Lens(ABC):
         return lens
 
     def fault(self) -> str | None:
-        """What no lens can have among its numbers, in a few words; None if all are sound."""
+        """Describe the first invalid parameter in a few words; None if all are valid."""
         for name, values in self._numbers().items():
             least, most = PARAMETER_RANGES.get(name, DEFAULT_RANGE)
             bad = ~((values >= least) & (values <= most))
@@ -253,7 +253,7 @@ class OpenCV(Lens):
         return z * z * z / ((xx * yy - xy * xy).clamp_min(1e-3) * area(self.focal, index))
 
     def _by_loop(self, given: Tensor) -> bool:
-        """Whether the quicker loops on the CPU will do: they know single precision and no gradients."""
+        """True if the faster CPU loops apply: single precision, no gradients."""
         tensors = (given, *self._numbers().values())
         return all(x.is_cpu and x.dtype == torch.float32 and not x.requires_grad for x in tensors)
 
@@ -504,7 +504,7 @@ def one_or_more(index: int | slice | Tensor) -> slice | Tensor:
 
 
 def small(step: Tensor) -> bool:
-    """Whether Newton's method has arrived."""
+    """True where Newton's method has converged."""
     return not len(step) or step.detach().abs().max().item() < CONVERGED_STEP
 
 

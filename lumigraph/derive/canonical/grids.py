@@ -21,7 +21,7 @@ Density = Callable[[Float[Tensor, "point 3"]], Float[Tensor, " point"]]
 
 @dataclass(frozen=True)
 class Instance:
-    """What is opaque in a grid of cells, in a frame of its own: centred at the weighted mean, of spread one.
+    """Opaque cells of a grid as weighted points, normalised: weighted mean at the origin, spread one.
 
     points:  centres of the cells that are not empty
     weights: how much light each cell stops, 1 - exp(-density times its side); they add up to one

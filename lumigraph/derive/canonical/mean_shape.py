@@ -63,7 +63,7 @@ def aligned(shapes: Float[Tensor, "some shell basis"], start: Float[Tensor, "som
 
 
 def best_alignment(shapes: Float[Tensor, "some shell basis"], starts: Sequence[Float[Tensor, "some 3 3"]]) -> Alignment:
-    """Of alignments from several beginnings, the one whose mean shape explains most."""
+    """Align from several initialisations; return the alignment whose mean shape explains most."""
     return max((aligned(shapes, start) for start in starts), key=lambda found: found.explained)
 
 
@@ -79,7 +79,7 @@ def best_rotations(
 def correlations(
     target: Float[Tensor, "shell basis"], shapes: Float[Tensor, "some shell basis"]
 ) -> Float[Tensor, "some entry"]:
-    """What the correlation of two shapes is linear in, the entries of D: sum over shells of g_l f_l^T for each band."""
+    """Coefficients of the entries of D in the correlation of two shapes: sum over shells of g_l f_l^T for each band."""
     parts = [target[:, band(n)].mT @ shapes[..., band(n)] for n in range(BANDS)]
     return torch.cat([part.flatten(-2) for part in parts], -1)
 
@@ -117,7 +117,7 @@ class Turns:
         return Turns(self.rotations[which], [matrix[which] for matrix in self.matrices])
 
     def pick(self, which: Tensor) -> Turns:
-        """Of each row of rotations the one with this number."""
+        """Select one rotation per row, by number."""
         rows = torch.arange(len(which))
         return Turns(self.rotations[rows, which], [matrix[rows, which] for matrix in self.matrices])
 

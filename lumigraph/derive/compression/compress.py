@@ -32,7 +32,7 @@ TRIAL_SHARE = 1 / 6  # of all tuning, per tried rung; the selected rung gets the
 
 @dataclass(frozen=True)
 class Aim:
-    """What is wanted, and what it may take; exactly one of size and loss.
+    """Target of a compression and its limit in time; exactly one of size and loss.
 
     size:     bytes of the model at most
     loss:     dB that photographs which were learnt from may lose at most
@@ -135,7 +135,7 @@ class Ladder:
 
 
 def important(method: Method, truth: Truth) -> dict[str, Tensor]:
-    """What each row of the method's tensors adds to the photographs, or to many of them."""
+    """Importance of each row of the method's tensors, over all photographs or a subset."""
     train = evenly(truth.scene.splits["train"].tolist(), IMPORTANCE_VIEWS)
     total: dict[str, Tensor] = {}
     for i in track(train, "Weighing what matters", len(train)):

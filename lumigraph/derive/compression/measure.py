@@ -1,4 +1,4 @@
-"""What a compressed run is compared with: its photographs where they are at hand, else what it used to show."""
+"""References for a compressed run: its photographs where available, else renderings of the original."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ DEFAULT_PSNR = 30.0  # dB of a run without a recorded training PSNR
 
 @dataclass(frozen=True)
 class Truth:
-    """What is learnt from and compared with.
+    """References for tuning and for comparison.
 
     photographed: whether these are photographs; renderings of the run before it was compressed otherwise
     error:        mean squared error of the run before, on the photographs that it has learnt

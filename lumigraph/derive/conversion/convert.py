@@ -36,7 +36,7 @@ COMPARED_VIEWS = 8  # held-out views that are compared
 
 @dataclass(frozen=True)
 class Aim:
-    """What is wanted, and what it may take; exactly one of steps, seconds and quality.
+    """Target of a conversion and its limit; exactly one of steps, seconds and quality.
 
     config:  the student's numbers; None takes its defaults for the device
     steps, seconds: of learning on, once the teacher is taken over
@@ -133,7 +133,7 @@ def take_over(teacher: Method, student: Method, data: Scene, cameras: Camera, as
 
 
 def budget_of(student: Method, data: Scene, aim: Aim) -> Budget:
-    """How long to learn on. What began as a field is at SHARE of its schedules already."""
+    """Budget of further training. Schedules of a converted field begin at INHERITED_PROGRESS."""
     share, steps = INHERITED_PROGRESS if can(student, FromField) else 0.0, aim.steps
     if aim.quality is not None:
         steps = max(1, round((1 - share) * student.steps_for(aim.quality, data)))

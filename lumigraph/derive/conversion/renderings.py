@@ -1,4 +1,4 @@
-"""What a student learns from where there are no photographs: pictures that its teacher renders, as a Scene."""
+"""Training pictures for a student without photographs: renderings of its teacher, as a Scene."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def between(cameras: Camera) -> Camera:
 
 
 def seconds_of_one(teacher: Method, camera: Camera) -> float:
-    """What rendering a picture takes; kernels are compiled before."""
+    """Seconds per rendered picture, without compilation of kernels."""
     teacher.render(camera.resized(min(1.0, 32 / int(camera.size.max()))))
     begin = time.perf_counter()
     teacher.render(camera)

@@ -1,4 +1,4 @@
-"""What goes into what, and how: told by what methods can do, so that a new one finds its place by itself."""
+"""Conversions between methods, by capability, so that a new method is supported without an entry here."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ SPATIAL_CAPABILITIES = FromField, HasField, HasDensity, HasLooks, HasGaussians  
 
 
 def way(teacher: type[Method], student: type[Method]) -> Way | None:
-    """How a student can be made of a teacher: by the teacher's field at points, by its Gaussians as they are, by the
+    """Conversion of a teacher to a student: by the teacher's field at points, by its Gaussians as they are, by the
     depth of what it renders, or by learning from its pictures alone; None if not at all."""
     shows = issubclass(Scene, teacher.learns_from) or Scene in teacher.accepts  # a prior's runs are of scenes too
     if not (shows and issubclass(Scene, student.learns_from)):
