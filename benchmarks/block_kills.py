@@ -23,7 +23,7 @@ from pathlib import Path
 
 import tyro
 
-from lumigraph.large.plan import DONE, FOLDER
+from lumigraph.large.plan import BLOCKS_FOLDER, DONE_FILE
 
 WEIGHTS = "checkpoints/*/weights.safetensors"
 
@@ -59,7 +59,7 @@ def ended(process: subprocess.Popen[bytes]) -> None:
 def holders(run: Path) -> list[tuple[str, int]]:
     """Blocks that a process holds, and which."""
     found = []
-    for lock in sorted((run / FOLDER).glob("*/lock.json")):
+    for lock in sorted((run / BLOCKS_FOLDER).glob("*/lock.json")):
         with contextlib.suppress(OSError, ValueError):
             number = json.loads(lock.read_text())["process"]
             os.kill(number, 0)
@@ -69,7 +69,7 @@ def holders(run: Path) -> list[tuple[str, int]]:
 
 def weights(run: Path) -> dict[str, bytes]:
     """Of all blocks that are done."""
-    done = sorted(path.parent for path in (run / FOLDER).glob(f"*/{DONE}"))
+    done = sorted(path.parent for path in (run / BLOCKS_FOLDER).glob(f"*/{DONE}"))
     return {folder.name: next(folder.glob(WEIGHTS)).read_bytes() for folder in done}
 
 
@@ -97,7 +97,9 @@ def killed_drivers(options: Options, run: Path, chance: random.Random, alone: fl
         if process.poll() is None:
             process.kill()
             kills += 1
-            left = sum((folder / DONE).exists() for folder in (run / FOLDER).iterdir()) if run.exists() else 0
+            left = (
+                sum((folder / DONE_FILE).exists() for folder in (run / BLOCKS_FOLDER).iterdir()) if run.exists() else 0
+            )
             print(f"  driver killed, {left} blocks done", flush=True)
         process.wait()
     ended(started(options, run))

@@ -14,7 +14,7 @@ from rich.table import Table
 
 from lumigraph import files
 from lumigraph.figures.charts import Series, line_chart, standalone
-from lumigraph.large.plan import DONE, NAME, Done, Plan
+from lumigraph.large.plan import DONE_FILE, PLAN_FILE, Done, Plan
 from lumigraph.large.planning import place_of
 from lumigraph.system.console import console
 
@@ -26,8 +26,8 @@ class Options:
 
 
 def done_of(run: Path) -> list[Done]:
-    plan = Plan.read(run / NAME)
-    return [files.read_json(place_of(run, block) / DONE, Done) for block in plan.blocks]
+    plan = Plan.read(run / PLAN_FILE)
+    return [files.read_json(place_of(run, block) / DONE_FILE, Done) for block in plan.blocks]
 
 
 def main(options: Options) -> None:

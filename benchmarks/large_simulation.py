@@ -18,9 +18,9 @@ import numpy as np
 import tyro
 
 from lumigraph import files
-from lumigraph.large.plan import DONE, NAME, Done, Plan
+from lumigraph.large.plan import DONE_FILE, PLAN_FILE, Done, Plan
 from lumigraph.large.planning import place_of
-from lumigraph.large.worker import SAVE_EVERY
+from lumigraph.large.worker import SAVE_SECONDS
 
 
 @dataclass(frozen=True)
@@ -97,7 +97,7 @@ def simulate(work: list[Work], costs: Costs, machines: Machines, seed: int = 0) 
                 break
             losses += 1
             took += until
-            left -= max(0.0, until - ahead) // SAVE_EVERY * SAVE_EVERY
+            left -= max(0.0, until - ahead) // SAVE_SECONDS * SAVE_SECONDS
         busy += took
         heapq.heappush(free, (begin + took, number))
     end = max(at for at, _ in free)
@@ -120,8 +120,8 @@ class Options:
 
 
 def main(options: Options) -> None:
-    plan = Plan.read(options.run / NAME)
-    done = [files.read_json(place_of(options.run, block) / DONE, Done) for block in plan.blocks]
+    plan = Plan.read(options.run / PLAN_FILE)
+    done = [files.read_json(place_of(options.run, block) / DONE_FILE, Done) for block in plan.blocks]
     costs = measured(done)
     print(
         f"measured, {len(done)} blocks: {1e3 * costs.per_photograph:.2f} ms to open a photograph, "

@@ -33,7 +33,7 @@ from lumigraph.files import write_json
 from lumigraph.methods import find
 from lumigraph.metrics import psnr, ssim_map
 from lumigraph.run import build
-from lumigraph.synthetic.sensor import BLACK, PHOTON, READ_NOISE, WHITE
+from lumigraph.synthetic.sensor import BLACK_LEVEL, DN_PER_PHOTON, READ_NOISE, WHITE_LEVEL
 from lumigraph.system.signals import go_on_unless
 from lumigraph.training import fit
 
@@ -142,13 +142,19 @@ def noise_of(picture: np.ndarray) -> float:
 
 def stabilised(mosaic: np.ndarray) -> np.ndarray:
     """Light as numbers whose noise has a deviation of 1 everywhere (generalised Anscombe transform, Starck 1998)."""
-    numbers = mosaic * (WHITE - BLACK)
-    return 2 / PHOTON * np.sqrt(np.maximum(PHOTON * numbers + 3 / 8 * PHOTON**2 + READ_NOISE**2, 0))
+    numbers = mosaic * (WHITE_LEVEL - BLACK_LEVEL)
+    return (
+        2 / DN_PER_PHOTON * np.sqrt(np.maximum(DN_PER_PHOTON * numbers + 3 / 8 * DN_PER_PHOTON**2 + READ_NOISE**2, 0))
+    )
 
 
 def linear(stable: np.ndarray) -> np.ndarray:
     """Back to light."""
-    return ((PHOTON * stable / 2) ** 2 - 3 / 8 * PHOTON**2 - READ_NOISE**2) / PHOTON / (WHITE - BLACK)
+    return (
+        ((DN_PER_PHOTON * stable / 2) ** 2 - 3 / 8 * DN_PER_PHOTON**2 - READ_NOISE**2)
+        / DN_PER_PHOTON
+        / (WHITE_LEVEL - BLACK_LEVEL)
+    )
 
 
 if __name__ == "__main__":

@@ -13,7 +13,7 @@ from .files.ranges import Lasted, Seconds, Share, Steps, typed
 
 # Where schedules go on, at the earliest, once a run is extended. Coarse beginnings (small photographs, few cells,
 # warm-up) lie before it in every method, and are not repeated on what has become fine.
-REJOIN = 0.3
+REJOIN_PROGRESS = 0.3
 
 
 @dataclass(frozen=True)
@@ -42,7 +42,7 @@ class Budget:
         return self.seconds if self.steps is None else self.steps  # type: ignore[return-value]
 
     def spent(self, step: int, seconds: float) -> float:
-        """How much is spent, in its own unit."""
+        """Amount used so far, in the budget's unit."""
         return seconds if self.steps is None else step
 
     def progress(self, step: int, seconds: float) -> float:
@@ -55,21 +55,21 @@ class Budget:
     def extended(self, to: Budget, step: int, seconds: float) -> Budget:
         """Another total, for a run that has come to a step by this one.
 
-        Schedules follow the new total. They do not go back behind REJOIN, nor behind where they are if that is less.
+        Schedules follow the new total. They do not go back behind REJOIN_PROGRESS, nor behind where they are if that is less.
         """
         if (to.steps, to.seconds) == (self.steps, self.seconds):
             return replace(self, quality=to.quality or self.quality)
-        share = min(self.progress(step, seconds), REJOIN)
+        share = min(self.progress(step, seconds), REJOIN_PROGRESS)
         return to if to.progress(step, seconds) >= share else replace(to, joined=(to.spent(step, seconds), share))
 
     def to_json(self) -> dict[str, Any]:
-        """As a run says it: {"seconds": 60.0}, {"steps": 500, "quality": "draft"}."""
+        """JSON of a run's file: {"seconds": 60.0}, {"steps": 500, "quality": "draft"}."""
         said = {x.name: getattr(self, x.name) for x in fields(self) if getattr(self, x.name) is not None}
         return said | ({"joined": list(self.joined)} if self.joined else {})
 
     @staticmethod
     def from_json(said: dict[str, Any], where: Path | str = "a run's budget") -> Budget:
-        """What a run says. Raises LumigraphError, naming `where`, for a run that says nothing, or no budget."""
+        """Read a budget from a run's JSON. Raises LumigraphError, naming `where`, if it is missing or invalid."""
         return typed(Budget, said, where)
 
     def __str__(self) -> str:
@@ -80,7 +80,7 @@ class Budget:
 
 
 def lasting(seconds: float) -> str:
-    """How long, for people: 0.5 is "0.5 s", 90 "90 s", 600 "10 min", 5400 "1 h 30 min"."""
+    """Duration as text: 0.5 is "0.5 s", 90 "90 s", 600 "10 min", 5400 "1 h 30 min"."""
     if seconds < 120:
         return f"{seconds:.3g} s"
     hours, minutes = divmod(round(seconds / 60), 60)

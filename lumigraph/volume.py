@@ -44,21 +44,21 @@ def weights_of(samples: Samples, density: Float[Tensor, " sample"], stop: float 
     return kernels.composite(tau, tau[:, None], samples.ray_starts, stop)[2]
 
 
-STRETCH = 8  # samples of a ray that are asked about at first; each time after that, twice as many
+FIRST_STRETCH = 8  # samples per ray in the first query; each further query has twice as many
 
 
 @torch.no_grad()
 def visible(
     samples: Samples, thickness_of: Callable[[Int[Tensor, " asked"]], Float[Tensor, " asked"]], stop: float
 ) -> Bool[Tensor, " sample"]:
-    """Which samples light reaches, asking about few others: front to back, a stretch of each ray at a time.
+    """Mask of samples that light reaches, with few queries: front to back, a stretch of each ray at a time.
 
     thickness_of: optical thickness of the samples of these numbers
     stop:         transmittance below which a ray is spent, as in `composite`
     """
     begin, end = samples.ray_starts[:-1], samples.ray_starts[1:]
     light, tau = torch.ones(len(begin), device=begin.device), torch.zeros_like(samples.t_start)
-    stretch = STRETCH
+    stretch = FIRST_STRETCH
     while len(going := ((begin < end) & (light >= stop)).nonzero()[:, 0]):
         begin, end, light = begin[going], end[going], light[going]
         starts = packed((end - begin).clamp(max=stretch))
@@ -72,5 +72,5 @@ def visible(
 
 
 def packed(counts: Int[Tensor, " ray"]) -> Int[Tensor, " ray_plus_one"]:
-    """Where each ray's samples begin, when they lie end to end."""
+    """Start offset of each ray's samples in a packed list."""
     return torch.nn.functional.pad(counts.cumsum(0), (1, 0))

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from lumigraph.files.marks import NAME
+from lumigraph.files.marks import MARKS_FILE
 
 
 def names(folder: Path) -> list[str]:
-    return sorted(path.name for path in folder.iterdir() if path.name != NAME)
+    return sorted(path.name for path in folder.iterdir() if path.name != MARKS_FILE)

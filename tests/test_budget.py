@@ -10,7 +10,7 @@ import torch
 from budgets import budget
 
 from lumigraph import methods
-from lumigraph.budget import QUALITIES, REJOIN, Budget, Effort, lasting
+from lumigraph.budget import QUALITIES, REJOIN_PROGRESS, Budget, Effort, lasting
 from lumigraph.commands.cli import main
 from lumigraph.errors import LumigraphError
 from lumigraph.evaluation import evaluate
@@ -55,9 +55,9 @@ def test_a_little_more_is_the_larger_budget_from_the_start():
 
 def test_much_more_goes_on_behind_the_coarse_beginning():
     budget = Budget(30).extended(Budget(3000), 30, 1.0)
-    assert [budget.progress(step, 1.0) for step in (30, 3000)] == [REJOIN, 1.0]
+    assert [budget.progress(step, 1.0) for step in (30, 3000)] == [REJOIN_PROGRESS, 1.0]
     shares = [budget.progress(step, 1.0) for step in range(30, 3001)]
-    assert shares == sorted(shares) and budget.progress(1515, 1.0) == pytest.approx((1 + REJOIN) / 2)
+    assert shares == sorted(shares) and budget.progress(1515, 1.0) == pytest.approx((1 + REJOIN_PROGRESS) / 2)
 
 
 def test_a_run_cut_short_never_falls_back():
@@ -115,10 +115,10 @@ def test_a_finished_run_goes_on_and_may_be_stopped_meanwhile(tmp_path, total):
     assert main(["train", "voxel-grid", str(photographs), "--output", str(run), "--steps", "20"]) == 0
     assert main(["resume", str(run), total, "--pause-at", "30"]) == 0 and Run(run).state.step == 30
     said = Run(run).settings.budget
-    assert said["joined"][1] == pytest.approx(REJOIN)
+    assert said["joined"][1] == pytest.approx(REJOIN_PROGRESS)
     assert main(["resume", str(run), "--pause-at", "35"]) == 0 and Run(run).settings.budget == said
     state = Run(run).state
-    assert state.step == 35 and REJOIN < Budget.from_json(said).progress(state.step, state.seconds) < 0.5
+    assert state.step == 35 and REJOIN_PROGRESS < Budget.from_json(said).progress(state.step, state.seconds) < 0.5
 
 
 def test_extending_is_exact_too(tmp_path):

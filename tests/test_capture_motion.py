@@ -210,7 +210,7 @@ def test_a_folded_model_is_made_again_from_near_neighbours(captured, monkeypatch
     stages.mark("unfolding", "other", False, 0)
     answers = iter([1, 0, 1])  # the first model leaps; the second, asked of before the first again, does not
     monkeypatch.setattr(Reconstruction, "leaps", lambda *_: next(answers))
-    monkeypatch.setattr(reconstruction, "NEIGHBOURS", 4)
+    monkeypatch.setattr(reconstruction, "SEQUENTIAL_NEIGHBOURS", 4)
     told = Told()
     result = reconstruct([photos], copied, track=told)
     assert list(told.counts)[-1] == "Placing cameras" and "Comparing pairs" not in told.counts
@@ -501,4 +501,4 @@ def test_where_one_mapper_finds_nothing_the_other_is_tried(tmp_path, monkeypatch
     work.database, work.options, work.map = tmp_path / "database.db", Options(mapper=asked), mapped
     for _ in range(2):  # once it is there it stays
         work.place("key")
-        assert tried == [asked, other] and (work.models / reconstruction.INSTEAD).exists()
+        assert tried == [asked, other] and (work.models / reconstruction.FALLBACK_MARK).exists()

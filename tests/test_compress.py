@@ -16,7 +16,7 @@ from lumigraph.capture import open_scene
 from lumigraph.commands.cli import main
 from lumigraph.commands.compress import bytes_in
 from lumigraph.derive.compression import LADDER
-from lumigraph.derive.compression.ladder import PLACES, rung_at
+from lumigraph.derive.compression.ladder import RUNG_POSITIONS, rung_at
 from lumigraph.derive.compression.measure import bytes_of, decibels, rendered, squared_error
 from lumigraph.derive.compression.model import Model
 from lumigraph.errors import LumigraphError
@@ -120,7 +120,7 @@ def test_a_size_is_kept_and_without_photographs_it_looks_as_it_did(cloud_run, tm
 
 def test_each_place_on_the_ladder_is_smaller_than_the_one_before(cloud_run):
     sizes = []
-    for place in PLACES[::6]:
+    for place in RUNG_POSITIONS[::6]:
         method = cloud_run.method()
         weights = {"cloud.harmonics": torch.rand(len(method.cloud), generator=torch.Generator().manual_seed(0))}
         sizes.append(len(Model(method, weights, rung_at(place), 30).packed()))

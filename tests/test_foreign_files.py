@@ -17,7 +17,7 @@ from listing import names
 from PIL import Image
 
 from lumigraph import files, methods
-from lumigraph.capture.motion.folder import WRITTEN, claim_results, copy_photographs
+from lumigraph.capture.motion.folder import WRITTEN_FILES, claim_results, copy_photographs
 from lumigraph.capture.photos import Photo
 from lumigraph.capture.photos.track import untracked
 from lumigraph.commands.cli import COMMANDS, main
@@ -264,7 +264,7 @@ def test_a_capture_clears_away_its_own_alone(tmp_path):
     copy_photographs(given[:1], scene / "images", untracked)
     assert names(scene / "images") == ["a.jpg", "mine.jpg"]
     claim_results(scene)
-    for name in WRITTEN:
+    for name in WRITTEN_FILES:
         (scene / name).write_text("precious")
         with pytest.raises(LumigraphError, match="is there already"):
             claim_results(scene)
@@ -275,18 +275,18 @@ def test_a_capture_clears_away_its_own_alone(tmp_path):
 
 
 def test_somebody_elses_record_stays(tmp_path):
-    (tmp_path / marks.NAME).write_text("precious")
+    (tmp_path / marks.MARKS_FILE).write_text("precious")
     files.write_bytes(tmp_path / "a", b"1")
     files.write_bytes(tmp_path / "a", b"2")  # by the same process
     files._granted.clear()
     with pytest.raises(LumigraphError, match="is there already"):
         files.write_bytes(tmp_path / "a", b"3")
-    assert (tmp_path / marks.NAME).read_text() == "precious" and (tmp_path / "a").read_bytes() == b"2"
+    assert (tmp_path / marks.MARKS_FILE).read_text() == "precious" and (tmp_path / "a").read_bytes() == b"2"
 
 
 def test_half_a_line_of_the_record_is_passed_over(tmp_path):
     files.write_bytes(tmp_path / "a", b"1")
-    with open(tmp_path / marks.NAME, "ab") as record:
+    with open(tmp_path / marks.MARKS_FILE, "ab") as record:
         record.write(b'\n{"name": "b", "ki')
     files.write_bytes(tmp_path / "c", b"1")
     assert marks.is_ours(tmp_path / "a", "file") and marks.is_ours(tmp_path / "c", "file")

@@ -171,7 +171,7 @@ def ball_centre(time: float) -> tuple[float, float, float]:
     """Centre of the swing's ball, by the pendulum's angle."""
     x, y, z = swing.PIVOT
     swung = math.radians(swing.angle(time))
-    return x + swing.LENGTH * math.sin(swung), y, z - swing.LENGTH * math.cos(swung)
+    return x + swing.ROD_LENGTH * math.sin(swung), y, z - swing.ROD_LENGTH * math.cos(swung)
 
 
 def test_a_moving_scene_is_photographed_at_its_times(tmp_path):

@@ -438,4 +438,4 @@ def test_alpha_over_a_background_means_one_thing():
 def test_every_reader_is_listed_once():
     assert tuple(READERS) == NAMES and LISTED.endswith(f" or {NAMES[-1]}")
     for reader in READERS.values():
-        assert reader.LOOKED_FOR and callable(reader.recognises) and callable(reader.read)
+        assert reader.EXPECTED_FILES and callable(reader.recognises) and callable(reader.read)

@@ -54,7 +54,7 @@ def test_a_second_one_hears_who_is_at_work(tmp_path):
         who = rf"{tmp_path} is being trained by process {other.pid} on \S+ since \d{{4}}-\d\d-\d\d \d\d:\d\d:\d\d; wait"
         assert re.match(who, str(told.value))
     with held(tmp_path, "trained"), held(tmp_path, "trained"):
-        assert [path.name for path in tmp_path.iterdir()] == [locks.NAME]
+        assert [path.name for path in tmp_path.iterdir()] == [locks.LOCK_FILE]
     assert not list(tmp_path.iterdir())
 
 
@@ -62,9 +62,9 @@ def test_what_a_killed_process_left_is_taken_over(tmp_path):
     with somebody(tmp_path) as other:
         other.kill()
         other.wait()
-        assert (tmp_path / locks.NAME).exists()
+        assert (tmp_path / locks.LOCK_FILE).exists()
         with held(tmp_path, "trained"):
-            assert str(os.getpid()) in (tmp_path / locks.NAME).read_text()
+            assert str(os.getpid()) in (tmp_path / locks.LOCK_FILE).read_text()
 
 
 def test_a_run_is_trained_by_one_process_at_a_time(tmp_path, capsys):
@@ -81,7 +81,7 @@ def test_a_run_is_trained_by_one_process_at_a_time(tmp_path, capsys):
 
 
 def test_a_run_begins_where_only_a_dead_lock_lies(tmp_path):
-    (tmp_path / locks.NAME).write_text('{"process": 4')
+    (tmp_path / locks.LOCK_FILE).write_text('{"process": 4')
     assert tiny.new_run(tmp_path).folder == tmp_path
 
 

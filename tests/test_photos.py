@@ -19,7 +19,7 @@ from PIL import Image
 from scipy.ndimage import gaussian_filter, uniform_filter1d
 
 from lumigraph.capture.photos import Intake, gather, is_bare, is_video
-from lumigraph.capture.photos.judge import MUDDY, blurred, judge, sharpness
+from lumigraph.capture.photos.judge import MIN_SHARPNESS, blurred, judge, sharpness
 from lumigraph.capture.photos.movement import Odometer
 from lumigraph.capture.photos.video import choose, extract
 from lumigraph.errors import LumigraphError, LumigraphWarning
@@ -362,7 +362,7 @@ def test_blurred_and_repeated_photographs_are_named_exactly(tmp_path):
     assert set(intake.blurred) == {"2.jpg", "6.jpg", "9.jpg"}
     assert intake.duplicates == {"0 sent.jpg": "11.jpg", "copy of 4.jpg": "4.jpg", "z turned.jpg": "13.jpg"}
     assert len(intake.photos) == 17
-    assert all(photo.sharpness < MUDDY * 1.5 for photo in intake.photos if photo.name in intake.blurred)
+    assert all(photo.sharpness < MIN_SHARPNESS * 1.5 for photo in intake.photos if photo.name in intake.blurred)
 
 
 def test_neighbours_are_no_duplicates(tmp_path):

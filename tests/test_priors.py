@@ -16,7 +16,7 @@ from PIL import Image
 from lumigraph import methods
 from lumigraph.capture import kind_of, open_dataset
 from lumigraph.commands.cli import main
-from lumigraph.datasets.collection import KEPT, Collection
+from lumigraph.datasets.collection import MAX_OPEN, Collection
 from lumigraph.datasets.scene import Scene
 from lumigraph.errors import LumigraphError, LumigraphWarning
 from lumigraph.evaluation.reveal import reveal
@@ -174,8 +174,8 @@ def test_a_split_without_members_is_one_sentence():
 
 
 def test_members_that_were_not_asked_for_are_let_go(monkeypatch):
-    assert KEPT >= 8
-    monkeypatch.setattr("lumigraph.datasets.collection.KEPT", 2)
+    assert MAX_OPEN >= 8
+    monkeypatch.setattr("lumigraph.datasets.collection.MAX_OPEN", 2)
     data = tiny_collection.collection()
     for name in ("amber", "blue", "amber", "green"):
         data[name]

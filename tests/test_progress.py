@@ -24,8 +24,8 @@ NAMES = ["[/bold]", "[red]a[/red]", ":smile: {0} {task}", "a 'quoted' \"name\"",
 @pytest.fixture
 def hurried(monkeypatch):
     """Lines come a hundred times as often."""
-    monkeypatch.setattr(progress, "FIRST", 0.03)
-    monkeypatch.setattr(progress, "PATIENCE", 0.03)
+    monkeypatch.setattr(progress, "FIRST_LINE_SECONDS", 0.03)
+    monkeypatch.setattr(progress, "BAR_DELAY", 0.03)
 
 
 def test_a_log_hears_of_work_before_its_first_item_is_done(hurried, capsys):
@@ -59,11 +59,11 @@ def test_a_stage_within_another_is_not_shown_and_a_fault_is_not_called_done(hurr
 
 
 def test_lines_come_soon_and_then_rarely():
-    when, pause, seconds = [], progress.FIRST, 0.0
+    when, pause, seconds = [], progress.FIRST_LINE_SECONDS, 0.0
     while seconds < 3600:
         seconds += pause
         when.append(seconds)
-        pause = min(progress.RARER * pause, progress.RAREST)
+        pause = min(progress.INTERVAL_GROWTH * pause, progress.MAX_INTERVAL)
     assert when[0] < 5 and len(when) < 80
 
 

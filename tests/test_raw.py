@@ -20,7 +20,7 @@ from lumigraph.capture.raw.library import turned_pattern
 from lumigraph.color.srgb import srgb_from_linear
 from lumigraph.datasets.images import resized
 from lumigraph.errors import LumigraphError, LumigraphWarning
-from lumigraph.synthetic.sensor import BLACK, PHOTON, READ_NOISE, WHITE, Sensor
+from lumigraph.synthetic.sensor import BLACK_LEVEL, DN_PER_PHOTON, READ_NOISE, WHITE_LEVEL, Sensor
 
 
 def bytes_of(rgb: np.ndarray) -> np.ndarray:
@@ -236,9 +236,9 @@ def test_noise_has_the_variance_and_the_mean_that_it_should():
         radiance = np.full((64, 64, 3), light)
         photo = sensor.photograph(lambda radiance=radiance: radiance, (64, 64), 0)
         assert isinstance(photo, RawPhoto)
-        green = photo.read()[photo.filters == 1] * (WHITE - BLACK)
-        expected = light * 0.02 * (WHITE - BLACK)
-        variance = READ_NOISE**2 + PHOTON * expected + 1 / 12
+        green = photo.read()[photo.filters == 1] * (WHITE_LEVEL - BLACK_LEVEL)
+        expected = light * 0.02 * (WHITE_LEVEL - BLACK_LEVEL)
+        variance = READ_NOISE**2 + DN_PER_PHOTON * expected + 1 / 12
         assert green.mean() == pytest.approx(expected, abs=4 * (variance / green.size) ** 0.5)
         assert green.var() == pytest.approx(variance, rel=0.15)
 

@@ -15,7 +15,7 @@ from budgets import budget
 from conftest import PACKAGE
 
 from lumigraph.commands.cli import main
-from lumigraph.system.signals import AGAIN, Interrupt, Stopped, go_on_unless, listening, until_interrupted
+from lumigraph.system.signals import REMINDER_SECONDS, Interrupt, Stopped, go_on_unless, listening, until_interrupted
 
 pytestmark = budget("runs", 15)
 
@@ -117,7 +117,7 @@ def test_a_signal_that_somebody_has_lost_comes_again():
     assert time.monotonic() - begin < 15
     with listening(), until_interrupted():
         signal.raise_signal(signal.SIGINT)
-    time.sleep(2 * AGAIN)  # one that was heeded does not
+    time.sleep(2 * REMINDER_SECONDS)  # one that was heeded does not
 
 
 def test_cleaning_up_is_not_disturbed_by_reminders_but_by_a_second_signal():
@@ -126,7 +126,7 @@ def test_cleaning_up_is_not_disturbed_by_reminders_but_by_a_second_signal():
         try:
             signal.raise_signal(signal.SIGTERM)
         finally:
-            time.sleep(3 * AGAIN)
+            time.sleep(3 * REMINDER_SECONDS)
             cleaned.append("up")
     assert cleaned
     with pytest.raises(Stopped), listening():

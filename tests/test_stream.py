@@ -32,7 +32,7 @@ def sources(count: int, mask: np.ndarray | None = None, opaque: tuple[int, ...] 
 @pytest.fixture
 def small(monkeypatch):
     """Few pixels stay, of few photographs."""
-    for name, value in {"KEPT": 10, "RAYS": 8, "BEGIN": 3, "AHEAD": 2}.items():
+    for name, value in {"KEPT_PIXELS": 10, "RAYS_PER_READ": 8, "FIRST_VIEWS": 3, "READ_AHEAD": 2}.items():
         monkeypatch.setattr(stream, name, value)
 
 
@@ -116,11 +116,11 @@ def test_alpha_is_known_from_the_first_and_a_stranger_is_named(small):
 
 
 def test_memory_holds_as_many_photographs_as_it_says():
-    reading = stream.READERS * stream.COPIES * 4 * WIDTH * HEIGHT
+    reading = stream.READER_THREADS * stream.READING_COPIES * 4 * WIDTH * HEIGHT
     room = 40
-    images = ImageStream(sources(200), reading + (room + stream.AHEAD) * 8 * stream.KEPT)
+    images = ImageStream(sources(200), reading + (room + stream.READ_AHEAD) * 8 * stream.KEPT_PIXELS)
     drawn(images, list(range(200)), 1)
-    assert images._rgba_of.nbytes + images._pixel.nbytes == room * 8 * stream.KEPT
+    assert images._rgba_of.nbytes + images._pixel.nbytes == room * 8 * stream.KEPT_PIXELS
 
 
 def test_a_folder_larger_than_memory_and_disk_opens_and_gives_rays(tmp_path, monkeypatch, ball_folder):

@@ -13,7 +13,7 @@ import pytest
 import torch
 
 from lumigraph.system import threads
-from lumigraph.system.allocation import OWN
+from lumigraph.system.allocation import USER_SETTINGS
 
 LOOP = """
 import lumigraph, torch, numpy
@@ -87,15 +87,15 @@ leave.set()
 
 @pytest.mark.skipif(sys.platform != "linux", reason="GNU's OpenMP")
 def test_torch_and_numba_share_one_set_of_threads_which_wait_for_a_bounded_time():
-    environment = {name: value for name, value in os.environ.items() if name not in threads.OWN}
+    environment = {name: value for name, value in os.environ.items() if name not in threads.USER_SETTINGS}
     environment |= {"PYTHONPATH": str(Path(__file__).parent.parent), "OMP_DISPLAY_ENV": "VERBOSE"}
     told = subprocess.run([sys.executable, "-c", LOOP], env=environment, capture_output=True, text=True, check=True)
     copies = told.stderr.split("OPENMP DISPLAY ENVIRONMENT BEGIN")[1:]  # each copy of the library says so when loaded
     assert len(copies) == 1
-    assert f"GOMP_SPINCOUNT = '{threads.LOOKS}'" in copies[0]
+    assert f"GOMP_SPINCOUNT = '{threads.SPIN_COUNT}'" in copies[0]
 
 
-@pytest.mark.parametrize("own", threads.OWN)
+@pytest.mark.parametrize("own", threads.USER_SETTINGS)
 def test_a_users_own_way_of_waiting_stays(own):
     environment = {own: "1"}
     threads.settle(environment)
@@ -112,8 +112,8 @@ def test_a_busy_machine_is_told(monkeypatch):
 
 
 def test_threads_sleep_for_a_while_when_others_hold_them_up(monkeypatch):
-    monkeypatch.setattr(threads, "EVERY", 0.0)
-    monkeypatch.setattr(threads, "WHILE", 3)
+    monkeypatch.setattr(threads, "POLL_SECONDS", 0.0)
+    monkeypatch.setattr(threads, "SLEEP_POLLS", 3)
     shares, log, over = iter([0.0, 0.1, 0.9, 0.0, 0.9, 0.9, 0.0, 0.5]), [], threading.Event()
 
     def held() -> float:
@@ -134,7 +134,7 @@ def test_threads_sleep_for_a_while_when_others_hold_them_up(monkeypatch):
     assert all(leave.is_set() for leave in log)
 
 
-@pytest.mark.skipif(not threads.TASKS.exists(), reason="tells what threads wait for by /proc")
+@pytest.mark.skipif(not threads.TASKS_FOLDER.exists(), reason="tells what threads wait for by /proc")
 def test_who_waits_behind_another_thread_is_held_up():
     held, end = threads.Held(), time.monotonic() + 0.3
     before = os.sched_getaffinity(0)
@@ -155,13 +155,15 @@ def test_who_hardly_runs_is_not_held_up(monkeypatch):
     second = 10**9
     states = iter([{"1": [0, 0], "2": [5, 5]}, {"1": [second // 1000, second // 1000], "3": [second, second]}])
     monkeypatch.setattr(threads.Held, "_now", staticmethod(lambda: next(states)))
-    assert threads.Held()() < threads.MUCH  # half of very little; threads that came or went between do not count
+    assert (
+        threads.Held()() < threads.MAX_WAITING_SHARE
+    )  # half of very little; threads that came or went between do not count
 
 
 @pytest.mark.skipif(threads.processors() < 2, reason="one thread waits for nobody")
 @pytest.mark.skipif(sys.platform != "linux", reason="GNU's OpenMP")
 def test_crowded_threads_hardly_look_for_work():
-    environment = {name: value for name, value in os.environ.items() if name not in threads.OWN}
+    environment = {name: value for name, value in os.environ.items() if name not in threads.USER_SETTINGS}
     environment |= {"PYTHONPATH": str(Path(__file__).parent.parent), "OMP_NUM_THREADS": f"{threads.processors()}"}
     told = subprocess.run([sys.executable, "-c", LOOKING], env=environment, capture_output=True, text=True, check=True)
     alone, crowded = map(float, told.stdout.split())
@@ -171,7 +173,7 @@ def test_crowded_threads_hardly_look_for_work():
 @pytest.mark.skipif(sys.platform != "linux", reason="arenas are of GNU's C library")
 @pytest.mark.parametrize(("own", "most"), [(None, 1), ("3", 3)])
 def test_commands_take_memory_from_one_place_unless_a_user_says_otherwise(own: str | None, most: int) -> None:
-    environment = {name: value for name, value in os.environ.items() if name not in OWN.values()}
+    environment = {name: value for name, value in os.environ.items() if name not in USER_SETTINGS.values()}
     environment |= {"MALLOC_ARENA_MAX": own} if own else {}
     done = subprocess.run([sys.executable, "-c", ARENAS], env=environment, capture_output=True, text=True, check=True)
     assert done.stdout.count("<heap nr") == most
@@ -180,7 +182,7 @@ def test_commands_take_memory_from_one_place_unless_a_user_says_otherwise(own: s
 @pytest.mark.skipif(sys.platform != "linux", reason="GNU's C library")
 @pytest.mark.parametrize(("own", "faults"), [(None, (0, 2000)), ("131072", (100_000, 1_000_000))])
 def test_commands_keep_the_memory_that_a_step_gives_back(own: str | None, faults: tuple[int, int]) -> None:
-    environment = {name: value for name, value in os.environ.items() if name not in OWN.values()}
+    environment = {name: value for name, value in os.environ.items() if name not in USER_SETTINGS.values()}
     environment |= {"MALLOC_MMAP_THRESHOLD_": own} if own else {}
     done = subprocess.run([sys.executable, "-c", STEPS], env=environment, capture_output=True, text=True, check=True)
     assert faults[0] <= int(done.stdout.split()[-1]) <= faults[1]

@@ -14,8 +14,8 @@ from ..geometry import look_at
 from .lens import Lens, Pinhole, one_or_more, rows
 from .rays import Rays
 
-RING, ELEVATION = 24, 15.0  # cameras of a ring, and degrees that they stand above its middle
-ELEVATIONS = (0.0, 30.0, 60.0)  # degrees, of the rings of a dome
+RING_CAMERAS, RING_ELEVATION = 24, 15.0  # cameras per ring; degrees above the horizon
+DOME_ELEVATIONS = (0.0, 30.0, 60.0)  # degrees, one per ring
 # A disc of this radius varies as much as a square pixel of side one (Barron 2021, section 3.1).
 PIXEL_RADIUS = 2 / math.sqrt(12)
 
@@ -56,7 +56,7 @@ class Camera:
 
     @property
     def forward(self) -> Float[Tensor, "camera 3"]:
-        """Where each camera looks, unit length."""
+        """Viewing direction of each camera, unit length."""
         return self.pose[:, :, 2]
 
     def pixels(self) -> Float[Tensor, "pixel 2"]:
@@ -138,7 +138,7 @@ def ring(
     distance: float = 2.6,
     angle: float = 50.0,
     size: int = 800,
-    count: int = RING,
+    count: int = RING_CAMERAS,
 ) -> Camera:
     """Cameras around a box that look at its middle, for what nobody has photographed.
 
@@ -148,7 +148,7 @@ def ring(
     """
     middle = torch.tensor(bounds).mean(0)
     azimuth = torch.arange(count) * (2 * math.pi / count)
-    height = torch.full_like(azimuth, math.radians(ELEVATION))
+    height = torch.full_like(azimuth, math.radians(RING_ELEVATION))
     outward = torch.stack([height.cos() * azimuth.cos(), height.cos() * azimuth.sin(), height.sin()], -1)
     pose = look_at(middle + distance * outward, -outward, torch.tensor([0.0, 0.0, 1.0]))
     focal = 0.5 * size / math.tan(0.5 * math.radians(angle))
@@ -159,7 +159,7 @@ def ring(
 def dome(ring: Camera) -> Camera:
     """Cameras over a whole dome, at the distances and azimuths of a ring around the origin."""
     parts = []
-    for degrees in ELEVATIONS:
+    for degrees in DOME_ELEVATIONS:
         angle = torch.full((len(ring),), math.radians(degrees))
         flat = torch.nn.functional.normalize(ring.position[:, :2], dim=-1)
         outward = torch.cat([angle.cos()[:, None] * flat, angle.sin()[:, None]], -1)

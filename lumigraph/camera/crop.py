@@ -13,7 +13,7 @@ from torch import Tensor
 from ..geometry import Rows, Similarity, Vector
 from .rays import Rays
 
-UNMOVED: Rows = Similarity.make(1.0).rows
+IDENTITY_ROWS: Rows = Similarity.make(1.0).rows
 
 
 class Crop(ABC):
@@ -21,7 +21,7 @@ class Crop(ABC):
 
     @abstractmethod
     def holds(self, points: Float[Tensor, "*point 3"], tolerance: float = 0.0) -> Bool[Tensor, "*point"]:
-        """Whether each point lies inside, or outside by no more than a tolerance, a share of the size."""
+        """True for points inside, or outside by at most a tolerance (a share of the size)."""
 
     @abstractmethod
     def through(self, rays: Rays) -> tuple[Float[Tensor, " ray"], Float[Tensor, " ray"]]:
@@ -52,7 +52,7 @@ class Box(Crop):
 
     lower: Vector
     upper: Vector
-    place: Rows = UNMOVED
+    place: Rows = IDENTITY_ROWS
 
     @property
     def corners(self) -> Float[Tensor, "8 3"]:
@@ -61,14 +61,14 @@ class Box(Crop):
         return self._place.points(torch.tensor(list(itertools.product(*ends)), dtype=torch.float64))
 
     def holds(self, points: Float[Tensor, "*point 3"], tolerance: float = 0.0) -> Bool[Tensor, "*point"]:
-        points = points if self.place == UNMOVED else self._place.inverse.points(points)
+        points = points if self.place == IDENTITY_ROWS else self._place.inverse.points(points)
         lower, upper = torch.tensor((self.lower, self.upper)).to(points)
         margin = tolerance * (upper - lower)
         return ((points >= lower - margin) & (points <= upper + margin)).all(-1)
 
     def through(self, rays: Rays) -> tuple[Float[Tensor, " ray"], Float[Tensor, " ray"]]:
         here = self._place
-        if self.place != UNMOVED:
+        if self.place != IDENTITY_ROWS:
             back = here.inverse
             rays = replace(rays, origins=back.points(rays.origins), directions=back.directions(rays.directions))
         enter, leave = rays.through_box(rays.origins.new_tensor((self.lower, self.upper)))
@@ -98,7 +98,7 @@ class Sphere(Crop):
         return (points - torch.tensor(self.middle).to(points)).norm(dim=-1) <= (1 + tolerance) * self.radius
 
     def through(self, rays: Rays) -> tuple[Float[Tensor, " ray"], Float[Tensor, " ray"]]:
-        """Where |o + t d - m| = r: t = b ± sqrt(r^2 - a^2), where b is how far along m is nearest, and a how near."""
+        """Solve |o + t d - m| = r: t = b ± sqrt(r^2 - a^2), where b is how far along m is nearest, and a how near."""
         away = torch.tensor(self.middle).to(rays.origins) - rays.origins
         nearest = (away * rays.directions).sum(-1)
         beside = (away - nearest[:, None] * rays.directions).square().sum(-1)

@@ -191,5 +191,5 @@ def choose_reader(folder: Path, name: str | None = None) -> ModuleType:
     pictures = len(list_images(folder))
     raise LumigraphError(
         f"{folder} holds no camera poses ({pictures} images were found): looked for "
-        f"{'; '.join(reader.LOOKED_FOR for reader in asked.values())}; find the poses first: lumigraph capture {folder}"
+        f"{'; '.join(r.EXPECTED_FILES for r in asked.values())}; find the poses first: lumigraph capture {folder}"
     )

@@ -18,7 +18,7 @@ from ..datasets.images import ImageSource, ImageStore, in_parallel, load
 from ..datasets.scene import Forward, Frame, Scene
 from ..errors import LumigraphError, LumigraphWarning
 from ..files.names import counted, natural
-from ..geometry import RIGID
+from ..geometry import RIGID_TOLERANCE
 from ..system.progress import counting
 from .beside import make_about, make_layers
 from .capture import Capture, Shot
@@ -28,8 +28,8 @@ from .oddities import oddities
 from .pictures import Chosen, check_downscale, choose
 
 HOLD_OUT = 8  # every 8th photograph by name, starting with the first, where nothing is published
-FARTHEST = 1e8  # units of the source that anything may be from its origin; maps in metres reach 1e7
-NAMED = 20  # missing files at most in a warning; further ones are counted
+MAX_COORDINATE = 1e8  # units of the source, from its origin; maps in metres reach 1e7
+MAX_NAMES = 20  # missing files in a warning; further ones are counted
 
 
 @dataclass(frozen=True)
@@ -146,9 +146,9 @@ def checked_pose(shot: Shot, source: str) -> Float[np.ndarray, "3 4"]:
     axes = shot.pose[:, :3]
     if not np.isfinite(shot.pose).all():
         fault = "holds NaN or infinite numbers"
-    elif np.abs(shot.pose[:, 3]).max() > FARTHEST:
-        fault = f"is {np.abs(shot.pose[:, 3]).max():.3g} units from the origin, and {FARTHEST:g} are the most"
-    elif np.abs(axes.T @ axes - np.eye(3)).max() > RIGID:
+    elif np.abs(shot.pose[:, 3]).max() > MAX_COORDINATE:
+        fault = f"is {np.abs(shot.pose[:, 3]).max():.3g} units from the origin, and {MAX_COORDINATE:g} are the most"
+    elif np.abs(axes.T @ axes - np.eye(3)).max() > RIGID_TOLERANCE:
         fault = "is not rigid, for its axes are not of unit length and at right angles"
     elif np.linalg.det(axes) < 0:
         fault = "is mirrored"
@@ -162,7 +162,7 @@ def without_stray_points(capture: Capture) -> tuple[Capture, list[str]]:
     """The capture without points that are nowhere or farther off than anything can be, and a sentence about them."""
     if capture.points is None:
         return capture, []
-    near = (np.abs(capture.points) <= FARTHEST).all(-1)
+    near = (np.abs(capture.points) <= MAX_COORDINATE).all(-1)
     if near.all():
         return capture, []
     kept = replace(
@@ -172,7 +172,9 @@ def without_stray_points(capture: Capture) -> tuple[Capture, list[str]]:
         sightings=None if capture.sightings is None else capture.sightings[near],
     )
     stray = counted(int((~near).sum()), "point")
-    return kept, [f"{capture.source} has {stray} that are not finite or {FARTHEST:g} units away; using the others"]
+    return kept, [
+        f"{capture.source} has {stray} that are not finite or {MAX_COORDINATE:g} units away; using the others"
+    ]
 
 
 def fitted_lens(shot: Shot, chosen: Chosen) -> Lens:
@@ -286,11 +288,11 @@ def within_reach(lens: Lens, size: tuple[int, int]) -> np.ndarray | None:
 def about_missing(capture: Capture) -> str:
     """One sentence with the names of all missing files."""
     names = sorted(capture.missing, key=natural)
-    more = f" and {len(names) - NAMED} more" if len(names) > NAMED else ""
+    more = f" and {len(names) - MAX_NAMES} more" if len(names) > MAX_NAMES else ""
     verb = "does" if len(names) == 1 else "do"
     return (
         f"{capture.source} lists {counted(len(names), 'file')} that {verb} not exist; using the other "
-        f"{len(capture.shots)} photographs without {', '.join(names[:NAMED])}{more}"
+        f"{len(capture.shots)} photographs without {', '.join(names[:MAX_NAMES])}{more}"
     )
 
 

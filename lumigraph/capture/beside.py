@@ -25,8 +25,8 @@ from .numbers import kind_of, read_numbers
 from .photos.exif import exposure
 from .pictures import Chosen, read_image, readable, same_shape, stat
 
-CAMERAS_WRITE = (".jpg", ".jpeg")  # files that say how long they were exposed
-LENGTHS = ("distance", "z-depth")
+EXPOSURE_SUFFIXES = (".jpg", ".jpeg")  # files with an exposure time
+DEPTH_KINDS = ("distance", "z-depth")
 DEPTH_VIEWS, POINTS_PER_VIEW = 64, 300  # depth maps that sparse points are drawn from at most, and points of each
 
 
@@ -56,7 +56,7 @@ def make_layers(
             None if plane is None else source_of(plane, name, dtype, c, turn)
             for plane, c in zip(planes, chosen, strict=True)
         ]
-        scale = first.scale * unit if first.encoding in LENGTHS else first.scale
+        scale = first.scale * unit if first.encoding in DEPTH_KINDS else first.scale
         about = first.unknown, first.empty, first.names
         layers[name] = Layer(images, sources, dtype, first.channels, first.encoding, scale, *about)
     return layers, told
@@ -76,7 +76,7 @@ def settled(plane: Plane, name: str) -> Plane:
     elif isinstance(plane.values, Path):
         with readable(plane.values):
             kind = kind_of(plane.values, name)
-        dtype, channels = kind.dtype, 1 if plane.encoding in (*LENGTHS, "index") else kind.channels
+        dtype, channels = kind.dtype, 1 if plane.encoding in (*DEPTH_KINDS, "index") else kind.channels
         identity = f"{plane.values.resolve()} {stat(plane.values)}"
     assert dtype is not None, f"{name} is made when asked, so its type must be said"
     if plane.encoding == "index":
@@ -175,7 +175,7 @@ def make_about(shots: list[Shot]) -> dict[str, Tensor]:
 def taken(shot: Shot) -> dict[str, float]:
     """When and for how long a photograph was exposed, as far as its reader and its file say."""
     facts = {} if shot.time is None else {"time": shot.time}
-    if isinstance(shot.image, dict) and (path := shot.image[min(shot.image)]).suffix.lower() in CAMERAS_WRITE:
+    if isinstance(shot.image, dict) and (path := shot.image[min(shot.image)]).suffix.lower() in EXPOSURE_SUFFIXES:
         with readable(path), Image.open(path) as image:
             light = exposure(image.getexif())
         facts |= {} if light is None else {"exposure": light}

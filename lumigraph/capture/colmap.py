@@ -18,9 +18,9 @@ from .capture import Capture, Shot
 from .pictures import reductions, versions
 from .points import SparsePoints, read_points3d
 
-PLACES = ("sparse/0", "sparse", "colmap/sparse/0", "colmap/sparse", "colmap", ".")
-LARGEST_SIDE = 10**5  # pixels
-LOOKED_FOR = "sparse/0 with cameras, images and points3D, .bin or .txt (COLMAP)"
+MODEL_FOLDERS = ("sparse/0", "sparse", "colmap/sparse/0", "colmap/sparse", "colmap", ".")
+MAX_SIDE = 10**5  # pixels
+EXPECTED_FILES = "sparse/0 with cameras, images and points3D, .bin or .txt (COLMAP)"
 
 # COLMAP's list of parameters begins with one focal length or two and the centre. For each model, which it is, and where
 # the rest of the list has what our lenses call their distortion.
@@ -48,7 +48,7 @@ def recognises(folder: Path) -> bool:
 
 def model_folder(folder: Path) -> Path | None:
     """The first place that holds a whole model."""
-    for place in PLACES:
+    for place in MODEL_FOLDERS:
         for suffix in (".bin", ".txt"):
             if all((folder / place / f"{part}{suffix}").is_file() for part in ("cameras", "images", "points3D")):
                 return folder / place
@@ -193,7 +193,7 @@ def read_points(place: Path, model: pycolmap.Reconstruction) -> SparsePoints:
 
 def read_lens(camera: pycolmap.Camera, place: Path) -> Lens:
     kind, p = camera.model.name, torch.tensor(camera.params, dtype=torch.float32)
-    if not (1 <= camera.width <= LARGEST_SIDE and 1 <= camera.height <= LARGEST_SIDE):
+    if not (1 <= camera.width <= MAX_SIDE and 1 <= camera.height <= MAX_SIDE):
         raise LumigraphError(
             f"{place}: camera {camera.camera_id} has pictures of {camera.width}x{camera.height} pixels; make or copy "
             "the model again"

@@ -11,13 +11,13 @@ from PIL import Image
 
 from .capture import Shot
 
-JUMP = 10.0  # times the usual distance between neighbours
-SAME_WAY = 45.0  # degrees between views; who walks far off seldom looks the same way there
-PAIRED = 200  # photographs, every two of which are compared
-LOOKED_AT = 4  # leaps, the widest, whose photographs are compared
-ALIKE = 1.25  # times the difference of photographs beside them, up to which two show the same
-THUMBNAIL = 16  # pixels a side
-STEADY = 0.5  # distance of neighbours, as a share of that of any two, up to which names tell the order of exposure
+JUMP_FACTOR = 10.0  # times the usual distance between neighbours
+MAX_VIEW_ANGLE = 45.0  # degrees between views; who walks far off seldom looks the same way there
+MAX_PAIRED_VIEWS = 200  # photographs, every two of which are compared
+CHECKED_JUMPS = 4  # widest jumps whose photographs are compared
+SAME_VIEW_FACTOR = 1.25  # times the difference to adjacent photographs; up to it two photographs show the same
+THUMBNAIL_SIDE = 16  # pixels
+ORDER_SHARE = 0.5  # distance of neighbours, as a share of that of any two, up to which names give the order of exposure
 
 
 def jumps(poses: Float[np.ndarray, "photo 3 4"], overlapping: Collection[int] = ()) -> list[tuple[int, float]]:
@@ -28,12 +28,12 @@ def jumps(poses: Float[np.ndarray, "photo 3 4"], overlapping: Collection[int] = 
     overlapping: photographs that are known to share details with the next; others count where both look the same way
     """
     steps = np.linalg.norm(np.diff(poses[:, :, 3], axis=0), axis=-1)
-    same_way = (poses[1:, :, 2] * poses[:-1, :, 2]).sum(-1) > np.cos(np.radians(SAME_WAY))
+    same_way = (poses[1:, :, 2] * poses[:-1, :, 2]).sum(-1) > np.cos(np.radians(MAX_VIEW_ANGLE))
     usual = float(np.median(steps)) if len(steps) else 0.0
     return [
         (i, float(step / usual))
         for i, step in enumerate(steps)
-        if step > JUMP * usual > 0 and (same_way[i] or i in overlapping)
+        if step > JUMP_FACTOR * usual > 0 and (same_way[i] or i in overlapping)
     ]
 
 
@@ -42,9 +42,9 @@ def in_steps(positions: Float[np.ndarray, "photo 3"]) -> bool:
     if len(positions) < 8:
         return False
     steps = np.linalg.norm(np.diff(positions, axis=0), axis=-1)
-    some = positions[:: -(-len(positions) // PAIRED)]
+    some = positions[:: -(-len(positions) // MAX_PAIRED_VIEWS)]
     between = np.linalg.norm(some[:, None] - some, axis=-1)
-    return bool(np.median(steps) < STEADY * np.median(between[np.triu_indices(len(some), 1)]))
+    return bool(np.median(steps) < ORDER_SHARE * np.median(between[np.triu_indices(len(some), 1)]))
 
 
 def about_fold(shots: Sequence[Shot], poses: Float[np.ndarray, "photo 3 4"]) -> str | None:
@@ -73,7 +73,7 @@ def leaps_alike(shots: Sequence[Shot], poses: Float[np.ndarray, "photo 3 4"]) ->
     """The widest jumps, whichever way cameras look, across which photographs differ no more than beside them."""
     if not in_steps(poses[:, :, 3]):
         return []
-    found = sorted(jumps(poses, range(len(poses))), key=lambda jump: -jump[1])[:LOOKED_AT]
+    found = sorted(jumps(poses, range(len(poses))), key=lambda jump: -jump[1])[:CHECKED_JUMPS]
     return [(i, times) for i, times in found if 0 < i < len(poses) - 2 and alike(shots[i - 1 : i + 3])]
 
 
@@ -83,7 +83,7 @@ def alike(four: Sequence[Shot]) -> bool:
     if len(seen) < len(four):
         return False
     before, between, after = (float(np.abs(b - a).mean()) for a, b in pairwise(seen))
-    return between < ALIKE * max(before, after)
+    return between < SAME_VIEW_FACTOR * max(before, after)
 
 
 def thumbnail(shot: Shot) -> Float[np.ndarray, "row column"] | None:
@@ -92,8 +92,10 @@ def thumbnail(shot: Shot) -> Float[np.ndarray, "row column"] | None:
         return None
     try:
         with Image.open(shot.image[max(shot.image)]) as image:
-            image.draft("L", (4 * THUMBNAIL, 4 * THUMBNAIL))
-            grey = np.asarray(image.convert("L").resize((THUMBNAIL, THUMBNAIL), Image.Resampling.BOX), np.float64)
+            image.draft("L", (4 * THUMBNAIL_SIDE, 4 * THUMBNAIL_SIDE))
+            grey = np.asarray(
+                image.convert("L").resize((THUMBNAIL_SIDE, THUMBNAIL_SIDE), Image.Resampling.BOX), np.float64
+            )
     except OSError:  # said where it is read
         return None
     return (grey - grey.mean()) / max(float(grey.std()), 1.0)

@@ -14,12 +14,12 @@ from ..datasets.scene import Forward
 from .capture import Capture, Shot
 from .normalise import reliable_points
 
-ONE_WAY = math.cos(math.radians(30))  # of the angle between a camera's axis and the mean camera's, at most
-WIDEST = math.tan(math.radians(70))  # that a camera may see, from the mean camera's axis
-MOST = 2.0  # times what is seen at infinity: a plane just before the cameras must not squeeze what lies far behind it
-BORDER = tuple((x, y) for x in (0.0, 0.5, 1.0) for y in (0.0, 0.5, 1.0))  # of a picture, and its middle
-BEFORE_NEAREST = 0.75  # of the way from the mean camera to the nearest thing: where the plane stands, as LLFF has it
-STRAY = 0.005  # share of sparse points that may lie nearer by mistake
+MIN_AXIS_COSINE = math.cos(math.radians(30))  # of the angle between a camera's axis and the mean camera's
+MAX_TANGENT = math.tan(math.radians(70))  # of the angle between a viewing ray and the mean camera's axis
+MAX_MAGNIFICATION = 2.0  # relative to infinity: a plane just before the cameras must not squeeze the background
+BORDER_POINTS = tuple((x, y) for x in (0.0, 0.5, 1.0) for y in (0.0, 0.5, 1.0))  # of a picture, and its centre
+NEAR_PLANE_SCALE = 0.75  # times the distance from the mean camera to the nearest point, as in LLFF
+OUTLIER_SHARE = 0.005  # of the sparse points may lie nearer
 
 
 def find_forward(
@@ -33,7 +33,7 @@ def find_forward(
     and before all that they see.
     """
     pose = mean_pose(cameras)
-    if float((cameras.forward.double() @ pose[:, 2]).min()) < ONE_WAY:
+    if float((cameras.forward.double() @ pose[:, 2]).min()) < MIN_AXIS_COSINE:
         return None
     standing = (cameras.position.double() - pose[:, 3]) @ pose[:, 2]
     unit = float(np.cbrt(np.linalg.det(scene_from_source[:3, :3])))
@@ -43,13 +43,13 @@ def find_forward(
         nearest = float((standing + torch.tensor(stated)).min())
     elif cloud is not None:
         points = torch.from_numpy(cloud.points @ scene_from_source[:3, :3].T + scene_from_source[:3, 3])
-        nearest = float(((points - pose[:, 3]) @ pose[:, 2]).quantile(STRAY))
+        nearest = float(((points - pose[:, 3]) @ pose[:, 2]).quantile(OUTLIER_SHARE))
     else:
         nearest = float(standing.min()) + near
     foremost = float(standing.max())
     if nearest <= foremost:
         return None
-    plane = max(BEFORE_NEAREST * nearest, foremost)
+    plane = max(NEAR_PLANE_SCALE * nearest, foremost)
     scale = fitting_scale(cameras, pose, plane)
     rows = tuple((a, b, c, d) for a, b, c, d in pose.tolist())
     return None if scale is None else Forward(rows, scale, plane)
@@ -70,14 +70,14 @@ def fitting_scale(cameras: Camera, pose: Float[Tensor, "3 4"], plane: float) -> 
     Mildenhall 2020 takes the focal lengths over half the picture. Cameras beside the mean one then see places beyond 1,
     which a positional encoding cannot tell from others.
     """
-    count = len(BORDER) * len(cameras)
-    pixels = (torch.tensor(BORDER) * cameras.size[:, None]).reshape(count, 2)
-    rays = cameras.rays(pixels, torch.arange(len(cameras)).repeat_interleave(len(BORDER)))
+    count = len(BORDER_POINTS) * len(cameras)
+    pixels = (torch.tensor(BORDER_POINTS) * cameras.size[:, None]).reshape(count, 2)
+    rays = cameras.rays(pixels, torch.arange(len(cameras)).repeat_interleave(len(BORDER_POINTS)))
     origins, directions = (rays.origins - pose[:, 3]) @ pose[:, :3], rays.directions.double() @ pose[:, :3]
     if float(directions[:, 2].min()) <= 0:
         return None
     at_infinity = directions[:, :2] / directions[:, 2:]
     at_plane = (origins[:, :2] + at_infinity * (plane - origins[:, 2:])) / plane
     far, near = (x.abs().amax(0) for x in (at_infinity, at_plane))
-    width, height = near.clamp(far, MOST * far).tolist()
-    return None if float(far.max()) > WIDEST else (1 / width, 1 / height)
+    width, height = near.clamp(far, MAX_MAGNIFICATION * far).tolist()
+    return None if float(far.max()) > MAX_TANGENT else (1 / width, 1 / height)

@@ -15,13 +15,20 @@ from ..camera.lens import OpenCV, Pinhole
 from ..datasets.images import ImageStore
 from ..datasets.scene import Vector
 
-VIEWS = 24
-GRIDS = (32, 32, 64)  # cells along each side of the box that is searched; each round searches what the last one found
-DOUBLINGS = 2  # of the first box, while the hull touches its walls
-OPAQUE = 8  # of 255: what is more opaque, or differs more from the background, belongs to the object
+MAX_VIEWS = 24
+GRID_SIDES = (
+    32,
+    32,
+    64,
+)  # cells along each side of the searched box, one per round; each round searches the result of the last
+MAX_DOUBLINGS = 2  # of the first box, while the hull touches its walls
+MIN_OPACITY = 8  # of 255: a pixel of higher opacity, or further from the background, belongs to the object
 BORDER_SHARE = 0.97  # of the pixels at the pictures' edges have one colour, where there is a plain background
-SEEN = 0.5  # share of the views that must have a point inside their picture
-SLACKS = (0.0, 0.1)  # share of the views that may disagree: first none, then some, for masks are seldom perfect
+MIN_VIEW_SHARE = 0.5  # share of the views that must have a point inside their picture
+MAX_DISAGREEMENTS = (
+    0.0,
+    0.1,
+)  # share of the views that may disagree: first none, then some, because masks are seldom perfect
 
 
 @dataclass(frozen=True)
@@ -49,9 +56,9 @@ def silhouettes(
     """
     position = cameras.position[views].double().numpy() - centre
     position /= np.linalg.norm(position, axis=-1, keepdims=True).clip(min=1e-9)
-    chosen = [views[i] for i in farthest(position, VIEWS)]
+    chosen = [views[i] for i in farthest(position, MAX_VIEWS)]
     if images.has_alpha:
-        return Silhouettes([Silhouette(cameras[i], images[i][..., 3] > OPAQUE) for i in chosen], (1.0, 1.0, 1.0))
+        return Silhouettes([Silhouette(cameras[i], images[i][..., 3] > MIN_OPACITY) for i in chosen], (1.0, 1.0, 1.0))
     if not isinstance(cameras.lens, Pinhole | OpenCV):
         return None  # the black around a fisheye's circle is no background
     edges = torch.cat([border(images[i]) for i in chosen]).int()
@@ -63,7 +70,7 @@ def silhouettes(
 
 
 def differs(pixels: Tensor, colour: Tensor) -> Tensor:
-    return (pixels.int() - colour).abs().amax(-1) > OPAQUE
+    return (pixels.int() - colour).abs().amax(-1) > MIN_OPACITY
 
 
 def border(picture: Tensor) -> Tensor:
@@ -89,16 +96,16 @@ def hull_box(
 
     None where the silhouettes enclose nothing, or no end to it.
     """
-    for slack in SLACKS:
+    for slack in MAX_DISAGREEMENTS:
         low, high = centre - half, centre + half
-        for _ in range(DOUBLINGS + 1):
-            found = carve(outlines, low, high, GRIDS[0], slack)
+        for _ in range(MAX_DOUBLINGS + 1):
+            found = carve(outlines, low, high, GRID_SIDES[0], slack)
             if found is None or ends_inside(found, low, high):
                 break
             low, high = centre + 2 * (low - centre), centre + 2 * (high - centre)
         else:
             return None
-        for grid in GRIDS[1:]:
+        for grid in GRID_SIDES[1:]:
             if found is not None:
                 found = carve(outlines, found[0] - found[2], found[1] + found[2], grid, slack)
         if found is not None:
@@ -130,7 +137,7 @@ def carve(
         points, seen, missed = points[keep], seen[keep], missed[keep]
         if not len(points):
             return None
-    points = points[seen >= SEEN * len(outlines)]
+    points = points[seen >= MIN_VIEW_SHARE * len(outlines)]
     if not len(points):
         return None
     lowest, highest = (x.double().numpy() for x in points.aminmax(dim=0))

@@ -20,10 +20,10 @@ from .numbers import load_array
 from .pictures import list_images, reductions, versions
 from .points import read_points3d
 
-LOOKED_FOR = "poses_bounds.npy (LLFF)"
+EXPECTED_FILES = "poses_bounds.npy (LLFF)"
 SIMPLE_RADIAL = 2  # COLMAP's number of the lens that LLFF's own script asks for
-ONE_CAMERA = struct.Struct("<QiiQQ4d")  # how many, id, model, width, height; focal length, centre and bend
-SAME = 1e-3  # of the focal length by which two cameras may differ
+CAMERA_RECORD = struct.Struct("<QiiQQ4d")  # how many, id, model, width, height; focal length, centre and bend
+FOCAL_TOLERANCE = 1e-3  # share of the focal length by which two cameras may differ
 
 
 def recognises(folder: Path) -> bool:
@@ -71,7 +71,7 @@ def read(folder: Path) -> Capture:
 def lens_of(width: float, height: float, focal: float, bend: tuple[float, float] | None) -> Lens:
     """A pinhole, or where a bend is known of the same focal length, in widths, the lens that has it."""
     focals, centre = torch.tensor([[focal, focal]]).float(), torch.tensor([[width / 2, height / 2]]).float()
-    if bend is None or abs(bend[0] * width / focal - 1) > SAME:
+    if bend is None or abs(bend[0] * width / focal - 1) > FOCAL_TOLERANCE:
         return Pinhole(focals, centre)
     distortion = torch.zeros(1, 8)
     distortion[0, 0] = bend[1]
@@ -82,7 +82,7 @@ def bend_of(path: Path) -> tuple[float, float] | None:
     """Focal length, in widths of the picture, and radial distortion of the one camera in a COLMAP file; None where it
     is another kind of file."""
     data = path.read_bytes() if path.is_file() else b""
-    if len(data) != ONE_CAMERA.size:
+    if len(data) != CAMERA_RECORD.size:
         return None
-    count, _, model, width, _, focal, _, _, bend = ONE_CAMERA.unpack(data)
+    count, _, model, width, _, focal, _, _, bend = CAMERA_RECORD.unpack(data)
     return (focal / width, bend) if count == 1 and model == SIMPLE_RADIAL and width and bend else None

@@ -20,7 +20,7 @@ from .capture import Capture
 from .pictures import list_images
 
 MASKS, OBJECT_MASKS = "masks", "object_masks"
-IMAGES = ("images", "image", "input", "photos", "photographs", "frames")  # folders that a name may begin with
+IMAGE_FOLDERS = ("images", "image", "input", "photos", "photographs", "frames")  # folders that a name may begin with
 
 
 def find_mask(folder: Path, name: str) -> Path | None:
@@ -36,7 +36,7 @@ def find_mask(folder: Path, name: str) -> Path | None:
 def inner_names(name: str) -> Iterator[str]:
     """A photograph's name below the folder of all photographs, which its path may begin with."""
     path = PurePosixPath(name)
-    if path.parts[0] in IMAGES and len(path.parts) > 1:
+    if path.parts[0] in IMAGE_FOLDERS and len(path.parts) > 1:
         yield PurePosixPath(*path.parts[1:]).as_posix()
     yield path.as_posix()
 

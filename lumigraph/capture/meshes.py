@@ -19,10 +19,10 @@ from ..system.memory import free_memory
 from ..system.progress import track
 
 SUFFIXES = (".obj", ".ply", ".off", ".stl", ".glb", ".gltf")
-STANDING = (".stl", ".off")  # by custom with +z up; the others have +y up
+Z_UP_SUFFIXES = (".stl", ".off")  # by custom with +z up; the others have +y up
 Y_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])  # to +z
-FARTHEST, NOTHING = 1e12, 1e-12  # units of a file that points may be from its origin, and that are no distance
-GREY = 160  # of what has no colour
+MAX_COORDINATE, ZERO_EXTENT = 1e12, 1e-12  # units of a file, from its origin; largest extent that counts as zero
+DEFAULT_GREY = 160  # for meshes without colour
 
 
 def recognises(path: Path) -> bool:
@@ -73,13 +73,13 @@ def read_shape(path: Path, name: str) -> Shape:
     if not all(map(is_sound, meshes or clouds[:1])):
         raise LumigraphError(f"{path} has corners without three numbers, or triangles of corners that it has not")
     made = joined(meshes) if meshes else cloud(clouds[0])
-    if not (np.abs(made.vertices) <= FARTHEST).all() or not np.ptp(made.vertices, 0).max() > NOTHING:
+    if not (np.abs(made.vertices) <= MAX_COORDINATE).all() or not np.ptp(made.vertices, 0).max() > ZERO_EXTENT:
         raise LumigraphError(
-            f"{path} has points that are not finite or farther than {FARTHEST:g} units, or all in one place; name "
-            "another file"
+            f"{path} has points that are not finite or farther than {MAX_COORDINATE:g} units, or all in one place; "
+            "name another file"
         )
     return normalised(
-        name, made, None if meshes else normals_of(path), None if path.suffix.lower() in STANDING else Y_UP
+        name, made, None if meshes else normals_of(path), None if path.suffix.lower() in Z_UP_SUFFIXES else Y_UP
     )
 
 
@@ -116,14 +116,16 @@ def colours_of(part: Any) -> UInt8[np.ndarray, "vertex 3"]:
             return found
     except Exception:  # a picture that is missing should keep nobody from the shape
         pass
-    return np.full((len(part.vertices), 3), GREY, np.uint8)
+    return np.full((len(part.vertices), 3), DEFAULT_GREY, np.uint8)
 
 
 def cloud(part: Any) -> Mesh:
     points = np.asarray(part.vertices, np.float64)
     colours = np.asarray(getattr(part, "colors", ()))
     known = (
-        colours[:, :3].astype(np.uint8) if len(colours) == len(points) else np.full((len(points), 3), GREY, np.uint8)
+        colours[:, :3].astype(np.uint8)
+        if len(colours) == len(points)
+        else np.full((len(points), 3), DEFAULT_GREY, np.uint8)
     )
     return Mesh(points, np.zeros((0, 3), np.int64), known)
 

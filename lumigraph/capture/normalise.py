@@ -21,17 +21,17 @@ from .capture import Capture
 from .hull import hull_box, silhouettes
 from .up import find_upright, upright_by
 
-MARGIN = 1.01  # around an object that is known exactly
-FARTHEST = 64  # half-size of the largest cube, in scene units
-UNKNOWN_REACH = 16.0  # of a capture without points
-HELD = 0.99  # share of sightings that the reach must hold
-CONVERGING = 0.02  # mean squared sine between optical axes from which on they tell where they meet: 8 degrees
+BOX_MARGIN = 1.01  # factor around an object whose bounds are known exactly
+MAX_REACH = 64  # half-size of the largest cube, in scene units
+DEFAULT_REACH = 16.0  # of a capture without points
+REACH_QUANTILE = 0.99  # share of observations that the reach must contain
+MIN_CONVERGENCE = 0.02  # mean squared sine between optical axes from which on their meeting point is known: 8 degrees
 BOX_SHARE = 0.5  # of the distance from which things are looked at: half-size of the box of interest
-SAME_WAY = 0.5  # length of the mean viewing direction, below which cameras look around themselves rather than one way
-BEFORE_NEAREST = 0.4  # rays begin at this share of the distance to the nearest thing seen
-SMALLEST_NEAR = 1e-3
-INSIDE_NEAR = 0.02  # of its half-size: how near things may be to cameras inside a box, where nothing tells
-SAME_PLACE = 1e-9  # units of the source that are nothing
+MIN_MEAN_DIRECTION = 0.5  # length of the mean viewing direction; below it cameras look around themselves
+NEAR_SCALE = 0.4  # rays begin at this share of the distance to the nearest visible point
+MIN_NEAR = 1e-3
+INDOOR_NEAR = 0.02  # of the half-size: near distance for cameras inside a box, without other evidence
+ZERO_EXTENT = 1e-9  # units of the source that count as zero
 SAMPLED_POINTS, SAMPLED_CAMERAS = 5000, 64
 
 
@@ -46,9 +46,9 @@ class Place:
     background: Vector
 
 
-CUBE: tuple[Vector, Vector] = ((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0))
-BLACK: Vector = (0.0, 0.0, 0.0)
-WHITE: Vector = (1.0, 1.0, 1.0)
+UNIT_CUBE: tuple[Vector, Vector] = ((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0))
+BLACK_COLOUR: Vector = (0.0, 0.0, 0.0)
+WHITE_COLOUR: Vector = (1.0, 1.0, 1.0)
 
 
 def find_place(
@@ -64,7 +64,7 @@ def find_place(
     views:   the images that may be looked at, not held out
     upright: the rotation that brings up to +z; None to find it
     """
-    background = capture.background or (WHITE if images.has_alpha else BLACK)
+    background = capture.background or (WHITE_COLOUR if images.has_alpha else BLACK_COLOUR)
     if capture.bounds is not None:
         return stated_place(capture, cameras, background)
     upright = upright_of(capture, cameras) if upright is None else upright
@@ -98,14 +98,14 @@ def part_place(capture: Capture, cameras: Camera, upright: np.ndarray, backgroun
     centre, half = upright[:3, :3] @ np.array(capture.around[0]), capture.around[1]
     cloud = reliable_points(capture, upright)
     depths = None if cloud is None else visible_depths(cameras, cloud)
-    near = INSIDE_NEAR * half if depths is None else BEFORE_NEAREST * float(np.nanpercentile(depths[:, 0], 2))
-    reach = UNKNOWN_REACH
+    near = INDOOR_NEAR * half if depths is None else NEAR_SCALE * float(np.nanpercentile(depths[:, 0], 2))
+    reach = DEFAULT_REACH
     if capture.reach is not None:
         reach = power_of_two(capture.reach / half)
     elif cloud is not None:
-        reach = power_of_two(quantile(np.abs(cloud.points - centre).max(-1), cloud.weights, HELD) / half)
+        reach = power_of_two(quantile(np.abs(cloud.points - centre).max(-1), cloud.weights, REACH_QUANTILE) / half)
     near = near if capture.near is None else capture.near
-    return Place(similarity(upright, centre, half), CUBE, max(2.0, reach), max(near / half, SMALLEST_NEAR), background)
+    return Place(similarity(upright, centre, half), UNIT_CUBE, max(2.0, reach), max(near / half, MIN_NEAR), background)
 
 
 def stated_place(capture: Capture, cameras: Camera, background: Vector) -> Place:
@@ -116,15 +116,15 @@ def stated_place(capture: Capture, cameras: Camera, background: Vector) -> Place
     bounds = box_in_scene(low, high, centre, half)
     reach = 1.0 if capture.reach is None else power_of_two(capture.reach / half)
     near = nearest_to_box(cameras, low, high) if capture.near is None else capture.near
-    return Place(similarity(np.eye(4), centre, half), bounds, reach, max(near / half, SMALLEST_NEAR), background)
+    return Place(similarity(np.eye(4), centre, half), bounds, reach, max(near / half, MIN_NEAR), background)
 
 
 def object_place(upright: np.ndarray, box: tuple[np.ndarray, np.ndarray], cameras: Camera, background: Vector) -> Place:
     """An object alone: its box fills the scene."""
     low, high = box
-    centre, half = 0.5 * (low + high), 0.5 * MARGIN * float((high - low).max())
-    low, high = centre - 0.5 * MARGIN * (high - low), centre + 0.5 * MARGIN * (high - low)
-    near = max(nearest_to_box(cameras, low, high) / half, SMALLEST_NEAR)
+    centre, half = 0.5 * (low + high), 0.5 * BOX_MARGIN * float((high - low).max())
+    low, high = centre - 0.5 * BOX_MARGIN * (high - low), centre + 0.5 * BOX_MARGIN * (high - low)
+    near = max(nearest_to_box(cameras, low, high) / half, MIN_NEAR)
     return Place(similarity(upright, centre, half), box_in_scene(low, high, centre, half), 1.0, near, background)
 
 
@@ -176,13 +176,13 @@ def find_gaze(capture: Capture, cameras: Camera, upright: np.ndarray) -> Gaze:
     else:
         away = np.linalg.norm(position - meeting, axis=-1) if converging else None
         spread = np.linalg.norm(position - position.mean(0), axis=-1).mean()
-        middle = np.median(away) if away is not None else 3 * spread if spread > SAME_PLACE else 1.0
+        middle = np.median(away) if away is not None else 3 * spread if spread > ZERO_EXTENT else 1.0
         nearest = 0.25 * (away.min() if away is not None else middle)
     if converging:
         centre, distance = meeting, float(np.median(np.linalg.norm(position - meeting, axis=-1)))
     else:
         centre, distance = (position + middle * forward).mean(0), float(middle)
-    around = not converging and np.linalg.norm(forward.mean(0)) < SAME_WAY
+    around = not converging and np.linalg.norm(forward.mean(0)) < MIN_MEAN_DIRECTION
     half = distance if around else BOX_SHARE * distance  # from inside, all that is seen lies at that distance
     return Gaze(centre, distance, converging, half, float(nearest), cloud)
 
@@ -190,18 +190,18 @@ def find_gaze(capture: Capture, cameras: Camera, upright: np.ndarray) -> Gaze:
 def open_place(capture: Capture, upright: np.ndarray, gaze: Gaze, background: Vector) -> Place:
     """A room or the open: a box in the middle of what is looked at, and cubes around it as far as the points go."""
     centre, half = gaze.centre, gaze.half
-    reach = UNKNOWN_REACH
+    reach = DEFAULT_REACH
     if gaze.cloud is not None:
         centre, half = settle(gaze.cloud, centre, half)
         radius = np.abs(gaze.cloud.points - centre).max(-1)
-        reach = power_of_two(quantile(radius, gaze.cloud.weights, HELD) / half)
+        reach = power_of_two(quantile(radius, gaze.cloud.weights, REACH_QUANTILE) / half)
     elif all(shot.depths is not None for shot in capture.shots):
         farthest = max(shot.depths[1] for shot in capture.shots if shot.depths is not None)
         reach = power_of_two((farthest + gaze.distance) / half)
     if capture.reach is not None:
         reach = power_of_two(capture.reach / half)
-    near = BEFORE_NEAREST * gaze.nearest if capture.near is None else capture.near
-    return Place(similarity(upright, centre, half), CUBE, reach, max(near / half, SMALLEST_NEAR), background)
+    near = NEAR_SCALE * gaze.nearest if capture.near is None else capture.near
+    return Place(similarity(upright, centre, half), UNIT_CUBE, reach, max(near / half, MIN_NEAR), background)
 
 
 def settle(cloud: WeightedPoints, centre: np.ndarray, half: float) -> tuple[np.ndarray, float]:
@@ -248,10 +248,10 @@ def visible_depths(cameras: Camera, cloud: WeightedPoints) -> Float[np.ndarray, 
 def where_axes_meet(position: np.ndarray, forward: np.ndarray) -> tuple[np.ndarray, bool]:
     """The point nearest to all optical axes (least squares), and whether there is one: in front, at an angle."""
     across = np.eye(3) - forward[:, :, None] * forward[:, None]
-    if np.linalg.eigvalsh(across.mean(0))[0] < CONVERGING:
+    if np.linalg.eigvalsh(across.mean(0))[0] < MIN_CONVERGENCE:
         return position.mean(0), False
     meeting = np.linalg.solve(across.sum(0), (across @ position[:, :, None]).sum(0))[:, 0]
-    in_front = ((meeting - position) * forward).sum(-1) > SAME_PLACE
+    in_front = ((meeting - position) * forward).sum(-1) > ZERO_EXTENT
     return meeting, bool(in_front.mean() > 0.8)
 
 
@@ -270,7 +270,7 @@ def box_in_scene(low: np.ndarray, high: np.ndarray, centre: np.ndarray, half: fl
 
 def power_of_two(value: float) -> float:
     """The smallest power of two that is at least `value`, from 1 to 64."""
-    return float(min(2 ** max(0, math.ceil(math.log2(max(value, 1e-9)) - 1e-6)), FARTHEST))
+    return float(min(2 ** max(0, math.ceil(math.log2(max(value, 1e-9)) - 1e-6)), MAX_REACH))
 
 
 def quantile(values: np.ndarray, weights: np.ndarray, share: float) -> float:

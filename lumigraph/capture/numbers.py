@@ -20,13 +20,13 @@ from ..color.srgb import srgb_from_linear
 from ..system.memory import free_memory
 
 Tag = ExifTags.Base
-PNG, EXR = b"\x89PNG\r\n\x1a\n", b"\x76\x2f\x31\x01"  # how these files begin
+PNG_SIGNATURE, EXR_SIGNATURE = b"\x89PNG\r\n\x1a\n", b"\x76\x2f\x31\x01"  # first bytes of these files
 EXR_HALF = 1  # among the types of its channels
 PNG_CHANNELS = {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}  # by PNG's colour type
 TIFF_SUFFIXES, TIFF_FLOAT = (".tif", ".tiff"), 3  # and its sample format
-LARGEST_SIDE, COPIES = 10**5, 4  # pixels; and how often one is held while it is decoded, turned and reduced
-PLANES = ("g", "b", "r", "a")  # in which FFmpeg keeps floating point
-ARRAYS = {"labels": ("labels", "ids", "semantics")}  # what an .npz may call them
+MAX_SIDE, DECODING_COPIES = 10**5, 4  # pixels; and copies in memory while an image is decoded, turned and reduced
+FFMPEG_PLANES = ("g", "b", "r", "a")  # order of FFmpeg's floating-point planes
+ARRAY_NAMES = {"labels": ("labels", "ids", "semantics")}  # accepted names in an .npz
 
 
 @dataclass(frozen=True)
@@ -65,9 +65,9 @@ def check_pixels(size: tuple[int, int], each: int = 4) -> None:
     each: bytes of a pixel
     """
     width, height = size
-    if not (1 <= width <= LARGEST_SIDE and 1 <= height <= LARGEST_SIDE):
+    if not (1 <= width <= MAX_SIDE and 1 <= height <= MAX_SIDE):
         raise ValueError(f"it says that it has {width}x{height} pixels")
-    needed, free = COPIES * each * width * height, free_memory()
+    needed, free = DECODING_COPIES * each * width * height, free_memory()
     if needed > free:
         raise ValueError(
             f"its {width}x{height} pixels take {needed / 1e9:.1f} GB to read, and {free / 1e9:.1f} GB are free"
@@ -99,7 +99,7 @@ def kind_of(path: Path, name: str = "") -> Kind:
     if suffix == ".png":
         with open(path, "rb") as file:
             header = file.read(26)
-        if header.startswith(PNG):
+        if header.startswith(PNG_SIGNATURE):
             width, height, bits, colour = struct.unpack_from(">IIBB", header, 16)
             if bits < 16:
                 return Kind((width, height), np.dtype(np.uint8), PNG_CHANNELS.get(colour, 1))
@@ -132,7 +132,7 @@ def exr_kind(path: Path) -> Kind:
     """Read an OpenEXR header: attributes as name, type, size and data, ended by an empty name."""
     with open(path, "rb") as file:
         data = file.read(1 << 16)
-    if not data.startswith(EXR):
+    if not data.startswith(EXR_SIGNATURE):
         raise ValueError("it is no OpenEXR file")
     found, at = {}, 8
     while data[at]:
@@ -176,7 +176,7 @@ def read_array(path: Path, name: str) -> np.ndarray:
         array = found
     else:
         with found:
-            wanted = [k for k in ARRAYS.get(name, (name,)) if k in found.files] or list(found.files)
+            wanted = [k for k in ARRAY_NAMES.get(name, (name,)) if k in found.files] or list(found.files)
             if len(wanted) != 1:
                 raise ValueError(f"it holds {', '.join(found.files)}, and none is called {name}")
             array = found[wanted[0]]
@@ -198,7 +198,7 @@ def decode(path: Path) -> np.ndarray:
     rows = [row[: frame.height, : frame.width] for row in rows]
     if len(rows) == 1:
         return rows[0].copy()
-    by_name = dict(zip(PLANES, rows, strict=False))
+    by_name = dict(zip(FFMPEG_PLANES, rows, strict=False))
     return np.stack([by_name[k] for k in "rgba" if k in by_name], -1)
 
 

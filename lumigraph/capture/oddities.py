@@ -11,13 +11,17 @@ from jaxtyping import Float
 from ..errors import LumigraphError
 from .capture import Capture, Shot
 from .folds import about_fold
-from .normalise import CONVERGING, SAMPLED_POINTS
+from .normalise import MIN_CONVERGENCE, SAMPLED_POINTS
 
-ONE_PLACE = 1e-9  # spread of cameras, as a share of their distance from the origin, that tells nothing
-NOTHING, TINY, HUGE = 1e-9, 1e-6, 1e6  # units that cameras are apart: that nobody can count with, or nobody means
-NARROW, WIDE = 0.5, 175.0  # degrees that a flat picture shows, across its longer side
-ASIDE = 0.1  # how far from an axis, as a share of the distance, axes still meet
-SEEN = 0.1  # share of the points before the middle camera, below which cameras look away from them
+MIN_RELATIVE_SPREAD = 1e-9  # spread of cameras, as a share of their distance from the origin
+ZERO_SPREAD, MIN_SPREAD, MAX_SPREAD = (
+    1e-9,
+    1e-6,
+    1e6,
+)  # units between cameras: zero for computation, implausibly small, implausibly large
+MIN_FIELD_OF_VIEW, MAX_FIELD_OF_VIEW = 0.5, 175.0  # degrees of a flat picture, across its longer side
+MAX_AXIS_OFFSET = 0.1  # distance to an axis, as a share of the distance, at which axes still meet
+MIN_VISIBLE_SHARE = 0.1  # share of the points in front of the median camera, below which cameras look away from them
 
 
 def oddities(capture: Capture, shots: list[Shot], poses: Float[np.ndarray, "camera 3 4"]) -> list[str]:
@@ -44,15 +48,15 @@ def about_places(poses: Float[np.ndarray, "camera 3 4"]) -> str | None:
     """Cameras in one place, and units in which nothing is measured. LumigraphError where nobody can count in them."""
     place = poses[:, :, 3]
     spread = float(np.linalg.norm(place - place.mean(0), axis=-1).max())
-    if spread <= ONE_PLACE * float(np.abs(place).max()):
+    if spread <= MIN_RELATIVE_SPREAD * float(np.abs(place).max()):
         alike = np.abs(poses - poses[0]).max() < 1e-9
         return (
             f"has {len(poses)} photographs with {'one and the same pose' if alike else 'poses in one place'}, which "
             "tells nothing of depth; check the file of poses, or take photographs a step apart"
         )
-    if spread < NOTHING:
+    if spread < ZERO_SPREAD:
         raise LumigraphError(f"The cameras are {spread:.3g} units apart at most; give their poses in another unit")
-    if not TINY < spread < HUGE:
+    if not MIN_SPREAD < spread < MAX_SPREAD:
         return f"has cameras {spread:.3g} units apart at most; check the unit of its poses"
     return None
 
@@ -61,17 +65,19 @@ def about_gaze(capture: Capture, poses: Float[np.ndarray, "camera 3 4"]) -> str 
     """Cameras that look away from where their axes meet, all of them, and from the points if there are any."""
     place, forward = poses[:, :, 3], poses[:, :, 2]
     across = np.eye(3) - forward[:, :, None] * forward[:, None]
-    if np.linalg.eigvalsh(across.mean(0))[0] < CONVERGING:
+    if np.linalg.eigvalsh(across.mean(0))[0] < MIN_CONVERGENCE:
         return None
     meeting = np.linalg.solve(across.sum(0), (across @ place[:, :, None]).sum(0))[:, 0]
     towards = meeting - place
     miss = np.linalg.norm((across @ towards[:, :, None])[:, :, 0], axis=-1)
-    if ((towards * forward).sum(-1) > -NOTHING).any() or (miss > ASIDE * np.linalg.norm(towards, axis=-1)).any():
+    if ((towards * forward).sum(-1) > -ZERO_SPREAD).any() or (
+        miss > MAX_AXIS_OFFSET * np.linalg.norm(towards, axis=-1)
+    ).any():
         return None
     if capture.points is not None and len(capture.points):
         points = capture.points[:: -(-len(capture.points) // SAMPLED_POINTS)]
         ahead = np.einsum("cpk,ck->cp", points - place[:, None], forward) > 0
-        if np.median(ahead.mean(1)) > SEEN:
+        if np.median(ahead.mean(1)) > MIN_VISIBLE_SHARE:
             return None
     return (
         "has cameras that all look away from the place where their axes meet; unless they stood in the middle, their "
@@ -86,6 +92,6 @@ def about_angles(shots: list[Shot]) -> str | None:
         if focal is None or shot.size is None:
             continue
         angle = float(np.degrees(2 * np.arctan(0.5 * max(shot.size) / float(focal.min()))))
-        if not NARROW < angle < WIDE:
+        if not MIN_FIELD_OF_VIEW < angle < MAX_FIELD_OF_VIEW:
             return f"has a lens that sees {angle:.3g} degrees, that of {shot.name}; check its focal length"
     return None

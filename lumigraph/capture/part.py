@@ -11,7 +11,7 @@ from ..files.ranges import Point, Positive
 from .assemble import HOLD_OUT, in_order
 from .capture import Capture, Shot
 
-FAR = 16.0  # radii of a part within which sparse points are kept: what lies beyond is the sky
+MAX_POINT_RADII = 16.0  # radii of a part within which sparse points are kept: beyond is the sky
 
 
 @dataclass(frozen=True)
@@ -45,7 +45,7 @@ def part_of(capture: Capture, part: Part) -> Capture:
     found = replace(capture, shots=chosen, missing=[], bounds=None, reach=reach, around=(part.centre, part.radius))
     if capture.points is None:
         return found
-    near = np.linalg.norm(capture.points - part.centre, axis=-1) < FAR * part.radius
+    near = np.linalg.norm(capture.points - part.centre, axis=-1) < MAX_POINT_RADII * part.radius
     return replace(
         found,
         points=capture.points[near],

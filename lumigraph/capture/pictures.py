@@ -19,8 +19,8 @@ from ..files import is_file
 from .capture import Plane, Shot
 from .numbers import TIFF_SUFFIXES, Kind, as_bytes, check_pixels, colours, kind_of, read_numbers, tiff_tags, turned
 
-LONGEST_SIDE = 1100  # pixels that a photograph is reduced to, where the user asks for nothing
-SUFFIXES = (".png", ".jpg", ".jpeg", ".JPG", ".JPEG", ".PNG", ".webp", ".tif", ".tiff", ".bmp", ".exr")
+DEFAULT_MAX_SIDE = 1100  # pixels of the longer side of a photograph
+IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".JPG", ".JPEG", ".PNG", ".webp", ".tif", ".tiff", ".bmp", ".exr")
 DEEP_SUFFIXES = (".png", ".tif", ".tiff", ".exr")  # of files that may hold more than eight bits
 EXIF_ORIENTATION = 0x0112
 EXIF_UPRIGHT = (None, 0, 1)
@@ -34,7 +34,7 @@ def find_file(path: Path) -> Path:
     """The file itself, or where it was named without a suffix, the image of that name. The file may not exist."""
     if is_file(path) or not path.name:
         return path
-    return next((p for s in SUFFIXES if is_file(p := path.with_name(path.name + s))), path)
+    return next((p for s in IMAGE_SUFFIXES if is_file(p := path.with_name(path.name + s))), path)
 
 
 def list_images(folder: Path) -> list[str]:
@@ -42,7 +42,7 @@ def list_images(folder: Path) -> list[str]:
     by their letters, 10 before 2."""
     if not folder.is_dir():
         return []
-    files = (p for p in folder.rglob("*") if p.suffix.lower() in {s.lower() for s in SUFFIXES} and p.is_file())
+    files = (p for p in folder.rglob("*") if p.suffix.lower() in {s.lower() for s in IMAGE_SUFFIXES} and p.is_file())
     return sorted(p.relative_to(folder).as_posix() for p in files if not p.name.startswith("."))
 
 
@@ -167,7 +167,7 @@ def check_downscale(downscale: int | None) -> None:
 
 
 def reduced(size: Size, downscale: int | None) -> Size:
-    times = math.ceil(max(size) / LONGEST_SIDE) if downscale is None else downscale
+    times = math.ceil(max(size) / DEFAULT_MAX_SIDE) if downscale is None else downscale
     return max(round(size[0] / times), 1), max(round(size[1] / times), 1)
 
 

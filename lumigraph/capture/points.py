@@ -12,7 +12,7 @@ from jaxtyping import Float, UInt8
 
 from ..errors import LumigraphError
 
-SAME_PLACE = 0.02  # two sets of camera positions are of the same capture if they agree to this share of their spread
+POSITION_TOLERANCE = 0.02  # of their spread, within which two sets of camera positions belong to one capture
 
 
 @dataclass(frozen=True)
@@ -80,4 +80,4 @@ def similarity(source: Float[np.ndarray, "point 3"], target: Float[np.ndarray, "
     matrix[:3, :3] = (s * np.diag(sign)).sum() / spread_a * (u @ sign @ vt)
     matrix[:3, 3] = target.mean(0) - matrix[:3, :3] @ source.mean(0)
     left = ((b - a @ matrix[:3, :3].T) ** 2).sum()
-    return matrix if left <= SAME_PLACE**2 * spread_b else None
+    return matrix if left <= POSITION_TOLERANCE**2 * spread_b else None

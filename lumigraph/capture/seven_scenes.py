@@ -19,9 +19,9 @@ from .beside import with_depth_points
 from .capture import Capture, Plane, Shot
 from .pictures import find_file, measure
 
-LOOKED_FOR = "frame-*.color and frame-*.pose.txt (7-Scenes, 3DMatch)"
-POSE = ".pose.txt"
-KINECT = np.array([[585.0, 0, 320], [0, 585, 240], [0, 0, 1]])  # as published with 7-Scenes
+EXPECTED_FILES = "frame-*.color and frame-*.pose.txt (7-Scenes, 3DMatch)"
+POSE_SUFFIX = ".pose.txt"
+KINECT_INTRINSICS = np.array([[585.0, 0, 320], [0, 585, 240], [0, 0, 1]])  # as published with 7-Scenes
 
 
 def recognises(folder: Path) -> bool:
@@ -30,7 +30,7 @@ def recognises(folder: Path) -> bool:
 
 def poses(folder: Path) -> Iterator[Path]:
     """Files of poses, in the folder and in those of its sequences."""
-    for pattern in (f"frame-*{POSE}", f"seq-*/frame-*{POSE}"):
+    for pattern in (f"frame-*{POSE_SUFFIX}", f"seq-*/frame-*{POSE_SUFFIX}"):
         yield from sorted(folder.glob(pattern))
 
 
@@ -38,13 +38,13 @@ def read(folder: Path) -> Capture:
     """Frames whose pose is not finite, because tracking was lost, are left out. Raises LumigraphError for files that
     hold no matrix."""
     matrix = folder / "camera-intrinsics.txt"
-    camera = read_matrix(matrix, 3) if matrix.is_file() else KINECT
+    camera = read_matrix(matrix, 3) if matrix.is_file() else KINECT_INTRINSICS
     lens = Pinhole(
         torch.tensor([[camera[0, 0], camera[1, 1]]]).float(), torch.tensor([[camera[0, 2], camera[1, 2]]]).float()
     )
     shots, missing = [], []
     for path in poses(folder):
-        pose, stem = read_matrix(path, 4), path.name.removesuffix(POSE)
+        pose, stem = read_matrix(path, 4), path.name.removesuffix(POSE_SUFFIX)
         picture, depth = find_file(path.with_name(f"{stem}.color")), path.with_name(f"{stem}.depth.png")
         name = picture.relative_to(folder).as_posix()
         if not picture.is_file():

@@ -15,18 +15,20 @@ import torch
 from ..camera.lens import Pinhole
 from ..errors import LumigraphError
 from .capture import Capture, Shot
-from .pictures import EXIF_SIDEWAYS, SUFFIXES, check_downscale, measure, read_image, reduced
+from .pictures import EXIF_SIDEWAYS, IMAGE_SUFFIXES, check_downscale, measure, read_image, reduced
 
-LONGEST_SIDE = 512  # pixels that a picture is reduced to, where the user asks for nothing
-SMALLEST_SIDE = 16  # pixels; the windows of SSIM are 11 wide
-AWAY = 2.0  # of the camera, where the longer side of the picture is 2
-THICKNESS = 0.05  # of the box around the picture
-FACING = np.array([[1.0, 0, 0, 0], [0, 0, 1, -AWAY], [0, -1, 0, 0]])  # right is +x, down is -z, forward is +y
-SEED = 0  # of the pixels that are held out
+DEFAULT_MAX_SIDE = 512  # pixels of the longer side of the picture
+MIN_SIDE = 16  # pixels; the windows of SSIM are 11 wide
+CAMERA_DISTANCE = 2.0  # where the longer side of the picture is 2
+BOX_THICKNESS = 0.05  # of the box around the picture
+CAMERA_POSE = np.array(
+    [[1.0, 0, 0, 0], [0, 0, 1, -CAMERA_DISTANCE], [0, -1, 0, 0]]
+)  # right is +x, down is -z, forward is +y
+SPLIT_SEED = 0  # of the held-out pixels
 
 
 def recognises(path: Path) -> bool:
-    return path.is_file() and path.suffix.lower() in SUFFIXES
+    return path.is_file() and path.suffix.lower() in IMAGE_SUFFIXES
 
 
 def read(path: Path, downscale: int | None = None) -> Capture:
@@ -38,19 +40,19 @@ def read(path: Path, downscale: int | None = None) -> Capture:
     check_downscale(downscale)
     stored, orientation = measure(path)
     whole = stored[::-1] if orientation in EXIF_SIDEWAYS else stored
-    size = width, height = reduced(whole, downscale or math.ceil(max(whole) / LONGEST_SIDE))
-    if min(size) < SMALLEST_SIDE:
+    size = width, height = reduced(whole, downscale or math.ceil(max(whole) / DEFAULT_MAX_SIDE))
+    if min(size) < MIN_SIDE:
         raise LumigraphError(
-            f"{path} is {width}x{height} pixels to learn from, and {SMALLEST_SIDE} a side are the least; "
+            f"{path} is {width}x{height} pixels to learn from, and {MIN_SIDE} a side are the least; "
             f"name a larger picture{' or a smaller --downscale' if size != whole else ''}"
         )
     pixels = read_image(path, True, size)
-    held_out = np.random.default_rng(SEED).permutation(width * height).reshape(height, width) % 2 == 1
+    held_out = np.random.default_rng(SPLIT_SEED).permutation(width * height).reshape(height, width) % 2 == 1
     longest = max(size)
-    lens = Pinhole(torch.full((1, 2), AWAY * longest / 2), torch.tensor([[width / 2, height / 2]]))
+    lens = Pinhole(torch.full((1, 2), CAMERA_DISTANCE * longest / 2), torch.tensor([[width / 2, height / 2]]))
     shots = [
-        Shot(name, FACING, lens, size, pixels, mask, split=split)
+        Shot(name, CAMERA_POSE, lens, size, pixels, mask, split=split)
         for name, split, mask in (("held-out", "test", held_out), ("learnt", "train", ~held_out))
     ]
-    corner = (width / longest, THICKNESS, height / longest)
+    corner = (width / longest, BOX_THICKNESS, height / longest)
     return Capture(str(path), shots, bounds=((-corner[0], -corner[1], -corner[2]), corner), reach=1.0)

@@ -23,10 +23,10 @@ from .capture import Capture, Plane, Shot
 from .pictures import EXIF_SIDEWAYS, find_file, measure, reductions, versions
 from .points import SparsePoints, read_ply, similarity
 
-LOOKED_FOR = "transforms.json (instant-ngp, nerfstudio)"
+EXPECTED_FILES = "transforms.json (instant-ngp, nerfstudio)"
 OPENCV_FROM_OPENGL = np.array([1.0, -1.0, -1.0])  # signs of the camera's axes
 NGP_SCALE = 0.33  # instant-ngp's unit cube is 1 / 0.33 of the file's units wide
-LARGEST_FACT = 10_000  # numbers that may be known of one photograph
+MAX_FACT_NUMBERS = 10_000  # numbers per fact of one photograph
 
 # Of a layer, what a frame may call its file: nerfstudio's name or instant-ngp's, and what annotated captures say.
 PLANES = {
@@ -35,7 +35,7 @@ PLANES = {
     "normals": ("normals_file_path",),
 }
 FACTS = ("exposure", "boxes", "body")  # of a photograph
-NOTHING = (1e10, 65504.0)  # depth that Blender writes where nothing is, in floats and in halves
+BLENDER_EMPTY_DEPTHS = (1e10, 65504.0)  # depth that Blender writes for background pixels, in floats and in halves
 
 Json = dict[str, Any]
 Across = Annotated[float, between(1, 1e5)]  # pixels
@@ -196,8 +196,8 @@ def fact(value: Any, name: str, where: str) -> np.ndarray:
         numbers = np.asarray(value, np.float64)
     except (ValueError, TypeError, OverflowError) as fault:
         raise LumigraphError(f'{where} has "{name}", which is no number and no array of them; correct it') from fault
-    if numbers.size > LARGEST_FACT:
-        raise LumigraphError(f'{where} has "{name}" of {numbers.size} numbers; {LARGEST_FACT} are the most')
+    if numbers.size > MAX_FACT_NUMBERS:
+        raise LumigraphError(f'{where} has "{name}" of {numbers.size} numbers; {MAX_FACT_NUMBERS} are the most')
     return numbers
 
 
@@ -225,7 +225,7 @@ def depth_plane(file: Path, key: str, about: Posed, lens: Lens) -> Plane:
     scale = stated if stated is not None else 1.0 if file.suffix.lower() == ".exr" else 1e-3
     along_ray = isinstance(lens, Equirectangular) or bool(about.is_euclidean_depth)
     whole = file.suffix.lower() in (".png", ".tif", ".tiff")
-    unknown, empty = ((0.0, 65535.0), ()) if whole else ((0.0,), NOTHING)
+    unknown, empty = ((0.0, 65535.0), ()) if whole else ((0.0,), BLENDER_EMPTY_DEPTHS)
     return Plane(file, "distance" if along_ray else "z-depth", scale, unknown, empty)
 
 

@@ -20,11 +20,11 @@ from ..geometry import to_matrix
 from .beside import with_depth_points
 from .capture import Capture, Plane, Shot
 
-LOOKED_FOR = "rgb.txt and groundtruth.txt (TUM's RGB-D benchmark)"
-APART = 0.02  # seconds that two moments may differ by and still be one, as in the benchmark's own tools
-METRE = 5000  # in numbers of a depth picture
+EXPECTED_FILES = "rgb.txt and groundtruth.txt (TUM's RGB-D benchmark)"
+MAX_TIME_DIFFERENCE = 0.02  # seconds between two entries that belong together, as in the benchmark's own tools
+DEPTH_PER_METRE = 5000  # in numbers of a depth picture
 POSE_COLUMNS = 8  # of a trajectory
-SIZE = (640, 480)
+IMAGE_SIZE = (640, 480)
 # What the benchmark publishes, with pixel centres at whole numbers, for the camera that a folder's name tells: focal
 # length, centre, k1 k2 p1 p2 k3. A folder's own camera.txt has the same nine numbers, or the first four.
 CAMERAS = {
@@ -32,7 +32,7 @@ CAMERAS = {
     "freiburg2": (520.9, 521.0, 325.1, 249.7, 0.2312, -0.7849, -0.0033, -0.0001, 0.9172),
     "freiburg3": (535.4, 539.2, 320.1, 247.6),
 }
-ANY_CAMERA = (525.0, 525.0, 319.5, 239.5)  # what its cameras' drivers suppose
+DEFAULT_INTRINSICS = (525.0, 525.0, 319.5, 239.5)  # default of the cameras' drivers
 
 
 def recognises(folder: Path) -> bool:
@@ -58,11 +58,11 @@ def read(folder: Path) -> Capture:
         if depth is not None:
             path = folder / depths[depth][1]
             if is_file(path):
-                planes["depth"] = Plane(path, "z-depth", 1 / METRE, unknown=(0, 65535))
+                planes["depth"] = Plane(path, "z-depth", 1 / DEPTH_PER_METRE, unknown=(0, 65535))
             else:
                 missing.append(depths[depth][1])
         shots.append(
-            Shot(name, read_pose(poses[pose]), lens, SIZE, {1: folder / name}, time=float(moment), planes=planes)
+            Shot(name, read_pose(poses[pose]), lens, IMAGE_SIZE, {1: folder / name}, time=float(moment), planes=planes)
         )
     return with_depth_points(Capture(str(folder), shots, missing=missing))
 
@@ -93,7 +93,9 @@ def read_pose(row: list[str]) -> np.ndarray:
 
 def read_lens(folder: Path) -> Lens:
     path = folder / "camera.txt"
-    numbers: tuple[float, ...] = next((c for name, c in CAMERAS.items() if name in folder.resolve().name), ANY_CAMERA)
+    numbers: tuple[float, ...] = next(
+        (c for name, c in CAMERAS.items() if name in folder.resolve().name), DEFAULT_INTRINSICS
+    )
     if path.is_file():
         try:
             numbers = tuple(float(x) for x in path.read_text(errors="replace").split())
@@ -112,4 +114,4 @@ def nearest(moments: np.ndarray, moment: float) -> int | None:
     if not len(moments):
         return None
     found = int(np.abs(moments - moment).argmin())
-    return found if abs(moments[found] - moment) <= APART else None
+    return found if abs(moments[found] - moment) <= MAX_TIME_DIFFERENCE else None

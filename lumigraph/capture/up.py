@@ -11,19 +11,23 @@ from jaxtyping import Float
 from ..camera import Camera
 from ..geometry import turning
 
-UPRIGHT = math.cos(math.radians(15))  # a source axis nearer to up than this is up
-LEVEL = 0.03  # mean square of what pictures' rows have along up, at most, where cameras are held level: 10 degrees
-TURNING = 0.02, 4  # and across their main direction at least, if they turn about up: 8 degrees, and times the former
-ALONG = 0.9  # cosine from which on a camera looks along a direction
-OBLIQUE = 0.1  # share of the cameras that must look elsewhere than the rest
-CANCELLING = (
-    0.5  # length of the pictures' mean up below which cameras were turned about their axes: nobody does by hand
-)
-HELD = 0.2  # below which it says nothing
-AGREEING = 0.7  # cosine between the pictures' mean up and the direction at right angles to rows, if that is up
-WIDE = 0.4  # times the distance to what is seen: deviation of the places both ways from which on they are a map's
-PLANE = 0.2, 0.2  # of the places' extent: the smallest deviation at most, and the middle one at least, of a plane
-FACING = 0.5  # cosine between a map's plane and the view: drones look no flatter than that
+MIN_UP_COSINE = math.cos(math.radians(15))  # a source axis nearer to up than this is up
+MAX_ROW_TILT = 0.03  # mean square of image rows along up where cameras are held level: 10 degrees
+MIN_ROW_TURN = (
+    0.02,
+    4,
+)  # mean square of image rows across their main direction, if cameras turn about up: 8 degrees; ratio to the former
+ALONG_COSINE = 0.9  # from which on a camera looks along a direction
+MIN_OBLIQUE_SHARE = 0.1  # share of the cameras that must look elsewhere than the rest
+MIN_MEAN_UP = 0.5  # length of the pictures' mean up; below it cameras were turned about their axes
+MIN_USABLE_UP = 0.2  # length of the mean up below which it is no evidence
+MIN_AGREEMENT = 0.7  # cosine between the pictures' mean up and the normal of their rows, if that is up
+MIN_MAP_SPREAD = 0.4  # times the distance to the scene: deviation of positions both ways from which on they are a map's
+PLANE_SPREADS = (
+    0.2,
+    0.2,
+)  # of the positions' extent: the smallest deviation at most, and the middle one at least, of a plane
+MIN_MAP_COSINE = 0.5  # between a map's plane and the view: drones look no flatter than that
 
 
 def find_upright(cameras: Camera, points: Float[np.ndarray, "point 3"] | None = None) -> Float[np.ndarray, "4 4"]:
@@ -37,7 +41,7 @@ def upright_by(up: Float[np.ndarray, " 3"]) -> Float[np.ndarray, "4 4"]:
     up = unit(up)
     nearest = np.zeros(3)
     nearest[np.abs(up).argmax()] = np.sign(up[np.abs(up).argmax()])
-    if up @ nearest > UPRIGHT:
+    if up @ nearest > MIN_UP_COSINE:
         up = nearest
     matrix = np.eye(4)
     matrix[:3, :3] = turn_onto_z(up)
@@ -58,16 +62,16 @@ def common_up(cameras: Camera, points: Float[np.ndarray, "point 3"] | None = Non
     places = cameras.position.double().numpy()
     own, gaze = -downs.mean(0), forwards.mean(0)
     values, vectors = np.linalg.eigh(rows.T @ rows / len(rows))
-    level, turning = vectors[:, 0], values[1] > max(TURNING[0], TURNING[1] * values[0])
-    elsewhere = np.quantile(np.abs(forwards @ level), OBLIQUE) < ALONG
-    if turning and values[0] < LEVEL and elsewhere:
+    level, turning = vectors[:, 0], values[1] > max(MIN_ROW_TURN[0], MIN_ROW_TURN[1] * values[0])
+    elsewhere = np.quantile(np.abs(forwards @ level), MIN_OBLIQUE_SHARE) < ALONG_COSINE
+    if turning and values[0] < MAX_ROW_TILT and elsewhere:
         return upwards(level, own, gaze)
     if (above := from_above(places, own, gaze, points)) is not None:
         return upwards(level, above, gaze) if turning else above
-    if np.linalg.norm(own) < HELD:
+    if np.linalg.norm(own) < MIN_USABLE_UP:
         return upwards(level, own, gaze) if turning else None
     own = unit(own)
-    return level * np.sign(level @ own) if turning and abs(level @ own) > AGREEING else own
+    return level * np.sign(level @ own) if turning and abs(level @ own) > MIN_AGREEMENT else own
 
 
 def from_above(
@@ -82,17 +86,21 @@ def from_above(
     over what they look at as for a map, which nobody walks. Then the plane of their places is level.
     own, gaze: mean of the pictures' own up, and of the viewing directions
     """
-    if np.linalg.norm(gaze) < ALONG:
+    if np.linalg.norm(gaze) < ALONG_COSINE:
         return None
     _, sizes, axes = np.linalg.svd(places - places.mean(0), full_matrices=False)
     back, normal = -unit(gaze), axes[-1] * np.sign(-axes[-1] @ gaze)
-    flat = sizes[2:].sum() < PLANE[0] * sizes[0] and sizes[1] > PLANE[1] * sizes[0] and normal @ back > FACING
-    if np.linalg.norm(own) < CANCELLING:
+    flat = (
+        sizes[2:].sum() < PLANE_SPREADS[0] * sizes[0]
+        and sizes[1] > PLANE_SPREADS[1] * sizes[0]
+        and normal @ back > MIN_MAP_COSINE
+    )
+    if np.linalg.norm(own) < MIN_MEAN_UP:
         return normal if flat else back
     if not flat or points is None or not len(points):
         return None
     distance = float(np.median((places.mean(0) - points) @ normal))
-    return normal if sizes[1] / math.sqrt(len(places)) > WIDE * distance > 0 else None
+    return normal if sizes[1] / math.sqrt(len(places)) > MIN_MAP_SPREAD * distance > 0 else None
 
 
 def upwards(
@@ -100,7 +108,7 @@ def upwards(
 ) -> Float[np.ndarray, " 3"]:
     """Side of an axis with the pictures' own up; if that is undecided, the side that cameras look from."""
     side = axis @ own
-    return axis * np.sign(side if abs(side) > HELD else -axis @ gaze)
+    return axis * np.sign(side if abs(side) > MIN_USABLE_UP else -axis @ gaze)
 
 
 def unit(vector: Float[np.ndarray, " 3"]) -> Float[np.ndarray, " 3"]:

@@ -60,7 +60,7 @@ class Blocks:
         """
         from ..capture import kind_of
         from ..datasets.scene import Scene
-        from ..large.layout import LARGE
+        from ..large.layout import MIN_LARGE_VIEWS
         from ..large.planning import survey
 
         if self.into is not None:
@@ -69,7 +69,7 @@ class Blocks:
         if kind_of(source, Scene) is not Scene or Path(source).is_file() or (self.blocks == "1" and not other):
             return None  # a file is a single picture
         places = survey(source, train.reader)
-        few = places.splits.count("train") < LARGE
+        few = places.splits.count("train") < MIN_LARGE_VIEWS
         if few and not other and (self.blocks, self.workers, self.address) == (None, None, None):
             return None
         for name in ("view", "pause_at", "views"):
@@ -137,14 +137,14 @@ class Blocks:
 
 def unfinished(prefix: str, plan: Any) -> Path:
     """The latest run of this name, if it is the same and not done; else the next name that is free."""
-    from ..large.plan import DONE, NAME, Plan
+    from ..large.plan import DONE_FILE, PLAN_FILE, Plan
     from ..large.planning import difference, place_of
 
     free = next_free(prefix)
     number = int(free.name.rpartition("-")[2])
     latest = free.with_name(f"{free.name.rpartition('-')[0]}-{number - 1}")
-    if (latest / NAME).is_file() and difference(known := Plan.read(latest / NAME), plan) is None:
-        if not all((place_of(latest, block) / DONE).exists() for block in known.blocks):
+    if (latest / PLAN_FILE).is_file() and difference(known := Plan.read(latest / PLAN_FILE), plan) is None:
+        if not all((place_of(latest, block) / DONE_FILE).exists() for block in known.blocks):
             return latest
     return free
 

@@ -40,7 +40,7 @@ def angles(a: Float[Tensor, "camera 3 3"], b: Float[Tensor, "camera 3 3"]) -> Fl
 
 @dataclass(frozen=True)
 class Moves:
-    """How far cameras are from others of the same order, in one frame.
+    """Distances between two lists of cameras in the same order, in one frame.
 
     turned:  degrees, of each camera
     shifted: percent of the longest side of the box of interest
@@ -66,7 +66,7 @@ class Moves:
 
 
 def moves(source: Camera, target: Camera, frame: Frame) -> Moves:
-    """How far cameras are from others of the same order, once they are aligned: what they share is the scene's frame,
+    """Distances between two lists of cameras in the same order, after alignment: what they share is the scene's frame,
     which nobody can tell from photographs."""
     there = source.to("cpu").transformed(aligning(source.to("cpu"), target.to("cpu")).matrix)
     low, high = torch.tensor(frame.bounds)

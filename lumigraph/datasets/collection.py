@@ -18,7 +18,7 @@ from ..files.names import natural
 from .dataset import Dataset, splits_of
 from .scene import Frame
 
-KEPT = 256  # members at most that stay open, those that were asked for last
+MAX_OPEN = 256  # members that stay open, the most recently used
 
 
 @dataclass(frozen=True)
@@ -43,7 +43,7 @@ class Collection:
 
     @staticmethod
     def of(members: Mapping[str, Dataset | Callable[[], Dataset]], source: str = "") -> Collection:
-        """Of datasets, or of what opens them, by name; every 8th is held out, the first one among them."""
+        """Build from datasets, or functions that open them, by name; hold out every 8th, starting with the first."""
         names = sorted(members, key=natural)
         ready = {name: x for name, x in members.items() if isinstance(x, Dataset)}
         openers = {name: opener_of(members[name]) for name in names}
@@ -60,7 +60,7 @@ class Collection:
         """A member by its name. Raises LumigraphError where it cannot be opened."""
         found = self._opened.pop(name, None) or self.openers[name]()
         self._opened[name] = found  # the latest last
-        while len(self._opened) > KEPT:
+        while len(self._opened) > MAX_OPEN:
             del self._opened[next(iter(self._opened))]
         return found
 
@@ -82,12 +82,12 @@ class Collection:
 
     @property
     def warnings(self) -> list[str]:
-        """Those of the members that are open, and which were passed over."""
+        """Warnings of the open members, and the names of skipped members."""
         told = [f"{name}: {warning}" for name, data in self._opened.items() for warning in data.warnings]
         return told + [skipped(name, fault) for name, fault in self._faults.items()]
 
     def preview(self) -> Camera | None:
-        """That of the first member to learn from."""
+        """Preview of the first training member."""
         return self._first.preview()
 
     def sample_member(self, generator: torch.Generator, split: str = "train") -> tuple[int, Dataset]:

@@ -13,12 +13,12 @@ from ..camera import Camera
 from ..errors import LumigraphError
 from .scene import Frame
 
-HELD_OUT = 8  # every so many members by name, the first one among them, as with photographs
+HOLD_OUT = 8  # every so many members by name, the first one among them, as with photographs
 
 
 @runtime_checkable
 class Dataset(Protocol):
-    """What the trainer, the run and the evaluation ask of all that can be learnt from.
+    """Interface of training data for the trainer, the run and the evaluation.
 
     kind:     what it holds, in a user's words: "photographs", "shapes", "a collection"
     source:   the path that it came from, or "procedural:<name>"
@@ -66,5 +66,5 @@ def check_kind(learner: str, wanted: type[Any], found: type[Any], source: str, o
 def splits_of(members: int) -> dict[str, Int[Tensor, " member"]]:
     """Every 8th member of many is for testing; a single one is for both."""
     index = torch.arange(members)
-    held_out = index % HELD_OUT == 0
+    held_out = index % HOLD_OUT == 0
     return {"train": index, "test": index} if members == 1 else {"train": index[~held_out], "test": index[held_out]}

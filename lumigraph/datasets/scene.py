@@ -20,7 +20,7 @@ from ..errors import LumigraphError
 from ..files.ranges import Coordinate, Point, Row, Share, between, typed
 from ..geometry import Similarity, is_similarity
 from ..geometry import Vector as Vector
-from .images import UNNAMED, ImageStore, Layer, cosines, resized
+from .images import UNKNOWN_INDEX, ImageStore, Layer, cosines, resized
 
 # How values of a layer are reduced, by its name (see `resized`); all others are picked, not averaged.
 AVERAGED = {
@@ -39,7 +39,7 @@ Size = Annotated[float, between(1e-9, 1e9)]  # scene units
 
 @dataclass(frozen=True)
 class Forward:
-    """How a capture looks one way: the mean of its cameras, before a plane that they look through.
+    """Geometry of a forward-facing capture: the mean of its cameras, and the near plane in front of it.
 
     pose:  camera-to-world of the mean camera, in scene units
     scale: of x / z and y / z in that camera, bringing all that the cameras see within [-1, 1]
@@ -53,7 +53,7 @@ class Forward:
 
 @dataclass(frozen=True)
 class Frame:
-    """Where a scene is, in plain numbers; all that a method must know to be built, with or without photographs.
+    """Bounds and frame of a scene, in plain numbers: sufficient to build a method, with or without photographs.
 
     bounds:      two corners of the box of interest, inside [-1, 1]^3
     reach:       half-size of the cube around the origin that holds everything to be modelled: 1 for an object, a power
@@ -86,7 +86,7 @@ class Frame:
 
     @property
     def is_open(self) -> bool:
-        """Whether the scene has no bounds: a room or the open, not an object."""
+        """True for an unbounded scene: a room or outdoors, not an object."""
         return self.reach > 1
 
     @property
@@ -100,7 +100,7 @@ class Frame:
 
     @staticmethod
     def from_json(data: Any, where: Path | str = "a frame") -> Frame:
-        """What a run says of its frame. Raises LumigraphError, naming `where`, for what is none."""
+        """Read a run's frame. Raises LumigraphError, naming `where`, for an invalid one."""
         frame = typed(Frame, data, where, closed=True)
         low, high = frame.bounds
         if not all(a < b for a, b in zip(low, high, strict=True)):
@@ -208,7 +208,7 @@ def smaller(values: Shaped[Tensor, "height width *channels"], factor: int, encod
     height, width = values.shape[:2]
     stored = values.cpu().numpy()
     per_pixel = stored.reshape(height, width, -1)
-    known = ~np.isnan(per_pixel).any(-1) if values.is_floating_point() else (per_pixel != UNNAMED).any(-1)
+    known = ~np.isnan(per_pixel).any(-1) if values.is_floating_point() else (per_pixel != UNKNOWN_INDEX).any(-1)
     return torch.from_numpy(resized(stored, (width // factor, height // factor), encoding, known)).to(values.device)
 
 
@@ -246,7 +246,7 @@ class Scene:
         return len(self.names)
 
     def pixels(self, split: str) -> int:
-        """How many pixels there are to learn from, or to compare."""
+        """Number of pixels for training or comparison."""
         return int(self.images.trusted_pixels[self.splits[split]].sum())
 
     def layer(self, name: str) -> Layer:

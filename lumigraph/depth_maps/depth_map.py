@@ -35,7 +35,7 @@ class Tolerance:
         return self.constant + self.per_distance * distance
 
 
-VISIBLE = Tolerance(per_distance=0.02)  # behind a rendered surface, where a point still counts as seen
+VISIBLE_TOLERANCE = Tolerance(per_distance=0.02)  # behind a rendered surface, within which a point is visible
 DEPTH_EDGE = Tolerance(per_distance=0.1)  # between neighbouring pixels, where one surface ends before another
 
 
@@ -197,13 +197,15 @@ class DepthMap:
         return Comparison(ahead, smooth, pixels, away)
 
     def sees(
-        self, points: Float[Tensor, "point 3"], tolerance: Tolerance = VISIBLE, edge: Tolerance = DEPTH_EDGE
+        self, points: Float[Tensor, "point 3"], tolerance: Tolerance = VISIBLE_TOLERANCE, edge: Tolerance = DEPTH_EDGE
     ) -> Bool[Tensor, " point"]:
         """Mask of visible points: inside the picture, and no farther than the tolerance behind its surface."""
         compared = self.compare(points, edge)
         return compared.ahead >= -tolerance(compared.distance)
 
-    def sees_past(self, points: Float[Tensor, "point 3"], tolerance: Tolerance = VISIBLE) -> Bool[Tensor, " point"]:
+    def sees_past(
+        self, points: Float[Tensor, "point 3"], tolerance: Tolerance = VISIBLE_TOLERANCE
+    ) -> Bool[Tensor, " point"]:
         """Mask of points in front of all that the pixels around them show, by more than the tolerance. Pixels that are
         neither clear nor solid count as surfaces here."""
         pixels, valid, away = self.project(points)

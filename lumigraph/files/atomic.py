@@ -30,9 +30,9 @@ from .partials import partial
 from .partials import remove as remove
 from .ranges import typed
 
-HERE, EXCHANGE = -100, 2  # AT_FDCWD, RENAME_EXCHANGE
-NUMBERS = re.compile(r"\[[-+.eE\d,\s]*\]")
-DEEPEST = 100  # levels that JSON may nest; whoever walks through it again has room for them
+AT_FDCWD, RENAME_EXCHANGE = -100, 2  # Linux's AT_FDCWD, RENAME_EXCHANGE
+NUMBER_LIST = re.compile(r"\[[-+.eE\d,\s]*\]")
+MAX_JSON_DEPTH = 100  # nesting levels of JSON; a recursive walk has room for them
 BUT_BRACKETS = bytes(set(range(256)) - set(b"[]{}"))
 
 Seen = tuple[int, ...]  # by which a file is known to be the same, unchanged
@@ -154,11 +154,11 @@ def exchange(new: Path, place: Path) -> None:
 def swapped(one: Path, other: Path) -> bool:
     """Let two paths change places in one step; False where the system has no such call (Linux has `renameat2`)."""
     call = getattr(ctypes.CDLL(None), "renameat2", None) if sys.platform == "linux" else None
-    return call is not None and call(HERE, os.fsencode(one), HERE, os.fsencode(other), EXCHANGE) == 0
+    return call is not None and call(AT_FDCWD, os.fsencode(one), AT_FDCWD, os.fsencode(other), RENAME_EXCHANGE) == 0
 
 
 def place_now(path: Path, ask: Callable[[], None]) -> Path:
-    """Where to put what has been made: where it was to go, or beside it if somebody else has been there meanwhile."""
+    """Destination of a finished output: the requested path, or one beside it if it has been taken meanwhile."""
     try:
         ask()
         return path
@@ -173,7 +173,7 @@ def tell_if_moved(wanted: Path, place: Path) -> None:
 
 
 def seen(path: Path) -> Seen | None:
-    """What lies at a path, links as such; None if nothing does."""
+    """Status of a path without following links; None if it does not exist."""
     try:
         about = os.lstat(path)
     except (FileNotFoundError, NotADirectoryError):
@@ -207,12 +207,12 @@ def write_bytes(path: Path, data: bytes, kind: Kind = "file", ours: bool = False
 def write_json(path: Path, value: Any, kind: Kind = "file", ours: bool = False) -> None:
     """JSON for programs and people: indented, but rows of numbers stay rows."""
     text = json.dumps(value, indent=2, ensure_ascii=False, allow_nan=False)
-    text = NUMBERS.sub(lambda match: " ".join(match[0].split()).replace("[ ", "[").replace(" ]", "]"), text)
+    text = NUMBER_LIST.sub(lambda match: " ".join(match[0].split()).replace("[ ", "[").replace(" ]", "]"), text)
     write_bytes(path, text.encode() + b"\n", kind, ours)
 
 
 def read_json(path: Path, kind: Any = Any) -> Any:
-    """What a file of JSON says, as a value of a kind (see `ranges.typed`); as it stands there if none is named.
+    """Read JSON as a value of a type (see `ranges.typed`), or unchecked if no type is given.
 
     Raises LumigraphError, naming the file, if it is missing, is no JSON (NaN, infinity and numbers of hundreds of
     digits are none either), nests deeper than anything sound does, or does not hold what the kind says.
@@ -224,8 +224,8 @@ def read_json(path: Path, kind: Any = Any) -> Any:
 def from_json(data: bytes, where: Path | str) -> Any:
     """Plain values of JSON. where: what to name in a LumigraphError; see `read_json`."""
     nesting = accumulate(1 if bracket in b"[{" else -1 for bracket in data.translate(None, BUT_BRACKETS))
-    if max(nesting, default=0) > DEEPEST:
-        raise LumigraphError(f"{where} nests deeper than {DEEPEST} levels, as no sound file does; restore it")
+    if max(nesting, default=0) > MAX_JSON_DEPTH:
+        raise LumigraphError(f"{where} nests deeper than {MAX_JSON_DEPTH} levels, as no sound file does; restore it")
     try:
         return msgspec.json.decode(data)
     except (ValueError, RecursionError) as error:
@@ -236,7 +236,7 @@ def from_json(data: bytes, where: Path | str) -> Any:
 
 
 def is_file(path: Path) -> bool:
-    """Whether a file lies there; none does under a name that the system takes for no name."""
+    """True if the path is a file; False for a name that the system rejects."""
     try:
         return path.is_file()
     except (OSError, ValueError):
@@ -244,7 +244,7 @@ def is_file(path: Path) -> bool:
 
 
 def exists(path: Path) -> bool:
-    """Whether something lies there; nothing does under a name that the system takes for no name."""
+    """True if the path exists; False for a name that the system rejects."""
     try:
         return path.exists()
     except (OSError, ValueError):

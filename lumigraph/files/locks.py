@@ -20,16 +20,16 @@ from typing import TextIO
 from ..errors import LumigraphError
 from .atomic import explained, read_json
 
-NAME = "lock.json"  # in the folder: who holds it, for people; what counts is the system's lock on this file
-BEGINS = b'{"process": '
-FAR = 1 << 30  # byte that Windows locks, for it lets nobody read what is locked
+LOCK_FILE = "lock.json"  # in the folder: the holder, for people; the system's lock on this file decides
+FILE_START = b'{"process": '
+LOCKED_BYTE = 1 << 30  # position of the byte that Windows locks, because it makes locked bytes unreadable
 
 _ours: set[Path] = set()  # held by this process
 
 
 @dataclass(frozen=True)
 class Holder:
-    """What the file says."""
+    """Contents of a lock file."""
 
     process: int
     host: str
@@ -43,7 +43,7 @@ def held(folder: Path, doing: str) -> Iterator[None]:
     doing: what is done with the folder meanwhile, as in "trained"
     Raises LumigraphError, which says who it is, if another process holds it.
     """
-    place = folder.resolve() / NAME
+    place = folder.resolve() / LOCK_FILE
     if place in _ours:
         yield
         return
@@ -64,19 +64,19 @@ def held(folder: Path, doing: str) -> Iterator[None]:
 
 def check_place(folder: Path) -> None:
     """Raise LumigraphError if somebody's file lies where a folder's lock would: it would be replaced, and deleted."""
-    with explained(folder / NAME):
-        if not is_lock(folder / NAME):
-            raise LumigraphError(f"{folder / NAME} is no lock of Lumigraph's; rename it, or choose another folder")
+    with explained(folder / LOCK_FILE):
+        if not is_lock(folder / LOCK_FILE):
+            raise LumigraphError(f"{folder / LOCK_FILE} is no lock of Lumigraph's; rename it, or choose another folder")
 
 
 def is_lock(place: Path) -> bool:
-    """Whether a lock's file may be put there: nothing is, or one that somebody holds or has left behind."""
+    """True if the path is free for a lock file: it does not exist, or is a held or abandoned lock file."""
     if not os.path.lexists(place):
         return True
     if place.is_symlink() or not place.is_file():
         return False
     try:
-        return place.read_bytes()[: len(BEGINS)] in (BEGINS, b"")
+        return place.read_bytes()[: len(FILE_START)] in (FILE_START, b"")
     except FileNotFoundError:
         return True  # it went just now
 
@@ -104,12 +104,12 @@ def is_still(place: Path, file: TextIO) -> bool:
 
 
 def lock(file: TextIO) -> bool:
-    """Whether an open file could be locked. Where the file system knows no locks, it could."""
+    """Try to lock an open file; True if it succeeds or the file system has no locks."""
     try:
         if sys.platform == "win32":
             import msvcrt
 
-            file.seek(FAR)
+            file.seek(LOCKED_BYTE)
             msvcrt.locking(file.fileno(), msvcrt.LK_NBLCK, 1)
         else:
             import fcntl

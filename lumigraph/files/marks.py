@@ -1,4 +1,4 @@
-"""What Lumigraph wrote into a folder, so that it knows its own again: lines of JSON in a file `.lumigraph` there.
+"""Records of files that Lumigraph wrote into a folder: lines of JSON in a file `.lumigraph` there.
 
 Each line is a file: its name, what kind of thing it is, its bytes and their SHA-256. A file is ours if a line says so
 and nobody has changed it since. Why here, rather than
@@ -22,9 +22,9 @@ from collections import defaultdict
 from pathlib import Path
 from typing import Literal
 
-NAME = ".lumigraph"
-HEAD = b'{"lumigraph": "what it wrote here, by which it knows its own again"}\n'
-WHOLE = "."  # the name that stands for a folder which was written as one
+MARKS_FILE = ".lumigraph"
+FIRST_LINE = b'{"lumigraph": "what it wrote here, by which it knows its own again"}\n'
+WHOLE_FOLDER = "."  # the name that stands for a folder which was written as one
 
 Sum = tuple[int, str]  # bytes, SHA-256
 Kind = Literal[
@@ -42,25 +42,25 @@ def note(path: Path, kind: Kind, written: Path) -> None:
 def note_folder(folder: Path, kind: Kind) -> None:
     """Remember that a folder and all that is in it are ours, of one kind. OSError if the disk is full."""
     for place, _, names in os.walk(folder):
-        whole: dict[str, Sum] = {WHOLE: (0, "")} if Path(place) == folder else {}
-        add(Path(place), kind, whole | {name: sum_of(Path(place, name)) for name in names if name != NAME})
+        whole: dict[str, Sum] = {WHOLE_FOLDER: (0, "")} if Path(place) == folder else {}
+        add(Path(place), kind, whole | {name: sum_of(Path(place, name)) for name in names if name != MARKS_FILE})
 
 
 def is_ours(path: Path, kind: Kind) -> bool:
-    """Whether a file is one of this kind that Lumigraph wrote, and is as it was then. Links never are."""
+    """True if Lumigraph wrote this file as this kind and it is unchanged. False for links."""
     return is_among(known(path.parent, kind), path)
 
 
 def is_whole(folder: Path, kind: Kind) -> bool:
-    """Whether Lumigraph wrote a folder as one thing of this kind; see `foreign_in` for what it holds now."""
-    return WHOLE in known(folder, kind)
+    """True if Lumigraph wrote a folder as a whole of this kind; see `foreign_in` for later additions."""
+    return WHOLE_FOLDER in known(folder, kind)
 
 
 def foreign_in(folder: Path, kind: Kind) -> Path | None:
     """Something in a folder, however deep, that Lumigraph did not write or that has been changed since; or None."""
     for place, folders, names in os.walk(folder):
         here, sums = Path(place), known(Path(place), kind)
-        own = {NAME} if is_record(here / NAME) else set()
+        own = {MARKS_FILE} if is_record(here / MARKS_FILE) else set()
         for name in {*folders, *names} - own:
             if (here / name).is_symlink() or (name in names and not is_among(sums, here / name)):
                 return here / name
@@ -80,9 +80,9 @@ def sum_of(path: Path) -> Sum:
 
 
 def known(folder: Path, kind: Kind) -> dict[str, set[Sum]]:
-    """What a folder's record says of this kind, by name; nothing where there is none, or somebody else's."""
+    """Recorded files of this kind, by name; empty without a valid record."""
     sums: dict[str, set[Sum]] = defaultdict(set)
-    for line in (folder / NAME).read_bytes().splitlines() if is_record(folder / NAME) else []:
+    for line in (folder / MARKS_FILE).read_bytes().splitlines() if is_record(folder / MARKS_FILE) else []:
         try:
             row = json.loads(line)
             if row["kind"] == kind:
@@ -93,19 +93,19 @@ def known(folder: Path, kind: Kind) -> dict[str, set[Sum]]:
 
 
 def is_record(path: Path) -> bool:
-    """Whether a path is a record that Lumigraph began."""
+    """True if a path is a record created by Lumigraph."""
     try:
         if not stat.S_ISREG(os.lstat(path).st_mode):
             return False
         with open(path, "rb") as file:
-            return file.read(len(HEAD)) == HEAD
+            return file.read(len(FIRST_LINE)) == FIRST_LINE
     except OSError:
         return False
 
 
 def add(folder: Path, kind: Kind, sums: dict[str, Sum]) -> None:
     """Add lines to a folder's record, and begin it if there is none."""
-    path = folder / NAME
+    path = folder / MARKS_FILE
     is_new = not os.path.lexists(path)
     if not (sums and (is_new or is_record(path))):
         return
@@ -117,4 +117,4 @@ def add(folder: Path, kind: Kind, sums: dict[str, Sum]) -> None:
     rows = [{"name": name, "kind": kind, "bytes": size, "sha256": sha256} for name, (size, sha256) in sums.items()]
     lines = b"".join(b"\n" + json.dumps(row).encode() + b"\n" for row in rows)  # after half a line, a line of its own
     with file:
-        file.write((HEAD if is_new else b"") + lines)
+        file.write((FIRST_LINE if is_new else b"") + lines)

@@ -6,15 +6,15 @@ import difflib
 import re
 from collections.abc import Sequence
 
-DIGITS = 20  # more than any number in a file's name has: nanoseconds since 1970 have 19
+MAX_DIGITS = 20  # more than any number in a file's name has: nanoseconds since 1970 have 19
 
 
 def natural(name: str) -> tuple[str, str]:
-    """What to sort names by so that numbers in them count as numbers: 1, 2, 10.
+    """Sort key by which numbers in names are ordered by value: 1, 2, 10.
 
     Names whose numbers have the same number of digits keep the order that `sorted` gives them.
     """
-    return re.sub("[0-9]+", lambda number: number[0].zfill(DIGITS), name), name
+    return re.sub("[0-9]+", lambda number: number[0].zfill(MAX_DIGITS), name), name
 
 
 def counted(number: int, noun: str) -> str:

@@ -1,4 +1,4 @@
-"""What is still being written: names that nobody else has, in the folder where it will lie, and what a kill left of it.
+"""Partial files: unique names in the destination folder, and removal of leftovers of killed processes.
 
 A process holds a lock on whatever it is writing, and the system drops the lock when the process ends, even killed. So
 what has such a name and no lock is a leftover of ours, and goes when somebody writes into the folder again. Where the
@@ -15,7 +15,7 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 
-FORM = re.compile(r"\.lumigraph-[0-9a-f]{16}\.partial")
+PARTIAL_NAME = re.compile(r"\.lumigraph-[0-9a-f]{16}\.partial")
 
 _swept: set[tuple[int, Path]] = set()  # processes and folders
 
@@ -43,7 +43,7 @@ def sweep(folder: Path) -> None:
     if (os.getpid(), folder.absolute()) in _swept:
         return
     _swept.add((os.getpid(), folder.absolute()))
-    for name in filter(FORM.fullmatch, os.listdir(folder)):
+    for name in filter(PARTIAL_NAME.fullmatch, os.listdir(folder)):
         lock = locked(folder / name)
         if lock is not None:
             remove(folder / name)

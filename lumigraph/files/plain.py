@@ -55,7 +55,7 @@ def understood(path: Path) -> Iterator[None]:
 
 
 def alike(a: Any, b: Any, tolerance: float = 1e-4) -> bool:
-    """Whether two JSON values agree, numbers up to a tolerance."""
+    """True if two JSON values agree, numbers up to a tolerance."""
     match a, b:
         case dict(), dict():
             return a.keys() == b.keys() and all(alike(a[k], b[k], tolerance) for k in a)

@@ -116,7 +116,7 @@ def value_of(value: Any, name: str) -> Any:
 
 
 def holds(value: Any, name: str) -> bool:
-    """Whether a dataclass, or one that it holds, has a field of a name."""
+    """True if a dataclass, or a nested one, has a field of this name."""
     found = fields(value)
     inner = (getattr(value, field.name) for field in found)
     return name in {field.name for field in found} or any(is_dataclass(x) and holds(x, name) for x in inner)

@@ -12,9 +12,9 @@ from torch import Tensor
 from ..camera.crop import Crop
 from .cloud import Gaussians
 
-NEIGHBOURS = 16  # whose distances say how isolated a Gaussian is
-SOLID = 0.1  # opacity from which on a Gaussian tells how large the cloud is
-MIDDLE = 0.9  # of the solid ones are within the extent, along each axis
+ISOLATION_NEIGHBOURS = 16  # nearest Gaussians whose mean distance measures isolation
+EXTENT_OPACITY = 0.1  # opacity from which on a Gaussian counts for the extent of the cloud
+EXTENT_SHARE = 0.9  # of these Gaussians are within the extent, along each axis
 
 # What most captures gain from and few lose by; the command line's `--clean`.
 MIN_OPACITY, MAX_SCALE, ISOLATION = 0.02, 1.0, 3.0
@@ -64,7 +64,7 @@ def unwanted(
     largest = math.inf if max_scale is None or not keep.any() else max_scale * extent(gaussians[keep])
     drop("too large", gaussians.log_scales.exp().amax(-1) > largest)
     alone = ~keep
-    if isolation is not None and int(keep.sum()) > NEIGHBOURS:
+    if isolation is not None and int(keep.sum()) > ISOLATION_NEIGHBOURS:
         logs = gaps(gaussians[keep]).log()
         alone[keep] = logs > logs.mean() + isolation * logs.std()
     drop("isolated", alone)
@@ -73,9 +73,9 @@ def unwanted(
 
 def extent(gaussians: Gaussians) -> float:
     """The longest side of the upright box that holds the middle of the solid Gaussians' centres along each axis."""
-    solid = gaussians.means[gaussians.opacities.sigmoid() > SOLID]
+    solid = gaussians.means[gaussians.opacities.sigmoid() > EXTENT_OPACITY]
     some = (solid if len(solid) else gaussians.means)[:: max(1, len(gaussians) // 100_000)]
-    low, high = torch.quantile(some, some.new_tensor([0.5 - MIDDLE / 2, 0.5 + MIDDLE / 2]), dim=0)
+    low, high = torch.quantile(some, some.new_tensor([0.5 - EXTENT_SHARE / 2, 0.5 + EXTENT_SHARE / 2]), dim=0)
     return float((high - low).max())
 
 
@@ -87,7 +87,7 @@ def gaps(gaussians: Gaussians) -> Float[Tensor, " gaussian"]:
     """
     means = gaussians.means.detach().cpu().numpy()
     sizes = gaussians.log_scales.mean(-1).exp().cpu()
-    count = min(NEIGHBOURS + 1, len(gaussians))
+    count = min(ISOLATION_NEIGHBOURS + 1, len(gaussians))
     distances, neighbours = cKDTree(means).query(means, count, workers=-1)
     away = torch.from_numpy(distances[:, 1:]).to(sizes)
     both = sizes[:, None] + sizes[torch.from_numpy(neighbours[:, 1:])]

@@ -18,10 +18,10 @@ from ..geometry import to_matrix, to_quaternion
 from ..kernels.spherical_harmonics import K00
 from .cloud import Gaussians
 
-NEIGHBOURS = 8  # that each Gaussian may merge with
-OPAQUE = 0.999  # opacity at most
+MERGE_NEIGHBOURS = 8  # merge candidates per Gaussian
+MAX_OPACITY = 0.999  # opacity at most
 PLANES = (1, 2), (0, 2), (0, 1)  # across each of three axes
-TINY = 1e-30
+EPSILON = 1e-30
 
 
 @torch.no_grad()
@@ -61,8 +61,8 @@ class _Ellipsoids:
         """In single precision, with what else is known of a cloud."""
         squares, axes = torch.linalg.eigh(self.covariances)
         axes = axes * torch.linalg.det(axes).sign()[:, None, None]  # turned, not mirrored
-        scales = squares.clamp_min(TINY).sqrt().log()
-        opacities = self.opacities.clamp(1e-6, OPAQUE).logit()
+        scales = squares.clamp_min(EPSILON).sqrt().log()
+        opacities = self.opacities.clamp(1e-6, MAX_OPACITY).logit()
         parts = self.means, to_quaternion(axes), scales, opacities, self.harmonics
         means, quaternions, scales, opacities, harmonics = (x.to(like.means.dtype) for x in parts)
         return Gaussians(means, quaternions, scales, opacities, harmonics, like.antialiased)
@@ -78,7 +78,7 @@ class _Ellipsoids:
         """The light that each stops, up to a factor: its opacity times the area it shows from all sides."""
         c = self.covariances
         trace = c.diagonal(dim1=-2, dim2=-1).sum(-1)
-        return self.opacities * (0.5 * (trace.square() - c.square().sum((-1, -2)))).clamp_min(TINY).sqrt()
+        return self.opacities * (0.5 * (trace.square() - c.square().sum((-1, -2)))).clamp_min(EPSILON).sqrt()
 
     def merged(self, other: _Ellipsoids) -> _Ellipsoids:
         """Pairs as one each, with the weighted mean, covariance and harmonics of both.
@@ -87,7 +87,7 @@ class _Ellipsoids:
         than all, the Gaussian grows instead.
         """
         a, b = self.weights, other.weights
-        share = (a / (a + b).clamp_min(TINY))[:, None]
+        share = (a / (a + b).clamp_min(EPSILON))[:, None]
         apart = self.means - other.means
         means = other.means + share * apart
         share = share[..., None]
@@ -99,8 +99,8 @@ class _Ellipsoids:
         stopped = 2 * math.pi * (self.opacities * mine.size + other.opacities * others.size)
         stopped = stopped - self.opacities * other.opacities * mine.overlap(others, _across(apart, plane))
         opacities = stopped / (2 * math.pi * both.size)
-        grown = covariances * (opacities / OPAQUE).clamp_min(1)[:, None, None]
-        return _Ellipsoids(means, grown, opacities.clamp_max(OPAQUE), harmonics)
+        grown = covariances * (opacities / MAX_OPACITY).clamp_min(1)[:, None, None]
+        return _Ellipsoids(means, grown, opacities.clamp_max(MAX_OPACITY), harmonics)
 
     @property
     def colours(self) -> Float[Tensor, "gaussian 4"]:
@@ -151,7 +151,7 @@ def _cost(one: _Ellipsoids, other: _Ellipsoids, merged: _Ellipsoids) -> Float[Te
 def _neighbours(means: Float[Tensor, "gaussian 3"]) -> tuple[Int[Tensor, " pair"], Int[Tensor, " pair"]]:
     """Each pair of which one is among the nearest to the other, once."""
     count = len(means)
-    nearest = cKDTree(means.numpy()).query(means.numpy(), min(NEIGHBOURS + 1, count))[1]
+    nearest = cKDTree(means.numpy()).query(means.numpy(), min(MERGE_NEIGHBOURS + 1, count))[1]
     here, there = torch.arange(count)[:, None].expand(nearest.shape), torch.from_numpy(nearest)
     pairs = torch.unique(torch.minimum(here, there) * count + torch.maximum(here, there))
     one, other = pairs // count, pairs % count
@@ -177,4 +177,4 @@ def _across(vectors: Float[Tensor, "gaussian 3"], plane: Float[Tensor, "gaussian
 
 
 def _determinant(matrices: Float[Tensor, "gaussian 2 2"]) -> Float[Tensor, " gaussian"]:
-    return (matrices[:, 0, 0] * matrices[:, 1, 1] - matrices[:, 0, 1] * matrices[:, 1, 0]).clamp_min(TINY**2)
+    return (matrices[:, 0, 0] * matrices[:, 1, 1] - matrices[:, 0, 1] * matrices[:, 1, 0]).clamp_min(EPSILON**2)

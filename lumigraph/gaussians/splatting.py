@@ -16,10 +16,10 @@ from ..color.blending import over
 from ..errors import LumigraphError
 from .cloud import Gaussians
 
-BLUR = 0.3  # square pixels by which every footprint is widened (Kerbl 2023; the original release)
-NEAR = 0.01  # scene units in front of a camera within which nothing is seen, where nobody knows better
-MARGIN = 0.15  # of the picture's width and height beyond its edges: how far out the lens is still followed
-EDGE_SAMPLES = 9  # pixels along each edge that tell what a lens sees
+FOOTPRINT_BLUR = 0.3  # square pixels added to the covariance of every footprint (Kerbl 2023; the original release)
+DEFAULT_NEAR = 0.01  # scene units in front of a camera; Gaussians before it are not rendered
+IMAGE_MARGIN = 0.15  # of the picture's width and height beyond its edges, within which the lens is linearised
+EDGE_SAMPLES = 9  # pixels along each edge that measure a lens's field of view
 
 
 @dataclass(frozen=True)
@@ -39,7 +39,9 @@ class Splatted:
     opacities: Float[Tensor, " gaussian"]
 
 
-def splat(cloud: Gaussians, view: kernels.View, bands: int = 4, stop: float = 1e-4, blur: float = BLUR) -> Splatted:
+def splat(
+    cloud: Gaussians, view: kernels.View, bands: int = 4, stop: float = 1e-4, blur: float = FOOTPRINT_BLUR
+) -> Splatted:
     """Project, tile, rasterise; differentiable in the cloud.
 
     bands: of the harmonics in use, at most as many as there are
@@ -66,9 +68,9 @@ def render(
     cloud: Gaussians,
     camera: Camera,
     background: tuple[float, float, float],
-    near: float = NEAR,
+    near: float = DEFAULT_NEAR,
     bands: int = 4,
-    blur: float = BLUR,
+    blur: float = FOOTPRINT_BLUR,
 ) -> Rendering:
     """Render a cloud for one camera over a background colour."""
     seen = splat(cloud, view_of(camera, near).to(cloud.means.device), bands, blur=blur)
@@ -80,7 +82,7 @@ def render(
     return Rendering(rgb, depth, seen.opacity)
 
 
-def view_of(camera: Camera, near: float = NEAR) -> kernels.View:
+def view_of(camera: Camera, near: float = DEFAULT_NEAR) -> kernels.View:
     """One camera as the kernels want it. Raises LumigraphError for lenses without a flat picture."""
     lens = camera.lens[0] if isinstance(camera.lens, Mixed) else camera.lens
     if not isinstance(lens, Pinhole | OpenCV):
@@ -105,5 +107,5 @@ def _limits(lens: Pinhole | OpenCV, width: int, height: int) -> Float[Tensor, " 
     directions = lens.unproject(torch.cat(edges))
     plane = directions[:, :2] / directions[:, 2:]
     low, high = plane.amin(0), plane.amax(0)
-    margin = MARGIN * (high - low)
+    margin = IMAGE_MARGIN * (high - low)
     return torch.stack([low - margin, high + margin], -1).flatten()

@@ -1,6 +1,6 @@
 """Vectors, rotations, similarities, and choosing some of many evenly."""
 
-from .transforms import RIGID as RIGID
+from .transforms import RIGID_TOLERANCE as RIGID_TOLERANCE
 from .transforms import Rows as Rows
 from .transforms import Similarity as Similarity
 from .transforms import Vector as Vector

@@ -13,9 +13,9 @@ from torch import Tensor
 
 Vector = tuple[float, float, float]
 Rows = tuple[tuple[float, float, float, float], ...]  # of a 4x4 matrix, as plain numbers
-ROUNDING = 1e-3  # by which a matrix may fail to be a similarity
-LOOSE = 0.02  # how much the other point counts for `nearest_to_lines`, beside one line
-RIGID = 0.01  # how far the axes of a pose may be from unit length and right angles
+SIMILARITY_TOLERANCE = 1e-3  # by which a matrix may fail to be a similarity
+ANCHOR_WEIGHT = 0.02  # weight of the other point in `nearest_to_lines`, relative to one line
+RIGID_TOLERANCE = 0.01  # deviation of a pose's axes from unit length and right angles
 
 
 def unit(vectors: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
@@ -41,7 +41,7 @@ def nearest_to_lines(
     directions: unit length
     """
     across = torch.eye(3).to(directions) - directions[:, :, None] * directions[:, None, :]
-    loose = LOOSE * torch.eye(3).to(directions)
+    loose = ANCHOR_WEIGHT * torch.eye(3).to(directions)
     target = (across @ origins[:, :, None])[:, :, 0].mean(0) + loose @ otherwise
     return torch.linalg.solve(across.mean(0) + loose, target)
 
@@ -187,11 +187,11 @@ def _nearer_difference(
 
 
 def is_similarity(matrix: Tensor) -> bool:
-    """Whether a tensor is a 4 x 4 matrix that moves, turns and scales, up to rounding, and does not mirror."""
+    """True for a 4 x 4 similarity matrix (translation, rotation, scale; no reflection), up to rounding."""
     if matrix.shape != (4, 4) or not matrix.isfinite().all() or matrix[3].tolist() != [0.0, 0.0, 0.0, 1.0]:
         return False
     linear, one = matrix[:3, :3], torch.eye(3, dtype=torch.float64)
     size = float(torch.linalg.det(linear))
     if size <= 0:
         return False
-    return bool((linear @ linear.T / size ** (2 / 3) - one).abs().max() <= ROUNDING)
+    return bool((linear @ linear.T / size ** (2 / 3) - one).abs().max() <= SIMILARITY_TOLERANCE)

@@ -20,10 +20,10 @@ from .block_cache import Nearby
 from .exposure_alignment import Asked, exposed
 from .visibility import saw
 
-TRIED, CHOSEN = 8, 6  # cameras between two blocks that are looked through, and those whose pictures are compared
-WIDTH = 48  # pixels along the longer side of these pictures
-SIDE = 4  # pixels of a patch
-WELL = 0.5  # of the best seen patch's visibility, from which on patches are compared
+MAX_CAMERAS, COMPARED_CAMERAS = 8, 6  # candidate cameras between two blocks, and those whose pictures are compared
+PICTURE_SIDE = 48  # pixels along the longer side of these pictures
+PATCH_SIDE = 4  # pixels
+MIN_RELATIVE_VISIBILITY = 0.5  # of the best seen patch's visibility, from which on patches are compared
 
 
 def align_appearance(
@@ -77,7 +77,7 @@ def align_appearance(
             continue
         alike = [x for k in neighbours if (x := patch(lit(k), own, centres[[k, i]], radii[[k, i]], cameras))]
         if alike:
-            seen = Patches(joined(alike), SIDE * SIDE)
+            seen = Patches(joined(alike), PATCH_SIDE * PATCH_SIDE)
             found[i] = Appearance(appearance_of(replace(own, method=own.method.given(seen))))
     return [appearance_of(lit(i)) for i in range(len(parts))]
 
@@ -95,7 +95,7 @@ def patch(
     """Rays in the frame of one block, with the colours that another shows along them: those of some cameras between the
     two, of pixels that both saw well (section 4.3.3). None where there are no cameras."""
     views = [looked(known, other, camera) for camera in between(centres, radii, cameras)]
-    views = sorted(views, key=lambda view: float(view.visibility.mean()), reverse=True)[:CHOSEN]
+    views = sorted(views, key=lambda view: float(view.visibility.mean()), reverse=True)[:COMPARED_CAMERAS]
     return joined([view.well_seen() for view in views]) if views else None
 
 
@@ -109,20 +109,25 @@ class View:
 
     def well_seen(self) -> Batch:
         """Patches of SIDE by SIDE pixels that both saw well, one after the other, as rays of the other block."""
-        height, width = (n // SIDE * SIDE for n in self.visibility.shape)
+        height, width = (n // PATCH_SIDE * PATCH_SIDE for n in self.visibility.shape)
         pixel = torch.arange(self.visibility.numel(), device=self.visibility.device).view_as(self.visibility)[
             :height, :width
         ]
-        patches = pixel[:height, :width].unfold(0, SIDE, SIDE).unfold(1, SIDE, SIDE).reshape(-1, SIDE * SIDE)
+        patches = (
+            pixel[:height, :width]
+            .unfold(0, PATCH_SIDE, PATCH_SIDE)
+            .unfold(1, PATCH_SIDE, PATCH_SIDE)
+            .reshape(-1, PATCH_SIDE * PATCH_SIDE)
+        )
         visibility = self.visibility.flatten()[patches].mean(-1)
-        chosen = patches[visibility >= WELL * visibility.max()].flatten()
+        chosen = patches[visibility >= MIN_RELATIVE_VISIBILITY * visibility.max()].flatten()
         rays = self.camera.rays(self.camera.pixels()[chosen])
         return Batch(rays, self.rgb.flatten(0, 1)[chosen].clamp(0, 1))
 
 
 def looked(known: Placed, other: Placed, camera: Camera) -> View:
     """One block looked at through a small picture, and by how much the less seeing of both saw each pixel."""
-    small = camera.resized(min(1.0, WIDTH / int(camera.size.max())))
+    small = camera.resized(min(1.0, PICTURE_SIDE / int(camera.size.max())))
     seen, theirs = known.rendering(small), other.rendering(small)
     both = torch.minimum(saw(known, small, seen), saw(other, small, theirs))
     background = torch.tensor(other.method.frame.background, device=seen.rgb.device)
@@ -132,8 +137,8 @@ def looked(known: Placed, other: Placed, camera: Camera) -> View:
 def between(centres: Float[Tensor, "2 3"], radii: Float[Tensor, 2], cameras: Camera) -> list[Camera]:
     """Some of the cameras that are about as near to one block as to the other, by their radii, the nearest of them."""
     farther = ((cameras.position[:, None] - centres) / radii[:, None]).norm(dim=-1).amax(-1)
-    near = farther.argsort()[: 3 * TRIED]
-    return [cameras[int(i)] for i in evenly(near.tolist(), TRIED)]
+    near = farther.argsort()[: 3 * MAX_CAMERAS]
+    return [cameras[int(i)] for i in evenly(near.tolist(), MAX_CAMERAS)]
 
 
 def joined(batches: Sequence[Batch]) -> Batch:

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 
 from ..composition import Placed
 
-AT_HAND = 8  # parts that stay open; a picture asks for three
+MAX_OPEN_BLOCKS = 8  # parts that stay open; a picture needs three
 
 
 class Nearby:
@@ -19,7 +19,7 @@ class Nearby:
     most:  that stay open at a time
     """
 
-    def __init__(self, open: Callable[[int], Placed], count: int, most: int = AT_HAND):
+    def __init__(self, open: Callable[[int], Placed], count: int, most: int = MAX_OPEN_BLOCKS):
         self._open, self._count, self._most = open, count, most
         self._there: OrderedDict[int, Placed] = OrderedDict()
         self._lock = threading.RLock()

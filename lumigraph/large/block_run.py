@@ -36,10 +36,12 @@ from ..run.settings import Settings, Source
 from .block_cache import Nearby
 from .compositing import InBlocks
 from .merging import merged
-from .plan import FOLDER, NAME, Block, Plan
+from .plan import BLOCKS_FOLDER, PLAN_FILE, Block, Plan
 
-LARGEST_REACH = 64.0
-NONE = "it has no block that has learnt anything yet; `lumigraph train` with the same options goes on with it"
+MAX_REACH = 64.0
+NO_BLOCK_MESSAGE = (
+    "it has no block that has learnt anything yet; `lumigraph train` with the same options goes on with it"
+)
 
 
 class BlockRun(Trained):
@@ -52,11 +54,11 @@ class BlockRun(Trained):
 
     def __init__(self, folder: Path | str):
         self.path = self.folder = Path(folder)
-        self.plan = Plan.read(self.folder / NAME)
+        self.plan = Plan.read(self.folder / PLAN_FILE)
         self.runs = {block.name: run for block in self.plan.blocks if (run := state_of(self.folder, block)) is not None}
         self.blocks = [block for block in self.plan.blocks if block.name in self.runs]
         if not self.blocks:
-            raise LumigraphError(f"{self.folder} cannot be shown: {NONE}")
+            raise LumigraphError(f"{self.folder} cannot be shown: {NO_BLOCK_MESSAGE}")
         if missing := [block.name for block in self.plan.blocks if block.name not in self.runs]:
             warnings.warn(
                 f"{self.folder} is shown without {len(missing)} of its blocks, which have learnt nothing yet: "
@@ -106,7 +108,7 @@ class BlockRun(Trained):
         return replace(
             own,
             bounds=(tuple(low.tolist()), tuple(high.tolist())),
-            reach=min(2.0 ** max(1, math.ceil(math.log2(farthest))), LARGEST_REACH),
+            reach=min(2.0 ** max(1, math.ceil(math.log2(farthest))), MAX_REACH),
             near=min(frame.near * scale for frame, scale in zip(frames, rescaled, strict=True)),
             background=frames[0].background,
             has_alpha=any(frame.has_alpha for frame in frames),
@@ -253,7 +255,7 @@ class BlockRun(Trained):
 
 def state_of(folder: Path, block: Block) -> Run | None:
     """The run of a block, if it has a state."""
-    place = folder / FOLDER / block.name
+    place = folder / BLOCKS_FOLDER / block.name
     if not files.is_file(place / "config.json"):
         return None
     run = Run(place)

@@ -24,11 +24,11 @@ from ..method import Method
 from ..method.controls import Control, Value
 from .block_cache import Nearby
 from .exposure_alignment import EXPOSURE, Asked, exposed
-from .visibility import GLANCE, saw
-from .weights import UNSEEN, Mixing, inverse_distance, seeing, shares
+from .visibility import PREVIEW_SIDE, saw
+from .weights import UNSEEN_WEIGHT, Mixing, inverse_distance, seeing, shares
 
-LITTLE = 1e-3  # share of a picture below which a block is not rendered: a quarter of a step of 8 bits
-ENTERED = 0.02  # share of a picture from which on a block counts fully where pixels are mixed one by one
+MIN_WEIGHT = 1e-3  # share of a picture below which a block is not rendered: a quarter of a step of 8 bits
+FULL_WEIGHT = 0.02  # share of a picture from which on a block counts fully where pixels are mixed one by one
 
 
 class InBlocks(Method):
@@ -81,7 +81,7 @@ class InBlocks(Method):
     def render(self, camera: Camera) -> Rendering:
         camera = camera.to(self.device)
         weights = self.weights(camera)
-        chosen = (weights >= LITTLE).nonzero()[:, 0]
+        chosen = (weights >= MIN_WEIGHT).nonzero()[:, 0]
         seen = [self.blocks[i].rendering(camera) for i in chosen.tolist()]
         if self.config.by in ("points", "visibility"):
             return mixed(seen, self._by_pixel(camera, chosen, weights[chosen], seen), self.frame)
@@ -96,7 +96,7 @@ class InBlocks(Method):
         weights = inverse_distance(distance, self.radii, c.power, c.most)
         chosen = (weights > 0).nonzero()[:, 0]
         if len(chosen) > 1:
-            small = camera.resized(min(1.0, GLANCE / int(camera.size.max())))
+            small = camera.resized(min(1.0, PREVIEW_SIDE / int(camera.size.max())))
             sights = [saw(self.blocks[i], small, self.blocks[i].rendering(small)).mean() for i in chosen.tolist()]
             weights[chosen] *= seeing(torch.stack(sights), c.threshold)
         if c.by == "nearest":
@@ -108,17 +108,17 @@ class InBlocks(Method):
     ) -> Float[Tensor, "height width chosen"]:
         """Shares of each pixel: by how far from a block's centre lies what it shows there, or by how much of it the
         block saw; a block that has hardly a say in the picture has no more in its pixels."""
-        c, entered = self.config, (weights / ENTERED).clamp(max=1)
+        c, entered = self.config, (weights / FULL_WEIGHT).clamp(max=1)
         if c.by == "visibility":
             found = [saw(self.blocks[i], camera, x) for i, x in zip(chosen.tolist(), seen, strict=True)]
-            return shares(torch.stack(found, -1).clamp_min(UNSEEN) * entered)
+            return shares(torch.stack(found, -1).clamp_min(UNSEEN_WEIGHT) * entered)
         rays = camera.rays(camera.pixels())
         far = 2 * self.frame.reach
         distances = [
             (rays.at(x.depth.reshape(-1).clamp(max=far)) - self.centres[i]).norm(dim=-1).view(x.depth.shape)
             for i, x in zip(chosen.tolist(), seen, strict=True)
         ]
-        distance = torch.stack(distances, -1).clamp_min(UNSEEN)
+        distance = torch.stack(distances, -1).clamp_min(UNSEEN_WEIGHT)
         return shares((distance / distance.amin(-1, keepdim=True)) ** -c.power * entered)
 
     # What is known of places
@@ -128,8 +128,8 @@ class InBlocks(Method):
         Raises LumigraphError where a block knows none."""
         weights = self._at(points)
         density = torch.zeros_like(points[:, 0])
-        for i in (weights > LITTLE).any(0).nonzero()[:, 0].tolist():
-            here = (weights[:, i] > LITTLE).nonzero()[:, 0]
+        for i in (weights > MIN_WEIGHT).any(0).nonzero()[:, 0].tolist():
+            here = (weights[:, i] > MIN_WEIGHT).nonzero()[:, 0]
             density = density.index_add(0, here, weights[here, i] * self.blocks[i].density(points[here]))
         return density
 

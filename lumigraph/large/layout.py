@@ -23,14 +23,17 @@ from ..files.ranges import Point, Positive, typed
 from .crossings import find_crossings
 from .plan import Block
 
-LARGE = 200  # photographs from which on a capture is divided where nobody says
-PER_BLOCK = 64  # photographs in a cell, about
-FEWEST = 16  # in a cell at a crossing, on average; with fewer, crossings are not what to go by
-OVERLAP = 4 / 3  # a block's radius, of how far its cell reaches
-NEAR, TOWARDS = 1.25, 0.7  # radii within which a photograph counts that looks so straight at the block: a cosine
-STRETCHED = 2.0  # times the usual reach of a cell, from which on it becomes two
-MOST = 100_000  # blocks
-ROUNDS = 50  # of k-means
+MIN_LARGE_VIEWS = 200  # photographs from which on a capture is divided by default
+VIEWS_PER_BLOCK = 64  # approximate
+MIN_CROSSING_VIEWS = 16  # mean number of photographs in a cell at a crossing; with fewer, crossings are not used
+OVERLAP_FACTOR = 4 / 3  # radius of a block relative to the radius of its cell
+NEAR_RADII, FACING_COSINE = (
+    1.25,
+    0.7,
+)  # radii within which a photograph that faces the block counts; minimum cosine of its direction
+SPLIT_FACTOR = 2.0  # times the usual radius of a cell, from which on it is split
+MAX_BLOCKS = 100_000  # blocks
+KMEANS_ROUNDS = 50  # of k-means
 
 
 @dataclass(frozen=True)
@@ -115,20 +118,20 @@ def discs(places: Places, number: int | None) -> list[Disc]:
     for i, (x, y) in enumerate(centres):
         height = float(heights[owner == i].mean()) if (owner == i).any() else float(heights.mean())
         a, b, c = (np.array([x, y, height]) @ places.upright).tolist()
-        made.append(Disc((a, b, c), max(OVERLAP * float(reach[i]), least)))
+        made.append(Disc((a, b, c), max(OVERLAP_FACTOR * float(reach[i]), least)))
     return made
 
 
 def centres_for(ground: Float[np.ndarray, "photograph 2"]) -> Float[np.ndarray, "block 2"]:
     """Crossings, and more where streets go far beyond them; k-means where there are no such streets."""
     centres = find_crossings(ground)
-    if len(centres) < 2 or len(ground) < FEWEST * len(centres):
-        return spread(ground, max(1, round(len(ground) / PER_BLOCK)))
+    if len(centres) < 2 or len(ground) < MIN_CROSSING_VIEWS * len(centres):
+        return spread(ground, max(1, round(len(ground) / VIEWS_PER_BLOCK)))
     while True:
         owner = cells(ground, centres)
         reach = np.array([farthest(ground[owner == i], centre) for i, centre in enumerate(centres)])
         worst = int(reach.argmax())
-        if reach[worst] <= STRETCHED * np.median(reach) or len(ground) < FEWEST * (len(centres) + 1):
+        if reach[worst] <= SPLIT_FACTOR * np.median(reach) or len(ground) < MIN_CROSSING_VIEWS * (len(centres) + 1):
             return centres
         own = ground[owner == worst]
         away = np.linalg.norm(own - centres[worst], axis=-1)
@@ -140,7 +143,7 @@ def centres_for(ground: Float[np.ndarray, "photograph 2"]) -> Float[np.ndarray, 
 def spread(ground: Float[np.ndarray, "photograph 2"], number: int) -> Float[np.ndarray, "block 2"]:
     """So many centres by k-means, from places as far apart as can be; by y, then by x. Nothing is random."""
     there = np.unique(ground.round(9), axis=0)
-    if number > min(len(there), MOST):
+    if number > min(len(there), MAX_BLOCKS):
         raise LumigraphError(
             f"{number} blocks are too many for photographs from {len(there)} places; give --blocks a smaller number"
         )
@@ -150,7 +153,7 @@ def spread(ground: Float[np.ndarray, "photograph 2"], number: int) -> Float[np.n
         first.append(int(nearest.argmax()))
         nearest = np.minimum(nearest, np.linalg.norm(there - there[first[-1]], axis=-1))
     centres = there[first]
-    for _ in range(ROUNDS):
+    for _ in range(KMEANS_ROUNDS):
         owner = cells(ground, centres)
         count = np.bincount(owner, minlength=number)
         sums = np.stack([np.bincount(owner, ground[:, k], number) for k in range(2)], -1)
@@ -172,8 +175,8 @@ def members(places: Places, disc: Disc) -> Bool[np.ndarray, " photograph"]:
     """Mask of the photographs of a block: those taken within its radius, and those from near by that look at it."""
     way = np.array(disc.centre) - places.positions
     flat = np.linalg.norm((way @ places.upright.T)[:, :2], axis=-1)
-    towards = (way * places.forwards).sum(-1) > TOWARDS * np.linalg.norm(way, axis=-1)
-    return (flat <= disc.radius) | (towards & (flat <= NEAR * disc.radius))
+    towards = (way * places.forwards).sum(-1) > FACING_COSINE * np.linalg.norm(way, axis=-1)
+    return (flat <= disc.radius) | (towards & (flat <= NEAR_RADII * disc.radius))
 
 
 def ground_of(places: Places, found: Sequence[Disc]) -> Float[np.ndarray, "block 2"]:

@@ -22,12 +22,16 @@ from ..budget import Budget
 from ..errors import LumigraphError
 from ..system.console import console, is_live
 from ..system.progress import clock, tell
-from .plan import DONE
+from .plan import DONE_FILE
 
-EVERY = 1.0  # seconds between looks
-TAIL = 4096  # bytes of a log's end that hold its last line
-FIRST, RARER, RAREST = 10.0, 1.5, 60.0  # seconds to the first line of a log, times as long to the next, at most
-PROGRESS = "progress.json"
+POLL_SECONDS = 1.0  # seconds between looks
+TAIL_BYTES = 4096  # at a log's end, which contain its last line
+FIRST_LINE_SECONDS, INTERVAL_GROWTH, MAX_INTERVAL = (
+    10.0,
+    1.5,
+    60.0,
+)  # until the first line of a log; growth of the interval; its upper limit in seconds
+PROGRESS_FILE = "progress.json"
 
 
 @dataclass(frozen=True)
@@ -44,7 +48,7 @@ def stand_of(folder: Path) -> Stand:
     """Progress of a block, read from its folder."""
     try:
         row = last_line(folder / "metrics.jsonl")
-        if (folder / DONE).exists():
+        if (folder / DONE_FILE).exists():
             return Stand("done", 1.0, float(row.get("seconds", 0.0)), row.get("psnr"))
         if not (folder / "config.json").exists():
             return Stand()
@@ -61,7 +65,7 @@ def last_line(path: Path) -> dict[str, Any]:
     """The last whole line of a run's metrics; nothing where there is none."""
     try:
         with open(path, "rb") as file:
-            file.seek(max(0, os.fstat(file.fileno()).st_size - TAIL))
+            file.seek(max(0, os.fstat(file.fileno()).st_size - TAIL_BYTES))
             lines = file.read().split(b"\n")[:-1]
     except OSError:
         return {}
@@ -109,7 +113,9 @@ class Watching:
 
     def note(self) -> None:
         """Leave what is known in the run's folder, for who looks from elsewhere."""
-        files.write_json(self.run / PROGRESS, {name: asdict(stand) for name, stand in self.stands.items()}, ours=True)
+        files.write_json(
+            self.run / PROGRESS_FILE, {name: asdict(stand) for name, stand in self.stands.items()}, ours=True
+        )
 
     @property
     def share(self) -> float:
@@ -127,14 +133,14 @@ class Watching:
         if self.show and is_live():
             self._draw()
             return
-        pause, due = FIRST, time.monotonic() + FIRST
-        while not self._over.wait(EVERY):
+        pause, due = FIRST_LINE_SECONDS, time.monotonic() + FIRST_LINE_SECONDS
+        while not self._over.wait(POLL_SECONDS):
             for name in self.look():
                 self._say(f"block {name} is done: {described(self.stands[name])}")
             if time.monotonic() >= due:
                 self._say(self.line())
                 self.note()
-                pause = min(RARER * pause, RAREST)
+                pause = min(INTERVAL_GROWTH * pause, MAX_INTERVAL)
                 due = time.monotonic() + pause
 
     def _say(self, line: str) -> None:
@@ -147,11 +153,11 @@ class Watching:
             rows = {name: bars.add_task(f"block {name}", total=1.0, told="waiting") for name in self.folders}
             noted = time.monotonic()
             while True:
-                over = self._over.wait(EVERY)
+                over = self._over.wait(POLL_SECONDS)
                 self.look()
                 for name, row in rows.items():
                     bars.update(row, completed=self.stands[name].share, told=described(self.stands[name]))
-                if time.monotonic() - noted > FIRST:
+                if time.monotonic() - noted > FIRST_LINE_SECONDS:
                     self.note()
                     noted = time.monotonic()
                 if over:

@@ -23,13 +23,13 @@ from .monitor import in_order
 from .plan import Done
 from .worker import Conducted, train_block, writable
 
-INSTALL = "Ray is not installed, which shares blocks out to workers: pip install 'lumigraph[ray]', or leave out"
-LOST = 30  # times that a block's worker may be lost before the block is given up
-ANSWER = 10.0  # seconds that an address has to answer
-LOOKS = 0.5  # seconds between looks at whether to stop
-ENDING = 90.0  # seconds for workers to end their step and save, once they are told to
-STORE = 100 << 20  # bytes of Ray's own store on this machine: results are small
-SETTINGS = {  # that Ray reads as it is loaded, unless the user's environment has them
+INSTALL_MESSAGE = "Ray is not installed, which shares blocks out to workers: pip install 'lumigraph[ray]', or leave out"
+MAX_LOSSES = 30  # of a block's worker, before the block is given up
+ADDRESS_TIMEOUT = 10.0  # seconds
+POLL_SECONDS = 0.5  # between checks for a stop
+END_SECONDS = 90.0  # for workers to finish their step and save after a stop
+STORE_BYTES = 100 << 20  # of Ray's object store on this machine: results are small
+RAY_ENVIRONMENT = {  # that Ray reads as it is loaded, unless the user's environment has them
     "RAY_USAGE_STATS_ENABLED": "0",  # nobody is told
     "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0",
     "RAY_worker_niceness": "0",  # else workers get next to nothing of a busy machine
@@ -57,14 +57,19 @@ def on_workers(run: Path, folders: dict[str, Path], workers: Workers) -> Conduct
     ray = library("--workers" if workers.address is None else "--address")
     with connected(ray, workers), Interrupt() as interrupt:
         feasible(ray.nodes(), workers)
-        asked = {"num_cpus": workers.cpus, "num_gpus": workers.gpus, "memory": workers.memory, "max_retries": LOST}
+        asked = {
+            "num_cpus": workers.cpus,
+            "num_gpus": workers.gpus,
+            "memory": workers.memory,
+            "max_retries": MAX_LOSSES,
+        }
         remote = ray.remote(**asked)(on_worker)
         waiting = {remote.remote(str(folders[name].resolve())): name for name in in_order(folders)}
         done: dict[str, Done] = {}
         failed: dict[str, str] = {}
         told_at = 0.0
         while waiting:
-            ready, _ = ray.wait(list(waiting), num_returns=1, timeout=LOOKS)
+            ready, _ = ray.wait(list(waiting), num_returns=1, timeout=POLL_SECONDS)
             for one in ready:
                 name = waiting.pop(one)
                 try:
@@ -82,7 +87,7 @@ def on_workers(run: Path, folders: dict[str, Path], workers: Workers) -> Conduct
                 told_at = time.monotonic()
                 for one in waiting:
                     ray.cancel(one, force=False)
-            if told_at and time.monotonic() > told_at + ENDING:
+            if told_at and time.monotonic() > told_at + END_SECONDS:
                 break
     return Conducted(done, failed, interrupt.signal)
 
@@ -108,7 +113,7 @@ def connected(ray: Any, workers: Workers) -> Iterator[None]:
     else:
         place = {
             "num_cpus": workers.cpus * (workers.count or 1),
-            "object_store_memory": STORE,
+            "object_store_memory": STORE_BYTES,
             "include_dashboard": False,
         }
     try:
@@ -138,12 +143,12 @@ def feasible(nodes: list[dict[str, Any]], workers: Workers) -> None:
 
 def library(option: str) -> Any:
     """Ray itself. Raises LumigraphError, saying how to install it, where it is not."""
-    for name, value in SETTINGS.items():
+    for name, value in RAY_ENVIRONMENT.items():
         os.environ.setdefault(name, value)
     try:
         import ray
     except ImportError as fault:
-        raise LumigraphError(f"{INSTALL} {option} to learn block after block in this process") from fault
+        raise LumigraphError(f"{INSTALL_MESSAGE} {option} to learn block after block in this process") from fault
     return ray
 
 
@@ -153,7 +158,7 @@ def answering(address: str) -> None:
     if not (host and port.isdigit()):
         raise LumigraphError(f"--address {address} is no HOST:PORT; `ray start --head` says which it is")
     try:
-        socket.create_connection((host, int(port)), ANSWER).close()
+        socket.create_connection((host, int(port)), ADDRESS_TIMEOUT).close()
     except (OSError, OverflowError) as fault:
         raise LumigraphError(
             f"Nothing answers at {address} ({first_line(fault)}); start a cluster there with `ray start --head "
@@ -165,7 +170,7 @@ def sentence(fault: BaseException) -> str:
     """Why a block was given up."""
     if "OutOfMemory" in type(fault).__name__:
         return "its worker ran out of memory again and again; give smaller blocks, or fewer --workers"
-    return f"its worker was lost {LOST} times or failed ({first_line(fault)})"
+    return f"its worker was lost {MAX_LOSSES} times or failed ({first_line(fault)})"
 
 
 def first_line(fault: BaseException) -> str:

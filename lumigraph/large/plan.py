@@ -25,9 +25,9 @@ from ..errors import LumigraphError
 from ..files.ranges import Point, Positive, between, typed
 from ..run.settings import Source
 
-FORMAT = "lumigraph blocks 1"
-NAME, FOLDER, TASK, DONE = "blocks.json", "blocks", "task.json", "done.json"
-LABEL = Annotated[str, msgspec.Meta(pattern=r"\A[0-9]{1,6}\Z")]  # of a block, and of its folder
+PLAN_FORMAT = "lumigraph blocks 1"
+PLAN_FILE, BLOCKS_FOLDER, TASK_FILE, DONE_FILE = "blocks.json", "blocks", "task.json", "done.json"
+BlockLabel = Annotated[str, msgspec.Meta(pattern=r"\A[0-9]{1,6}\Z")]  # of a block, and of its folder
 Turn = tuple[Point, Point, Point]  # rows of a rotation
 Number = Annotated[float, between(-1e6, 1e6)]
 
@@ -48,7 +48,7 @@ class Block:
     scene, budget: of a block that was learnt again from other photographs: where they are, and for how long
     """
 
-    name: LABEL
+    name: BlockLabel
     centre: Point
     radius: Positive
     photographs: list[str]
@@ -86,7 +86,7 @@ class Task:
     @staticmethod
     def read(folder: Path) -> Task:
         """The task in a block's folder. Raises LumigraphError, naming the file, where it is missing or damaged."""
-        return files.read_json(folder / TASK, Task)
+        return files.read_json(folder / TASK_FILE, Task)
 
 
 @dataclass(frozen=True)
@@ -131,7 +131,7 @@ class Plan:
     def read(path: Path) -> Plan:
         """The plan in a file. Raises LumigraphError, naming it, where it is none of ours or damaged."""
         said = files.read_json(path)
-        if not isinstance(said, dict) or said.get("format") != FORMAT:
+        if not isinstance(said, dict) or said.get("format") != PLAN_FORMAT:
             raise LumigraphError(f"{path} was not written by this version of Lumigraph; open it with the one that did")
         plan = typed(Plan, said, path)
         if not plan.blocks or len({block.name for block in plan.blocks}) < len(plan.blocks):
@@ -141,7 +141,9 @@ class Plan:
     def write(self, path: Path) -> None:
         said = {name: value for name, value in asdict(self).items() if name not in ("scene", "blocks")}
         blocks = [{name: x for name, x in asdict(block).items() if x is not None} for block in self.blocks]
-        files.write_json(path, {"format": FORMAT, **said, "scene": self.scene.to_json(), "blocks": blocks}, ours=True)
+        files.write_json(
+            path, {"format": PLAN_FORMAT, **said, "scene": self.scene.to_json(), "blocks": blocks}, ours=True
+        )
 
     def block(self, name: str) -> Block:
         """Raises LumigraphError, naming those there are, for a block that there is not."""

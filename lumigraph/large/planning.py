@@ -19,10 +19,10 @@ from ..run import check_new, processor
 from ..run.folder import versions
 from .drawing import draw_plan
 from .layout import lay_out
-from .plan import FOLDER, NAME, TASK, Block, Plan, Task, source_of
+from .plan import BLOCKS_FOLDER, PLAN_FILE, TASK_FILE, Block, Plan, Task, source_of
 
-BY_BLOCK = 60.0  # seconds, where nobody says
-PICTURE = "blocks.png"
+DEFAULT_SECONDS = 60.0  # per block
+PICTURE_FILE = "blocks.png"
 
 
 def survey(source: str, reader: str | None = None) -> Places:
@@ -53,7 +53,7 @@ class Recipe:
         if self.quality:
             return {"quality": self.quality}
         if self.budget is None:
-            return {"seconds": BY_BLOCK}
+            return {"seconds": DEFAULT_SECONDS}
         if self.budget.steps is not None:
             return {"steps": max(1, math.ceil(self.budget.steps / blocks))}
         return {"seconds": self.budget.total / blocks}
@@ -84,31 +84,31 @@ def begin(folder: Path, plan: Plan, places: Places | None = None, threads: int |
     threads: see `Task`
     Returns the plan as the folder has it. Raises LumigraphError where something else lies there, or another plan.
     """
-    if (folder / NAME).exists():
-        known = Plan.read(folder / NAME)
+    if (folder / PLAN_FILE).exists():
+        known = Plan.read(folder / PLAN_FILE)
         if (what := difference(known, plan)) is not None:
             raise LumigraphError(f"{folder} holds a run in blocks with another {what}; choose another --output")
         plan = known
     else:
         check_new(folder)
-        plan.write(folder / NAME)  # a folder with it is a run; what is missing of it is made anew
+        plan.write(folder / PLAN_FILE)  # a folder with it is a run; what is missing of it is made anew
     for block in plan.blocks:
         write_task(place_of(folder, block), replace(plan.task(block), threads=threads))
-    if places is not None and not (folder / PICTURE).exists():
-        save_picture(folder / PICTURE, draw_plan(places, plan.blocks), ours=True)
+    if places is not None and not (folder / PICTURE_FILE).exists():
+        save_picture(folder / PICTURE_FILE, draw_plan(places, plan.blocks), ours=True)
     return plan
 
 
 def write_task(folder: Path, task: Task) -> None:
     """Leave a task in a block's folder; one that is there already stays if it is the same."""
-    if (folder / TASK).exists() and (there := Task.read(folder)).key == task.key and there.threads == task.threads:
+    if (folder / TASK_FILE).exists() and (there := Task.read(folder)).key == task.key and there.threads == task.threads:
         return
-    files.write_json(folder / TASK, asdict(task))  # a run that begins there knows it for ours
+    files.write_json(folder / TASK_FILE, asdict(task))  # a run that begins there knows it for ours
 
 
 def place_of(run: Path, block: Block) -> Path:
     """Folder of a block in a run."""
-    return run / FOLDER / block.name
+    return run / BLOCKS_FOLDER / block.name
 
 
 def difference(known: Plan, wanted: Plan) -> str | None:

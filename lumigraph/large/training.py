@@ -17,11 +17,11 @@ from .block_cache import Nearby
 from .block_run import BlockRun
 from .monitor import Watching, in_order
 from .on_ray import Workers, on_workers
-from .plan import NAME, Done, Plan
+from .plan import PLAN_FILE, Done, Plan
 from .planning import place_of
 from .worker import Conducted, train_block
 
-CLOUD = "cloud.ply"
+CLOUD_FILE = "cloud.ply"
 
 
 def conduct(run: Path, plan: Plan, workers: Workers, show: bool = True) -> Conducted:
@@ -64,7 +64,7 @@ def finish(folder: Path, again: Sequence[str] = ()) -> Plan:
     if Appearance in first.takes:
         return aligned(opened, again)
     if can(first, HasGaussians):
-        write_gaussians(folder / CLOUD, opened.source_gaussians())
+        write_gaussians(folder / CLOUD_FILE, opened.source_gaussians())
     return opened.plan
 
 
@@ -80,5 +80,5 @@ def aligned(opened: BlockRun, again: Sequence[str]) -> Plan:
     codes = align_appearance(parts, opened.centres, opened.radii, opened.cameras()["train"], kept or None)
     found = {name: code.tolist() for name, code in zip(names, codes, strict=True)}
     plan = replace(opened.plan, appearance=found | known)
-    plan.write(opened.folder / NAME)
+    plan.write(opened.folder / PLAN_FILE)
     return plan

@@ -16,12 +16,12 @@ from ..errors import LumigraphError
 from ..files.locks import held
 from .layout import Disc, members
 from .monitor import Watching
-from .plan import NAME, TASK, Block, Plan, Task, source_of
+from .plan import PLAN_FILE, TASK_FILE, Block, Plan, Task, source_of
 from .planning import place_of, write_task
 from .training import finish
 from .worker import Ended, finished, train_block
 
-NEW = "updates"  # folder in the run where a block is learnt before it takes its place
+UPDATES_FOLDER = "updates"  # in the run: a block is trained there before it replaces the old one
 
 
 def update(
@@ -35,14 +35,14 @@ def update(
     The new block takes its place when it is done; what is lost before is gone on with. Files of other blocks stay.
     Raises LumigraphError for a block that there is not, and where no photograph is of it.
     """
-    if not files.is_file(run / NAME):
+    if not files.is_file(run / PLAN_FILE):
         raise LumigraphError(f"{run} holds no run in blocks; give --into one that `lumigraph train block-nerf` made")
     with held(run, "trained"):
-        plan = Plan.read(run / NAME)
+        plan = Plan.read(run / PLAN_FILE)
         block = again(plan.block(name), source, places, options, budget)
         task, place = plan.task(block), place_of(run, block)
-        if not ((place / TASK).exists() and Task.read(place).key == task.key and finished(place, task)):
-            folder = run / NEW / f"{name}-{task.key[:8]}"
+        if not ((place / TASK_FILE).exists() and Task.read(place).key == task.key and finished(place, task)):
+            folder = run / UPDATES_FOLDER / f"{name}-{task.key[:8]}"
             write_task(folder, task)
             with Watching(run, {name: folder}, show):
                 ended = train_block(folder)
@@ -51,7 +51,7 @@ def update(
             files.exchange(folder, place)
             shutil.rmtree(folder, ignore_errors=True)  # what was there before
         blocks = [block if one.name == name else one for one in plan.blocks]
-        replace(plan, blocks=blocks).write(run / NAME)
+        replace(plan, blocks=blocks).write(run / PLAN_FILE)
         finish(run, again=[name])
     return Ended(finished(place, task))
 

@@ -11,8 +11,8 @@ from ..camera.rays import Rendering
 from ..composition import Placed
 from ..method.capabilities import HasVisibility, can, needs
 
-GLANCE = 16  # pixels along the longer side of a picture that tells whether a block sees what a camera looks at
-STATIONS = (0.125, 0.375, 0.625, 0.875)  # of the way to what a pixel shows, where visibility is asked
+PREVIEW_SIDE = 16  # pixels along the longer side of the picture that estimates a block's visibility
+RAY_FRACTIONS = (0.125, 0.375, 0.625, 0.875)  # of the way to a pixel's surface, at which visibility is evaluated
 
 
 @torch.no_grad()
@@ -29,5 +29,5 @@ def saw(part: Placed, camera: Camera, seen: Rendering) -> Float[Tensor, "height 
     local, scale = part.camera(camera), part.place.scale
     rays = local.rays(local.pixels())
     depth = (seen.depth.reshape(-1) / scale).clamp(max=part.method.frame.reach)
-    found = [visibility(rays.at(share * depth), rays.directions) for share in STATIONS]
+    found = [visibility(rays.at(share * depth), rays.directions) for share in RAY_FRACTIONS]
     return torch.stack(found).mean(0).view(seen.depth.shape)

@@ -11,8 +11,8 @@ from torch import Tensor
 
 from ..files.ranges import Share, between
 
-NEAREST = 1e-6  # of a radius: distance that is divided by at least
-UNSEEN = 1e-12  # of its weight, that a block keeps which does not see: where none sees, they are mixed by distance
+MIN_DISTANCE = 1e-6  # of a radius, to avoid division by zero
+UNSEEN_WEIGHT = 1e-12  # factor on the weight of a block that does not see: if none sees, distance alone decides
 
 
 @dataclass(frozen=True)
@@ -44,7 +44,7 @@ def inverse_distance(
     if most < count:
         inside = torch.where(distance < radii, distance, torch.inf)
         reach = torch.minimum(reach, inside.kthvalue(most + 1, -1, keepdim=True).values)
-    inverse = 1 / torch.maximum(distance, NEAREST * radii) - 1 / reach
+    inverse = 1 / torch.maximum(distance, MIN_DISTANCE * radii) - 1 / reach
     largest = inverse.amax(-1, keepdim=True).clamp_min(1e-12)
     weights = (inverse / largest).clamp_min(0) ** power  # a common factor, so that no power overflows
     alone = torch.nn.functional.one_hot(distance.argmin(-1), count).to(weights)
@@ -54,7 +54,7 @@ def inverse_distance(
 def seeing(visibility: Float[Tensor, "*place block"], threshold: float) -> Float[Tensor, "*place block"]:
     """Weights of blocks by the mean visibility of what they show (section 4.3.1): 0 up to a threshold, 1 from twice
     that on, so that none leaves a film at once."""
-    return (visibility / max(threshold, UNSEEN) - 1).clamp(UNSEEN, 1)
+    return (visibility / max(threshold, UNSEEN_WEIGHT) - 1).clamp(UNSEEN_WEIGHT, 1)
 
 
 def shares(weights: Float[Tensor, "*place block"]) -> Float[Tensor, "*place block"]:

@@ -32,10 +32,10 @@ from ..files.ranges import typed
 from ..method import Method
 from ..run import Run, build
 from ..training import fit
-from .plan import DONE, Done, Task
+from .plan import DONE_FILE, Done, Task
 
-PATIENCE = 60.0  # seconds to wait for a process that was told to end, and still holds the folder
-SAVE_EVERY = 30.0  # seconds of training that a lost worker costs at most
+LOCK_TIMEOUT = 60.0  # seconds to wait for a stopped process that still holds the folder
+SAVE_SECONDS = 30.0  # of training, the most that a lost worker costs
 
 
 @dataclass(frozen=True)
@@ -56,7 +56,7 @@ class Conducted:
     signal: int | None = None
 
 
-def train_block(folder: Path, save_every: float = SAVE_EVERY) -> Ended:
+def train_block(folder: Path, save_every: float = SAVE_SECONDS) -> Ended:
     """Learn what a block's task.json says, as far as that is not done.
 
     Of a budget in steps the weights are the same to the bit, however often this was interrupted, on a CPU. Ctrl-C and
@@ -79,15 +79,15 @@ def train_block(folder: Path, save_every: float = SAVE_EVERY) -> Ended:
         state = run.state
         took = state.step, state.seconds, state.compile_seconds, opening, state.peak_memory
         done = Done(task.key, *took, len(data), run.model_bytes)
-        files.write_json(folder / DONE, asdict(done), ours=True)
+        files.write_json(folder / DONE_FILE, asdict(done), ours=True)
     return Ended(done)
 
 
 def finished(folder: Path, task: Task) -> Done | None:
     """Cost of a block that is done, None of any other. Raises LumigraphError for one that was another task's."""
-    if not (folder / DONE).exists():
+    if not (folder / DONE_FILE).exists():
         return None
-    done: Done = files.read_json(folder / DONE, Done)
+    done: Done = files.read_json(folder / DONE_FILE, Done)
     if done.key != task.key:
         raise LumigraphError(
             f"{folder} was trained for other settings than its task.json says; choose another --output"
@@ -126,7 +126,7 @@ def begun(folder: Path, task: Task, data: Scene) -> tuple[Run, Method]:
 @contextmanager
 def patiently_held(folder: Path) -> Iterator[None]:
     """Hold a block's folder; wait for a while for a process that is about to end. Raises LumigraphError as `held`."""
-    until = time.monotonic() + PATIENCE
+    until = time.monotonic() + LOCK_TIMEOUT
     while True:
         holding = held(folder, "trained")
         try:

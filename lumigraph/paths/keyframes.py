@@ -25,7 +25,7 @@ from ..datasets.scene import Frame
 from ..errors import LumigraphError
 from ..files import read_json, write_json
 from ..files.ranges import Coordinate, Row, Side, between, typed
-from ..geometry import RIGID, is_similarity, to_matrix, to_quaternion
+from ..geometry import RIGID_TOLERANCE, is_similarity, to_matrix, to_quaternion
 
 FORMAT = "lumigraph camera path 1"
 NARROWEST, WIDEST = 1.0, 170.0  # degrees that a flat picture can show
@@ -232,7 +232,7 @@ def check(key: Keyframe, name: str) -> None:
         raise LumigraphError(f"{name} has a pose of shape {tuple(pose.shape)}; a pose has 3 rows of 4 numbers")
     rotation = pose[:, :3]
     off = float((rotation @ rotation.T - torch.eye(3, dtype=torch.double)).abs().max())
-    if off > RIGID or float(torch.linalg.det(rotation)) < 0:
+    if off > RIGID_TOLERANCE or float(torch.linalg.det(rotation)) < 0:
         raise LumigraphError(
             f"{name} has a pose that is no rotation and a place; its first three columns must be unit length, "
             "at right angles and right-handed"

@@ -14,14 +14,14 @@ from ..datasets.scene import Scene
 from ..errors import LumigraphError
 from ..files import read_json
 from ..files.ranges import Coordinate, Row, Side
-from ..geometry import RIGID
+from ..geometry import RIGID_TOLERANCE
 
-MOST_PIXELS = 10**9  # of one picture
+MAX_PIXELS = 10**9  # of one picture
 
 
 @dataclass(frozen=True)
 class Cameras:
-    """What the file says: a row for each camera, and by split the numbers of its rows. lens: see `Lens.to_json`."""
+    """Contents of the file: one row per camera, and row numbers by split. lens: see `Lens.to_json`."""
 
     names: list[str]
     splits: dict[str, list[int]]
@@ -44,7 +44,7 @@ def to_json(scene: Scene) -> dict[str, Any]:
 
 
 def read(path: Path) -> Cameras:
-    """What the file says. Raises LumigraphError, naming it, where its rows do not fit together."""
+    """Read the file. Raises LumigraphError, naming it, if its rows are inconsistent."""
     said = read_json(path, Cameras)
     count = len(said.pose)
     rows = {"names": len(said.names), "size": len(said.size), "time": count if said.time is None else len(said.time)}
@@ -52,8 +52,8 @@ def read(path: Path) -> Cameras:
         raise LumigraphError(f"{path} has {count} poses, but {', '.join(wrong)}; restore it from a copy")
     if not said.splits.get("train") or any(i not in range(count) for index in said.splits.values() for i in index):
         raise LumigraphError(f"{path} has splits that name other cameras than its {count}, or none to learn from")
-    if any(width * height > MOST_PIXELS for width, height in said.size):
-        raise LumigraphError(f"{path} has pictures of more than {MOST_PIXELS:,} pixels; correct their size")
+    if any(width * height > MAX_PIXELS for width, height in said.size):
+        raise LumigraphError(f"{path} has pictures of more than {MAX_PIXELS:,} pixels; correct their size")
     return said
 
 
@@ -65,7 +65,7 @@ def cameras(path: Path, photographs: int) -> dict[str, Camera]:
     said, lens = (found := read(path)), Lens.from_json(found.lens, path)
     pose = torch.tensor(said.pose)
     axes = pose[:, :, :3].double()
-    if len(lens) != len(pose) or float((axes @ axes.mT - torch.eye(3)).abs().max()) > RIGID:
+    if len(lens) != len(pose) or float((axes @ axes.mT - torch.eye(3)).abs().max()) > RIGID_TOLERANCE:
         raise LumigraphError(f"{path} has poses that are not rigid, or not a lens for each; restore it from a copy")
     time = None if said.time is None else torch.tensor(said.time)
     camera = Camera(pose, lens, torch.tensor(said.size), time, torch.arange(len(pose)) % max(photographs, 1))

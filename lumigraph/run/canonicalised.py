@@ -1,4 +1,4 @@
-"""What `lumigraph canonicalise` wrote of a run: the same, turned, moved and scaled as all of its kind are.
+"""A run in its category's canonical frame, written by `lumigraph canonicalise`: rotated, translated and scaled.
 
     {
       "format": "lumigraph canonical 1",
@@ -66,7 +66,7 @@ class Canonicalised(Opened):
         return compose(self.frame, [Placed(self.run.method(device), self.place, leads=True)]).to(device)
 
     def cameras(self) -> dict[str, Camera]:
-        """Those of the run, moved with it."""
+        """Cameras of the run, in the canonical frame."""
         return {split: cameras.transformed(self.place.matrix) for split, cameras in self.run.cameras().items()}
 
     @property

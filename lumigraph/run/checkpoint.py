@@ -30,17 +30,17 @@ from ..files.plain import flatten, understood, unflatten
 from ..files.ranges import Lasted, Tally, typed
 from ..method import Method
 
-FORMAT = "lumigraph checkpoint 1"
-GRID = 4  # axes of a grid of cells, of which the first says which of several grids
-WEIGHTS, OPTIMIZER, STATE = "weights.safetensors", "optimizer.safetensors", "state.json"
-PACKED = "weights.packed"  # in the place of both
-STRUCTURE = "optimizers"
-NAME = re.compile(r"\d+")
+CHECKPOINT_FORMAT = "lumigraph checkpoint 1"
+GRID_AXES = 4  # axes of a grid of cells, of which the first is the number of the grid
+WEIGHTS_FILE, OPTIMIZER_FILE, STATE_FILE = "weights.safetensors", "optimizer.safetensors", "state.json"
+PACKED_FILE = "weights.packed"  # replaces both
+STRUCTURE_KEY = "optimizers"
+CHECKPOINT_NAME = re.compile(r"\d+")
 
 
 @dataclass(frozen=True)
 class State:
-    """How far training has come: completed steps, and seconds that they took; compilation is counted apart.
+    """Progress of training: completed steps and their seconds; compilation is counted separately.
 
     peak_memory: bytes at most, see `memory.peak_memory`; 0 if unknown
     passes:      how often everything was learnt from, on average, see `verdict.shares_seen`; 0 if unknown
@@ -90,7 +90,7 @@ class Checkpoints:
         self.folder = run / "checkpoints"
 
     def __bool__(self) -> bool:
-        """Whether there is a complete state."""
+        """True if there is a complete checkpoint."""
         return bool(self._all())
 
     @property
@@ -104,7 +104,7 @@ class Checkpoints:
 
     @property
     def state(self) -> State:
-        """How far the latest complete state has come."""
+        """Progress of the latest complete checkpoint."""
         about = self._about(self.latest)
         return State(**{field.name: getattr(about, field.name) for field in fields(State)})
 
@@ -120,12 +120,12 @@ class Checkpoints:
         with files.replacing_folder(folder) as new:
             sums = {
                 name: write_tensors(new / name, content)
-                for name, content in ((WEIGHTS, method.state_dict()), (OPTIMIZER, tensors))
+                for name, content in ((WEIGHTS_FILE, method.state_dict()), (OPTIMIZER_FILE, tensors))
             }
-            sums[STRUCTURE] = checksum(json.dumps(structure).encode())
+            sums[STRUCTURE_KEY] = checksum(json.dumps(structure).encode())
             known = {name: asdict(total) for name, total in sums.items()}
-            about = {"format": FORMAT, "method": self.method, **asdict(state), "files": known}
-            (new / STATE).write_text(json.dumps({**about, STRUCTURE: structure}), "utf-8")
+            about = {"format": CHECKPOINT_FORMAT, "method": self.method, **asdict(state), "files": known}
+            (new / STATE_FILE).write_text(json.dumps({**about, STRUCTURE_KEY: structure}), "utf-8")
         for path in self.folder.iterdir():
             if path != folder and is_state(path):
                 retire(path)
@@ -133,16 +133,22 @@ class Checkpoints:
     def save_packed(self, state: State, weights: bytes) -> None:
         """Write the state of a run that was compressed, in which there is nothing yet. weights: see `packing.write`"""
         with files.replacing_folder(self.folder / f"{state.step:06d}") as new:
-            (new / PACKED).write_bytes(weights)
-            known = {PACKED: asdict(checksum(weights))}
-            about = {"format": FORMAT, "method": self.method, **asdict(state), "files": known, STRUCTURE: []}
-            (new / STATE).write_text(json.dumps(about), "utf-8")
+            (new / PACKED_FILE).write_bytes(weights)
+            known = {PACKED_FILE: asdict(checksum(weights))}
+            about = {
+                "format": CHECKPOINT_FORMAT,
+                "method": self.method,
+                **asdict(state),
+                "files": known,
+                STRUCTURE_KEY: [],
+            }
+            (new / STATE_FILE).write_text(json.dumps(about), "utf-8")
 
     @property
     def weights(self) -> Path:
         """The file of the latest state's weights."""
-        packed = self.latest / PACKED
-        return packed if files.is_file(packed) else self.latest / WEIGHTS
+        packed = self.latest / PACKED_FILE
+        return packed if files.is_file(packed) else self.latest / WEIGHTS_FILE
 
     def load_weights(self, method: Method) -> None:
         """Give a method the latest state's weights."""
@@ -159,14 +165,14 @@ class Checkpoints:
     def load_training(self, optimizers: Iterable[torch.optim.Optimizer], generator: torch.Generator) -> None:
         """Give optimizers and random numbers the latest state."""
         checkpoint = self.latest
-        if self.weights.name == PACKED:
+        if self.weights.name == PACKED_FILE:
             raise LumigraphError(
                 f"{self.run} was compressed, which keeps nothing to go on learning with; resume the run it was made of"
             )
-        tensors = self._read_tensors(checkpoint, OPTIMIZER)
+        tensors = self._read_tensors(checkpoint, OPTIMIZER_FILE)
         about = self._about(checkpoint)
         structure = about.optimizers
-        if about.files.get(STRUCTURE) != checksum(json.dumps(structure).encode()):
+        if about.files.get(STRUCTURE_KEY) != checksum(json.dumps(structure).encode()):
             raise LumigraphError(
                 f"{checkpoint / 'state.json'} is damaged: its optimizers are not those that were saved"
             )
@@ -177,12 +183,12 @@ class Checkpoints:
                 check_moments(optimizer)
 
     def _all(self) -> list[Path]:
-        found = [x for x in self.folder.iterdir() if NAME.fullmatch(x.name)] if self.folder.is_dir() else []
+        found = [x for x in self.folder.iterdir() if CHECKPOINT_NAME.fullmatch(x.name)] if self.folder.is_dir() else []
         return sorted(found, key=lambda x: int(x.name))
 
     def _about(self, checkpoint: Path) -> Saved:
-        said = files.read_json(path := checkpoint / STATE)
-        if not isinstance(said, dict) or said.get("format") != FORMAT:
+        said = files.read_json(path := checkpoint / STATE_FILE)
+        if not isinstance(said, dict) or said.get("format") != CHECKPOINT_FORMAT:
             raise LumigraphError(f"{checkpoint} is not a checkpoint that Lumigraph wrote; restore it from a copy")
         about = typed(Saved, said, path)
         if about.method != self.method:
@@ -198,7 +204,7 @@ class Checkpoints:
             data = path.read_bytes()
         if checksum(data) != expected:
             raise LumigraphError(f"{path} is damaged: its checksum is not the one it was saved with; restore a copy")
-        if name == PACKED:
+        if name == PACKED_FILE:
             return packing.read(data, path)
         try:
             return safetensors.torch.load(data)
@@ -217,9 +223,9 @@ def take_shapes(method: nn.Module, tensors: dict[str, Tensor]) -> None:
             saved, own = tensors.get(f"{place}.{name}" if place else name), getattr(module, name)
             if saved is None:
                 continue
-            sizes.add(saved.shape if own.dim() == GRID else saved.shape[:1])
+            sizes.add(saved.shape if own.dim() == GRID_AXES else saved.shape[:1])
             if saved.shape[1:] == own.shape[1:] or (
-                saved.dim() == own.dim() == GRID and saved.shape[0] == own.shape[0]
+                saved.dim() == own.dim() == GRID_AXES and saved.shape[0] == own.shape[0]
             ):
                 sized = own.detach().new_empty(saved.shape)
                 setattr(module, name, nn.Parameter(sized) if isinstance(own, nn.Parameter) else sized)
@@ -257,10 +263,13 @@ def checksum(data: bytes) -> Sum:
 
 
 def is_state(path: Path) -> bool:
-    """Whether a folder is a state or a part of one, and holds nothing that somebody else has put there."""
-    if not NAME.fullmatch(path.name) or path.is_symlink() or not path.is_dir():
+    """True if a folder is a complete or partial checkpoint and contains no foreign files."""
+    if not CHECKPOINT_NAME.fullmatch(path.name) or path.is_symlink() or not path.is_dir():
         return False
-    return all(file.name in (WEIGHTS, OPTIMIZER, STATE, PACKED) and not file.is_dir() for file in path.iterdir())
+    return all(
+        file.name in (WEIGHTS_FILE, OPTIMIZER_FILE, STATE_FILE, PACKED_FILE) and not file.is_dir()
+        for file in path.iterdir()
+    )
 
 
 def retire(path: Path) -> None:

@@ -97,7 +97,7 @@ class Composition(Opened):
         return compose(self.frame, placed).to(device)
 
     def cameras(self) -> dict[str, Camera]:
-        """Those of the part that leads."""
+        """Cameras of the leading part."""
         return self.opened[self.lead].cameras()
 
     @property

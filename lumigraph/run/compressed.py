@@ -9,7 +9,7 @@ from typing import Literal
 from .. import files
 from ..files.ranges import Count, Lasted, Share, Tally
 
-NAME = "compress.json"
+COMPRESS_FILE = "compress.json"
 
 
 @dataclass(frozen=True)
@@ -45,16 +45,16 @@ class Compressed:
 
     @property
     def times(self) -> float:
-        """How many times smaller the model is."""
+        """Compression ratio of the model."""
         return self.bytes_before / max(self.bytes_after, 1)
 
     def write(self, folder: Path) -> None:
-        files.write_json(folder / NAME, asdict(self), ours=True)
+        files.write_json(folder / COMPRESS_FILE, asdict(self), ours=True)
 
     @staticmethod
     def read(folder: Path) -> Compressed | None:
-        """What a run's folder says; None where it was not compressed. Raises LumigraphError for what is damaged."""
-        return files.read_json(folder / NAME, Compressed) if files.is_file(folder / NAME) else None
+        """Read the record of a compressed run; None for other runs. Raises LumigraphError for a damaged record."""
+        return files.read_json(folder / COMPRESS_FILE, Compressed) if files.is_file(folder / COMPRESS_FILE) else None
 
 
 def bytes_in(folder: Path) -> int:

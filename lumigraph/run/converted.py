@@ -10,7 +10,7 @@ from .. import files
 from ..files.ranges import Count, Lasted, Name, Tally, typed
 from .settings import Settings
 
-NAME = "convert.json"
+CONVERT_FILE = "convert.json"
 LearntFrom = Literal["photographs", "renderings of the source"]
 
 
@@ -33,7 +33,7 @@ class Begun:
 
     @staticmethod
     def of(settings: Settings, file: Path) -> Begun | None:
-        """What settings say; None of a run that was trained from its beginning. file: to name what is damaged in it"""
+        """Read from settings; None for a run that was trained from scratch. file: to name what is damaged in it"""
         told = settings.said.get("converted")
         return None if told is None else typed(Begun, told, f"{file}: converted")
 
@@ -78,9 +78,9 @@ class Converted:
     seconds: Lasted
 
     def write(self, folder: Path) -> None:
-        files.write_json(folder / NAME, asdict(self), ours=True)
+        files.write_json(folder / CONVERT_FILE, asdict(self), ours=True)
 
     @staticmethod
     def read(folder: Path) -> Converted | None:
-        """What a run's folder says; None where it was not converted. Raises LumigraphError for what is damaged."""
-        return files.read_json(folder / NAME, Converted) if files.is_file(folder / NAME) else None
+        """Read the record of a converted run; None for other runs. Raises LumigraphError for a damaged record."""
+        return files.read_json(folder / CONVERT_FILE, Converted) if files.is_file(folder / CONVERT_FILE) else None

@@ -31,15 +31,15 @@ from ..datasets.dataset import Dataset
 from ..datasets.scene import Frame, Scene
 from ..errors import LumigraphError
 from ..files import marks
-from ..files.locks import NAME as LOCK
+from ..files.locks import LOCK_FILE as LOCK
 from ..files.locks import check_place, held
-from ..files.marks import NAME as RECORD
-from ..files.partials import FORM
+from ..files.marks import LOCK_FILE as RECORD
+from ..files.partials import PARTIAL_NAME
 from ..files.plain import understood
 from ..files.ranges import check
 from ..method import Method
 from . import cameras
-from .checkpoint import PACKED, Checkpoints, State
+from .checkpoint import PACKED_FILE, Checkpoints, State
 from .measured import read_rows
 from .needs import check_memory
 from .opened import Trained
@@ -165,12 +165,12 @@ class Run(Trained):
 
     @property
     def kind(self) -> str:
-        """What it learnt from, in a user's words: see `Dataset.kind`."""
+        """Kind of its dataset: see `Dataset.kind`."""
         return self.settings.scene.kind
 
     @property
     def photographed(self) -> bool:
-        """Whether it learnt from photographs, so that there are cameras."""
+        """True if it was trained on photographs, so that there are cameras."""
         return self.kind == Scene.kind
 
     @property
@@ -182,7 +182,7 @@ class Run(Trained):
         return None if self.photographed else f"learnt from {self.kind}, so it has no colours that could be taken over"
 
     def dataset(self, source: str | None = None) -> Dataset:
-        """What it learnt from again. source: where that is now, if it has moved.
+        """Open its dataset again. source: its present path, if it has moved.
 
         Raises LumigraphError if it gives another frame than the run was trained in.
         """
@@ -218,7 +218,7 @@ class Run(Trained):
         return cameras.cameras(self._cameras, self.frame.image_count)
 
     def view_names(self) -> dict[str, list[str]]:
-        """What the photographs are called, by split, in the order of `cameras`; nothing where there were none."""
+        """Names of the photographs by split, in the order of `cameras`; empty without photographs."""
         if not self.photographed:
             return {}
         said = cameras.read(self._cameras)
@@ -228,7 +228,7 @@ class Run(Trained):
 
     @property
     def state(self) -> State:
-        """How far the latest complete state has come. Raises LumigraphError if there is none."""
+        """Progress of the latest complete checkpoint. Raises LumigraphError if there is none."""
         return self._checkpoints.state
 
     @property
@@ -237,8 +237,8 @@ class Run(Trained):
 
     @property
     def compressed(self) -> bool:
-        """Whether it was made by `lumigraph compress`, so that it cannot go on learning."""
-        return self.has_state and self._checkpoints.weights.name == PACKED
+        """True if it was made by `lumigraph compress`; training cannot continue then."""
+        return self.has_state and self._checkpoints.weights.name == PACKED_FILE
 
     @property
     def model_bytes(self) -> int:
@@ -310,7 +310,7 @@ def build(
 
 
 def is_block_run(folder: Path) -> bool:
-    """Whether a folder holds a run in blocks; see `large`."""
+    """True if a folder contains a block run; see `large`."""
     return files.is_file(folder / "blocks.json")
 
 
@@ -327,8 +327,8 @@ def check_new(folder: Path) -> None:
 
 
 def is_leftover(path: Path) -> bool:
-    """Whether something in a folder is of a run that was killed before it had begun."""
-    return path.name in (LOCK, RECORD) or FORM.fullmatch(path.name) is not None or marks.is_ours(path, "file")
+    """True for leftovers of a run that was killed before its first step."""
+    return path.name in (LOCK, RECORD) or PARTIAL_NAME.fullmatch(path.name) is not None or marks.is_ours(path, "file")
 
 
 def versions() -> dict[str, str]:
@@ -342,7 +342,7 @@ def versions() -> dict[str, str]:
 
 
 def processor(device: torch.device) -> str:
-    """What kind of machine a device is."""
+    """Hardware name of a device."""
     if device.type == "cuda":
         return torch.cuda.get_device_name(device)
     about = Path("/proc/cpuinfo")

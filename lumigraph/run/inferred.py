@@ -36,7 +36,7 @@ class Inferred:
 
     @staticmethod
     def of(settings: Settings, file: Path) -> Inferred | None:
-        """What settings say; None of a run that was trained. file: to name what is damaged in it"""
+        """Read from settings; None for a trained run. file: to name what is damaged in it"""
         told = settings.said.get("inferred")
         return None if told is None else typed(Inferred, told, f"{file}: inferred")
 

@@ -1,4 +1,4 @@
-"""What was measured of a run: the lines of metrics.jsonl, and what eval.json and its sisters say."""
+"""Measurements of a run: the lines of metrics.jsonl, and the contents of eval.json and related files."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class Line:
 
 @dataclass(frozen=True)
 class Protocol:
-    """How views or shapes were compared, as far as anybody relies on it: how many of how many, of which split."""
+    """Evaluation protocol in eval.json, the fields in use: number of compared views or shapes, total, split."""
 
     split: str
     of: Tally = 0
@@ -68,7 +68,7 @@ class Size:
 
 @dataclass(frozen=True)
 class Evaluation:
-    """Of all that was compared, as far as anybody relies on it. scores: means of all, by name"""
+    """Contents of eval.json, the fields in use. scores: means of all, by name"""
 
     protocol: Protocol
     steps: Tally
@@ -102,7 +102,7 @@ def read_rows(path: Path) -> list[dict[str, Any]]:
 
 
 def read_evaluation(path: Path) -> dict[str, Any]:
-    """What eval.json says. Raises LumigraphError, naming the file, for what no evaluation says."""
+    """Read eval.json. Raises LumigraphError, naming the file, if it is invalid."""
     said = files.read_json(path)
     typed(Evaluation, said, path)
     return {"lpips": None, "evaluated_on": "unknown"} | {key: x for key, x in said.items() if x is not None}

@@ -1,4 +1,4 @@
-"""How much memory a method will need: told by its Config before anything is made."""
+"""Estimate the memory of a method from its Config, before allocation."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from ..files.ranges import hints, numbers, value_of
 from ..method import Method
 from ..system.memory import ask_for, free_on
 
-LEARNING = 4  # times a parameter: itself, its gradient, and the two moments that optimizers like Adam keep
+BYTES_FACTOR = 4  # copies of a parameter: itself, its gradient, and the two moments of optimizers like Adam
 
 
 def check_memory(kind: type[Method], frame: Frame, config: Any, device: torch.device, learning: bool = False) -> None:
@@ -53,7 +53,7 @@ def bytes_of(kind: type[Method], frame: Frame, config: Any, learning: bool) -> i
         return further
     parameters = sum(x.numel() * x.element_size() for x in method.parameters())
     buffers = sum(x.numel() * x.element_size() for x in method.buffers())
-    return (LEARNING if learning else 1) * parameters + buffers + further
+    return (BYTES_FACTOR if learning else 1) * parameters + buffers + further
 
 
 def halved(config: Any) -> list[tuple[str, Any]]:

@@ -33,22 +33,22 @@ class Opened(ABC):
 
     @property
     def title(self) -> str:
-        """What a page of it is called."""
+        """Title of its pages."""
         return self.path.name.partition(".")[0]
 
     @property
     def renders(self) -> Path:
-        """Where films of it go: not beside a file, which may lie where nobody may write."""
+        """Folder of its films: not beside a file, whose folder may be read-only."""
         return Path("renders") / self.title
 
     @property
     def paths(self) -> Path:
-        """Where camera paths that somebody saves go."""
+        """Folder of saved camera paths."""
         return self.renders / "paths"
 
     @abstractmethod
     def method(self, device: torch.device | str = "cpu") -> Method:
-        """What it shows, ready to render."""
+        """Method, ready to render."""
 
     @abstractmethod
     def cameras(self) -> dict[str, Camera]:
@@ -56,7 +56,7 @@ class Opened(ABC):
 
     @property
     def photographed(self) -> bool:
-        """Whether these are cameras of photographs, rather than a ring around what nobody has photographed."""
+        """True for cameras of photographs, False for a synthetic ring of cameras."""
         return False
 
     @property
@@ -80,7 +80,7 @@ class Opened(ABC):
         return needs(self.method(), HasGaussians).gaussians().transformed(self.frame.to_source.matrix)
 
     def view_names(self) -> dict[str, list[str]]:
-        """What the photographs are called, by split, in the order of `cameras`; nothing where there are none."""
+        """Names of the photographs by split, in the order of `cameras`; empty without photographs."""
         return {}
 
     def survey(self, cameras: Camera) -> Camera:
@@ -88,7 +88,7 @@ class Opened(ABC):
         return cameras if self.photographed else dome(cameras)
 
     def metrics(self) -> list[dict[str, Any]]:
-        """What was measured while it was learnt, a row every few steps; none where that is not known."""
+        """Training metrics, one row every few steps; empty where unknown."""
         return []
 
 
@@ -105,7 +105,7 @@ class Trained(Opened):
     @property
     @abstractmethod
     def learnt_from(self) -> Source:
-        """Where its photographs or shapes came from."""
+        """Source of its photographs or shapes."""
 
     @property
     @abstractmethod
@@ -115,11 +115,11 @@ class Trained(Opened):
     @property
     @abstractmethod
     def state(self) -> State:
-        """How far the latest complete state has come. Raises LumigraphError if there is none."""
+        """Progress of the latest complete checkpoint. Raises LumigraphError if there is none."""
 
     @abstractmethod
     def dataset(self, source: str | None = None) -> Dataset:
-        """What it learnt from again. source: where that is now, if it has moved."""
+        """Open its dataset again. source: its present path, if it has moved."""
 
     @property
     def title(self) -> str:
@@ -136,6 +136,6 @@ class Trained(Opened):
         return self.folder / "paths"
 
     def evaluation(self) -> dict[str, Any] | None:
-        """What eval.json says, if it has been evaluated."""
+        """Contents of eval.json, if it has been evaluated."""
         path = self.folder / "eval.json"
         return read_evaluation(path) if path.exists() else None

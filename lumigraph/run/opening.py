@@ -17,7 +17,7 @@ from .splat_file import SplatFile
 
 
 def open_any(path: Path | str, within: tuple[Path, ...] = ()) -> Opened:
-    """What lies at a path: a run's folder, one in blocks, a splat file (`exchange.SUFFIXES`, SOG, streamed or
+    """Open a path: a run's folder, one in blocks, a splat file (`exchange.SUFFIXES`, SOG, streamed or
     not), a folder of SNeRG's viewer, a composition (.json), a run as `lumigraph canonicalise` placed it (.json).
 
     within: compositions that it is opened as a part of

@@ -15,12 +15,12 @@ from ..files.plain import alike
 from ..files.ranges import Count, Downscale, Name, Scales, Tally, between, typed
 from ..method import Method
 
-FORMAT = "lumigraph run 1"
+RUN_FORMAT = "lumigraph run 1"
 
 
 @dataclass(frozen=True)
 class Options:
-    """What a run may tell `open_dataset` besides its source: see `capture.open_scene`."""
+    """Options of a run for `open_dataset`: see `capture.open_scene`."""
 
     downscale: Downscale | None = None
     reader: str | None = None
@@ -32,20 +32,20 @@ class Options:
 
 @dataclass(frozen=True)
 class Source:
-    """Where a dataset came from, what else `open_dataset` was told to open it, and of which kind it is."""
+    """Source of a dataset: its path, its options for `open_dataset`, and its kind."""
 
     source: Name
     options: dict[str, Any] = field(default_factory=dict)
     kind: str = Scene.kind
 
     def to_json(self) -> dict[str, Any]:
-        """As the file says it: photographs are not mentioned."""
+        """JSON of the source; the kind is omitted for photographs."""
         return {name: value for name, value in asdict(self).items() if (name, value) != ("kind", Scene.kind)}
 
 
 @dataclass(frozen=True)
 class Settings:
-    """What was trained on what, and how.
+    """Settings of a run: method, dataset and budget.
 
     method:    as the user types it
     config:    the method's numbers by name, as the run was written with; see `method_config`
@@ -70,9 +70,9 @@ class Settings:
 
     @staticmethod
     def read(file: Path) -> Settings:
-        """What a config.json says. Raises LumigraphError, naming the file, where it is none of ours or damaged."""
+        """Read a config.json. Raises LumigraphError, naming the file, if it is foreign or damaged."""
         said = files.read_json(file)
-        if not isinstance(said, dict) or said.get("format") != FORMAT:
+        if not isinstance(said, dict) or said.get("format") != RUN_FORMAT:
             raise LumigraphError(f"{file} was not written by this version of Lumigraph; open it with the one that did")
         settings = typed(Settings, said, file)
         frame = Frame.from_json(said["frame"], f"{file}: frame")
@@ -85,10 +85,10 @@ class Settings:
         files.write_json(file, self.to_json(), ours=True)
 
     def to_json(self) -> dict[str, Any]:
-        """What config.json says, under the same names."""
+        """Contents of config.json, under the same names."""
         own: dict[str, Any] = {x.name: getattr(self, x.name) for x in fields(self) if x.name != "said"}
         parts = {"frame": self.frame.to_json(), "scene": self.scene.to_json()}
-        return {"format": FORMAT} | self.said | own | parts
+        return {"format": RUN_FORMAT} | self.said | own | parts
 
     def with_budget(self, **budget: Any) -> Settings:
         """The same with another budget."""
@@ -100,5 +100,5 @@ class Settings:
         return typed(kind.Config, self.config, file, closed=True)
 
     def agrees(self, frame: Frame) -> bool:
-        """Whether a frame is the run's, up to rounding."""
+        """True if a frame equals the run's, up to rounding."""
         return alike(self.frame.to_json(), frame.to_json())

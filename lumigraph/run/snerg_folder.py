@@ -20,8 +20,8 @@ from ..geometry import Similarity
 from ..method import Method
 from .opened import Opened
 
-SLACK = 0.02  # beyond [-1, 1]^3, that a voxel may reach
-WHITE = (1.0, 1.0, 1.0)  # is behind everything in that viewer
+VOXEL_MARGIN = 0.02  # beyond [-1, 1]^3, that a voxel may reach
+WHITE_BACKGROUND = (1.0, 1.0, 1.0)  # the background of that viewer
 
 
 class SnergFolder(Opened):
@@ -42,7 +42,9 @@ class SnergFolder(Opened):
         low, high = ((scale * corner + shift).clamp(-1, 1).tolist() for corner in corners)
         reach = reach_of(atlas, places) if atlas.contracted else 1.0
         rows = to_source.rows
-        self.frame = Frame((tuple(low), tuple(high)), reach, near=0.01, background=WHITE, source_from_scene=rows)
+        self.frame = Frame(
+            (tuple(low), tuple(high)), reach, near=0.01, background=WHITE_BACKGROUND, source_from_scene=rows
+        )
 
     def method(self, device: torch.device | str = "cpu") -> Method:
         """The atlas, ready to render."""
@@ -69,6 +71,6 @@ def reach_of(atlas: Atlas, places: Int[Tensor, "voxel 3"]) -> float:
 def within_reach(corners: Float[Tensor, "2 3"]) -> Similarity:
     """The way back from where a box lies in [-1, 1]^3: as it is if it lies there, else shrunk and moved."""
     low, high = corners.double()
-    if float(corners.abs().max()) <= 1 + SLACK:
+    if float(corners.abs().max()) <= 1 + VOXEL_MARGIN:
         return Similarity.make(1.0)
     return Similarity.make(float((high - low).max()) / 2, torch.eye(3, dtype=torch.float64), (low + high) / 2)

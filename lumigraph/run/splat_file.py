@@ -17,9 +17,9 @@ from ..geometry import Similarity
 from ..method import Method
 from .opened import Opened
 
-SHARE = 0.96  # of what is visible that the box of interest holds, along each axis
+BOX_SHARE = 0.96  # of visible Gaussians inside the box of interest, along each axis
 # Splat files have y pointing down by custom, as the cameras they were learnt from; scenes stand upright.
-UPRIGHT = torch.tensor([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]], dtype=torch.float64)
+UPRIGHT_ROTATION = torch.tensor([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]], dtype=torch.float64)
 
 
 class SplatFile(Opened):
@@ -55,12 +55,12 @@ def frame_of(gaussians: Gaussians) -> Frame:
 
 
 def upright_similarity(gaussians: Gaussians) -> Similarity:
-    """What brings most of the visible cloud into [-1, 1]^3, standing upright."""
+    """Similarity that moves most of the visible cloud into [-1, 1]^3, upright."""
     means = gaussians.means.double().cpu()
     solid = means[gaussians.opacities.sigmoid().cpu() > 0.1]
-    means = (solid if len(solid) > 10 else means) @ UPRIGHT.T
+    means = (solid if len(solid) > 10 else means) @ UPRIGHT_ROTATION.T
     some = means[:: max(1, len(means) // 100_000)]
-    shares = torch.tensor([(1 - SHARE) / 2, (1 + SHARE) / 2], dtype=torch.float64)
+    shares = torch.tensor([(1 - BOX_SHARE) / 2, (1 + BOX_SHARE) / 2], dtype=torch.float64)
     low, high = torch.quantile(some, shares, dim=0)
     scale = 2 / max(float((high - low).max()), 1e-9)
-    return Similarity.make(scale, UPRIGHT, -scale * (low + high) / 2)
+    return Similarity.make(scale, UPRIGHT_ROTATION, -scale * (low + high) / 2)

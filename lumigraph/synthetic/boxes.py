@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 NODE = np.dtype([("low", "f8", 3), ("high", "f8", 3), ("object", "i8"), ("skip", "i8")])
-FAR = 1e30  # infinity times zero is no number; this is far enough
+FAR_DISTANCE = 1e30  # in place of infinity, because infinity times zero is not a number
 
 
 def hierarchy(boxes: list[tuple[np.ndarray, np.ndarray]]) -> np.ndarray:
@@ -20,8 +20,8 @@ def hierarchy(boxes: list[tuple[np.ndarray, np.ndarray]]) -> np.ndarray:
     """
     if not boxes:
         return np.zeros(0, NODE)
-    low, high = (np.clip(np.array(x).reshape(-1, 3), -FAR, FAR) for x in zip(*boxes, strict=True))
-    bounded = high[:, 0] < FAR
+    low, high = (np.clip(np.array(x).reshape(-1, 3), -FAR_DISTANCE, FAR_DISTANCE) for x in zip(*boxes, strict=True))
+    bounded = high[:, 0] < FAR_DISTANCE
     nodes: list[tuple] = []
 
     def grow(members: np.ndarray) -> None:

@@ -8,7 +8,7 @@ from typing import Annotated, TypeVar
 from ..errors import LumigraphError
 from ..files.ranges import Seed, between, typed
 
-DIGITS = 20  # of a number, at most
+MAX_DIGITS = 20  # of a number
 Options = TypeVar("Options")
 
 
@@ -38,6 +38,6 @@ def parse(kind: type, request: str, text: str) -> tuple[str, int]:
     known = [field.name for field in fields(kind)]
     if name not in known:
         raise LumigraphError(f"procedural:{request}: there is no option {name!r}; there are {', '.join(known)}")
-    if not value.isdecimal() or len(value) > DIGITS:
+    if not value.isdecimal() or len(value) > MAX_DIGITS:
         raise LumigraphError(f"procedural:{request}: {name} must be a whole number, as in {name}=20; got {value!r}")
     return name, int(value)

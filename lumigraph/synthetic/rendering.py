@@ -20,8 +20,8 @@ from . import tracer
 from .world import World
 
 RAYS_PER_TASK = 4096
-HEADROOM = 64.0  # how much brighter than white light may be and still be below the film's shoulder
-CONTRAST = 0.08  # samples of a pixel that differ by more than this are not enough (0 is black, 1 white, as it looks)
+FILM_HEADROOM = 64.0  # radiance relative to white that stays below the film's shoulder
+MAX_CONTRAST = 0.08  # between samples of a pixel; above it more are taken (0 is black, 1 white, sRGB-encoded)
 
 
 class Seen(NamedTuple):
@@ -75,9 +75,9 @@ def photograph(world: World, camera: Camera, samples: int = 4, more: int = 8) ->
 def radiance(world: World, camera: Camera, samples: int = 12) -> np.ndarray:
     """The light of every pixel, linear sRGB (height, width, 3), without a film that bends what is bright."""
     width, height = camera.size[0].tolist()
-    dim = replace(world, sky=replace(world.sky, exposure=world.sky.exposure / HEADROOM))
+    dim = replace(world, sky=replace(world.sky, exposure=world.sky.exposure / FILM_HEADROOM))
     pixels = _gather(dim, camera, camera.pixels(), samples, aims=1)
-    return (HEADROOM / samples * pixels[:, :3]).astype(np.float32).reshape(height, width, 3)
+    return (FILM_HEADROOM / samples * pixels[:, :3]).astype(np.float32).reshape(height, width, 3)
 
 
 def eight_bits(rgb: np.ndarray, opacity: np.ndarray, alpha: bool) -> np.ndarray:
@@ -139,10 +139,10 @@ def _gather(world: World, camera: Camera, places: Tensor, samples: int, aims: in
 
 def _uneven(pixels: np.ndarray, spread: np.ndarray) -> np.ndarray:
     """Pixels whose few samples may have missed something: they differ among themselves, or from their neighbours."""
-    uneven = spread > CONTRAST
+    uneven = spread > MAX_CONTRAST
     seen = np.sqrt(pixels[..., :4])
     for axis in (0, 1):
-        jump = np.abs(np.diff(seen, axis=axis)).max(-1) > 4 * CONTRAST
+        jump = np.abs(np.diff(seen, axis=axis)).max(-1) > 4 * MAX_CONTRAST
         uneven[(slice(1, None), slice(None))[:: 1 - 2 * axis]] |= jump
         uneven[(slice(None, -1), slice(None))[:: 1 - 2 * axis]] |= jump
     return uneven

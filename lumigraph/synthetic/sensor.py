@@ -20,11 +20,11 @@ from ..capture.raw.demosaic import repeated
 from ..capture.raw.photo import srgb_from_camera
 
 COLOUR_MATRIX = ((0.9020, -0.2890, -0.0715), (-0.4535, 1.2436, 0.2348), (-0.0934, 0.1919, 0.7086))  # XYZ to camera
-GAINS = (1.949, 1.0, 1.344)  # of red, green and blue: its white balance
+WHITE_BALANCE = (1.949, 1.0, 1.344)  # gains of red, green and blue
 PATTERN = ((0, 1), (1, 2))
-BLACK, WHITE, LARGEST = 600, 15520, (1 << 14) - 1  # DN
+BLACK_LEVEL, WHITE_LEVEL, MAX_LEVEL = 600, 15520, (1 << 14) - 1  # DN
 READ_NOISE = 2.8  # DN, standard deviation
-PHOTON = 0.29  # DN of one that is counted
+DN_PER_PHOTON = 0.29  # DN of one that is counted
 
 
 @dataclass(frozen=True)
@@ -52,13 +52,15 @@ class Sensor:
         """
 
         def read() -> np.ndarray:
-            return (self.numbers(radiance(), image).astype(np.float32) - BLACK) / np.float32(WHITE - BLACK)
+            return (self.numbers(radiance(), image).astype(np.float32) - BLACK_LEVEL) / np.float32(
+                WHITE_LEVEL - BLACK_LEVEL
+            )
 
         return RawPhoto(
             Path(f"{image:04d}"),
             size,
             PATTERN,
-            GAINS,
+            WHITE_BALANCE,
             srgb_from_camera(np.array(COLOUR_MATRIX)),
             self.exposure(image),
             read,
@@ -67,10 +69,10 @@ class Sensor:
     def numbers(self, radiance: Float[np.ndarray, "height width 3"], image: int) -> np.ndarray:
         """Sensor readout: whole numbers of 14 bits, (height, width)."""
         random = np.random.default_rng(image)
-        camera = radiance @ np.linalg.inv(srgb_from_camera(np.array(COLOUR_MATRIX))).T / GAINS
+        camera = radiance @ np.linalg.inv(srgb_from_camera(np.array(COLOUR_MATRIX))).T / WHITE_BALANCE
         filters = repeated(PATTERN, (radiance.shape[1], radiance.shape[0])).astype(np.int64)
         light = np.take_along_axis(camera, filters[..., None], -1)[..., 0].clip(0, None)
-        mean = light * self.sensitivity * self.exposure(image) * (WHITE - BLACK)
-        counted = random.poisson(mean / PHOTON) * PHOTON
-        read = BLACK + counted + READ_NOISE * random.standard_normal(mean.shape)
-        return np.rint(read).clip(0, LARGEST).astype(np.uint16)
+        mean = light * self.sensitivity * self.exposure(image) * (WHITE_LEVEL - BLACK_LEVEL)
+        counted = random.poisson(mean / DN_PER_PHOTON) * DN_PER_PHOTON
+        read = BLACK_LEVEL + counted + READ_NOISE * random.standard_normal(mean.shape)
+        return np.rint(read).clip(0, MAX_LEVEL).astype(np.uint16)

@@ -12,11 +12,11 @@ from dataclasses import dataclass
 import numpy as np
 from numba import njit
 
-from .vector import INNER, along, dot, unit
+from .vector import INNER_OPTIONS, along, dot, unit
 
 SPHERE, BOX, CYLINDER, CONE, TORUS, ARCH, PLANE, TRIANGLE = range(8)
 INFINITY = math.inf
-TINY = 1e-12  # a direction's component below this counts as this: no division by zero
+MIN_COMPONENT = 1e-12  # of a direction, against division by zero
 ON_SURFACE = 1e-7  # where a march along the ray ends, scene units
 NEAR_SURFACE = 5e-3  # within this distance the march around a shape that is not convex may use the secant
 MAX_STEPS = 400
@@ -152,7 +152,7 @@ def triangle_of(corners: np.ndarray, thickness: float) -> tuple[Triangle, np.nda
     a, b, c = np.roll(corners, -int(np.argmax(np.linalg.norm(sides, axis=1))), 0)
     long = float(np.linalg.norm(b - a))
     normal = np.cross(b - a, c - a)
-    if np.linalg.norm(normal) < TINY:
+    if np.linalg.norm(normal) < MIN_COMPONENT:
         return None
     x, z = (b - a) / long, normal / np.linalg.norm(normal)
     y = np.cross(z, x)
@@ -161,7 +161,7 @@ def triangle_of(corners: np.ndarray, thickness: float) -> tuple[Triangle, np.nda
     return shape, np.stack([x, y, z], 1), a + 0.5 * long * x + 0.5 * up * y
 
 
-@njit(**INNER)
+@njit(**INNER_OPTIONS)
 def beside_segment(x, y, ax, ay, bx, by):
     """Squared distance to a segment in the plane; and on which side, positive to its left."""
     dx, dy, px, py = bx - ax, by - ay, x - ax, y - ay
@@ -169,13 +169,13 @@ def beside_segment(x, y, ax, ay, bx, by):
     return (px - s * dx) ** 2 + (py - s * dy) ** 2, dx * py - dy * px
 
 
-@njit(**INNER)
+@njit(**INNER_OPTIONS)
 def hollow(kind):
     """True if a ray that leaves the shape can meet it again: it is not convex."""
     return kind == TORUS or kind == ARCH
 
 
-@njit(**INNER)
+@njit(**INNER_OPTIONS)
 def outside_corner(x, y):
     """Distance to the quadrant x < 0, y < 0."""
     if x > 0.0 and y > 0.0:
@@ -183,7 +183,7 @@ def outside_corner(x, y):
     return max(x, y)
 
 
-@njit(**INNER)
+@njit(**INNER_OPTIONS)
 def arch_profile(x, z, a, c, r, spring):
     """Distance to a rectangle of half-size (a, c) less a gate of radius r; x >= 0."""
     up = z + c  # above the floor
@@ -198,7 +198,7 @@ def arch_profile(x, z, a, c, r, spring):
     return outside_corner(x - a, abs(z) - c)
 
 
-@njit(**INNER)
+@njit(**INNER_OPTIONS)
 def distance(kind, size, p):
     """Signed distance from a point to a shape, both in the shape's frame; size[5] is the rounding."""
     x, y, z = p
@@ -236,7 +236,7 @@ def distance(kind, size, p):
     return z  # a plane
 
 
-@njit(**INNER)
+@njit(**INNER_OPTIONS)
 def gradient(kind, size, p):
     """The outward normal at a point of the surface: central differences over a tetrahedron (Quilez 2015)."""
     h = 1e-5
@@ -247,16 +247,16 @@ def gradient(kind, size, p):
     return unit((a - b - c + d, -a - b + c + d, -a + b - c + d))
 
 
-@njit(**INNER)
+@njit(**INNER_OPTIONS)
 def inverse(d):
     """The reciprocal of each component."""
-    x = d[0] if abs(d[0]) > TINY else math.copysign(TINY, d[0])
-    y = d[1] if abs(d[1]) > TINY else math.copysign(TINY, d[1])
-    z = d[2] if abs(d[2]) > TINY else math.copysign(TINY, d[2])
+    x = d[0] if abs(d[0]) > MIN_COMPONENT else math.copysign(MIN_COMPONENT, d[0])
+    y = d[1] if abs(d[1]) > MIN_COMPONENT else math.copysign(MIN_COMPONENT, d[1])
+    z = d[2] if abs(d[2]) > MIN_COMPONENT else math.copysign(MIN_COMPONENT, d[2])
     return (1.0 / x, 1.0 / y, 1.0 / z)
 
 
-@njit(**INNER)
+@njit(**INNER_OPTIONS)
 def slab(o, over, low, high):
     """Distances at which a ray enters and leaves a box, enter > leave if it misses; over is one over its direction."""
     ax, bx = (low[0] - o[0]) * over[0], (high[0] - o[0]) * over[0]
@@ -266,21 +266,21 @@ def slab(o, over, low, high):
     return enter, min(min(max(ax, bx), max(ay, by)), max(az, bz))
 
 
-@njit(**INNER)
+@njit(**INNER_OPTIONS)
 def quadratic(a, b, c):
     """Roots of a t² + 2 b t + c, smaller first; infinity twice if there are none."""
     root = b * b - a * c
-    if root < 0.0 or a < TINY:
+    if root < 0.0 or a < MIN_COMPONENT:
         return INFINITY, INFINITY
     root = math.sqrt(root)
     return (-b - root) / a, (-b + root) / a
 
 
-@njit(**INNER)
+@njit(**INNER_OPTIONS)
 def intersect(kind, size, half, o, d, limit):
     """Distance to where a ray from outside first meets the shape, infinity beyond `limit`. In the shape's frame."""
     if kind == PLANE:
-        t = -o[2] / (d[2] if abs(d[2]) > TINY else TINY)
+        t = -o[2] / (d[2] if abs(d[2]) > MIN_COMPONENT else MIN_COMPONENT)
         return t if t > 0.0 and t < limit and d[2] < 0.0 else INFINITY
     if kind == SPHERE:
         t, _ = quadratic(1.0, dot(o, d), dot(o, o) - size[0] * size[0])

@@ -14,7 +14,7 @@ from typing import ClassVar
 import numpy as np
 from numba import njit
 
-from .vector import INNER, clamp, smooth
+from .vector import INNER_OPTIONS, clamp, smooth
 
 PLAIN, CHECKER, STRIPES, SECTORS, RINGS, WOOD, MARBLE, BRICKS, MOTTLE = range(9)
 PRIMES = (73856093, 19349663, 83492791)
@@ -123,26 +123,26 @@ class Mottle(Texture):
     seed: float = 0.0
 
 
-@njit(**INNER)
+@njit(**INNER_OPTIONS)
 def scramble(x, y, z):
     """Sixteen bits of a lattice point's own, from its coordinates times three large primes (Teschner 2003)."""
     h = (x ^ y ^ z) & 0xFFFFFFFF
     return (((h ^ (h >> 15)) * 0x2C1B3C6D) & 0xFFFFFFFF) >> 16
 
 
-@njit(**INNER)
+@njit(**INNER_OPTIONS)
 def slope(bits, x, y, z):
     """A lattice point's gradient, times an offset from it."""
     k = bits & 15
     return GRADIENTS[k, 0] * x + GRADIENTS[k, 1] * y + GRADIENTS[k, 2] * z
 
 
-@njit(**INNER)
+@njit(**INNER_OPTIONS)
 def fade(t):
     return t * t * t * (t * (6.0 * t - 15.0) + 10.0)
 
 
-@njit(**INNER)
+@njit(**INNER_OPTIONS)
 def noise(x, y, z):
     """Gradient noise in about [-1, 1] with features of size one (Perlin 2002)."""
     i, j, k = math.floor(x), math.floor(y), math.floor(z)
@@ -160,7 +160,7 @@ def noise(x, y, z):
     return low + w * (high - low)
 
 
-@njit(**INNER)
+@njit(**INNER_OPTIONS)
 def clouds(p, size, finest, footprint):
     """Noise summed over octaves from `size` down to `finest`, each half as strong; what the footprint covers fades."""
     total, strength, shift = 0.0, 0.5, 0.0
@@ -173,7 +173,7 @@ def clouds(p, size, finest, footprint):
     return total
 
 
-@njit(**INNER)
+@njit(**INNER_OPTIONS)
 def band(x, period, share, footprint):
     """1 on `share` of each period, 0 elsewhere, edges as wide as the footprint; x = 0 is the middle of a band."""
     from_edge = 0.5 * share * period - abs(x - period * math.floor(x / period + 0.5))
@@ -182,7 +182,7 @@ def band(x, period, share, footprint):
     return sharp + blur * (share - sharp)
 
 
-@njit(**INNER)
+@njit(**INNER_OPTIONS)
 def pattern(kind, n, p, normal, footprint):
     """(blend, shade) at a point p of a surface, so that colour = shade mix(a, b, blend). All in the object's frame.
 

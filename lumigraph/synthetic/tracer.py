@@ -16,10 +16,25 @@ from numba import njit
 
 from .shapes import INFINITY, distance, gradient, hollow, intersect, inverse, slab
 from .textures import PRIMES, clouds, pattern, scramble
-from .vector import FAST, INNER, along, clamp, cross, dot, mix, mul, rotate, rotate_back, scale, smooth, unit, vec
+from .vector import (
+    COMPILE_OPTIONS,
+    INNER_OPTIONS,
+    along,
+    clamp,
+    cross,
+    dot,
+    mix,
+    mul,
+    rotate,
+    rotate_back,
+    scale,
+    smooth,
+    unit,
+    vec,
+)
 
-LIFT = 2e-4  # shadow and mirrored rays begin this far above the surface, scene units
-MIRRORED = 0.04, 0.10  # a weaker reflection shows the sky alone; a stronger one what is there
+RAY_OFFSET = 2e-4  # shadow and mirrored rays begin this far above the surface, scene units
+REFLECTANCE_LIMITS = 0.04, 0.10  # a weaker reflection shows the sky alone; a stronger one traces the scene
 SHOULDER = 0.75  # radiance above this is compressed as by film, so that highlights keep their shape
 
 
@@ -33,7 +48,7 @@ def spread(count: int) -> np.ndarray:
 DISC = spread(256)  # successive rays, hence the samples of a pixel, aim at different points of a light
 
 
-@njit(**INNER)
+@njit(**INNER_OPTIONS)
 def meet(objects, nodes, o, d, limit, enough, leaving):
     """(distance, object) of the first surface along a ray, or (infinity, -1) if none is nearer than limit.
 
@@ -61,7 +76,7 @@ def meet(objects, nodes, o, d, limit, enough, leaving):
     return (best if found >= 0 else INFINITY), found
 
 
-@njit(**INNER)
+@njit(**INNER_OPTIONS)
 def gap(p, low, high):
     """Squared distance from a point to a box, 0 inside."""
     x = max(0.0, max(low[0] - p[0], p[0] - high[0]))
@@ -70,7 +85,7 @@ def gap(p, low, high):
     return x * x + y * y + z * z
 
 
-@njit(**INNER)
+@njit(**INNER_OPTIONS)
 def clearance(objects, nodes, p):
     """Signed distance from a point to the nearest surface."""
     best, i = INFINITY, 0
@@ -88,7 +103,7 @@ def clearance(objects, nodes, p):
     return best
 
 
-@njit(**INNER)
+@njit(**INNER_OPTIONS)
 def surroundings(sky, d, cover):
     """Radiance from the sky in a direction; of which clouds cover a share."""
     if d[2] < 0.0:
@@ -102,7 +117,7 @@ def surroundings(sky, d, cover):
     return colour
 
 
-@njit(**INNER)
+@njit(**INNER_OPTIONS)
 def ambient(objects, nodes, sky, found, p, n):
     """Light from all of the sky onto a surface, less what its neighbourhood hides (Evans 2006): balls that touch the
     surface from outside, each within the last, and how much room other things leave around their centres."""
@@ -129,7 +144,7 @@ def ambient(objects, nodes, sky, found, p, n):
     return scale(light, 1.0 - 0.29 * hidden)
 
 
-@njit(**INNER)
+@njit(**INNER_OPTIONS)
 def towards(toward, width, ray):
     """Direction to one of the points of a round light; successive rays choose different ones.
 
@@ -140,14 +155,14 @@ def towards(toward, width, ray):
     return unit(along(along(toward, width * point[0], side), width * point[1], cross(toward, side)))
 
 
-@njit(**INNER)
+@njit(**INNER_OPTIONS)
 def reflect(objects, nodes, lights, sky, found, p, n, d, albedo, material, ray, aims):
     """Radiance that a surface sends back along a ray d, all but its mirrored surroundings."""
     base = scale(albedo, 1.0 - material.metal)
     coat = 0.04 * material.gloss
     mirror = mix((coat, coat, coat), albedo, material.metal)
     colour = mul(base, ambient(objects, nodes, sky, found, p, n))
-    start = along(p, LIFT, n)
+    start = along(p, RAY_OFFSET, n)
     for i in range(len(lights)):
         light = lights[i]
         toward, away, power, width = vec(light.position), INFINITY, vec(light.colour), light.radius
@@ -179,13 +194,13 @@ def reflect(objects, nodes, lights, sky, found, p, n, d, albedo, material, ray, 
     return colour
 
 
-@njit(**INNER)
+@njit(**INNER_OPTIONS)
 def film(x):
     """Linear up to the shoulder, then ever slower towards one."""
     return x if x < SHOULDER else 1.0 - (1.0 - SHOULDER) * math.exp((SHOULDER - x) / (1.0 - SHOULDER))
 
 
-@njit(**INNER)
+@njit(**INNER_OPTIONS)
 def look(objects, materials, lights, sky, nodes, o, d, radius, ray, aims):
     """(radiance, distance, normal, thing, reflectance) for one ray; see `trace`."""
     t, found = meet(objects, nodes, o, d, INFINITY, 0.0, -1)
@@ -221,8 +236,8 @@ def look(objects, materials, lights, sky, nodes, o, d, radius, ray, aims):
         fresnel = (1.0 - clamp(-dot(n, d), 0.0, 1.0)) ** 5 * max(material.gloss, material.metal)
         weight = mix(mix((coat, coat, coat), albedo, material.metal), (1.0, 1.0, 1.0), fresnel)
         weight = scale(weight, (1.0 - material.roughness) ** 2 * (1.0 - thick))  # roughness blurs it away
-        o, d = along(p, LIFT, n), along(d, -2.0 * dot(d, n), n)
-        strong = smooth(max(weight[0], max(weight[1], weight[2])), MIRRORED[0], MIRRORED[1])
+        o, d = along(p, RAY_OFFSET, n), along(d, -2.0 * dot(d, n), n)
+        strong = smooth(max(weight[0], max(weight[1], weight[2])), REFLECTANCE_LIMITS[0], REFLECTANCE_LIMITS[1])
         total = along(total, 1.0 - strong, mul(weight, surroundings(sky, d, 0.0)))
         if strong <= 0.0:
             break
@@ -235,7 +250,7 @@ def _build(sources: int):
     """The entry points. Numba's cache on disk looks at this file only; `sources`, being part of the compiled functions,
     renews it when any file of the tracer changes."""
 
-    @njit(cache=True, **FAST)
+    @njit(cache=True, **COMPILE_OPTIONS)
     def trace(arrays, origins, directions, radius, first, aims, radiance, depth, normal, identity, reflectance):
         """Everything about each ray. first: number of the first; aims: shadow rays to each light, 0 for no shading."""
         objects, materials, lights, sky, nodes = arrays
@@ -247,7 +262,7 @@ def _build(sources: int):
                 radiance[i, axis] = film(sky[0].exposure[axis] * c[axis])
                 normal[i, axis], reflectance[i, axis] = n[axis], own[axis]
 
-    @njit(cache=True, **FAST)
+    @njit(cache=True, **COMPILE_OPTIONS)
     def gather(arrays, origins, directions, radius, first, aims, samples, pixels):
         """Rays pixel by pixel, `samples` to each: sums of radiance where something was seen, how often that was, and
         the largest difference between two samples, in radiance's square root, which is about as unequal as it looks."""
@@ -271,7 +286,7 @@ def _build(sources: int):
                 spread = max(spread, math.sqrt(high[axis]) - math.sqrt(low[axis]))
             pixels[pixel, 3], pixels[pixel, 4] = hits, spread
 
-    @njit(cache=True, **FAST)
+    @njit(cache=True, **COMPILE_OPTIONS)
     def signed_distance(arrays, points, out):
         for i in range(len(points)):
             out[i] = clearance(arrays.objects, arrays.nodes, vec(points[i])) + 0 * sources

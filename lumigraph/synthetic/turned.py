@@ -7,13 +7,13 @@ from dataclasses import replace
 import numpy as np
 
 from .cameras import dome, pinhole, spiral
-from .categories import ANGLE
+from .categories import FIELD_OF_VIEW
 from .stage import Stage
 from .world import Pose, nested
 
-BALL = 1.2  # radius that every member stays within, whichever way it is turned
-DISTANCE = 4.1  # of cameras from the middle, from where that ball just fits into the picture
-HIGHEST = 60.0  # degrees that cameras stand above the horizon, and below it, for no side is the lower one
+BALL_RADIUS = 1.2  # contains every member in every rotation
+CAMERA_DISTANCE = 4.1  # from the centre, at which that ball just fits into the picture
+MAX_ELEVATION = 60.0  # degrees of the cameras above and below the horizon: no side is the lower one
 
 
 def turned(stage: Stage, size: int, seed: tuple[int, int]) -> Stage:
@@ -27,13 +27,13 @@ def turned(stage: Stage, size: int, seed: tuple[int, int]) -> Stage:
     objects = tuple(replace(thing, pose=motion @ thing.pose) for thing in stage.world.objects)
     views, held_out = (len(stage.cameras[split]) for split in ("train", "test"))
     cameras = {
-        "train": pinhole(dome(views, DISTANCE, random, -HIGHEST, HIGHEST), size, ANGLE),
-        "test": pinhole(spiral(held_out, DISTANCE, random, -HIGHEST, HIGHEST), size, ANGLE),
+        "train": pinhole(dome(views, CAMERA_DISTANCE, random, -MAX_ELEVATION, MAX_ELEVATION), size, FIELD_OF_VIEW),
+        "test": pinhole(spiral(held_out, CAMERA_DISTANCE, random, -MAX_ELEVATION, MAX_ELEVATION), size, FIELD_OF_VIEW),
     }
-    bounds = (-BALL, -BALL, -BALL), (BALL, BALL, BALL)
+    bounds = (-BALL_RADIUS, -BALL_RADIUS, -BALL_RADIUS), (BALL_RADIUS, BALL_RADIUS, BALL_RADIUS)
     known = Pose() if stage.turn is None else Pose(rotation=stage.turn)
     world, turn = replace(stage.world, objects=objects), (motion @ known).rotation
-    return replace(stage, world=world, cameras=cameras, bounds=bounds, reach=BALL, turn=turn)
+    return replace(stage, world=world, cameras=cameras, bounds=bounds, reach=BALL_RADIUS, turn=turn)
 
 
 def any_rotation(random: np.random.Generator) -> np.ndarray:

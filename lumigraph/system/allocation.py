@@ -13,9 +13,9 @@ import os
 import sys
 
 ARENA_MAX, MMAP_THRESHOLD, TRIM_THRESHOLD = -8, -3, -1  # mallopt's names for what follows
-LARGE = 256 << 20  # bytes of a piece that is asked from the system, and returned to it, by itself
-KEPT = 1 << 30  # bytes that are kept when they are given back
-OWN = {  # by which users, and programs, say so themselves
+LARGE_BYTES = 256 << 20  # size of a piece that is requested from the system, and returned to it, by itself
+KEPT_BYTES = 1 << 30  # that stay allocated after they are freed
+USER_SETTINGS = {  # by which users, and programs, say so themselves
     ARENA_MAX: "MALLOC_ARENA_MAX",
     MMAP_THRESHOLD: "MALLOC_MMAP_THRESHOLD_",
     TRIM_THRESHOLD: "MALLOC_TRIM_THRESHOLD_",
@@ -33,6 +33,6 @@ def settle_memory() -> None:
         return
     with contextlib.suppress(AttributeError):  # another C library
         mallopt = ctypes.CDLL(None).mallopt
-        for name, value in ((ARENA_MAX, 1), (MMAP_THRESHOLD, LARGE), (TRIM_THRESHOLD, KEPT)):
-            if OWN[name] not in os.environ:
+        for name, value in ((ARENA_MAX, 1), (MMAP_THRESHOLD, LARGE_BYTES), (TRIM_THRESHOLD, KEPT_BYTES)):
+            if USER_SETTINGS[name] not in os.environ:
                 mallopt(name, value)

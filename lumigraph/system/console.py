@@ -19,7 +19,7 @@ def console(errors: bool = False, **options: Any) -> Any:
 
 
 def is_live(errors: bool = True) -> bool:
-    """Whether somebody watches who can be shown a line that changes: a terminal, and no log, however colourful."""
+    """True for an interactive terminal that can redraw a line; False for a log, even with colours."""
     stream = sys.stderr if errors else sys.stdout
     return stream.isatty() and not console(errors).is_dumb_terminal
 

@@ -15,13 +15,18 @@ import torch
 
 from ..errors import LumigraphError
 
-STATUS = Path("/proc/self/status")
-SPARED = 0.3  # of what is free now, for everybody else
-IMAGES = 0.4  # share of the machine's memory that images may take; the rest is for training and all else that runs
-PIXEL = 128  # bytes that one needs on its way to a picture: its ray, its colour, depth and opacity, in parts and whole
-SIGNS = ("can't allocate memory", "bad_alloc", "Storage size calculation overflowed", "Cannot allocate memory")
+STATUS_FILE = Path("/proc/self/status")
+SPARED_SHARE = 0.3  # of free memory, left to other programs
+IMAGES_SHARE = 0.4  # of the machine's memory that images may take; the rest is for training and other programs
+BYTES_PER_PIXEL = 128  # while a picture is rendered: ray, colour, depth and opacity, in parts and in total
+OUT_OF_MEMORY_MESSAGES = (
+    "can't allocate memory",
+    "bad_alloc",
+    "Storage size calculation overflowed",
+    "Cannot allocate memory",
+)
 UNITS = {unit: 1024**power for power, unit in enumerate("bKMGTPE")}
-LIMITS = (  # of a container, and what it uses of it
+CONTAINER_LIMITS = (  # files with the limit of a container, and its use
     ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory.current"),
     ("/sys/fs/cgroup/memory/memory.limit_in_bytes", "/sys/fs/cgroup/memory/memory.usage_in_bytes"),
 )
@@ -34,8 +39,8 @@ def peak_memory(device: torch.device) -> int:
     """
     if device.type == "cuda":
         return torch.cuda.max_memory_allocated(device)
-    if STATUS.exists():  # getrusage would count the process that started this one too
-        found = re.search(r"VmHWM:\s*(\d+) kB", STATUS.read_text())
+    if STATUS_FILE.exists():  # getrusage would count the process that started this one too
+        found = re.search(r"VmHWM:\s*(\d+) kB", STATUS_FILE.read_text())
         return 1024 * int(found[1]) if found else 0
     if sys.platform == "win32":
         return 0
@@ -44,8 +49,8 @@ def peak_memory(device: torch.device) -> int:
 
 
 def room_for(size: int, device: torch.device) -> int:
-    """How many more things of so many bytes may be made on a device; very many where the system does not say."""
-    return int((1 - SPARED) * free_on(device)) // size
+    """Number of further objects of a size in bytes that fit on a device; very large if free memory is unknown."""
+    return int((1 - SPARED_SHARE) * free_on(device)) // size
 
 
 def free_on(device: torch.device) -> int:
@@ -65,7 +70,9 @@ def ask_for(size: int, device: torch.device, what: str, remedy: Callable[[], str
 
 def ask_for_picture(width: int, height: int, device: torch.device) -> None:
     """Raise LumigraphError unless a rendering of so many pixels may be had on a device."""
-    ask_for(PIXEL * width * height, device, f"A picture of {width} x {height} pixels", "give a smaller --size")
+    ask_for(
+        BYTES_PER_PIXEL * width * height, device, f"A picture of {width} x {height} pixels", "give a smaller --size"
+    )
 
 
 def gigabytes(size: float) -> str:
@@ -76,7 +83,9 @@ def gigabytes(size: float) -> str:
 def want_of_memory(error: BaseException) -> str | None:
     """One sentence for a fault that is for want of memory: what asked for how much. None for any other fault."""
     told = str(error)
-    if not (isinstance(error, MemoryError | torch.OutOfMemoryError) or any(sign in told for sign in SIGNS)):
+    if not (
+        isinstance(error, MemoryError | torch.OutOfMemoryError) or any(sign in told for sign in OUT_OF_MEMORY_MESSAGES)
+    ):
         return None
     asked = re.search(r"allocate ([\d.]+) ?(bytes|[KMGTPE]iB)", told)
     amount = "more" if asked is None else gigabytes(float(asked[1]) * UNITS[asked[2][0]])
@@ -97,7 +106,7 @@ def free_memory() -> int:
         free = 1024 * int(known["MemAvailable"].split()[0])
     except (OSError, KeyError, ValueError):
         return 1 << 50
-    for limit, used in LIMITS:
+    for limit, used in CONTAINER_LIMITS:
         try:
             with open(limit, encoding="ascii") as most, open(used, encoding="ascii") as now:
                 free = min(free, int(most.read()) - int(now.read()))
@@ -112,7 +121,7 @@ def memory_for_images() -> int:
         total = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
     except (AttributeError, ValueError, OSError):
         total = 8 << 30
-    for limit, _ in LIMITS:
+    for limit, _ in CONTAINER_LIMITS:
         with suppress(OSError, ValueError):  # no container, or no limit
             total = min(total, int(Path(limit).read_text()))
-    return int(IMAGES * total)
+    return int(IMAGES_SHARE * total)

@@ -10,7 +10,7 @@ import sys
 from collections.abc import Sequence
 from typing import Any
 
-ON_PARENTS_DEATH = 1  # Linux's PR_SET_PDEATHSIG
+PR_SET_PDEATHSIG = 1  # Linux's number
 
 
 def start(command: Sequence[str], ends_by: int = signal.SIGTERM, **options: Any) -> subprocess.Popen[Any]:
@@ -22,11 +22,11 @@ def start(command: Sequence[str], ends_by: int = signal.SIGTERM, **options: Any)
 
 
 def tied(number: int) -> Any:
-    """What the child does between fork and exec, where it must not load anything."""
+    """Set-up of the child between fork and exec, where it must not load modules."""
     prctl, parent = ctypes.CDLL(None).prctl, os.getpid()
 
     def tie() -> None:
-        prctl(ON_PARENTS_DEATH, number)
+        prctl(PR_SET_PDEATHSIG, number)
         if os.getppid() != parent:  # it died just before
             os._exit(1)
 

@@ -13,10 +13,10 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from .console import console, is_live
 
-PATIENCE = 1.0  # seconds before a bar appears
-FIRST = 3.0  # seconds before the first line in a log
-RARER = 1.5  # from one line of a log to the next, times as long as before
-RAREST = 60.0  # seconds between two lines, at most
+BAR_DELAY = 1.0  # seconds before a bar appears
+FIRST_LINE_SECONDS = 3.0  # until the first line in a log
+INTERVAL_GROWTH = 1.5  # factor from one interval between lines to the next
+MAX_INTERVAL = 60.0  # seconds between two lines
 
 T = TypeVar("T")
 
@@ -77,13 +77,13 @@ class Stage:
 
     def _watch(self) -> None:
         if is_live():
-            if not self._over.wait(PATIENCE):
+            if not self._over.wait(BAR_DELAY):
                 self._draw()
             return
-        pause = FIRST
+        pause = FIRST_LINE_SECONDS
         while not self._over.wait(pause):
             tell(self.line())
-            self._told, pause = True, min(RARER * pause, RAREST)
+            self._told, pause = True, min(INTERVAL_GROWTH * pause, MAX_INTERVAL)
 
     def _draw(self) -> None:
         """A bar until the work is over."""
@@ -96,7 +96,7 @@ class Stage:
                 bar.update(task, completed=self.count)
 
     def line(self) -> str:
-        """What a log says: how many, which share, how long still."""
+        """Line of a log: count, share, remaining time."""
         if self.total is None:
             return f"{self.description}: {clock(self.seconds)} so far"
         told = f"{self.description}: {self.count} of {self.total}"

@@ -13,9 +13,9 @@ from collections.abc import Callable, Iterator
 from types import FrameType
 from typing import Any
 
-NUMBERS = (signal.SIGINT, signal.SIGTERM)
-AGAIN = 0.5  # seconds between reminders
-ROOM = 1024  # bytes; no system's struct sigaction is as large
+HANDLED_SIGNALS = (signal.SIGINT, signal.SIGTERM)
+REMINDER_SECONDS = 0.5  # between reminders
+SIGACTION_BYTES = 1024  # no system's struct sigaction is as large
 
 
 class Stopped(KeyboardInterrupt):
@@ -32,7 +32,7 @@ def number_of(stopped: KeyboardInterrupt) -> int:
 
 
 def exit_code(number: int | None) -> int:
-    """As shells count: 130 after Ctrl-C, 143 after SIGTERM, 0 without a signal."""
+    """Exit code as in shells: 130 after Ctrl-C, 143 after SIGTERM, 0 without a signal."""
     return 0 if number is None else 128 + number
 
 
@@ -99,7 +99,7 @@ class listening:  # noqa: N801
             raise Stopped(number, self)
 
     def _remind(self, number: int) -> None:
-        while not self._heeded.wait(AGAIN):
+        while not self._heeded.wait(REMINDER_SECONDS):
             self._reminding = True
             if sys.platform == "win32":
                 _thread.interrupt_main(number)
@@ -107,7 +107,7 @@ class listening:  # noqa: N801
                 signal.pthread_kill(threading.main_thread().ident or 0, number)
 
     def _is_loading(self, frame: FrameType | None) -> bool:
-        """Whether a module is being loaded inside the block."""
+        """True while a module is being loaded inside the block."""
         while frame is not None and frame is not self._home:
             if frame.f_code.co_filename.startswith("<frozen importlib"):
                 return True
@@ -143,7 +143,7 @@ class Handlers:
 
     def set(self) -> None:
         if threading.current_thread() is threading.main_thread():
-            self._before = {number: signal.signal(number, self.hear) for number in NUMBERS}
+            self._before = {number: signal.signal(number, self.hear) for number in HANDLED_SIGNALS}
 
     def restore(self) -> None:
         for number, handler in self._before.items():
@@ -160,7 +160,7 @@ def untouched() -> Iterator[None]:
     if os.name == "nt":
         yield
         return
-    system, before = ctypes.CDLL(None), ctypes.create_string_buffer(ROOM)
+    system, before = ctypes.CDLL(None), ctypes.create_string_buffer(SIGACTION_BYTES)
     system.sigaction(signal.SIGTERM, None, before)
     try:
         yield

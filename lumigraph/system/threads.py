@@ -17,13 +17,13 @@ import threading
 from collections.abc import Callable, Iterator, MutableMapping
 from pathlib import Path
 
-LOOKS = 300_000  # for work, before a thread sleeps: some milliseconds
-OWN = "OMP_WAIT_POLICY", "GOMP_SPINCOUNT"  # by which users say how threads wait
-EVERY = 0.5  # seconds between looks at how much others hold us up
-WHILE = 20  # such looks that threads then sleep for
-MUCH = 0.25  # of the time that our threads could run: from here on it matters that others have it
-IDLE = 0.1  # of the time: what runs less than that has nothing to wait for
-TASKS = Path("/proc/self/task")
+SPIN_COUNT = 300_000  # polls for work before a thread sleeps: some milliseconds
+USER_SETTINGS = "OMP_WAIT_POLICY", "GOMP_SPINCOUNT"  # environment variables by which users set how threads wait
+POLL_SECONDS = 0.5  # between measurements of contention
+SLEEP_POLLS = 20  # measurements during which threads then sleep
+MAX_WAITING_SHARE = 0.25  # of the time that our threads could run: above it other programs slow them down
+MIN_RUNNING_SHARE = 0.1  # of the time: threads that run less do not wait for others
+TASKS_FOLDER = Path("/proc/self/task")
 
 
 def settle(environment: MutableMapping[str, str] = os.environ) -> None:
@@ -32,8 +32,8 @@ def settle(environment: MutableMapping[str, str] = os.environ) -> None:
     It counts for libraries that are loaded afterwards: for PyTorch and Numba, or for Numba alone where PyTorch was
     imported before Lumigraph.
     """
-    if not any(name in environment for name in OWN):
-        environment["GOMP_SPINCOUNT"] = str(LOOKS)
+    if not any(name in environment for name in USER_SETTINGS):
+        environment["GOMP_SPINCOUNT"] = str(SPIN_COUNT)
 
 
 def share_one_pool() -> None:
@@ -53,7 +53,9 @@ def considerate() -> Iterator[None]:
 
     Only where Linux tells so; a user's own way of waiting stays.
     """
-    if not (TASKS / str(os.getpid()) / "schedstat").exists() or os.environ.get("GOMP_SPINCOUNT") != str(LOOKS):
+    if not (TASKS_FOLDER / str(os.getpid()) / "schedstat").exists() or os.environ.get("GOMP_SPINCOUNT") != str(
+        SPIN_COUNT
+    ):
         yield
         return
     over = threading.Event()
@@ -78,13 +80,13 @@ class Held:
         pairs = [(before, now[name]) for name, before in self._before.items() if name in now]
         self._before = now
         ran, waited = (sum(after[i] - before[i] for before, after in pairs) for i in (0, 1))
-        return waited / max(ran + waited, IDLE * EVERY * 1e9)
+        return waited / max(ran + waited, MIN_RUNNING_SHARE * POLL_SECONDS * 1e9)
 
     @staticmethod
     def _now() -> dict[str, list[int]]:
         """Nanoseconds that each thread has run, and has waited for a processor."""
         found = {}
-        for thread in TASKS.iterdir():
+        for thread in TASKS_FOLDER.iterdir():
             with contextlib.suppress(OSError):  # a thread that has just ended
                 found[thread.name] = [int(x) for x in (thread / "schedstat").read_text().split()[:2]]
         return found
@@ -98,13 +100,13 @@ def make_way(over: threading.Event, held: Callable[[], float]) -> None:
     """
     crowding: tuple[threading.Thread, threading.Event] | None = None
     looks = 0
-    while not over.wait(EVERY):
+    while not over.wait(POLL_SECONDS):
         looks, share = looks + 1, held()
-        if crowding is None and share > MUCH and "torch" in sys.modules:
+        if crowding is None and share > MAX_WAITING_SHARE and "torch" in sys.modules:
             leave, looks = threading.Event(), 0
             crowding = threading.Thread(target=crowd, args=(leave,), name="crowd", daemon=True), leave
             crowding[0].start()
-        elif crowding is not None and looks >= WHILE:
+        elif crowding is not None and looks >= SLEEP_POLLS:
             disperse(*crowding)
             crowding = None
     if crowding is not None:
@@ -127,7 +129,7 @@ def crowd(leave: threading.Event) -> None:
 
 
 def told() -> str:
-    """How many threads share the work; and the load of the last minute, where it is more than the processors can do."""
+    """Describe the number of threads, and the load of the last minute if it exceeds the processors."""
     import torch
 
     count = torch.get_num_threads()
@@ -137,5 +139,5 @@ def told() -> str:
 
 
 def processors() -> int:
-    """How many this process may use."""
+    """Number of processors available to this process."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

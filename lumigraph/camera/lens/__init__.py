@@ -23,33 +23,35 @@ from ...files.ranges import Tally, typed
 from . import undistortion
 
 FOLD_SAMPLES = 1024  # angles from the axis at which a distortion is tested for folding over
-WIDEST_FLAT = math.radians(89.0)  # flat image planes end here: tan is still harmless in float32
+MAX_FLAT_ANGLE = math.radians(
+    89.0
+)  # largest angle from the axis on a flat image plane: tan is still harmless in float32
 NEWTON_STEPS = 20  # usually three are enough; more only beside a fold
-SMALL_STEP = 3e-5  # the error left after one this small is about its square
+CONVERGED_STEP = 3e-5  # after a Newton step this small the remaining error is about its square
 # What the numbers of lenses that exist lie between; in pixels, but for distortion and for the offset of an eye.
-SOUND = {"focal": (1e-2, 1e7), "centre": (-1e7, 1e7), "size": (1.0, 1e7), "distortion": (-1e4, 1e4)}
-SOUND |= {"offset": (-1e6, 1e6)}
-ANY = (-1e9, 1e9)  # of what a new kind may have besides
+PARAMETER_RANGES = {"focal": (1e-2, 1e7), "centre": (-1e7, 1e7), "size": (1.0, 1e7), "distortion": (-1e4, 1e4)}
+PARAMETER_RANGES |= {"offset": (-1e6, 1e6)}
+DEFAULT_RANGE = (-1e9, 1e9)  # for further parameters of a new kind of lens
 NO_INDEX = torch.empty(0, dtype=torch.int64)
 
 
 @dataclass(frozen=True)
 class Named:
-    """Of a lens in a file, what all kinds have."""
+    """Fields of a lens in a file that all kinds share."""
 
     kind: str
 
 
 @dataclass(frozen=True)
 class MixedParts:
-    """Of lenses of several kinds in a file; see `Mixed`."""
+    """Fields of lenses of several kinds in a file; see `Mixed`."""
 
     parts: list[Any]
     part: list[Tally]
 
 
 class Lens(ABC):
-    """What all lenses have in common. Subclasses are frozen dataclasses of tensors with leading axis camera.
+    """Base class of lenses. Subclasses are frozen dataclasses of tensors with leading axis camera.
 
     In every method `index` names the camera of each pixel or point; None means camera 0 for all.
     """
@@ -79,7 +81,7 @@ class Lens(ABC):
     def origins(
         self, pixels: Float[Tensor, "ray 2"], index: Int[Tensor, " ray"] | None = None
     ) -> Float[Tensor, "ray 3"] | None:
-        """Where rays begin in the camera's frame, in scene units; None where all begin at the camera's centre."""
+        """Origins of rays in the camera's frame, in scene units; None where all begin at the camera's centre."""
         return None
 
     def solid_angle(
@@ -88,7 +90,7 @@ class Lens(ABC):
         directions: Float[Tensor, "ray 3"],
         index: Int[Tensor, " ray"] | None = None,
     ) -> Float[Tensor, " ray"]:
-        """What each pixel covers of the unit sphere, in steradians. `directions` are those that `unproject` gave."""
+        """Solid angle of each pixel, in steradians. `directions` are those that `unproject` gave."""
         half_x, half_y = 0.5 * torch.eye(2, dtype=pixels.dtype, device=pixels.device)
         across = self.unproject(pixels + half_x, index) - self.unproject(pixels - half_x, index)
         down = self.unproject(pixels + half_y, index) - self.unproject(pixels - half_y, index)
@@ -122,7 +124,7 @@ class Lens(ABC):
 
     @staticmethod
     def from_json(data: Any, where: Any = "a lens") -> Lens:
-        """What a file says of the lenses of its cameras. Raises LumigraphError, naming `where`, for what are none."""
+        """Read the lenses of cameras from a file's JSON. Raises LumigraphError, naming `where`, for what are none."""
         kind = Lens.kinds.get(typed(Named, data, where).kind)
         if kind is None:
             raise LumigraphError(f"{where} has a lens of kind {data['kind']!r}; there are {', '.join(Lens.kinds)}")
@@ -147,9 +149,9 @@ class Lens(ABC):
         return lens
 
     def fault(self) -> str | None:
-        """What no lens can have among its numbers, in a few words; None if all are sound."""
+        """Describe the first invalid parameter in a few words; None if all are valid."""
         for name, values in self._numbers().items():
-            least, most = SOUND.get(name, ANY)
+            least, most = PARAMETER_RANGES.get(name, DEFAULT_RANGE)
             bad = ~((values >= least) & (values <= most))
             if bad.any():
                 return f"{name} is {float(values[bad][0]):g}, which is not between {least:g} and {most:g}"
@@ -212,7 +214,7 @@ class OpenCV(Lens):
     @cached_property
     def fold(self) -> Float[Tensor, "camera 1"]:
         """Radius on the plane z = 1 up to which the radial distortion only grows."""
-        r = torch.linspace(0, WIDEST_FLAT, FOLD_SAMPLES, dtype=torch.float64, device=self.focal.device).tan()
+        r = torch.linspace(0, MAX_FLAT_ANGLE, FOLD_SAMPLES, dtype=torch.float64, device=self.focal.device).tan()
         k1, k2, _, _, k3, k4, k5, k6 = self.distortion.double().T[:, :, None]
         s = r * r
         bent = r * (1 + s * (k1 + s * (k2 + s * k3))) / (1 + s * (k4 + s * (k5 + s * k6)))
@@ -251,7 +253,7 @@ class OpenCV(Lens):
         return z * z * z / ((xx * yy - xy * xy).clamp_min(1e-3) * area(self.focal, index))
 
     def _by_loop(self, given: Tensor) -> bool:
-        """Whether the quicker loops on the CPU will do: they know single precision and no gradients."""
+        """True if the faster CPU loops apply: single precision, no gradients."""
         tensors = (given, *self._numbers().values())
         return all(x.is_cpu and x.dtype == torch.float32 and not x.requires_grad for x in tensors)
 
@@ -260,7 +262,7 @@ class OpenCV(Lens):
         which = NO_INDEX if index is None else index
         inputs = (pixels, which, self.focal, self.centre, self.distortion, self.fold)
         # Each ray stops by itself here, so one beside a fold, where steps merely halve, gets no company's extra steps.
-        undistortion.undistort(*(x.numpy() for x in inputs), NEWTON_STEPS, 0.03 * SMALL_STEP, directions.numpy())
+        undistortion.undistort(*(x.numpy() for x in inputs), NEWTON_STEPS, 0.03 * CONVERGED_STEP, directions.numpy())
         return directions
 
     def _solid_angle_by_loop(self, directions: Tensor, index: Tensor | None) -> Tensor:
@@ -502,8 +504,8 @@ def one_or_more(index: int | slice | Tensor) -> slice | Tensor:
 
 
 def small(step: Tensor) -> bool:
-    """Whether Newton's method has arrived."""
-    return not len(step) or step.detach().abs().max().item() < SMALL_STEP
+    """True where Newton's method has converged."""
+    return not len(step) or step.detach().abs().max().item() < CONVERGED_STEP
 
 
 def through_plane(x: Float[Tensor, " ray"], y: Float[Tensor, " ray"]) -> Float[Tensor, "ray 3"]:

@@ -90,7 +90,7 @@ class Samples:
 
     @staticmethod
     def rows(t: Float[Tensor, "ray count"], end: Float[Tensor, " ray"]) -> Samples:
-        """As many samples on each ray, each from one distance to the next, the last one to `end`."""
+        """Samples of equal count per ray, each from one distance to the next, the last one to `end`."""
         ends = torch.cat([t[:, 1:], end[:, None]], -1)
         starts = torch.arange(len(t) + 1, device=t.device) * t.shape[1]
         return Samples(t.flatten(), ends.flatten(), starts)
@@ -131,7 +131,7 @@ class Look:
 
 @dataclass(frozen=True)
 class Rendering:
-    """What a camera or a batch of rays saw. Leading axes are (height, width) or (ray,).
+    """Output of rendering a camera or a batch of rays. Leading axes are (height, width) or (ray,).
 
     rgb:     as photographed (sRGB-encoded), background already behind it
     depth:   distance along the ray in scene units, expected over what is opaque; infinity where nothing is

@@ -14,14 +14,14 @@ import time
 from contextlib import closing
 from pathlib import Path
 
-LOOKS = 0.2  # seconds between looks at the database
+POLL_SECONDS = 0.2  # between reads of the database
 
 
 def watch(database: str, table: str) -> None:
     """Tell the number of rows, for ever."""
     where = f"{Path(database).as_uri()}?mode=ro"
     while True:
-        time.sleep(LOOKS)
+        time.sleep(POLL_SECONDS)
         try:
             with closing(sqlite3.connect(where, uri=True)) as connection:
                 print(connection.execute(f"SELECT COUNT(*) FROM {table}").fetchone()[0], flush=True)

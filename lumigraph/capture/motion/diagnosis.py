@@ -17,17 +17,17 @@ from ..folds import in_steps, jumps
 from ..normalise import where_axes_meet
 from ..photos import Intake, Photo
 
-FEW_FEATURES = 100
-FEW_MATCHES = 15  # details that two photographs must share for COLMAP to believe them
-STOPS = 1.5  # of exposure that a photograph may differ from others
-WINDOW = 5  # neighbours on each side that a frame's exposure is compared with
-SMALL_ANGLE = 2.0  # degrees between the rays that meet at a point, in the middle: less says little of depth
-ROTATIONS = 0.6  # share of the pairs that a turn of the camera explains alone
-OVERLAPPING = 30  # details that neighbours share, from which on they cannot be far apart
-GAP = 30.0  # degrees between neighbouring directions from which on nobody looked from between
-INACCURATE = 2.0  # pixels of reprojection error
-SEEN_ANGLES = 2000  # points whose angles are measured
-NAMED = 8  # photographs that a warning lists
+MIN_FEATURES = 100
+MIN_MATCHES = 15  # shared features of two photographs that COLMAP accepts
+MAX_EXPOSURE_STOPS = 1.5  # of exposure that a photograph may differ from others
+EXPOSURE_WINDOW = 5  # neighbours on each side with which a frame's exposure is compared
+MIN_TRIANGULATION_ANGLE = 2.0  # degrees, median over points: below it depth is uncertain
+ROTATION_SHARE = 0.6  # share of the pairs that a pure rotation of the camera explains
+MIN_OVERLAP_MATCHES = 30  # shared features from which on two neighbours count as close
+MAX_GAP_ANGLE = 30.0  # degrees between neighbouring viewing directions
+MAX_REPROJECTION_ERROR = 2.0  # pixels
+ANGLE_SAMPLES = 2000  # points whose angles are measured
+MAX_NAMES = 8  # photographs that a warning lists
 
 
 @dataclass(frozen=True)
@@ -73,7 +73,7 @@ def read_matches(database: Path) -> Matches:
         shared, turned, flat = {}, 0, 0
         kinds = pycolmap.TwoViewGeometryConfiguration
         for number, pair in zip(*opened.read_two_view_geometries(), strict=True):
-            if len(pair.inlier_matches) >= FEW_MATCHES:
+            if len(pair.inlier_matches) >= MIN_MATCHES:
                 a, b = pycolmap.pair_id_to_image_pair(number)
                 shared[names[a], names[b]] = len(pair.inlier_matches)
                 turned += pair.config == kinds.PANORAMIC
@@ -154,7 +154,7 @@ def diagnose(
         *about_rotation(angle, matches),
         *about_jumps(registered, folds(registered, poses, matches, intake.in_order)),
     ]
-    if error > INACCURATE:
+    if error > MAX_REPROJECTION_ERROR:
         warnings.append(
             f"details are {error:.1f} pixels from where the model has them, on average: photographs may be blurred, or "
             f"the subject moved"
@@ -182,7 +182,7 @@ def why_not(
 ) -> str:
     """Why no camera was found for a photograph, in a few words."""
     features = matches.features.get(name, 0)
-    if features < FEW_FEATURES:
+    if features < MIN_FEATURES:
         fault = "blurred" if blurred and features else "blank, dark or out of focus"
         return f"too few details ({features} found): {fault}"
     for model in others:
@@ -201,7 +201,7 @@ def triangulation_angle(model: pycolmap.Reconstruction, seed: int = 0) -> float:
     """Median over points of the angle between the outermost rays that meet there, degrees."""
     centres = {number: image.projection_center() for number, image in model.images.items() if image.has_pose}
     numbers = np.array(sorted(model.points3D.keys()))
-    chosen = np.random.default_rng(seed).permutation(len(numbers))[:SEEN_ANGLES]
+    chosen = np.random.default_rng(seed).permutation(len(numbers))[:ANGLE_SAMPLES]
     angles = []
     for number in numbers[chosen].tolist():
         point = model.points3D[number]
@@ -238,7 +238,7 @@ def coverage(names: Sequence[str], poses: Float[np.ndarray, "photo 3 4"]) -> Cov
     azimuth = np.degrees(np.arctan2(away[:, 1], away[:, 0]))
     order = np.argsort(azimuth)
     steps = np.diff(azimuth[order], append=azimuth[order[0]] + 360)
-    wide = [i for i in range(len(order)) if steps[i] > GAP]
+    wide = [i for i in range(len(order)) if steps[i] > MAX_GAP_ANGLE]
     degrees = float(360 - steps[wide].sum())
     gaps = [Gap(float(steps[i]), (names[order[i]], names[order[(i + 1) % len(order)]])) for i in wide]
     return Coverage(degrees, sorted(gaps, key=lambda gap: -gap.degrees) if degrees > 180 else [])
@@ -250,7 +250,9 @@ def folds(
     """The jumps of a capture, where its order tells anything."""
     if not (in_order or in_steps(poses[:, :, 3])):
         return []
-    return jumps(poses, [i for i in range(len(names) - 1) if matches.between(names[i], names[i + 1]) >= OVERLAPPING])
+    return jumps(
+        poses, [i for i in range(len(names) - 1) if matches.between(names[i], names[i + 1]) >= MIN_OVERLAP_MATCHES]
+    )
 
 
 def about_left_out(left_out: Mapping[str, str], used: int) -> list[str]:
@@ -272,20 +274,20 @@ def about_exposure(photos: Sequence[Photo], in_order: bool) -> list[str]:
     """Photographs more than 1.5 stops from their neighbours, or where there is no order, from the median of all."""
     found = []
     for i, photo in enumerate(photos):
-        others = photos[max(0, i - WINDOW) : i + WINDOW + 1] if in_order else photos
-        if abs(photo.brightness - statistics.median(p.brightness for p in others)) > STOPS:
+        others = photos[max(0, i - EXPOSURE_WINDOW) : i + EXPOSURE_WINDOW + 1] if in_order else photos
+        if abs(photo.brightness - statistics.median(p.brightness for p in others)) > MAX_EXPOSURE_STOPS:
             found.append(photo.name)
     if not found:
         return []
     return [
-        f"exposure jumps by more than {STOPS:g} stops at {listed(found)}; lock the exposure, or leave these out, for "
-        f"colours will not agree"
+        f"exposure jumps by more than {MAX_EXPOSURE_STOPS:g} stops at {listed(found)}; lock the exposure, or "
+        f"leave these out, for colours will not agree"
     ]
 
 
 def about_rotation(angle: float, matches: Matches) -> list[str]:
-    turned = matches.turned > ROTATIONS * max(len(matches.shared), 1)
-    if angle >= SMALL_ANGLE and not turned:
+    turned = matches.turned > ROTATION_SHARE * max(len(matches.shared), 1)
+    if angle >= MIN_TRIANGULATION_ANGLE and not turned:
         return []
     return [
         f"the photographs were taken from nearly one place (the outermost views of a point are {angle:.1f} degrees "
@@ -308,5 +310,5 @@ def about_jumps(names: Sequence[str], leaps: Sequence[tuple[int, float]]) -> lis
 
 def listed(names: Mapping[str, str] | Sequence[str]) -> str:
     found = list(names)
-    rest = f" and {len(found) - NAMED} more" if len(found) > NAMED else ""
-    return ", ".join(found[:NAMED]) + rest
+    rest = f" and {len(found) - MAX_NAMES} more" if len(found) > MAX_NAMES else ""
+    return ", ".join(found[:MAX_NAMES]) + rest

@@ -16,16 +16,16 @@ from ...system.library import pycolmap
 from ..photos import Intake
 from .diagnosis import Diagnosis
 
-INK, FAINT, PAPER = "#1b1d22", "#6d717a", "#fbfaf8"
-LEFT_OUT, BLURRED, DUPLICATE = "#c0392b", "#d98200", "#3f6fb0"
-PANEL, MARGIN, LINE = 720, 28, 20
-FINE = 2  # times larger than shown, so that lines and dots come out smooth
-SHADE = 0.85  # of points' colours, so that white ones show on paper
-RELIABLE = 3  # photographs that show a point worth drawing
-OUTLYING = 0.04  # share of the points on each side that do not decide what is shown
-FARTHEST = 2.0  # times the distance from cameras to points that is shown around the cameras
-NARROWEST, WIDEST = 110, 1720  # pixels of a column and of the columns together, on the sheet of photographs
-FRUSTUM = 0.05  # depth of a camera's pyramid, as a share of what is shown
+INK_COLOUR, FAINT_COLOUR, PAPER_COLOUR = "#1b1d22", "#6d717a", "#fbfaf8"
+LEFT_OUT_COLOUR, BLURRED_COLOUR, DUPLICATE_COLOUR = "#c0392b", "#d98200", "#3f6fb0"
+PANEL_SIDE, MARGIN, LINE_HEIGHT = 720, 28, 20
+SUPERSAMPLING = 2  # for smooth lines and dots
+POINT_SHADE = 0.85  # factor on points' colours, so that white ones show on paper
+MIN_TRACK_LENGTH = 3  # photographs that show a drawn point
+OUTLIER_SHARE = 0.04  # of the points on each side, ignored for the extent of the drawing
+MAX_DISTANCE_FACTOR = 2.0  # times the distance from cameras to points that is shown around the cameras
+MIN_COLUMN, MAX_SHEET_WIDTH = 110, 1720  # pixels of a column and of the columns together, on the sheet of photographs
+FRUSTUM_DEPTH = 0.05  # as a share of the drawing's extent
 
 
 @dataclass(frozen=True)
@@ -47,16 +47,16 @@ def draw_capture(path: Path, model: pycolmap.Reconstruction, diagnosis: Diagnosi
     sketch = sketch_of(model, diagnosis.registered, keep_axes)
     low, high = interesting(sketch)
     extent = high - low
-    height = [round(PANEL * min(max(extent[k] / extent[0], 0.35), 1.25)) for k in (1, 2)]
-    sheet = Image.new("RGB", (2 * PANEL + 3 * MARGIN, max(height) + 3 * MARGIN + 2 * LINE), PAPER)
+    height = [round(PANEL_SIDE * min(max(extent[k] / extent[0], 0.35), 1.25)) for k in (1, 2)]
+    sheet = Image.new("RGB", (2 * PANEL_SIDE + 3 * MARGIN, max(height) + 3 * MARGIN + 2 * LINE_HEIGHT), PAPER_COLOUR)
     draw = ImageDraw.Draw(sheet)
-    draw.text((MARGIN, MARGIN - 8), heading(diagnosis), INK, ImageFont.load_default(18))
+    draw.text((MARGIN, MARGIN - 8), heading(diagnosis), INK_COLOUR, ImageFont.load_default(18))
     for i, (name, axis) in enumerate((("from above", 2), ("from the side", 1))):
-        corner = MARGIN + i * (PANEL + MARGIN), 2 * MARGIN + LINE
-        draw.text((corner[0], corner[1] - LINE), name, FAINT, ImageFont.load_default(14))
-        sheet.paste(draw_view(sketch, axis, low, high, (PANEL, height[i])), corner)
+        corner = MARGIN + i * (PANEL_SIDE + MARGIN), 2 * MARGIN + LINE_HEIGHT
+        draw.text((corner[0], corner[1] - LINE_HEIGHT), name, FAINT_COLOUR, ImageFont.load_default(14))
+        sheet.paste(draw_view(sketch, axis, low, high, (PANEL_SIDE, height[i])), corner)
     foot = "cameras from first (dark) to last (bright); points in their own colours"
-    draw.text((MARGIN, sheet.height - MARGIN), foot, FAINT, ImageFont.load_default(14))
+    draw.text((MARGIN, sheet.height - MARGIN), foot, FAINT_COLOUR, ImageFont.load_default(14))
     save_picture(path, sheet, "capture")
 
 
@@ -77,7 +77,7 @@ def sketch_of(model: pycolmap.Reconstruction, names: list[str], keep_axes: bool)
         directions = np.array([[x * half[0], y * half[1], 1.0] for x, y in ((-1, -1), (1, -1), (1, 1), (-1, 1))])
         eyes.append(pose[:, 3])
         corners.append(directions @ pose[:, :3].T)
-    found = [point for point in model.points3D.values() if point.track.length() >= RELIABLE]
+    found = [point for point in model.points3D.values() if point.track.length() >= MIN_TRACK_LENGTH]
     found = found or list(model.points3D.values())
     turn = np.eye(3) if keep_axes else longest_first(np.array(eyes))
     return Sketch(
@@ -101,8 +101,8 @@ def interesting(sketch: Sketch) -> tuple[Float[np.ndarray, " 3"], Float[np.ndarr
     low, high = sketch.eyes.min(0), sketch.eyes.max(0)
     if len(sketch.points):
         middle = np.median(sketch.points, axis=0)
-        away = FARTHEST * np.median(np.linalg.norm(sketch.eyes - middle, axis=-1))
-        inner, outer = np.quantile(sketch.points, [OUTLYING, 1 - OUTLYING], axis=0)
+        away = MAX_DISTANCE_FACTOR * np.median(np.linalg.norm(sketch.eyes - middle, axis=-1))
+        inner, outer = np.quantile(sketch.points, [OUTLIER_SHARE, 1 - OUTLIER_SHARE], axis=0)
         low, high = np.minimum(low, np.maximum(inner, low - away)), np.maximum(high, np.minimum(outer, high + away))
     margin = 0.06 * (high - low).max()
     return low - margin, high + margin
@@ -110,7 +110,7 @@ def interesting(sketch: Sketch) -> tuple[Float[np.ndarray, " 3"], Float[np.ndarr
 
 def draw_view(sketch: Sketch, axis: int, low: np.ndarray, high: np.ndarray, size: tuple[int, int]) -> Image.Image:
     """One view along an axis, with equal scales to the right and upwards."""
-    width, height = FINE * size[0], FINE * size[1]
+    width, height = SUPERSAMPLING * size[0], SUPERSAMPLING * size[1]
     right, up = sketch.seen_along(axis)
     scale = min(width / (high[right] - low[right]), height / (high[up] - low[up]))
 
@@ -123,7 +123,7 @@ def draw_view(sketch: Sketch, axis: int, low: np.ndarray, high: np.ndarray, size
     order = np.argsort(sketch.points[:, axis] * (1 if axis == 2 else -1), kind="stable")
     at = place(sketch.points[order]).round().astype(int)
     dot = range(-1, 2) if len(at) > 4000 else range(-2, 3)
-    colours = (SHADE * sketch.colours[order]).astype(np.uint8)
+    colours = (POINT_SHADE * sketch.colours[order]).astype(np.uint8)
     for dx in dot:
         for dy in dot:
             x, y = at[:, 0] + dx, at[:, 1] + dy
@@ -131,15 +131,15 @@ def draw_view(sketch: Sketch, axis: int, low: np.ndarray, high: np.ndarray, size
             canvas[y[inside], x[inside]] = colours[inside]
     image = Image.fromarray(canvas)
     draw = ImageDraw.Draw(image)
-    depth = min(FRUSTUM * float((high - low).max()), 0.8 * typical_gap(sketch.eyes))
+    depth = min(FRUSTUM_DEPTH * float((high - low).max()), 0.8 * typical_gap(sketch.eyes))
     for i in range(len(sketch.eyes)):
         colour = ramp_at(i / max(len(sketch.eyes) - 1, 1))
         eye = place(sketch.eyes[i])
         tips = place(sketch.eyes[i] + depth * sketch.corners[i])
         for j in range(4):
-            draw.line([tuple(eye), tuple(tips[j])], colour, FINE)
-            draw.line([tuple(tips[j]), tuple(tips[(j + 1) % 4])], colour, FINE)
-        draw.ellipse([*(eye - 2.5 * FINE), *(eye + 2.5 * FINE)], colour)
+            draw.line([tuple(eye), tuple(tips[j])], colour, SUPERSAMPLING)
+            draw.line([tuple(tips[j]), tuple(tips[(j + 1) % 4])], colour, SUPERSAMPLING)
+        draw.ellipse([*(eye - 2.5 * SUPERSAMPLING), *(eye + 2.5 * SUPERSAMPLING)], colour)
     return image.resize(size, Image.Resampling.BOX)
 
 
@@ -165,34 +165,38 @@ def draw_photographs(path: Path, intake: Intake, diagnosis: Diagnosis) -> None:
     names = [*files, *sorted(intake.unreadable, key=natural)]
     cell = 220 if len(names) <= 60 else 150 if len(names) <= 200 else 110
     pictures = {name: thumbnail(files.get(name), cell) for name in names}
-    cell = max(NARROWEST, *(picture.width for picture in pictures.values()))
-    columns = min(max(round((1.4 * len(names)) ** 0.5), 4), WIDEST // cell)
+    cell = max(MIN_COLUMN, *(picture.width for picture in pictures.values()))
+    columns = min(max(round((1.4 * len(names)) ** 0.5), 4), MAX_SHEET_WIDTH // cell)
     letters = cell // 6
     notes = {name: textwrap.wrap(note, letters)[:3] for name in names if (note := remark(name, diagnosis)[0])}
     gap, text = 12, 15
-    rows, y = [], 2 * MARGIN + LINE
+    rows, y = [], 2 * MARGIN + LINE_HEIGHT
     for start in range(0, len(names), columns):
         row = [(name, pictures[name]) for name in names[start : start + columns]]
         height = max(image.height for _, image in row)
         rows.append((y, height, row))
         y += height + text * (1 + max(len(notes.get(name, ())) for name, _ in row)) + gap
-    sheet = Image.new("RGB", (2 * MARGIN + columns * (cell + gap) - gap, y + MARGIN - gap), PAPER)
+    sheet = Image.new("RGB", (2 * MARGIN + columns * (cell + gap) - gap, y + MARGIN - gap), PAPER_COLOUR)
     draw, small = ImageDraw.Draw(sheet), ImageFont.load_default(12)
-    draw.text((MARGIN, MARGIN - 8), heading(diagnosis), INK, ImageFont.load_default(18))
+    draw.text((MARGIN, MARGIN - 8), heading(diagnosis), INK_COLOUR, ImageFont.load_default(18))
     x = MARGIN
-    for colour, name in ((LEFT_OUT, "left out"), (BLURRED, "blurred"), (DUPLICATE, "duplicate")):
-        draw.rectangle([x, MARGIN + LINE + 2, x + 12, MARGIN + LINE + 14], colour)
-        draw.text((x + 18, MARGIN + LINE), name, FAINT, small)
+    for colour, name in ((LEFT_OUT_COLOUR, "left out"), (BLURRED_COLOUR, "blurred"), (DUPLICATE_COLOUR, "duplicate")):
+        draw.rectangle([x, MARGIN + LINE_HEIGHT + 2, x + 12, MARGIN + LINE_HEIGHT + 14], colour)
+        draw.text((x + 18, MARGIN + LINE_HEIGHT), name, FAINT_COLOUR, small)
         x += 90
     for y, height, row in rows:
         for i, (name, image) in enumerate(row):
             x, mark = MARGIN + i * (cell + gap), remark(name, diagnosis)[1]
             left = x + (cell - image.width) // 2
-            faded = Image.blend(image, Image.new("RGB", image.size, PAPER), 0.35) if mark == LEFT_OUT else image
+            faded = (
+                Image.blend(image, Image.new("RGB", image.size, PAPER_COLOUR), 0.35)
+                if mark == LEFT_OUT_COLOUR
+                else image
+            )
             sheet.paste(faded, (left, y))
             if mark:
                 draw.rectangle([left - 3, y - 3, left + image.width + 2, y + image.height + 2], None, mark, 4)
-            draw.text((x, y + height + 3), shortened(name, letters), INK, small)
+            draw.text((x, y + height + 3), shortened(name, letters), INK_COLOUR, small)
             for k, line in enumerate(notes.get(name, ())):
                 draw.text((x, y + height + 3 + text * (k + 1)), line, mark, small)
     save_picture(path, sheet, "capture")
@@ -201,11 +205,11 @@ def draw_photographs(path: Path, intake: Intake, diagnosis: Diagnosis) -> None:
 def remark(name: str, diagnosis: Diagnosis) -> tuple[str, str | None]:
     """Remark on a photograph, and its colour."""
     if name in diagnosis.left_out:
-        return diagnosis.left_out[name], LEFT_OUT
+        return diagnosis.left_out[name], LEFT_OUT_COLOUR
     if name in diagnosis.duplicates:
-        return f"shows what {diagnosis.duplicates[name]} shows", DUPLICATE
+        return f"shows what {diagnosis.duplicates[name]} shows", DUPLICATE_COLOUR
     if name in diagnosis.blurred:
-        return f"blurred: {diagnosis.blurred[name]}", BLURRED
+        return f"blurred: {diagnosis.blurred[name]}", BLURRED_COLOUR
     return "", None
 
 

@@ -21,15 +21,15 @@ from ..masks import MASKS as MASKS
 from ..photos import Photo
 from ..photos.track import Track
 from ..pictures import list_images, read_grey
-from ..raw import REMEMBERED
+from ..raw import RAW_FILE
 from ..transforms import OPENCV_FROM_OPENGL, Made
 
-WORK = "work"
-RESULT = "capture.json"
-OWNER = "sources.json"  # inside WORK: what the folder was made of
-POINTS = "points.ply"
-DRAWN = "capture.png", "photographs.png"
-WRITTEN = (RESULT, "transforms.json", POINTS, REMEMBERED, *DRAWN)
+WORK_FOLDER = "work"
+RESULT_FILE = "capture.json"
+SOURCES_FILE = "sources.json"  # inside WORK_FOLDER: the sources of the folder
+POINTS_FILE = "points.ply"
+DRAWING_FILES = "capture.png", "photographs.png"
+WRITTEN_FILES = (RESULT_FILE, "transforms.json", POINTS_FILE, RAW_FILE, *DRAWING_FILES)
 
 # COLMAP's parameters by the names that transforms.json has for them.
 NAMES = {
@@ -43,17 +43,17 @@ def claim(folder: Path, sources: Sequence[Path]) -> Path:
 
     Raises LumigraphError for a folder that holds something else.
     """
-    work, wanted = folder / WORK, [str(path.resolve()) for path in sources]
+    work, wanted = folder / WORK_FOLDER, [str(path.resolve()) for path in sources]
     for path in sources:
-        if (path / WORK / OWNER).is_file():
-            began = " ".join(read_json(path / WORK / OWNER, list[str]))
+        if (path / WORK_FOLDER / SOURCES_FILE).is_file():
+            began = " ".join(read_json(path / WORK_FOLDER / SOURCES_FILE, list[str]))
             raise LumigraphError(
                 f"{path} is an unfinished capture; go on with: lumigraph capture {began} --output {path}"
             )
     if any(path.resolve() == folder.resolve() for path in sources):
         raise LumigraphError(f"{folder} holds the photographs themselves; name another folder by --output")
     if folder.is_dir() and any(folder.iterdir()):
-        owner, result = work / OWNER, folder / RESULT
+        owner, result = work / SOURCES_FILE, folder / RESULT_FILE
         if owner.is_file():
             made_of = read_json(owner, list[str])
         elif result.is_file():
@@ -67,13 +67,13 @@ def claim(folder: Path, sources: Sequence[Path]) -> Path:
             )
     # Beside a folder called sparse lie no bare photographs: so those of a scene that lies among them are passed over.
     (folder / "sparse").mkdir(parents=True, exist_ok=True)
-    write_json(work / OWNER, wanted, ours=True)
+    write_json(work / SOURCES_FILE, wanted, ours=True)
     return work
 
 
 def claim_results(folder: Path) -> None:
     """Raise LumigraphError unless everything that a capture results in may be written into its folder."""
-    for name in WRITTEN:
+    for name in WRITTEN_FILES:
         claim_file(folder / name, "capture")
     claim_folder(folder / "sparse", "capture")
 
@@ -131,7 +131,7 @@ def write_model(folder: Path, model: pycolmap.Reconstruction, photos: Sequence[P
     with replacing_folder(folder / "sparse", "capture") as partial:
         (partial / "0").mkdir(parents=True)
         model.write(partial / "0")
-    write_points(folder / POINTS, model)
+    write_points(folder / POINTS_FILE, model)
     by_name = {image.name: image for image in model.images.values() if image.has_pose}
     up = {"up": [0.0, 0.0, 1.0]} if z_up else {}
     images = [by_name[p.name] for p in photos if p.name in by_name]
@@ -149,7 +149,7 @@ def transforms(model: pycolmap.Reconstruction, images: Sequence[pycolmap.Image])
         own = {} if shared else lens(model.cameras[image.camera_id])
         frames.append({"file_path": f"images/{image.name}", **own, "transform_matrix": pose.tolist()})
     common = lens(model.cameras[images[0].camera_id]) if shared else {"camera_model": "OPENCV"}
-    return {**common, "ply_file_path": POINTS, "frames": frames}
+    return {**common, "ply_file_path": POINTS_FILE, "frames": frames}
 
 
 def lens(camera: pycolmap.Camera) -> dict[str, Any]:

@@ -15,10 +15,10 @@ from ...system.library import pycolmap
 from ..photos import Photo
 from ..up import common_up, turn_onto_z
 
-GPS_ERROR = 10.0  # metres that a position may be off before it is taken for a fault of the receiver
-AGREEMENT = 0.25  # typical error of positions, as a share of how far they spread across their longest axis, at most
-FEWEST = 3
-CONSENSUS = 0.5  # share of the positions that must agree
+MAX_GPS_ERROR = 10.0  # metres; a position with a larger error is an outlier
+MAX_RELATIVE_ERROR = 0.25  # typical error of positions, as a share of their spread along the longest axis
+MIN_POSITIONS = 3
+MIN_INLIER_SHARE = 0.5  # of the positions
 
 
 @dataclass(frozen=True)
@@ -68,21 +68,21 @@ def georeference(centres: Float[np.ndarray, "photo 3"], photos: Sequence[Photo])
     some = [photos[i] for i in known]
     origin = middle(some)
     source, target = centres[known], local(some, origin)
-    if len(known) < FEWEST:
+    if len(known) < MIN_POSITIONS:
         return Georeference(None, f"GPS is not used: {len(known)} of the photographs have a position, and 3 are needed")
     options = pycolmap.RANSACOptions()
-    options.max_error, options.random_seed = GPS_ERROR, 0
+    options.max_error, options.random_seed = MAX_GPS_ERROR, 0
     found = pycolmap.estimate_sim3d_robust(source, target, options)
     if not found:
         return Georeference(None, "GPS is not used: positions and photographs contradict each other")
     matrix = found["tgt_from_src"]
     error = np.linalg.norm(source @ matrix.matrix()[:, :3].T + matrix.translation - target, axis=-1)
-    kept = error <= GPS_ERROR
-    if kept.sum() < max(FEWEST, CONSENSUS * len(known)):
+    kept = error <= MAX_GPS_ERROR
+    if kept.sum() < max(MIN_POSITIONS, MIN_INLIER_SHARE * len(known)):
         return Georeference(None, "GPS is not used: positions and photographs contradict each other")
     typical = float(np.sqrt((error[kept] ** 2).mean()))
     spread = np.linalg.svd(target[kept] - target[kept].mean(0), compute_uv=False) / np.sqrt(kept.sum())
-    if typical > AGREEMENT * spread[1]:
+    if typical > MAX_RELATIVE_ERROR * spread[1]:
         return Georeference(
             None,
             f"GPS is not used: its error ({typical:.1f} m) is too large for positions that spread {spread[0]:.1f} m "

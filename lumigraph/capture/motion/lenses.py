@@ -13,11 +13,9 @@ from ..photos import Photo
 
 Sharing = Literal["auto", "single", "per-device", "per-image"]
 
-GUESSED_FOCAL = 1.2  # longer sides of the picture: 43 mm before a full frame
-ENOUGH = 30  # photographs of one lens from which on two focal lengths and four numbers of distortion can be told
-MOST = (
-    0.5  # share of the photographs of unknown origin that have one size, from which on they are taken to share a lens
-)
+DEFAULT_FOCAL = 1.2  # longer sides of the picture: 43 mm on full frame
+MIN_FULL_MODEL_VIEWS = 30  # photographs of one lens that determine two focal lengths and four distortion coefficients
+MIN_SAME_SIZE_SHARE = 0.5  # of the photographs of unknown device; from it on one size means one lens
 
 
 def group_by_lens(photos: Sequence[Photo], in_order: bool, sharing: Sharing = "auto") -> list[list[Photo]]:
@@ -32,7 +30,11 @@ def group_by_lens(photos: Sequence[Photo], in_order: bool, sharing: Sharing = "a
             "--camera single needs photographs of one size, and these have several; use --camera per-device"
         )
     unknown = Counter(p.size for p in photos if p.device is None)
-    shared = {size for size, n in unknown.items() if in_order or sharing == "per-device" or n > MOST * unknown.total()}
+    shared = {
+        size
+        for size, n in unknown.items()
+        if in_order or sharing == "per-device" or n > MIN_SAME_SIZE_SHARE * unknown.total()
+    }
 
     def lens(photo: Photo) -> tuple:
         if sharing == "single":
@@ -50,12 +52,12 @@ def group_by_lens(photos: Sequence[Photo], in_order: bool, sharing: Sharing = "a
 def prior(group: Sequence[Photo]) -> tuple[float, bool]:
     """The focal length in pixels to begin with, and whether it is more than a guess: the median of what files say."""
     known = sorted(p.focal for p in group if p.focal)
-    return (known[len(known) // 2], True) if known else (GUESSED_FOCAL * max(group[0].size), False)
+    return (known[len(known) // 2], True) if known else (DEFAULT_FOCAL * max(group[0].size), False)
 
 
 def model_for(group: Sequence[Photo]) -> str:
     """COLMAP's name of a lens with as many unknowns as so many photographs can tell."""
-    return "OPENCV" if len(group) >= ENOUGH else "SIMPLE_RADIAL"
+    return "OPENCV" if len(group) >= MIN_FULL_MODEL_VIEWS else "SIMPLE_RADIAL"
 
 
 def write_database(path: Path, groups: Sequence[Sequence[Photo]]) -> None:

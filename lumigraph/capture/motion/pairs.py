@@ -17,29 +17,29 @@ from ...system.library import pycolmap
 Matching = Literal["auto", "exhaustive", "sequential", "retrieval"]
 Pair = tuple[int, int]
 
-ALL_BELOW = 80  # photographs, of which every pair is compared
-NEIGHBOURS = 10  # in order, on each side; beyond them those 16, 32, ... places away
-ALIKE = 30  # photographs that each is compared with where not all can be
-LOOPS = 5  # those of an ordered capture that look alike without being neighbours: where the camera came back
-WORDS = 64  # of the vocabulary
-SAMPLED = 500  # descriptors of each photograph that are looked at
-SPEAKERS = 240  # photographs that the vocabulary is learnt from
-LEARNT_FROM = 30_000  # of their descriptors, of which it is learnt
-BLOCK = 256  # photographs that are compared with all others at a time
-TILE = 16  # photographs whose features COLMAP keeps at hand: pairs are compared tile by tile
+MAX_EXHAUSTIVE_VIEWS = 80  # photographs, of which every pair is compared
+SEQUENTIAL_NEIGHBOURS = 10  # in order, on each side; beyond them those 16, 32, ... places away
+RETRIEVED_VIEWS = 30  # similar photographs compared with each one in large captures
+LOOP_CANDIDATES = 5  # similar photographs far apart in an ordered capture, for loop closure
+VOCABULARY_SIZE = 64  # of the vocabulary
+SAMPLED_DESCRIPTORS = 500  # per photograph
+VOCABULARY_VIEWS = 240  # photographs from which the vocabulary is learnt
+VOCABULARY_DESCRIPTORS = 30_000  # descriptors from which the vocabulary is learnt
+BLOCK_VIEWS = 256  # photographs compared with all others at a time
+TILE_VIEWS = 16  # photographs whose features COLMAP keeps in memory: pairs are compared tile by tile
 
 
 def choose_matching(count: int, in_order: bool) -> Matching:
     if in_order:
         return "sequential"
-    return "exhaustive" if count <= ALL_BELOW else "retrieval"
+    return "exhaustive" if count <= MAX_EXHAUSTIVE_VIEWS else "retrieval"
 
 
 def exhaustive(count: int) -> set[Pair]:
     return {(i, j) for j in range(count) for i in range(j)}
 
 
-def sequential(count: int, neighbours: int = NEIGHBOURS) -> set[Pair]:
+def sequential(count: int, neighbours: int = SEQUENTIAL_NEIGHBOURS) -> set[Pair]:
     """Pairs of photographs in order: nearby ones all, farther ones at distances that double."""
     steps = [*range(1, neighbours + 1), *(2**k for k in range(4, 10) if 2**k > neighbours)]
     return {(i, i + step) for step in steps for i in range(count - step)}
@@ -51,7 +51,7 @@ def alike(vectors: Float[np.ndarray, "photo number"], most: int, apart: int = 1)
     vectors: of each, see `aggregated`
     """
     places, pairs = np.arange(len(vectors)), set()
-    for block in np.split(places, range(BLOCK, len(places), BLOCK)):
+    for block in np.split(places, range(BLOCK_VIEWS, len(places), BLOCK_VIEWS)):
         likeness = vectors[block] @ vectors.T
         likeness[np.abs(block[:, None] - places) < apart] = -np.inf
         order = np.argsort(-likeness, axis=1, kind="stable")[:, :most]
@@ -75,15 +75,17 @@ def aggregated(descriptors: Sequence[np.ndarray], seed: int = 0) -> Float[np.nda
 
     def sampled(photo: int) -> np.ndarray:
         found = descriptors[photo]
-        return found[np.random.default_rng([seed, photo]).permutation(len(found))[:SAMPLED]].astype(np.float32)
+        return found[np.random.default_rng([seed, photo]).permutation(len(found))[:SAMPLED_DESCRIPTORS]].astype(
+            np.float32
+        )
 
-    speakers = evenly(range(len(descriptors)), SPEAKERS)
+    speakers = evenly(range(len(descriptors)), VOCABULARY_VIEWS)
     joined = np.concatenate([sampled(photo) for photo in speakers])
-    if len(joined) <= WORDS:
+    if len(joined) <= VOCABULARY_SIZE:
         return np.zeros((len(descriptors), 1), np.float32)
-    learnt = joined[np.random.default_rng(seed).permutation(len(joined))[:LEARNT_FROM]]
-    words, _ = kmeans2(learnt, WORDS, iter=10, minit="++", seed=seed)
-    vectors = np.zeros((len(descriptors), WORDS, joined.shape[1]), np.float32)
+    learnt = joined[np.random.default_rng(seed).permutation(len(joined))[:VOCABULARY_DESCRIPTORS]]
+    words, _ = kmeans2(learnt, VOCABULARY_SIZE, iter=10, minit="++", seed=seed)
+    vectors = np.zeros((len(descriptors), VOCABULARY_SIZE, joined.shape[1]), np.float32)
     for photo, vector in enumerate(vectors):
         if len(found := sampled(photo)):
             nearest, _ = vq(found, words)
@@ -93,7 +95,7 @@ def aggregated(descriptors: Sequence[np.ndarray], seed: int = 0) -> Float[np.nda
     return vectors.reshape(len(vectors), -1)
 
 
-def near(positions: Float[np.ndarray, "photo 3"], most: int = NEIGHBOURS) -> set[Pair]:
+def near(positions: Float[np.ndarray, "photo 3"], most: int = SEQUENTIAL_NEIGHBOURS) -> set[Pair]:
     """Each photograph with the `most` taken nearest to it; NaN where nobody knows."""
     known = np.flatnonzero(np.isfinite(positions).all(1))
     if len(known) < 2:
@@ -113,16 +115,16 @@ def choose_pairs(
     positions: by GPS, in metres; NaN where unknown
     """
     count = len(names)
-    if matching == "exhaustive" or count <= NEIGHBOURS:
+    if matching == "exhaustive" or count <= SEQUENTIAL_NEIGHBOURS:
         pairs = exhaustive(count)
     else:
         with Descriptors(database, names) as descriptors:
             similar = aggregated(descriptors)
         if matching == "sequential":
-            pairs = sequential(count) | alike(similar, LOOPS, apart=NEIGHBOURS + 1)
+            pairs = sequential(count) | alike(similar, LOOP_CANDIDATES, apart=SEQUENTIAL_NEIGHBOURS + 1)
         else:
-            pairs = sequential(count, 2) | alike(similar, ALIKE) | near(positions)
-    return sorted(pairs, key=lambda pair: (pair[1] // TILE, pair[0] // TILE, pair))
+            pairs = sequential(count, 2) | alike(similar, RETRIEVED_VIEWS) | near(positions)
+    return sorted(pairs, key=lambda pair: (pair[1] // TILE_VIEWS, pair[0] // TILE_VIEWS, pair))
 
 
 class Descriptors(Sequence[np.ndarray]):

@@ -23,25 +23,38 @@ from ...system.library import pycolmap
 from ...system.progress import counting
 from ..photos import Intake, Photo, gather
 from ..photos.track import Track, untracked
-from ..raw import REMEMBERED, Remembered
+from ..raw import RAW_FILE, Remembered
 from ..transforms import Made
-from .diagnosis import FEW_FEATURES, Diagnosis, Matches, diagnose, folds, read_matches
+from .diagnosis import MIN_FEATURES, Diagnosis, Matches, diagnose, folds, read_matches
 from .drawings import draw_capture, draw_photographs
-from .folder import DRAWN, MASKS, RESULT, claim, claim_results, copy_masks, copy_photographs, stamp, write_model
+from .folder import (
+    DRAWING_FILES,
+    MASKS,
+    RESULT_FILE,
+    claim,
+    claim_results,
+    copy_masks,
+    copy_photographs,
+    stamp,
+    write_model,
+)
 from .georeference import Georeference, georeference, gps_positions, upright
 from .lenses import Sharing, group_by_lens, model_for, prior, write_database
-from .pairs import NEIGHBOURS, Matching, choose_matching, choose_pairs
+from .pairs import SEQUENTIAL_NEIGHBOURS, Matching, choose_matching, choose_pairs
 from .stages import Stages, key_of
 
-FEWEST = 3  # photographs that make a model
-MAX_SIZE = 1600  # pixels of the longer side at which details are looked for
-FEATURES = ((20, 8192), (60, 4096))  # up to so many photographs so many features each; comparing goes by their square
-FEWEST_FEATURES = 2048
-KEPT = 0.8  # share of the photographs that a model must keep to be preferred for being free of folds
-INSTEAD = "instead"  # a file among the models, empty: they were not made by the mapper that was asked for
-OTHER: dict[str, Literal["incremental", "global"]] = {"incremental": "global", "global": "incremental"}
-UNSAFE = re.compile(r"[\s#]")  # COLMAP's lists of pairs end names at spaces
-SPECIFICATION = 2  # of what is written; another number has everything written again
+MIN_VIEWS = 3  # photographs of a model
+MAX_SIDE = 1600  # pixels of the longer side for feature detection
+FEATURE_BUDGETS = (
+    (20, 8192),
+    (60, 4096),
+)  # (photographs, features each): up to so many photographs; matching costs the square of features
+MIN_FEATURE_BUDGET = 2048
+MIN_KEPT_SHARE = 0.8  # share of the photographs that a model without folds must keep to be preferred
+FALLBACK_MARK = "instead"  # an empty file among the models: they come from the other mapper, not the requested one
+OTHER_MAPPER: dict[str, Literal["incremental", "global"]] = {"incremental": "global", "global": "incremental"}
+UNSAFE_CHARACTERS = re.compile(r"[\s#]")  # COLMAP's lists of pairs end names at spaces
+OUTPUT_VERSION = 2  # another number makes all outputs be written again
 
 
 @dataclass(frozen=True)
@@ -59,7 +72,7 @@ class Options:
     mapper: Literal["incremental", "global"] = "incremental"
     matching: Matching = "auto"
     camera: Sharing = "auto"
-    max_size: int = MAX_SIZE
+    max_size: int = MAX_SIDE
 
 
 def reconstruct(
@@ -95,9 +108,9 @@ def taken_in(sources: Sequence[Path], work: Path, options: Options, track: Track
     """Gather photographs, and list those that are no duplicates. Raises LumigraphError if there are too few."""
     intake = with_safe_names(gather(sources, work, options.frames, track))
     photos = [photo for photo in intake.photos if photo.name not in intake.duplicates]
-    if len(photos) < FEWEST:
+    if len(photos) < MIN_VIEWS:
         raise LumigraphError(
-            f"{intake.source} has {counted(len(photos), 'photograph')} that can be used, and {FEWEST} are the "
+            f"{intake.source} has {counted(len(photos), 'photograph')} that can be used, and {MIN_VIEWS} are the "
             f"least{also_unreadable(intake)}; take some from other places"
         )
     return intake, photos
@@ -106,15 +119,15 @@ def taken_in(sources: Sequence[Path], work: Path, options: Options, track: Track
 def check(options: Options) -> None:
     if options.max_size < 200:
         raise LumigraphError(f"--max-size {options.max_size} leaves no details to find; give at least 200 pixels")
-    if options.frames is not None and options.frames < FEWEST:
-        raise LumigraphError(f"--frames {options.frames} are too few to tell depth from; give at least {FEWEST}")
+    if options.frames is not None and options.frames < MIN_VIEWS:
+        raise LumigraphError(f"--frames {options.frames} are too few to tell depth from; give at least {MIN_VIEWS}")
 
 
 def with_safe_names(intake: Intake) -> Intake:
     """The intake with names that COLMAP can hold in its lists."""
     new: dict[str, str] = {}
     for photo in intake.photos:
-        name = UNSAFE.sub("_", photo.name)
+        name = UNSAFE_CHARACTERS.sub("_", photo.name)
         while name in new.values():
             name = f"_{name}"
         new[photo.name] = name
@@ -136,11 +149,11 @@ def intake_identity(intake: Intake) -> list[Any]:
 
 def finished(folder: Path, key: str) -> dict[str, Any] | None:
     """Result of an earlier call that finished with the same inputs; None if there is none."""
-    needed = ("transforms.json", "sparse/0/images.bin", "images", RESULT)
+    needed = ("transforms.json", "sparse/0/images.bin", "images", RESULT_FILE)
     if not all((folder / name).exists() for name in needed):
         return None
-    known = read_json(folder / RESULT)
-    return known if typed(Made, known, folder / RESULT).key == key else None
+    known = read_json(folder / RESULT_FILE)
+    return known if typed(Made, known, folder / RESULT_FILE).key == key else None
 
 
 @dataclass
@@ -183,7 +196,7 @@ class Reconstruction:
         places = [p.gps for p in self.photos] if self.matching == "retrieval" else None
         matching = key_of(features, self.matching, places)
         mapping = key_of(matching, self.options.mapper)
-        result = key_of(SPECIFICATION, mapping, intake_identity(self.intake))
+        result = key_of(OUTPUT_VERSION, mapping, intake_identity(self.intake))
         return {"features": features, "matching": matching, "mapping": mapping, "result": result}
 
     def run(self) -> dict[str, Any]:
@@ -198,7 +211,7 @@ class Reconstruction:
             return self.write(self.keys["result"])
 
     def count_features(self) -> int:
-        return next((features for most, features in FEATURES if len(self.photos) <= most), FEWEST_FEATURES)
+        return next((features for most, features in FEATURE_BUDGETS if len(self.photos) <= most), MIN_FEATURE_BUDGET)
 
     def find_features(self, key: str) -> None:
         if self.stages.is_done("features", key) and self.database.is_file():
@@ -238,15 +251,15 @@ class Reconstruction:
     def place(self, key: str) -> None:
         """By the mapper that was asked for; by the other where it finds no model. One by one needs a pair that tells
         depth to begin with, which a walk straight ahead may lack; all at once needs focal lengths and many pairs."""
-        if self.stages.is_done("mapping", key) and self.models.is_dir() and largest(self.models) >= FEWEST:
+        if self.stages.is_done("mapping", key) and self.models.is_dir() and largest(self.models) >= MIN_VIEWS:
             return
         with self.stages.working("mapping", key), replacing_folder(self.models, ours=True) as partial:
             self.map(self.database, partial, self.options.mapper)
-            if largest(partial) < FEWEST:
+            if largest(partial) < MIN_VIEWS:
                 for place in partial.iterdir():  # a pair at most
                     remove(place)
-                self.map(self.database, partial, OTHER[self.options.mapper])
-                (partial / INSTEAD).touch()
+                self.map(self.database, partial, OTHER_MAPPER[self.options.mapper])
+                (partial / FALLBACK_MARK).touch()
 
     def unfold(self, key: str) -> None:
         """If the model leaps between neighbours, make another from what near neighbours share alone.
@@ -263,7 +276,7 @@ class Reconstruction:
             if folded:
                 near = self.work / "near.db"
                 copy_database(self.database, near)
-                keep_near(near, self.names, NEIGHBOURS)
+                keep_near(near, self.names, SEQUENTIAL_NEIGHBOURS)
                 with replacing_folder(self.unfolded, ours=True) as partial:
                     self.map(near, partial, "incremental")
 
@@ -283,16 +296,16 @@ class Reconstruction:
     def choose(self, matches: Matches) -> tuple[list[pycolmap.Reconstruction], list[str]]:
         """The models, largest first, and what to say of how they came about."""
         found, told = read_models(self.models), []
-        if (self.models / INSTEAD).exists():
+        if (self.models / FALLBACK_MARK).exists():
             how = "all at once" if self.options.mapper == "incremental" else "one by one"
             told.append(f"--mapper {self.options.mapper} found no model, so photographs were placed {how}")
         if self.unfolded.is_dir() and (unfolded := read_models(self.unfolded)):
-            enough = unfolded[0].num_reg_images() >= KEPT * found[0].num_reg_images()
+            enough = unfolded[0].num_reg_images() >= MIN_KEPT_SHARE * found[0].num_reg_images()
             if enough and self.leaps(unfolded[0], matches) < self.leaps(found[0], matches):
                 found = unfolded
                 told.append(
                     f"parts of the place look alike and the model folded, so it was made again from the nearest "
-                    f"{NEIGHBOURS} neighbours of each photograph alone; look at capture.png"
+                    f"{SEQUENTIAL_NEIGHBOURS} neighbours of each photograph alone; look at capture.png"
                 )
         return found, told
 
@@ -308,9 +321,9 @@ class Reconstruction:
         """The largest model becomes the scene. capture.json comes last: where it is, the rest is whole."""
         matches = read_matches(self.database)
         found, told = self.choose(matches)
-        if not found or found[0].num_reg_images() < FEWEST:
+        if not found or found[0].num_reg_images() < MIN_VIEWS:
             raise LumigraphError(nothing_fits(self.intake, self.photos, matches))
-        for name in (RESULT, "transforms.json"):
+        for name in (RESULT_FILE, "transforms.json"):
             claim_file(self.folder / name, "capture")
             remove(self.folder / name)
         model = found[0]
@@ -328,12 +341,12 @@ class Reconstruction:
         known = place is not None and place.new_from_old is not None
         write_model(self.folder, model, self.photos, z_up=known)
         if self.intake.raw:
-            write_json(self.folder / REMEMBERED, Remembered(self.intake.raw).to_json(), "capture")
-        capture_sheet, photograph_sheet = (self.folder / name for name in DRAWN)
+            write_json(self.folder / RAW_FILE, Remembered(self.intake.raw).to_json(), "capture")
+        capture_sheet, photograph_sheet = (self.folder / name for name in DRAWING_FILES)
         draw_capture(capture_sheet, model, diagnosis, known)
         draw_photographs(photograph_sheet, self.intake, diagnosis)
         result = self.summary(key, model, place, diagnosis)
-        write_json(self.folder / RESULT, result, "capture")
+        write_json(self.folder / RESULT_FILE, result, "capture")
         return result
 
     def turn_upright(self, model: pycolmap.Reconstruction) -> Georeference | None:
@@ -427,7 +440,7 @@ def also_unreadable(intake: Intake) -> str:
 
 def nothing_fits(intake: Intake, photos: Sequence[Photo], matches: Matches) -> str:
     """Why no model came about, in a sentence."""
-    poor = sum(matches.features.get(photo.name, 0) < FEW_FEATURES for photo in photos)
+    poor = sum(matches.features.get(photo.name, 0) < MIN_FEATURES for photo in photos)
     if poor > len(photos) / 2:
         why = f"{poor} of {len(photos)} show too few details, being blank, dark or out of focus"
     elif not matches.shared:

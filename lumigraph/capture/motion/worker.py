@@ -21,9 +21,9 @@ from typing import Any
 import pycolmap
 
 COUNTER = Path(__file__).with_name("counter.py")
-BLOCK = 64  # pairs that COLMAP compares between two writes to the database
-RELIABLE = 3  # photographs that make a model, at the least
-MANY_CORES = 16  # more threads would ask for more memory than they save time
+BLOCK_PAIRS = 64  # pairs that COLMAP compares between two writes to the database
+MIN_MODEL_VIEWS = 3  # photographs of a model
+MAX_THREADS = 16  # more threads need more memory than they save time
 
 
 def find_features(job: dict[str, Any]) -> None:
@@ -49,7 +49,7 @@ def match(job: dict[str, Any]) -> None:
     """Compare listed pairs and keep what one motion between two views explains; pairs that are done are passed over."""
     options, pairing = pycolmap.FeatureMatchingOptions(), pycolmap.ImportedPairingOptions()
     options.num_threads = job["threads"]
-    pairing.match_list_path, pairing.block_size = job["pairs"], BLOCK
+    pairing.match_list_path, pairing.block_size = job["pairs"], BLOCK_PAIRS
     verification = pycolmap.TwoViewGeometryOptions()
     verification.ransac.random_seed = job["seed"]
     pycolmap.match_image_pairs(job["database"], options, pairing, verification, device=pycolmap.Device.cpu)
@@ -59,7 +59,7 @@ def place_one_by_one(job: dict[str, Any]) -> None:
     """Incremental structure from motion (Schönberger and Frahm 2016)."""
     options = pycolmap.IncrementalPipelineOptions()
     options.num_threads, options.random_seed = job["threads"], job["seed"]
-    options.min_model_size = RELIABLE
+    options.min_model_size = MIN_MODEL_VIEWS
     placed = 2
 
     def another() -> None:
@@ -86,7 +86,7 @@ def place_all_at_once(job: dict[str, Any]) -> None:
     """Global structure from motion (GLOMAP, Pan 2024). Focal lengths that are guesses are first found from pairs."""
     options = pycolmap.GlobalPipelineOptions()
     options.num_threads, options.random_seed = job["threads"], job["seed"]
-    options.min_model_size = RELIABLE
+    options.min_model_size = MIN_MODEL_VIEWS
     if job["calibrate"]:
         pycolmap.calibrate_view_graph(job["database"])
     pycolmap.global_mapping(job["database"], job["images"], job["models"], options)
@@ -112,7 +112,7 @@ def end_with_input() -> None:
 def main() -> None:
     signal.signal(signal.SIGTERM, signal.SIG_DFL)  # COLMAP's logging library has taken it
     job = json.loads(sys.argv[1])
-    job["threads"] = min(os.cpu_count() or 1, MANY_CORES)
+    job["threads"] = min(os.cpu_count() or 1, MAX_THREADS)
     job["seed"] = 0
     threading.Thread(target=end_with_input, daemon=True).start()
     run, table = STAGES[job["stage"]]

@@ -8,10 +8,10 @@ import numpy as np
 from jaxtyping import Float
 from scipy.cluster.vq import kmeans2
 
-KINDS = 10  # of colour, each a Gaussian
-FEWEST = 50  # pixels that a kind of colour is told from
-GRAIN = 2.0  # units of CIELAB by which colours of one surface differ at the least
-SAMPLES = 20_000  # pixels that a mixture is learnt from
+COMPONENTS = 10  # Gaussians of a mixture
+MIN_PIXELS = 50  # per Gaussian
+MIN_DEVIATION = 2.0  # units of CIELAB by which colours of one surface differ at the least
+MAX_SAMPLES = 20_000  # pixels from which a mixture is learnt
 
 
 @dataclass(frozen=True)
@@ -26,12 +26,12 @@ class Mixture:
     def of(colours: Float[np.ndarray, "pixel 3"]) -> Mixture:
         """The mixture that k-means finds in some colours."""
         chance = np.random.default_rng(0)
-        some = colours[chance.permutation(len(colours))[:SAMPLES]].astype(np.float64)
-        count = int(np.clip(len(some) // FEWEST, 1, KINDS))
+        some = colours[chance.permutation(len(colours))[:MAX_SAMPLES]].astype(np.float64)
+        count = int(np.clip(len(some) // MIN_PIXELS, 1, COMPONENTS))
         means, kinds = kmeans2(some, count, minit="++", seed=0)
         found = [k for k in range(count) if (kinds == k).sum() > 3]
         weights = np.array([(kinds == k).mean() for k in found])
-        spreads = [np.cov(some[kinds == k].T) + GRAIN**2 * np.eye(3) for k in found]
+        spreads = [np.cov(some[kinds == k].T) + MIN_DEVIATION**2 * np.eye(3) for k in found]
         roots = np.stack([np.linalg.cholesky(np.linalg.inv(spread)) for spread in spreads])
         return Mixture(weights, means[found], roots)
 

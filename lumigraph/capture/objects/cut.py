@@ -9,9 +9,9 @@ from scipy.sparse.csgraph import breadth_first_order, maximum_flow
 
 from .view import View
 
-UNITS = 1000  # of capacity to one of cost: the flow counts in whole numbers
-STIFFNESS = 3.0  # cost of an outline along one pixel where colours do not change
-HOLD = 30.0  # the largest of these costs
+CAPACITY_SCALE = 1000  # of capacity to one of cost: the flow counts in whole numbers
+SMOOTHNESS = 3.0  # cost of an outline along one pixel where colours do not change
+MAX_COST = 30.0  # the largest of these costs
 
 
 def cut(view: View, costs: Float[np.ndarray, " patch"]) -> Bool[np.ndarray, " patch"]:
@@ -22,16 +22,16 @@ def cut(view: View, costs: Float[np.ndarray, " patch"]) -> Bool[np.ndarray, " pa
     An outline costs less where colours change: exp(-|a - b|^2 / 2 mean) to a pixel of its length.
     """
     count = len(costs)
-    weighed = np.clip(costs, -HOLD, HOLD) * np.sqrt(view.sizes)
+    weighed = np.clip(costs, -MAX_COST, MAX_COST) * np.sqrt(view.sizes)
     a, b = view.edges.T
     apart = np.square(view.colours[a] - view.colours[b]).sum(-1)
-    along = STIFFNESS * view.lengths * np.exp(-apart / (2 * apart.mean() + 1e-9))
+    along = SMOOTHNESS * view.lengths * np.exp(-apart / (2 * apart.mean() + 1e-9))
     source, sink = count, count + 1
     every = np.arange(count)
     tails = np.concatenate([np.full(count, source), every, a, b])
     heads = np.concatenate([every, np.full(count, sink), b, a])
     capacity = np.concatenate([np.maximum(-weighed, 0), np.maximum(weighed, 0), along, along])
-    whole = np.minimum(capacity * UNITS, 2**30).astype(np.int32)
+    whole = np.minimum(capacity * CAPACITY_SCALE, 2**30).astype(np.int32)
     graph = csr_matrix((whole, (tails, heads)), (count + 2, count + 2))
     left = graph - maximum_flow(graph, source, sink).flow
     left.data = np.maximum(left.data, 0)

@@ -24,13 +24,13 @@ from .guided import guided
 from .segment import Segmentation, segment
 from .view import View
 
-SHEET = "object.png"
-SHOWN, ROW = 16, 4  # photographs on the sheet, and on a line of it
-EDGE = 0.006  # of a photograph's longer side: how far an outline may move to the edge that it means
-SHARPER = 2.0  # times, that the filter's soft outline is made steeper
-ALIKE = 0.8  # share of superpixels that colours tell apart, below which they are said not to
-WHOLE = 0.6  # share of the region that a body may fill before it is no object
-DIM = 0.2  # of the light of what is outside, on the sheet
+SHEET_FILE = "object.png"
+MAX_SHOWN, ROW_LENGTH = 16, 4  # photographs on the sheet, and on a line of it
+OUTLINE_RADIUS = 0.006  # of a photograph's longer side: distance over which an outline may snap to an edge
+OUTLINE_GAIN = 2.0  # steepness factor of the filter's soft outline
+MIN_SEPARATION = 0.8  # share of superpixels that colours separate, below which a warning is due
+MAX_FILLED_SHARE = 0.6  # share of the region that an object may fill
+BACKGROUND_BRIGHTNESS = 0.2  # factor on the background of the sheet
 
 Track = Callable[[Sequence[Any], str, int], Iterable[Any]]
 
@@ -53,12 +53,12 @@ def mask_object(folder: Path, capture: Capture, track: Track) -> Masked:
     """
     if (folder / OBJECT_MASKS).exists():
         raise LumigraphError(f"{folder / OBJECT_MASKS} is there already; delete it, and masks will be made anew")
-    claim(folder / SHEET, "masks")
+    claim(folder / SHEET_FILE, "masks")
     scene = assemble(replace(capture, shots=[replace(shot, mask=None, alpha=None) for shot in capture.shots]))
     views = [view_of(scene, i) for i in track(range(len(scene)), "Dividing photographs", len(scene))]
     found = segment(views, scene.points, track)
     tiles: dict[int, Image.Image] = {}
-    shown = evenly(range(len(scene)), SHOWN)
+    shown = evenly(range(len(scene)), MAX_SHOWN)
     with replacing_folder(folder / OBJECT_MASKS) as partial:
         for i in track(range(len(scene)), "Writing masks", len(scene)):
             rgb = scene.photograph(i).rgb.numpy()
@@ -67,10 +67,10 @@ def mask_object(folder: Path, capture: Capture, track: Track) -> Masked:
             path.parent.mkdir(parents=True, exist_ok=True)
             Image.fromarray((alpha * 255).round().astype(np.uint8)).save(path)
             if i in shown:
-                lit = rgb * (DIM + (1 - DIM) * alpha[..., None])
+                lit = rgb * (BACKGROUND_BRIGHTNESS + (1 - BACKGROUND_BRIGHTNESS) * alpha[..., None])
                 tiles[i] = fit_into(Image.fromarray((lit * 255).astype(np.uint8)), 320, 320)
-    save_picture(folder / SHEET, sheet_of(scene, tiles), "masks")
-    return Masked(len(scene), folder / SHEET, doubts(found))
+    save_picture(folder / SHEET_FILE, sheet_of(scene, tiles), "masks")
+    return Masked(len(scene), folder / SHEET_FILE, doubts(found))
 
 
 def view_of(scene: Scene, index: int) -> View:
@@ -84,8 +84,8 @@ def refined(
     height, width = rgb.shape[:2]
     small = Image.fromarray(found.inside[index][found.views[index].patches])
     rough = np.asarray(small.convert("L").resize((width, height), Image.Resampling.BILINEAR)) / 255
-    soft = guided(rgb.mean(-1), rough, max(1, round(EDGE * max(width, height))))
-    return (SHARPER * (soft - 0.5) + 0.5).clip(0, 1)
+    soft = guided(rgb.mean(-1), rough, max(1, round(OUTLINE_RADIUS * max(width, height))))
+    return (OUTLINE_GAIN * (soft - 0.5) + 0.5).clip(0, 1)
 
 
 def doubts(found: Segmentation) -> list[str]:
@@ -93,9 +93,9 @@ def doubts(found: Segmentation) -> list[str]:
     told = []
     if found.region.table is None:
         told.append("no table or floor was found below the object, so shadows at its foot may belong to it")
-    if len(found.body) > WHOLE * len(found.region.cells):
+    if len(found.body) > MAX_FILLED_SHARE * len(found.region.cells):
         told.append("what was found fills nearly all that the photographs look at, so it may be no object at all")
-    if found.distinct < ALIKE:
+    if found.distinct < MIN_SEPARATION:
         told.append("the object has nearly the colours of what is around it, so the outlines are guesses")
     if names := found.doubtful:
         some = ", ".join(names[:5]) + (" ..." if len(names) > 5 else "")
@@ -105,6 +105,6 @@ def doubts(found: Segmentation) -> list[str]:
 
 def sheet_of(scene: Scene, tiles: dict[int, Image.Image]) -> Image.Image:
     pictures = [(scene.names[i], torch.from_numpy(np.asarray(tile) / 255).float()) for i, tile in tiles.items()]
-    lines = [pictures[k : k + ROW] for k in range(0, len(pictures), ROW)]
+    lines = [pictures[k : k + ROW_LENGTH] for k in range(0, len(pictures), ROW_LENGTH)]
     rows = [Row([Path(name).name for name, _ in line], [picture for _, picture in line]) for line in lines]
-    return contact_sheet("What the masks keep", [""] * min(ROW, len(pictures)), rows, 240)
+    return contact_sheet("What the masks keep", [""] * min(ROW_LENGTH, len(pictures)), rows, 240)

@@ -19,18 +19,21 @@ from torch import Tensor
 
 from ...errors import LumigraphError
 from .colours import Mixture
-from .cut import HOLD, cut
-from .region import CELLS, Region, find_region
+from .cut import MAX_COST, cut
+from .region import GRID_SIDE, Region, find_region
 from .view import View
 
-SLACKS = (0.35, 0.3, 0.25, 0.2, 0.15, 0.15)  # share of the views that may see past a cell, round by round
-CORE = 0.35  # of the region's radius around its middle: where colours are first learnt, without sparse points
-SHADED, DARKEST = 0.25, 0.35  # share of surrounding colours that count as shaded too, and what shadows leave of light
-PLAIN, SAME = 0.8, 3.0  # share of a plain backdrop that differs from its middle by at most so much, in CIELAB
-PRIOR = 2.5  # logarithm of likelihood by which a body speaks for the pixels that it covers
-SURE = 4.0  # the largest that colours alone may speak with
-FEWEST = 20  # cells that make a body
-DOUBTFUL = 0.75  # overlap of a cut with the body below which a photograph is named
+MAX_DISAGREEMENTS = (0.35, 0.3, 0.25, 0.2, 0.15, 0.15)  # share of the views that may see past a cell, round by round
+CORE_RADIUS = 0.35  # of the region's radius: where colours are first learnt, without sparse points
+MIN_SHADOW_SHARE, SHADOW_BRIGHTNESS = (
+    0.25,
+    0.35,
+)  # share of surrounding colours that also count as shaded; brightness of the darkest shadow
+PLAIN_SHARE, PLAIN_DISTANCE = 0.8, 3.0  # share of a plain backdrop within this CIELAB distance of its median
+BODY_LOG_LIKELIHOOD = 2.5  # log-likelihood added to the pixels that a body covers
+MAX_COLOUR_LOG_LIKELIHOOD = 4.0  # limit of the evidence of colours alone
+MIN_CELLS = 20  # of a body
+MIN_OVERLAP = 0.75  # of a cut with the body, below which a warning names the photograph
 
 
 Patches = np.ndarray  # bool: which superpixels of one picture; each picture has a number of its own
@@ -57,7 +60,7 @@ class Segmentation:
     @property
     def doubtful(self) -> list[str]:
         """Names of photographs whose outline does not agree with the others'."""
-        return [view.name for view, overlap in zip(self.views, self.overlaps, strict=True) if overlap < DOUBTFUL]
+        return [view.name for view, overlap in zip(self.views, self.overlaps, strict=True) if overlap < MIN_OVERLAP]
 
 
 def segment(
@@ -71,7 +74,7 @@ def segment(
     Raises LumigraphError where no body agrees with the cuts.
     """
     region = find_region(views, points)
-    if len(region.cells) < FEWEST:
+    if len(region.cells) < MIN_CELLS:
         raise LumigraphError("The photographs do not look at one thing together, so there is no object to find")
     allowed = [view.mean((view.shadow(region.cells, region.size) > 0.5).astype(float)) > 0.5 for view in views]
     shown = [behind(region, view) for view in views]
@@ -79,16 +82,16 @@ def segment(
     shares = [view.mean(view.shadow(body, region.size)) for view in views]
     inside = [share > 0.5 for share in shares]
     strength = 0.0  # at first the body is a guess, and only colours speak
-    for slack in track(SLACKS, "Cutting the object out", len(SLACKS)):
+    for slack in track(MAX_DISAGREEMENTS, "Cutting the object out", len(MAX_DISAGREEMENTS)):
         own, around = learn_colours(views, inside)
         inside = []
         for view, share, may in zip(views, shares, allowed, strict=True):
             colour = around.log_likelihood(view.colours) - own.log_likelihood(view.colours)
-            costs = colour.clip(-SURE, SURE) - strength * (2 * share - 1)
-            inside.append(cut(view, np.where(may, costs, HOLD)))
+            costs = colour.clip(-MAX_COLOUR_LOG_LIKELIHOOD, MAX_COLOUR_LOG_LIKELIHOOD) - strength * (2 * share - 1)
+            inside.append(cut(view, np.where(may, costs, MAX_COST)))
         body = carved(region, shown, inside, slack)
         shares = [view.mean(view.shadow(body, region.size)) for view in views]
-        strength = PRIOR
+        strength = BODY_LOG_LIKELIHOOD
     overlaps = np.array([overlap(view, a, b > 0.5) for view, a, b in zip(views, inside, shares, strict=True)])
     return Segmentation(list(views), inside, body, region, overlaps, distinctness(views, inside, own, around))
 
@@ -104,20 +107,20 @@ def first_guess(region: Region, points: Float[Tensor, "point 3"] | None) -> Floa
     """The cells near sparse points inside the region; those in the middle of it where there are none."""
     if points is not None:
         some = points[region.holds(points)]
-        if len(some) >= FEWEST:
+        if len(some) >= MIN_CELLS:
             middle = some.median(0).values
             radius = (some - middle).norm(dim=-1).median()
             return region.cells[(region.cells - middle).norm(dim=-1) <= 1.2 * radius]
     middle = region.cells.mean(0)
     away = (region.cells - middle).norm(dim=-1)
-    return region.cells[away <= CORE * away.max()]
+    return region.cells[away <= CORE_RADIUS * away.max()]
 
 
 def learn_colours(views: Sequence[View], inside: Sequence[Patches]) -> tuple[Mixture, Mixture]:
     """The colours of the object, and of what is around it: all that is not inside."""
     own = np.concatenate([view.colours[i] for view, i in zip(views, inside, strict=True)])
     around = np.concatenate([view.colours[~i] for view, i in zip(views, inside, strict=True)])
-    if min(len(own), len(around)) < FEWEST:
+    if min(len(own), len(around)) < MIN_CELLS:
         raise LumigraphError("No object stands out from what is around it; take photographs that show it whole")
     return Mixture.of(own), Mixture.of(np.concatenate([around, shaded(around)]))
 
@@ -129,8 +132,8 @@ def shaded(colours: Float[np.ndarray, "patch 3"]) -> Float[np.ndarray, "shaded 3
     Of CIELAB all three numbers shrink together when light does.
     """
     away = np.linalg.norm(colours - np.median(colours, 0), axis=-1)
-    some = colours[:: round(1 / SHADED)] if np.quantile(away, PLAIN) > SAME else colours[:0]
-    return some * np.random.default_rng(0).uniform(DARKEST, 1, (len(some), 1))
+    some = colours[:: round(1 / MIN_SHADOW_SHARE)] if np.quantile(away, PLAIN_SHARE) > PLAIN_DISTANCE else colours[:0]
+    return some * np.random.default_rng(0).uniform(SHADOW_BRIGHTNESS, 1, (len(some), 1))
 
 
 def behind(region: Region, view: View) -> Int[np.ndarray, " cell"]:
@@ -151,7 +154,7 @@ def carved(
         seen += patch >= 0
         past += (patch >= 0) & ~own[patch]
     keep = past <= slack * seen
-    grid = np.zeros((CELLS,) * 3, bool)
+    grid = np.zeros((GRID_SIDE,) * 3, bool)
     index = tuple(((region.cells.numpy() + 1) / region.size).astype(int).T)
     grid[index] = keep
     pieces, count = ndimage.label(grid)
@@ -159,7 +162,7 @@ def carved(
         raise LumigraphError("No body looks like the outlines found, so no object can be told from the rest")
     largest = 1 + int(np.argmax(np.bincount(pieces.ravel())[1:]))
     body = region.cells[torch.from_numpy((pieces == largest)[index])]
-    if len(body) < FEWEST:
+    if len(body) < MIN_CELLS:
         raise LumigraphError("No body looks like the outlines found, so no object can be told from the rest")
     return body
 

@@ -13,9 +13,9 @@ from skimage.segmentation import slic
 
 from ...camera import Camera
 
-SIDE = 400  # pixels of the longer side
-PATCHES = 1500  # superpixels of a picture (SLIC, Achanta 2012)
-COMPACT = 8.0
+MAX_SIDE = 400  # pixels of the longer side
+SUPERPIXELS = 1500  # of a picture (SLIC, Achanta 2012)
+COMPACTNESS = 8.0
 
 
 @dataclass
@@ -40,9 +40,9 @@ class View:
 
     def __post_init__(self) -> None:
         # SLIC scales what it is given to [0, 1]; compactness is meant for CIELAB's own units.
-        compact = COMPACT / float(np.ptp(self.lab))
+        compact = COMPACTNESS / float(np.ptp(self.lab))
         self.patches = slic(
-            self.lab, PATCHES, compact, max_num_iter=5, start_label=0, convert2lab=False, channel_axis=2
+            self.lab, SUPERPIXELS, compact, max_num_iter=5, start_label=0, convert2lab=False, channel_axis=2
         )
         count = int(self.patches.max()) + 1
         self.sizes = np.bincount(self.patches.ravel(), minlength=count).astype(np.float64)
@@ -57,7 +57,7 @@ class View:
     @staticmethod
     def of(name: str, camera: Camera, rgb: Float[torch.Tensor, "height width 3"]) -> View:
         """A view of a photograph of any size."""
-        share = min(1.0, SIDE / max(rgb.shape[:2]))
+        share = min(1.0, MAX_SIDE / max(rgb.shape[:2]))
         small = camera.resized(share)
         width, height = small.size[0].tolist()
         shrunk = torch.nn.functional.interpolate(rgb.permute(2, 0, 1)[None].float(), (height, width), mode="area")[

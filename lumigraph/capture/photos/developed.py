@@ -13,12 +13,12 @@ from PIL import Image
 from ...errors import LumigraphError
 from ...files import read_json, replacing, write_json
 from ...geometry.choice import evenly
-from ..raw import REMEMBERED, Developed, RawPhoto, Remembered, exif_of, open_raw
+from ..raw import RAW_FILE, Developed, RawPhoto, Remembered, exif_of, open_raw
 from .track import Track
-from .upright import QUALITY, is_current
+from .upright import JPEG_QUALITY, is_current
 
-PROBES = 8  # photographs that tell how bright all are to be
-AT_ONCE = 2  # photographs in memory, each some ten times as large there as its file
+PROBE_VIEWS = 8  # photographs that set the common brightness
+PARALLEL_FILES = 2  # photographs in memory, each some ten times as large there as its file
 
 
 def develop(files: Mapping[str, Path], folder: Path, track: Track) -> dict[str, Developed | str]:
@@ -30,7 +30,7 @@ def develop(files: Mapping[str, Path], folder: Path, track: Track) -> dict[str, 
     """
     opened: dict[str, RawPhoto | str] = {name: open_or_why(path) for name, path in files.items()}
     photos = {name: one for name, one in opened.items() if isinstance(one, RawPhoto)}
-    record = folder / REMEMBERED
+    record = folder / RAW_FILE
     before = read_json(record, Remembered).photographs if record.is_file() else {}
     common = brightness_of_all(list(photos.values()))
 
@@ -46,7 +46,7 @@ def develop(files: Mapping[str, Path], folder: Path, track: Track) -> dict[str, 
             return reason(photo.path, fault)
         return Developed(str(photo.path.resolve()), brightness)
 
-    with ThreadPoolExecutor(AT_ONCE) as pool:
+    with ThreadPoolExecutor(PARALLEL_FILES) as pool:
         try:
             made = dict(
                 zip(photos, track(pool.map(make, photos), "Developing raw photographs", len(photos)), strict=True)
@@ -74,7 +74,7 @@ def reason(path: Path, fault: LumigraphError) -> str:
 def brightness_of_all(photos: list[RawPhoto]) -> float | None:
     """Factor on each photograph's light, times its exposure; None if some exposures are unknown."""
     found = []
-    for photo in evenly(photos, PROBES):
+    for photo in evenly(photos, PROBE_VIEWS):
         if photo.exposure is None:
             return None
         try:
@@ -90,6 +90,6 @@ def write(photo: RawPhoto, brightness: float, target: Path) -> None:
     picture = Image.fromarray(photo.developed(brightness))
     exif = exif_of(photo.path)
     with replacing(target, ours=True) as partial:
-        picture.save(partial, "JPEG", quality=QUALITY, subsampling=0, exif=exif)
+        picture.save(partial, "JPEG", quality=JPEG_QUALITY, subsampling=0, exif=exif)
         stat = photo.path.stat()
         os.utime(partial, ns=(stat.st_atime_ns, stat.st_mtime_ns))

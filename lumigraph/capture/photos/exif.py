@@ -11,10 +11,10 @@ from PIL import ExifTags, Image
 
 Tag, Gps = ExifTags.Base, ExifTags.GPS
 
-FULL_FRAME = math.hypot(36, 24)  # mm, the diagonal that "35 mm equivalent" refers to (CIPA DCG-001)
-UNITS = {1: 25.4, 2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}  # mm, of FocalPlaneResolutionUnit
-SENSORS = (2.0, 80.0)  # mm, widths that a sensor may have; else the file's numbers are wrong
-CROPPED = 0.02  # ratio of sides that may differ from the one at exposure, by rounding
+FULL_FRAME_DIAGONAL = math.hypot(36, 24)  # mm, to which "35 mm equivalent" refers (CIPA DCG-001)
+FOCAL_PLANE_UNITS = {1: 25.4, 2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}  # mm, of FocalPlaneResolutionUnit
+SENSOR_WIDTHS = (2.0, 80.0)  # mm, the plausible range; beyond it the file's numbers are wrong
+ASPECT_TOLERANCE = 0.02  # relative difference of aspect ratios that rounding explains
 
 
 @dataclass(frozen=True)
@@ -64,18 +64,18 @@ def focal_length(tags: dict[int, Any], size: tuple[int, int]) -> float | None:
     """
     width, height = number(tags.get(Tag.ExifImageWidth)), number(tags.get(Tag.ExifImageHeight))
     if width and height:
-        if abs(math.log(max(width, height) / min(width, height) * min(size) / max(size))) > CROPPED:
+        if abs(math.log(max(width, height) / min(width, height) * min(size) / max(size))) > ASPECT_TOLERANCE:
             return None
     if equivalent := number(tags.get(Tag.FocalLengthIn35mmFilm)):
-        return equivalent / FULL_FRAME * math.hypot(*size)
+        return equivalent / FULL_FRAME_DIAGONAL * math.hypot(*size)
     length, density = number(tags.get(Tag.FocalLength)), number(tags.get(Tag.FocalPlaneXResolution))
     if not (length and density):
         return None
-    unit = UNITS.get(int(number(tags.get(Tag.FocalPlaneResolutionUnit)) or 2), 25.4)
+    unit = FOCAL_PLANE_UNITS.get(int(number(tags.get(Tag.FocalPlaneResolutionUnit)) or 2), 25.4)
     # Its width at exposure. Software that turns a picture may leave these tags as they were, hence the longer side.
     exposed = max(width or 0, height or 0) or max(size)
     sensor = exposed / density * unit
-    return length / sensor * max(size) if SENSORS[0] < sensor < SENSORS[1] else None
+    return length / sensor * max(size) if SENSOR_WIDTHS[0] < sensor < SENSOR_WIDTHS[1] else None
 
 
 def exposure(exif: Image.Exif) -> float | None:

@@ -26,12 +26,17 @@ from .photo import Intake, Photo
 from .track import Track, untracked
 from .video import extract, is_video
 
-HEIC = (".heic", ".heif")
+HEIC_SUFFIXES = (".heic", ".heif")
 PHOTOGRAPHS = {
     ".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".bmp", ".heic", ".heif", ".avif"
 }  # fmt: skip
-LEVELS = 3  # of folders above a photograph in which a folder of masks is looked for
-MADE = ("transforms.json", "transforms_train.json", "sparse", "checkpoints")  # a folder with these is a program's
+MASK_LEVELS = 3  # folders above a photograph that are searched for a folder of masks
+PROGRAM_FILES = (
+    "transforms.json",
+    "transforms_train.json",
+    "sparse",
+    "checkpoints",
+)  # a folder with these belongs to a program
 
 
 def gather(sources: Sequence[Path], work: Path, frames: int | None = None, track: Track = untracked) -> Intake:
@@ -132,7 +137,7 @@ def is_bare(path: Path) -> bool:
 
     if not path.is_dir():
         return is_video(path)
-    if any((path / name).exists() for name in MADE) or any(r.recognises(path) for r in READERS.values()):
+    if any((path / name).exists() for name in PROGRAM_FILES) or any(r.recognises(path) for r in READERS.values()):
         return False
     return next(walk(path), None) is not None
 
@@ -159,7 +164,7 @@ def walk(folder: Path, work: Path | None = None) -> Iterator[Path]:
         if entry.name in (MASKS, OBJECT_MASKS) and entry.is_dir():
             continue
         if entry.is_dir():
-            if not entry.is_symlink() and not any((entry / name).exists() for name in MADE):
+            if not entry.is_symlink() and not any((entry / name).exists() for name in PROGRAM_FILES):
                 yield from walk(entry, work)
         elif entry.suffix.lower() in PHOTOGRAPHS or is_raw(entry):
             yield entry
@@ -211,13 +216,13 @@ def take(name: str, path: Path, copies: Path) -> Candidate | str:
 
 def mask_beside(path: Path) -> Path | None:
     """The mask of a photograph, in a folder of masks beside it or beside the folder it is in, as far as three above."""
-    above = path.absolute().parents[:LEVELS]
+    above = path.absolute().parents[:MASK_LEVELS]
     found = (find_mask(folder / MASKS, path.absolute().relative_to(folder).as_posix()) for folder in above)
     return next((mask for mask in found if mask is not None), None)
 
 
 def unread(path: Path, fault: Exception) -> str:
-    if path.suffix.lower() in HEIC and isinstance(fault, UnidentifiedImageError):
+    if path.suffix.lower() in HEIC_SUFFIXES and isinstance(fault, UnidentifiedImageError):
         return "HEIC can be read once pillow-heif is installed (pip install pillow-heif)"
     return describe(fault)
 

@@ -27,19 +27,19 @@ from scipy.ndimage import gaussian_filter
 from ...color.srgb import linear_from_srgb
 from ..pictures import eight_bits, same_shape
 
-WORKING = 640  # pixels, the longer side of what is judged
-SHORT, LONG = 2, 8  # pixels; along diagonals half as many steps, each √2 long
-ROUNDING = 1 / 6 / LONG**2  # squared slope that rounding to whole numbers may feign
+JUDGED_SIDE = 640  # pixels, the longer side of the judged picture
+SHORT_STEP, LONG_STEP = 2, 8  # pixels; along diagonals half as many steps, each √2 long
+ROUNDING_SLOPE = 1 / 6 / LONG_STEP**2  # squared slope that rounding to whole numbers may cause
 
-MUDDY = 1.4  # sharpness below which nobody would call a picture sharp; clean edges blurred with σ = 1.2 have it
-SOFT = 1.8  # below this a picture is soft, if others of the subject are not; σ = 0.9
-CRISP = 3.5  # above this a picture is no worse than its subject
-LESS = 1.6  # times less sharp than the others' median is noticeable, and
-DEVIATIONS = 4.0  # standard deviations of the logarithm below it is unusual
+MIN_SHARPNESS = 1.4  # blurred in every context below this; clean edges blurred with σ = 1.2 have it
+SOFT_SHARPNESS = 1.8  # below this a picture is blurred if others of the subject are sharp; σ = 0.9
+CRISP_SHARPNESS = 3.5  # above this a picture counts as sharp
+MIN_BLUR_RATIO = 1.6  # times less sharp than the others' median is noticeable, and
+MIN_DEVIATIONS = 4.0  # standard deviations of the logarithm below it is unusual
 
-GRID = 96  # pixels to a side of a signature
-DETAIL = 3.0  # σ in pixels of the grid; what is larger says little, for all pictures of one subject share it
-SAME = 0.95  # correlation of signatures; neighbours of a walk around a subject stay below 0.8
+SIGNATURE_SIDE = 96  # pixels to a side of a signature
+DETAIL_SIGMA = 3.0  # pixels of the grid; larger structures are shared by all pictures of one subject
+DUPLICATE_CORRELATION = 0.95  # of signatures; neighbours of a walk around a subject stay below 0.8
 
 
 @dataclass(frozen=True)
@@ -62,9 +62,9 @@ def judge(image: Image.Image) -> Judgement:
     EXIF's orientation is not looked at: only pictures that stand the same way have comparable signatures.
     Raises whatever Pillow raises for damaged files.
     """
-    image.draft("L", (WORKING, WORKING))
+    image.draft("L", (JUDGED_SIDE, JUDGED_SIDE))
     grey = eight_bits(image).convert("L")
-    times = max(grey.size) / WORKING
+    times = max(grey.size) / JUDGED_SIDE
     if times > 1:
         grey = grey.resize(
             (max(round(grey.width / times), 1), max(round(grey.height / times), 1)), Image.Resampling.BOX
@@ -75,8 +75,8 @@ def judge(image: Image.Image) -> Judgement:
 
 def sharpness(luminance: Float[np.ndarray, "height width"]) -> float:
     """A picture's sharpness, from 1, smooth, to 16, nothing but fine texture. luminance: 0 to 255."""
-    pairs = zip(slopes(luminance, SHORT), slopes(luminance, LONG), strict=True)
-    return min((short + ROUNDING) / (long + ROUNDING) for short, long in pairs)
+    pairs = zip(slopes(luminance, SHORT_STEP), slopes(luminance, LONG_STEP), strict=True)
+    return min((short + ROUNDING_SLOPE) / (long + ROUNDING_SLOPE) for short, long in pairs)
 
 
 def slopes(y: Float[np.ndarray, "height width"], d: int) -> list[float]:
@@ -98,10 +98,10 @@ def brightness(luminance: Float[np.ndarray, "height width"]) -> float:
 
 
 def signature(grey: Image.Image) -> Float[np.ndarray, " cell"]:
-    small = np.asarray(grey.resize((GRID, GRID), Image.Resampling.BOX), np.float32)
-    detail = (small - gaussian_filter(small, DETAIL)).ravel()
+    small = np.asarray(grey.resize((SIGNATURE_SIDE, SIGNATURE_SIDE), Image.Resampling.BOX), np.float32)
+    detail = (small - gaussian_filter(small, DETAIL_SIGMA)).ravel()
     length = float(np.linalg.norm(detail))
-    return detail / length if length > math.sqrt(ROUNDING) * GRID else np.zeros_like(detail)
+    return detail / length if length > math.sqrt(ROUNDING_SLOPE) * SIGNATURE_SIDE else np.zeros_like(detail)
 
 
 def blurred(sharpness: Mapping[str, float]) -> dict[str, str]:
@@ -117,13 +117,13 @@ def blurred(sharpness: Mapping[str, float]) -> dict[str, str]:
     logs = np.log(list(sharpness.values()))
     median = float(np.median(logs))
     spread = 1.4826 * float(np.median(np.abs(logs - median)))
-    usual, unusual = math.exp(median), math.exp(median - DEVIATIONS * spread)
-    limit = min(usual / LESS, max(unusual, SOFT), CRISP)
+    usual, unusual = math.exp(median), math.exp(median - MIN_DEVIATIONS * spread)
+    limit = min(usual / MIN_BLUR_RATIO, max(unusual, SOFT_SHARPNESS), CRISP_SHARPNESS)
     found = {}
     for name, value in sharpness.items():
         if value < limit:
             found[name] = f"far less sharp than the others: {value:.1f} where they have {usual:.1f}"
-        elif value < MUDDY:
+        elif value < MIN_SHARPNESS:
             found[name] = f"no fine detail: sharpness {value:.1f} where clean edges have 4"
     return found
 
@@ -138,7 +138,7 @@ def duplicates(
     """
     names = list(signatures)
     table = np.stack([signatures[name] for name in names]) if names else np.zeros((0, 1), np.float32)
-    alike = np.triu(table @ table.T > SAME, 1)
+    alike = np.triu(table @ table.T > DUPLICATE_CORRELATION, 1)
     found: dict[str, str] = {}
     for i, j in np.argwhere(alike).tolist():
         first, second = names[i], names[j]

@@ -12,9 +12,9 @@ from PIL import Image, ImageOps
 from ...files import replacing
 from ..pictures import EXIF_ORIENTATION, EXIF_UPRIGHT, eight_bits
 
-JPEG, PNG = (".jpg", ".jpeg"), (".png",)
-QUALITY = 95  # of JPEG, with colours at full size: no difference can be seen
-PNG_DEPTH = 24  # the byte of a PNG's header that says how many bits a channel has
+JPEG_SUFFIXES, PNG_SUFFIXES = (".jpg", ".jpeg"), (".png",)
+JPEG_QUALITY = 95  # with colours at full size: no visible difference
+PNG_DEPTH_OFFSET = 24  # position of the bit depth in a PNG's header
 
 
 def learn_formats() -> None:
@@ -34,12 +34,12 @@ def is_plain(image: Image.Image, path: Path) -> bool:
 
 def bits(png: Path) -> int:
     with open(png, "rb") as file:
-        return file.read(PNG_DEPTH + 1)[-1]
+        return file.read(PNG_DEPTH_OFFSET + 1)[-1]
 
 
 def name_of_copy(name: str, image: Image.Image) -> str:
     """PNG stays PNG, alpha becomes PNG, the rest JPEG; a name that says otherwise gets the right suffix added."""
-    suffixes = PNG if image.format == "PNG" or image.has_transparency_data else JPEG
+    suffixes = PNG_SUFFIXES if image.format == "PNG" or image.has_transparency_data else JPEG_SUFFIXES
     return name if name.lower().endswith(suffixes) else name + suffixes[0]
 
 
@@ -58,8 +58,8 @@ def copy(image: Image.Image, source: Path, path: Path) -> None:
 
 def save(image: Image.Image, path: Path, suffix: str, profile: bytes | None = None) -> None:
     """Write an image as JPEG or PNG, as a suffix says. profile: of the image's colours (ICC)."""
-    if suffix.lower() in JPEG:
-        image.save(path, "JPEG", icc_profile=profile, quality=QUALITY, subsampling=0)
+    if suffix.lower() in JPEG_SUFFIXES:
+        image.save(path, "JPEG", icc_profile=profile, quality=JPEG_QUALITY, subsampling=0)
     else:
         image.save(path, "PNG", icc_profile=profile)
 

@@ -26,7 +26,7 @@ from PIL import Image
 from ...errors import LumigraphError, LumigraphWarning
 from ...files import is_file, read_json, replacing_folder, write_json
 from ...files.ranges import Lasted
-from .judge import SAME, WORKING, sharpness, signature
+from .judge import DUPLICATE_CORRELATION, JUDGED_SIDE, sharpness, signature
 from .movement import Odometer
 from .track import Track, untracked
 from .upright import save
@@ -34,13 +34,13 @@ from .upright import save
 VIDEOS = {
     ".mp4", ".mov", ".m4v", ".mkv", ".webm", ".avi", ".mpg", ".mpeg", ".mts", ".m2ts", ".3gp", ".wmv", ".ogv", ".flv"
 }  # fmt: skip
-PER_SECOND, FEWEST, MOST = 2.5, 20, 150  # frames, where the user asks for no number
-JUDGED = 15.0  # frames per second that are looked at, or
-CANDIDATES = 4  # for each frame that is wanted, if that is more
-TIME = 0.2  # share of the clock in what counts as even
-MIDDLE = 0.3  # how much sharper (log) than in the middle of its stretch a frame at its end must be, lest two ends meet
-WHOLE = 0.9  # share of its length that a film must have, else it has been cut short
-WATCHED = 192  # pixels, the longer side of what movement is seen in
+FRAMES_PER_SECOND, MIN_FRAMES, MAX_FRAMES = 2.5, 20, 150  # default number of frames
+JUDGED_PER_SECOND = 15.0  # frames per second that are judged, or
+CANDIDATES_PER_FRAME = 4  # for each selected frame, if that is more
+TIME_SHARE = 0.2  # weight of the clock in even spacing; the rest is movement
+EDGE_PENALTY = 0.3  # log sharpness that a frame at the end of its interval must have above one in the middle
+MIN_DURATION_SHARE = 0.9  # share of its length that a complete film must have
+MOVEMENT_SIDE = 192  # pixels, the longer side for measuring movement
 
 
 @dataclass(frozen=True)
@@ -90,14 +90,17 @@ def judge(
     odometer, end = Odometer(), 0.0
     with opened(path) as film:
         total = film.streams.video[0].frames or max(round(duration(film) * speed(film)), 1)
-        step = max(int(min(speed(film) / JUDGED, total / (CANDIDATES * frames) if frames else math.inf)), 1)
+        step = max(
+            int(min(speed(film) / JUDGED_PER_SECOND, total / (CANDIDATES_PER_FRAME * frames) if frames else math.inf)),
+            1,
+        )
         for number, (frame, end) in enumerate(track(decoded(path, film), f"Watching {path.name}", total)):
             if number % step == 0:
-                luminance = grey(frame, WORKING)
-                rows.append((number, end, sharpness(luminance), odometer.show(grey(frame, WATCHED))))
+                luminance = grey(frame, JUDGED_SIDE)
+                rows.append((number, end, sharpness(luminance), odometer.show(grey(frame, MOVEMENT_SIDE))))
         if not rows:
             raise LumigraphError(f"{path} has no frames; record it again or take it from its source")
-        if end - rows[0][1] < WHOLE * duration(film) - 1 / speed(film):
+        if end - rows[0][1] < MIN_DURATION_SHARE * duration(film) - 1 / speed(film):
             text = f"{path} breaks off after {end:.1f} of {duration(film):.1f} s; what comes before is used"
             warnings.warn(LumigraphWarning(text), stacklevel=2)
     numbers = [number for number, *_ in rows]
@@ -114,12 +117,12 @@ def choose(
 ) -> list[int]:
     """The numbers of the sharpest frames of equal stretches, ascending. Other arguments are as `judge` gives them."""
     length = float(seconds[-1])
-    count = frames or min(max(round(PER_SECOND * length), FEWEST), MOST)
+    count = frames or min(max(round(FRAMES_PER_SECOND * length), MIN_FRAMES), MAX_FRAMES)
     clock = seconds / max(length, 1e-9)
     way = travelled / travelled[-1] if travelled[-1] > 0 else clock
-    place = ((1 - TIME) * way + TIME * clock) * count
+    place = ((1 - TIME_SHARE) * way + TIME_SHARE * clock) * count
     stretch = np.minimum(place, count - 1).astype(int)
-    worth = np.log(sharp) - MIDDLE * (2 * (place - stretch) - 1) ** 2
+    worth = np.log(sharp) - EDGE_PENALTY * (2 * (place - stretch) - 1) ** 2
     return [numbers[int(max(np.flatnonzero(stretch == s), key=worth.__getitem__))] for s in np.unique(stretch)]
 
 
@@ -130,7 +133,7 @@ def write(path: Path, folder: Path, chosen: Sequence[int], track: Track) -> dict
     for number, frame, seconds in track(picked(path, chosen), f"Taking frames of {path.name}", len(chosen)):
         image = upright(frame)
         new = signature(image.convert("L"))
-        if not any(new @ old > SAME for old in signatures):
+        if not any(new @ old > DUPLICATE_CORRELATION for old in signatures):
             name = f"{number:06d}.jpg"
             save(image, folder / name, ".jpg")
             signatures.append(new)

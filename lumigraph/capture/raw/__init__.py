@@ -9,7 +9,7 @@ from .library import exif_of as exif_of
 from .opening import is_raw as is_raw
 from .opening import open_raw as open_raw
 from .photo import RawPhoto as RawPhoto
-from .remembered import REMEMBERED as REMEMBERED
+from .remembered import RAW_FILE as RAW_FILE
 from .remembered import Developed as Developed
 from .remembered import Remembered as Remembered
 from .remembered import facts as facts

@@ -10,9 +10,13 @@ RED, GREEN, BLUE = range(3)
 Pattern = tuple[tuple[int, int], tuple[int, int]]  # the filters over each square of four pixels, row by row
 
 # Malvar 2004, figure 2: bilinear means, corrected by how the colour that was measured here curves.
-CROSS = np.array([[0, 0, -1, 0, 0], [0, 0, 2, 0, 0], [-1, 2, 4, 2, -1], [0, 0, 2, 0, 0], [0, 0, -1, 0, 0]]) / 8
-BESIDE = np.array([[0, 0, 1, 0, 0], [0, -2, 0, -2, 0], [-2, 8, 10, 8, -2], [0, -2, 0, -2, 0], [0, 0, 1, 0, 0]]) / 16
-CORNERS = np.array([[0, 0, -3, 0, 0], [0, 4, 0, 4, 0], [-3, 0, 12, 0, -3], [0, 4, 0, 4, 0], [0, 0, -3, 0, 0]]) / 16
+CROSS_FILTER = np.array([[0, 0, -1, 0, 0], [0, 0, 2, 0, 0], [-1, 2, 4, 2, -1], [0, 0, 2, 0, 0], [0, 0, -1, 0, 0]]) / 8
+BESIDE_FILTER = (
+    np.array([[0, 0, 1, 0, 0], [0, -2, 0, -2, 0], [-2, 8, 10, 8, -2], [0, -2, 0, -2, 0], [0, 0, 1, 0, 0]]) / 16
+)
+CORNERS_FILTER = (
+    np.array([[0, 0, -3, 0, 0], [0, 4, 0, 4, 0], [-3, 0, 12, 0, -3], [0, 4, 0, 4, 0], [0, 0, -3, 0, 0]]) / 16
+)
 
 
 def demosaiced(light: Float[np.ndarray, "height width"], pattern: Pattern) -> Float[np.ndarray, "height width 3"]:
@@ -21,7 +25,8 @@ def demosaiced(light: Float[np.ndarray, "height width"], pattern: Pattern) -> Fl
     light: white-balanced, so that grey has the same value behind each filter
     """
     green, along, across, corners = (
-        convolve(light, kernel.astype(light.dtype), mode="mirror") for kernel in (CROSS, BESIDE, BESIDE.T, CORNERS)
+        convolve(light, kernel.astype(light.dtype), mode="mirror")
+        for kernel in (CROSS_FILTER, BESIDE_FILTER, BESIDE_FILTER.T, CORNERS_FILTER)
     )
     rgb = np.stack([light, green, light], -1)
     for colour in (RED, BLUE):

@@ -18,13 +18,13 @@ from ..numbers import check_pixels
 from .demosaic import Pattern
 from .photo import RawPhoto, srgb_from_camera
 
-SUFFIXES = (
+RAW_SUFFIXES = (
     ".dng", ".nef", ".nrw", ".cr2", ".cr3", ".crw", ".arw", ".srf", ".sr2", ".raf", ".orf", ".rw2", ".pef", ".srw",
     ".3fr", ".fff", ".iiq", ".erf", ".kdc", ".dcr", ".mrw", ".x3f", ".rwl",
 )  # fmt: skip
-TURNS = {0: 0, 3: 2, 5: 1, 6: 3}  # LibRaw's flip, and quarter turns to the left
-TIFF = (b"II*\0", b"MM\0*")  # how the files of most cameras begin
-TOLD = (
+QUARTER_TURNS = {0: 0, 3: 2, 5: 1, 6: 3}  # LibRaw's flip, and quarter turns to the left
+TIFF_SIGNATURES = (b"II*\0", b"MM\0*")  # first bytes of most cameras' files
+EXIF_TAGS = (
     "ExposureTime", "FNumber", "ISOSpeedRatings", "FocalLength", "FocalLengthIn35mmFilm", "DateTimeOriginal",
     "OffsetTimeOriginal", "SubsecTimeOriginal",
 )  # fmt: skip
@@ -44,7 +44,7 @@ def open_file(path: Path) -> RawPhoto:
             check_pixels((width, height))
         except ValueError as fault:
             raise LumigraphError(f"{path} cannot be read ({fault}); restore it") from fault
-        turns = TURNS.get(raw.sizes.flip, 0)
+        turns = QUARTER_TURNS.get(raw.sizes.flip, 0)
         gains = np.array(raw.camera_whitebalance[:3], np.float64)
         if not (gains > 0).all():  # the camera did not judge
             gains = np.array(raw.daylight_whitebalance[:3], np.float64)
@@ -146,14 +146,14 @@ def exif_of(path: Path) -> Image.Exif:
     TIFF inside."""
     told, found = Image.Exif(), Image.Exif()
     with open(path, "rb") as file, contextlib.suppress(Exception):  # Pillow raises anything for odd tags
-        if file.read(4) in TIFF:
+        if file.read(4) in TIFF_SIGNATURES:
             file.seek(0)
             found.load_from_fp(file)
             for tag in (ExifTags.Base.Make, ExifTags.Base.Model):
                 if tag in found:
                     told[tag] = found[tag]
             details = {**found, **found.get_ifd(ExifTags.IFD.Exif)}
-            tags = [ExifTags.Base[name] for name in TOLD]
+            tags = [ExifTags.Base[name] for name in EXIF_TAGS]
             told.get_ifd(ExifTags.IFD.Exif).update({tag: details[tag] for tag in tags if tag in details})
             told.get_ifd(ExifTags.IFD.GPSInfo).update(found.get_ifd(ExifTags.IFD.GPSInfo))
     return told

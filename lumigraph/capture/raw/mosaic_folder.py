@@ -20,7 +20,7 @@ from ..numbers import check_pixels, kind_of, read_numbers
 from ..pictures import readable
 from .photo import RawPhoto, srgb_from_camera
 
-LISTING, BARE = "mosaics.json", ".raw"
+LISTING_FILE, MOSAIC_SUFFIX = "mosaics.json", ".raw"
 Level = Annotated[float, between(0, 65_535)]
 Gain = Annotated[float, between(0.01, 100)]
 Vector = tuple[Coordinate, Coordinate, Coordinate]
@@ -58,7 +58,7 @@ class Listing:
 
 def is_listed(path: Path) -> bool:
     """True if the folder of a file lists it as a mosaic."""
-    listing = path.parent / LISTING
+    listing = path.parent / LISTING_FILE
     return listing.is_file() and path.name in listed(listing, listing.stat().st_mtime_ns).photographs
 
 
@@ -69,7 +69,7 @@ def listed(path: Path, date: int) -> Listing:
 
 def open_mosaic(path: Path) -> RawPhoto:
     """A mosaic that mosaics.json beside it lists. Raises LumigraphError, naming both, for what it does not say."""
-    listing = path.parent / LISTING
+    listing = path.parent / LISTING_FILE
     found = listed(listing, listing.stat().st_mtime_ns)
     own, common = found.photographs[path.name], found.all
     about = About(**{x.name: x_of(own, common, x.name) for x in fields(About)})
@@ -101,14 +101,14 @@ def needed(about: About, name: str, path: Path):
     value = getattr(about, name)
     if value is None:
         raise LumigraphError(
-            f'{path.parent / LISTING} does not say the {name} of {path.name}; add it there, or to "all"'
+            f'{path.parent / LISTING_FILE} does not say the {name} of {path.name}; add it there, or to "all"'
         )
     return value
 
 
 def size_of(path: Path, about: About) -> tuple[int, int]:
     """Width and height, which the file must hold."""
-    if path.suffix.lower() != BARE:
+    if path.suffix.lower() != MOSAIC_SUFFIX:
         with readable(path):
             kind = kind_of(path)
             if kind.dtype != np.uint16 or kind.channels != 1:
@@ -121,7 +121,7 @@ def size_of(path: Path, about: About) -> tuple[int, int]:
     if there != 2 * width * height:
         raise LumigraphError(
             f"{path} has {there:,} bytes, and {width}x{height} pixels of 16 bits are {2 * width * height:,}; "
-            f"restore it, or correct {path.parent / LISTING}"
+            f"restore it, or correct {path.parent / LISTING_FILE}"
         )
     return width, height
 
@@ -129,7 +129,7 @@ def size_of(path: Path, about: About) -> tuple[int, int]:
 def read_light(path: Path, size: tuple[int, int], black: float, white: float) -> np.ndarray:
     """The light of every pixel, 0 at black and 1 at white; float32 (height, width)."""
     with readable(path):
-        if path.suffix.lower() == BARE:
+        if path.suffix.lower() == MOSAIC_SUFFIX:
             numbers = np.fromfile(path, "<u2").reshape(size[::-1])
         else:
             numbers = read_numbers(path)

@@ -15,7 +15,7 @@ from .demosaic import GREEN, Pattern, demosaiced, repeated
 XYZ_FROM_SRGB = np.array(
     [[0.412453, 0.357580, 0.180423], [0.212671, 0.715160, 0.072169], [0.019334, 0.119193, 0.950227]]
 )
-WHITE = 97  # percentile of the light that becomes white in a developed picture (Mildenhall 2022, supplement)
+WHITE_PERCENTILE = 97  # of the light, which becomes white in a developed picture (Mildenhall 2022, supplement)
 
 
 @dataclass(frozen=True)
@@ -62,7 +62,7 @@ class RawPhoto:
     def highlight(self) -> float:
         """The light that a developed picture shows as white: of green, which is nearest to what eyes call bright."""
         green = self.read()[self.filters == GREEN] * self.gains[GREEN]
-        return max(float(np.percentile(green, WHITE)), 1e-6)
+        return max(float(np.percentile(green, WHITE_PERCENTILE)), 1e-6)
 
 
 def srgb_from_camera(camera_from_xyz: Float[np.ndarray, "3 3"] | None) -> Float[np.ndarray, "3 3"]:

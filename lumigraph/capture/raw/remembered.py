@@ -24,9 +24,9 @@ from .demosaic import repeated
 from .opening import is_raw, open_raw
 from .photo import RawPhoto
 
-REMEMBERED, FOLDER = "raw.json", "raw"
+RAW_FILE, RAW_FOLDER = "raw.json", "raw"
 FILTERS = ("red", "green", "blue")
-NOT_KNOWN = -1
+UNKNOWN_VALUE = -1
 
 
 @dataclass(frozen=True)
@@ -68,10 +68,10 @@ def with_raw(capture: Capture, folder: Path) -> Capture:
 
 def raw_files(capture: Capture, folder: Path) -> dict[str, Developed]:
     """The raw files of a capture's photographs, by the photographs' names."""
-    if exists(folder / REMEMBERED):
-        files = read_json(folder / REMEMBERED, Remembered).photographs
-    elif (folder / FOLDER).is_dir():
-        by_stem = {path.stem: path for path in sorted((folder / FOLDER).iterdir()) if is_raw(path)}
+    if exists(folder / RAW_FILE):
+        files = read_json(folder / RAW_FILE, Remembered).photographs
+    elif (folder / RAW_FOLDER).is_dir():
+        by_stem = {path.stem: path for path in sorted((folder / RAW_FOLDER).iterdir()) if is_raw(path)}
         return {
             s.name: Developed(str(by_stem[k])) for s in capture.shots if (k := PurePosixPath(s.name).stem) in by_stem
         }
@@ -85,7 +85,7 @@ def with_its_raw(shot: Shot, developed: Developed) -> Shot:
     path = Path(developed.file)
     if not exists(path):
         raise LumigraphError(
-            f"{path}, from which {shot.name} was developed, does not exist; bring it back, or delete {REMEMBERED} "
+            f"{path}, from which {shot.name} was developed, does not exist; bring it back, or delete {RAW_FILE} "
             f"to do without raw light"
         )
     photo = open_raw(path)
@@ -104,7 +104,12 @@ def planes(photo: RawPhoto, identity: str | None = None) -> dict[str, Plane]:
     return {
         "mosaic": Plane(photo.read, "mosaic", dtype=np.dtype(np.float32), identity=identity),
         "filter": Plane(
-            filters, "filter", unknown=(NOT_KNOWN,), names=FILTERS, dtype=np.dtype(np.int8), identity=f"{photo.pattern}"
+            filters,
+            "filter",
+            unknown=(UNKNOWN_VALUE,),
+            names=FILTERS,
+            dtype=np.dtype(np.int8),
+            identity=f"{photo.pattern}",
         ),
     }
 

@@ -6,7 +6,7 @@ from __future__ import annotations
 from .cache import cache_folder as cache_folder
 from .cache import in_parallel as in_parallel
 from .layer import ENCODINGS as ENCODINGS
-from .layer import UNNAMED as UNNAMED
+from .layer import UNKNOWN_INDEX as UNKNOWN_INDEX
 from .layer import Layer as Layer
 from .layer import LayerSource as LayerSource
 from .layer import cosines as cosines

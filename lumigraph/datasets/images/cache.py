@@ -18,8 +18,8 @@ import numpy as np
 from ...errors import LumigraphError
 from ...files import is_file
 
-FORMAT = 2  # of the cache's files
-MARK = "store.json"  # written last: a folder that holds it is whole
+CACHE_FORMAT = 2  # version of the cache's files
+MARK_FILE = "store.json"  # written last: a folder that holds it is complete
 
 Found = TypeVar("Found")
 
@@ -38,7 +38,7 @@ def cache_folder() -> Path:
 def key(parts: Iterable[str | None]) -> str:
     """A name for files that are made of these parts; with a part that has no name, one that nobody else will ask
     for."""
-    digest = hashlib.sha256(f"{FORMAT} {sys.byteorder}".encode())
+    digest = hashlib.sha256(f"{CACHE_FORMAT} {sys.byteorder}".encode())
     for number, part in enumerate(parts):
         digest.update(f"\n{part or f'{os.getpid()} {time.time_ns()} {number}'}".encode())
     return digest.hexdigest()[:32]
@@ -53,7 +53,7 @@ def filled(folder: Path, size: int) -> Iterator[Path]:
         part.mkdir(parents=True)
         try:
             yield part
-            if not (folder / MARK).exists():  # else another process was quicker
+            if not (folder / MARK_FILE).exists():  # else another process was quicker
                 os.replace(part, folder)
         finally:
             shutil.rmtree(part, ignore_errors=True)

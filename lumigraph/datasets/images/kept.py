@@ -14,7 +14,7 @@ from PIL import Image
 from .cache import key
 from .store import ImageSource
 
-FOLDER = "pictures"  # of the cache
+PICTURES_FOLDER = "pictures"  # inside the cache
 
 
 def kept(picture: ImageSource, cache: Path) -> ImageSource:
@@ -22,7 +22,7 @@ def kept(picture: ImageSource, cache: Path) -> ImageSource:
     nothing says what it depends on."""
     if picture.identity is None:
         return picture
-    return replace(picture, read=partial(read_or_make, picture, cache / FOLDER))
+    return replace(picture, read=partial(read_or_make, picture, cache / PICTURES_FOLDER))
 
 
 def read_or_make(picture: ImageSource, folder: Path) -> tuple[np.ndarray, np.ndarray | None]:

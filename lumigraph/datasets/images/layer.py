@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from .cache import MARK, cache_folder, check_size, filled, in_parallel, key, new_file
+from .cache import MARK_FILE, cache_folder, check_size, filled, in_parallel, key, new_file
 from .resize import resized
 from .store import ImageStore
 
@@ -29,8 +29,8 @@ ENCODINGS = {
     "pixels": "offsets (x, y) in pixels of the picture",
     "plain": "numbers of any other kind",
 }
-NUMBERED = ("index", "filter")  # encodings of whole numbers
-UNNAMED = -1  # an index that is not known
+INTEGER_ENCODINGS = ("index", "filter")  # whole numbers
+UNKNOWN_INDEX = -1  # an index that is not known
 
 
 @dataclass(frozen=True)
@@ -107,8 +107,8 @@ class Layer:
         cosine: of the angle between each pixel's ray and the optical axis; asked for where lengths lie along the axis
         """
         sure = self.known(stored)
-        if self.encoding in NUMBERED:
-            return torch.from_numpy(np.where(sure, stored, UNNAMED).astype(np.int64))
+        if self.encoding in INTEGER_ENCODINGS:
+            return torch.from_numpy(np.where(sure, stored, UNKNOWN_INDEX).astype(np.int64))
         values = torch.from_numpy(stored.astype(np.float64) * self.scale)
         if self.empty:
             values[torch.from_numpy(np.isin(stored, self.empty))] = torch.inf
@@ -165,7 +165,7 @@ class Layer:
         """Read one photograph's numbers, in an order; None for row by row."""
         plane = self._planes[image]
         if plane is None:
-            place[:] = self.unknown[0] if self.unknown else UNNAMED if self.encoding == "index" else np.nan
+            place[:] = self.unknown[0] if self.unknown else UNKNOWN_INDEX if self.encoding == "index" else np.nan
             return
         found = plane.read()
         width, height = self._images.sizes[image].tolist()
@@ -179,12 +179,12 @@ class Layer:
         parts = [p.identity if p else "nothing" for p in self._planes]
         called = key([None if nameless else f"{self._images.name} {self.dtype.str} {self.channels}", *parts])
         folder = (self._images.cache or cache_folder() / "images") / called
-        if not (folder / MARK).exists():
+        if not (folder / MARK_FILE).exists():
             with filled(folder, int(np.prod(shape)) * self.dtype.itemsize) as part:
                 values = new_file(part / "values", self.dtype, shape)
                 in_parallel(lambda image: self._fill(values, image), range(len(self._planes)))
                 values.flush()
-                (part / MARK).write_text(json.dumps({"dtype": self.dtype.str, "channels": self.channels}))
+                (part / MARK_FILE).write_text(json.dumps({"dtype": self.dtype.str, "channels": self.channels}))
         check_size(folder / "values", int(np.prod(shape)) * self.dtype.itemsize)
         found = np.memmap(folder / "values", self.dtype, "c", shape=shape)
         if nameless:

@@ -9,7 +9,7 @@ from jaxtyping import Bool, Int, Shaped
 from PIL import Image
 
 Size = tuple[int, int]
-AVERAGED = ("sRGB", "linear", "linear premultiplied")  # encodings; see `Layer`
+AVERAGED_ENCODINGS = ("sRGB", "linear", "linear premultiplied")  # see `Layer`
 
 
 def resized(
@@ -25,7 +25,7 @@ def resized(
     height, width = values.shape[:2]
     if (width, height) == size:
         return values
-    if encoding in AVERAGED and size[0] <= width and size[1] <= height:
+    if encoding in AVERAGED_ENCODINGS and size[0] <= width and size[1] <= height:
         return averaged(values, size, known, straight=encoding != "linear premultiplied")
     if encoding == "mosaic":
         return in_phase(values, size)

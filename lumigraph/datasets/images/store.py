@@ -17,12 +17,12 @@ from torch import Tensor
 
 from ...files import read_json
 from ...system.memory import memory_for_images
-from .cache import MARK, cache_folder, check_size, filled, in_parallel, key, new_file
+from .cache import MARK_FILE, cache_folder, check_size, filled, in_parallel, key, new_file
 from .order import Runs, shuffled_order, spread
 from .pixel_sampling import sample_pixels
 
-PIECES = 64  # a batch from a file comes in about so many reads
-SHORTEST_PIECE, LONGEST_PIECE = 64, 1024  # pixels; the longest fills a page
+READS_PER_BATCH = 64  # about so many reads per batch from a file
+MIN_PIECE, MAX_PIECE = 64, 1024  # pixels; the longest fills a page
 
 
 @dataclass(frozen=True)
@@ -122,9 +122,9 @@ class ImageStore:
             left, name = memory - 4 * total, None if nameless else f"{called} in order"
             return cls(torch.from_numpy(rgba), sizes, has_alpha, trusted, False, name, left, cache)
         folder = (cache or cache_folder() / "images") / called
-        if not (folder / MARK).exists():
+        if not (folder / MARK_FILE).exists():
             write_store(folder, total, pictures, progress)
-        about = read_json(folder / MARK, Mark)
+        about = read_json(folder / MARK_FILE, Mark)
         check_size(folder / "pixels", 4 * total)
         trusted = None
         if about.trusted:
@@ -192,7 +192,7 @@ class ImageStore:
 
         positions: whether to tell where they lie, for layers
         """
-        piece = min(max(count // PIECES, SHORTEST_PIECE), LONGEST_PIECE) if self.shuffled else 1
+        piece = min(max(count // READS_PER_BATCH, MIN_PIECE), MAX_PIECE) if self.shuffled else 1
         chance = torch.rand(-(-count // piece), dtype=torch.float64, generator=generator)
         image, xy = torch.empty(count, dtype=torch.int64), torch.empty(count, 2)
         rgba = torch.empty(count, 4, dtype=torch.uint8)
@@ -248,4 +248,4 @@ def write_store(folder: Path, total: int, pictures: Sequence[ImageSource], progr
         if trusted is not None:
             start, before, count = (x.numpy() for x in (trusted.start, trusted.before, trusted.count))
             np.savez(part / "trusted.npz", start=start, before=before, count=count)
-        (part / MARK).write_text(json.dumps({"has_alpha": has_alpha, "trusted": trusted is not None}))
+        (part / MARK_FILE).write_text(json.dumps({"has_alpha": has_alpha, "trusted": trusted is not None}))

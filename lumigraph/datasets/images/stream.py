@@ -15,18 +15,18 @@ from torch import Tensor
 from ...errors import LumigraphError
 from ...geometry.choice import evenly
 from ...system.memory import memory_for_images
-from .cache import MARK, cache_folder, free_space
+from .cache import MARK_FILE, cache_folder, free_space
 from .kept import kept
 from .store import ImageSource, ImageStore, PixelBatch, name_of
 
-OF_DISK = 0.5  # share of what is free there that a file of photographs may take
-KEPT = 1 << 16  # random pixels that stay of a photograph
-RAYS = 1 << 13  # that are drawn before another photograph is read
-BEGIN = 16  # photographs that are there for the first batch
-READERS = 2  # threads that read ahead
-AHEAD = 4  # photographs that are read before their turn
-COPIES = 3  # of a photograph, while it is read
-LOOKED_AT = 4  # photographs that say whether all have alpha
+DISK_SHARE = 0.5  # of the free space that a file of photographs may take
+KEPT_PIXELS = 1 << 16  # random pixels kept per photograph
+RAYS_PER_READ = 1 << 13  # rays that are drawn before another photograph is read
+FIRST_VIEWS = 16  # photographs available for the first batch
+READER_THREADS = 2  # threads that read ahead
+READ_AHEAD = 4  # photographs that are read before their turn
+READING_COPIES = 3  # of a photograph in memory, while it is read
+ALPHA_PROBES = 4  # photographs that are tested for alpha
 
 Some = tuple[UInt8[np.ndarray, "kept 4"], Int[np.ndarray, " kept"]]  # pixels of a photograph, and where they lie in it
 
@@ -49,7 +49,7 @@ def load(
         pictures = [kept(picture, cache or cache_folder()) for picture in pictures]
     if size > memory:
         folder = (cache or cache_folder() / "images") / name_of(pictures)
-        if not (folder / MARK).exists() and size > OF_DISK * free_space(folder):
+        if not (folder / MARK_FILE).exists() and size > DISK_SHARE * free_space(folder):
             return ImageStream(pictures, memory, cache)
     return ImageStore.load(pictures, memory, cache, progress)
 
@@ -72,11 +72,13 @@ class ImageStream(ImageStore):
     def __init__(self, pictures: Sequence[ImageSource], memory: int, cache: Path | None = None):
         sizes = torch.tensor([p.size for p in pictures])
         self._pictures = list(pictures)
-        has_alpha = any(see_through(whole(self._pictures[i])[0]) for i in evenly(range(len(pictures)), LOOKED_AT))
+        has_alpha = any(see_through(whole(self._pictures[i])[0]) for i in evenly(range(len(pictures)), ALPHA_PROBES))
         super().__init__(torch.empty(0, dtype=torch.int32), sizes, has_alpha, memory=0, cache=cache)
-        reading = READERS * COPIES * 4 * int(sizes.prod(-1).max())
-        self._room = int(np.clip((memory - reading) // (8 * KEPT) - AHEAD, BEGIN, max(len(pictures), BEGIN)))
-        self._readers = ThreadPoolExecutor(READERS, "reading ahead")
+        reading = READER_THREADS * READING_COPIES * 4 * int(sizes.prod(-1).max())
+        self._room = int(
+            np.clip((memory - reading) // (8 * KEPT_PIXELS) - READ_AHEAD, FIRST_VIEWS, max(len(pictures), FIRST_VIEWS))
+        )
+        self._readers = ThreadPoolExecutor(READER_THREADS, "reading ahead")
         self._images: Tensor | None = None  # those that are drawn from
 
     def __getitem__(self, index: int) -> UInt8[Tensor, "height width channel"]:
@@ -101,9 +103,9 @@ class ImageStream(ImageStore):
         if self._images is None or not torch.equal(self._images, images):
             self._begin(images, generator)
         self._due += count
-        while self._due >= RAYS:
+        while self._due >= RAYS_PER_READ:
             self._take()
-            self._due -= RAYS
+            self._due -= RAYS_PER_READ
         which, share = torch.rand(2, count, dtype=torch.float64, generator=generator).numpy()
         place = (which * self._filled).astype(np.int64)
         rank = (share * self._held[place]).astype(np.int64)
@@ -119,16 +121,16 @@ class ImageStream(ImageStore):
         self._left: list[int] = []
         self._coming: deque[tuple[int, Future[Some]]] = deque()
         self._filled, self._next = 0, 0
-        self._rgba_of = np.empty((self._room, KEPT, 4), np.uint8)
-        self._pixel = np.empty((self._room, KEPT), np.int32)
+        self._rgba_of = np.empty((self._room, KEPT_PIXELS, 4), np.uint8)
+        self._pixel = np.empty((self._room, KEPT_PIXELS), np.int32)
         self._held, self._number = np.zeros((2, self._room), np.int64)
-        for _ in range(min(BEGIN, len(images))):
+        for _ in range(min(FIRST_VIEWS, len(images))):
             self._take()
 
     def _take(self) -> None:
         """Wait for the next photograph, and have further ones read meanwhile."""
         assert self._images is not None
-        while len(self._coming) <= AHEAD:
+        while len(self._coming) <= READ_AHEAD:
             if not self._left:
                 self._left = self._random.permutation(self._images.numpy()).tolist()
             number = self._left.pop()
@@ -155,10 +157,10 @@ class ImageStream(ImageStore):
             raise LumigraphError(
                 f"the mask of photograph {number} trusts no pixel; correct it or remove the photograph"
             )
-        if count <= KEPT:
+        if count <= KEPT_PIXELS:
             chosen = np.arange(count)
         else:
-            chosen = np.sort(np.random.default_rng(seed).integers(count, size=KEPT))  # in the order of memory
+            chosen = np.sort(np.random.default_rng(seed).integers(count, size=KEPT_PIXELS))  # in the order of memory
         chosen = chosen if known is None else known[chosen]
         return rgba[chosen], chosen.astype(np.int32)
 

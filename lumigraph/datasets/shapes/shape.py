@@ -17,10 +17,13 @@ from ..mesh import Mesh
 from ..scene import Frame
 from .triangles import Triangles
 
-FILLED = 0.9  # half of the longest side, once it is normalised
-MARGIN = 0.05  # scene units, of the box of interest around the shape
-PROBES, SEED = 256, 0  # points at which a closed surface has a whole winding number
-WHOLE, MOST = 0.05, 0.97  # how near to a whole number, and the share of the probes
+HALF_SIDE = 0.9  # half of the longest side after normalisation
+BOX_MARGIN = 0.05  # scene units between the shape and the box of interest
+PROBE_POINTS, PROBE_SEED = 256, 0  # points at which a closed surface has an integer winding number
+INTEGER_TOLERANCE, MIN_CLOSED_SHARE = (
+    0.05,
+    0.97,
+)  # distance to an integer, and the required share of probe points within it
 
 
 @dataclass(frozen=True)
@@ -91,9 +94,9 @@ class Shape:
         if self.is_cloud:
             return False
         low, high = np.array(self.frame.bounds)
-        points = np.random.default_rng(SEED).uniform(low, high, (PROBES, 3))
+        points = np.random.default_rng(PROBE_SEED).uniform(low, high, (PROBE_POINTS, 3))
         found = self._triangles.winding(points, np.inf)
-        return bool((np.abs(found - found.round()) < WHOLE).mean() >= MOST)
+        return bool((np.abs(found - found.round()) < INTEGER_TOLERANCE).mean() >= MIN_CLOSED_SHARE)
 
     def distance(self, points: Float[Tensor, "point 3"]) -> Float[Tensor, " point"]:
         """To the nearest point of the surface, in scene units: signed, negative inside, if it is closed."""
@@ -176,12 +179,12 @@ def normalised(
     turn = torch.eye(3, dtype=torch.float64) if upright is None else torch.from_numpy(np.asarray(upright, np.float64))
     places = np.asarray(mesh.vertices, np.float64) @ turn.numpy().T
     low, high = places.min(0), places.max(0)
-    scale = 2 * FILLED / max(float((high - low).max()), 1e-12)
+    scale = 2 * HALF_SIDE / max(float((high - low).max()), 1e-12)
     scene_from_file = Similarity.make(scale, turn, torch.from_numpy(-scale * (low + high) / 2))
     made = mesh.transformed(scene_from_file.matrix.numpy())
     if len(made.faces) and volume(made) < 0:  # it was inside out
         made = replace(made, faces=made.faces[:, ::-1].copy())
-    half = np.minimum(scale * (high - low) / 2 + MARGIN, 1.0)
+    half = np.minimum(scale * (high - low) / 2 + BOX_MARGIN, 1.0)
     corner = (float(half[0]), float(half[1]), float(half[2]))
     frame = Frame(
         bounds=((-corner[0], -corner[1], -corner[2]), corner),

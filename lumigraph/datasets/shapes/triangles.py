@@ -12,8 +12,8 @@ import math
 import numpy as np
 from numba import njit, prange
 
-LEAF = 8  # triangles of a box that is not divided
-DEPTH = 64  # boxes that wait while a tree is walked
+LEAF_TRIANGLES = 8  # triangles of a box that is not divided
+STACK_DEPTH = 64  # boxes that wait while a tree is walked
 
 
 class Triangles:
@@ -47,12 +47,12 @@ def divide(centres):
     Returns the order of the points, and for each node its first place in it, how many, and its left child (the right
     one is next to it; -1 for a leaf).
     """
-    most = max(1, 4 * len(centres) // LEAF + 4)
+    most = max(1, 4 * len(centres) // LEAF_TRIANGLES + 4)
     order = np.arange(len(centres))
     first, count, child = np.zeros(most, np.int64), np.zeros(most, np.int64), np.full(most, -1, np.int64)
     count[0], made, node = len(centres), 1, 0
     while node < made:
-        if count[node] > LEAF:
+        if count[node] > LEAF_TRIANGLES:
             begin, end = first[node], first[node] + count[node]
             inside = centres[order[begin:end]]
             axis, longest = 0, -1.0
@@ -153,7 +153,7 @@ def nearest(triangles, box, first, count, child, points):
     distance, place = np.empty(len(points)), np.empty(len(points), np.int64)
     for p in prange(len(points)):
         px, py, pz = points[p, 0], points[p, 1], points[p, 2]
-        waiting = np.empty(DEPTH, np.int64)
+        waiting = np.empty(STACK_DEPTH, np.int64)
         best, found, held = np.inf, 0, 1
         waiting[0] = 0
         while held:
@@ -196,7 +196,7 @@ def winding(triangles, dipole, first, count, child, points, reach):
     found = np.empty(len(points))
     for p in prange(len(points)):
         px, py, pz = points[p, 0], points[p, 1], points[p, 2]
-        waiting = np.empty(DEPTH, np.int64)
+        waiting = np.empty(STACK_DEPTH, np.int64)
         total, held = 0.0, 1
         waiting[0] = 0
         while held:

@@ -30,10 +30,10 @@ from .grids import Instance, sampled
 from .learning import Config
 from .solve import Solution, solve
 
-SPREAD = 0.4  # of what is opaque about its middle, canonical units: nearly all lies within [-1, 1]^3
-PICTURE, SHOWN = 200, 12  # pixels a side, and runs at most
-ANGLE, VIEW = 38.0, 4  # of view, degrees, and which camera of a ring sees them
-SHEET = "canonical.png"
+CANONICAL_SPREAD = 0.4  # of opaque points about their mean, canonical units: nearly all lie within [-1, 1]^3
+PICTURE_SIDE, MAX_SHOWN = 200, 12  # pixels; runs on the sheet
+FIELD_OF_VIEW, CAMERA_INDEX = 38.0, 4  # degrees; number of the ring's camera
+SHEET_FILE = "canonical.png"
 
 
 @dataclass(frozen=True)
@@ -108,13 +108,13 @@ def canonicalise(found: Sequence[Found], config: Config, output: Path, like: str
             bounds = bounds_of(one.instance, place)
             source = relative(one.run.folder, output / "one.json")
             write_canonicalised(new / f"{one.name}.json", source, to_source, bounds, min(agreement, 1.0))
-        save_picture(new / SHEET, before_and_after(found, places), ours=True)
+        save_picture(new / SHEET_FILE, before_and_after(found, places), ours=True)
     return solution
 
 
 def placed(instance: Instance, rotation: Float[Tensor, "3 3"]) -> Similarity:
     """From the frame that an instance was sampled in to the canonical one."""
-    return Similarity.make(SPREAD, rotation) @ instance.place.inverse
+    return Similarity.make(CANONICAL_SPREAD, rotation) @ instance.place.inverse
 
 
 def bounds_of(instance: Instance, place: Similarity) -> tuple[Vector, Vector]:
@@ -127,8 +127,8 @@ def bounds_of(instance: Instance, place: Similarity) -> tuple[Vector, Vector]:
 def before_and_after(found: Sequence[Found], places: Sequence[Similarity]) -> Image.Image:
     """Some of the runs from one side, as they stood in their scenes, and in the canonical frame."""
     cube = (-1.0, -1.0, -1.0), (1.0, 1.0, 1.0)
-    camera = ring(cube, angle=ANGLE, size=PICTURE)[-VIEW]
-    some = evenly(list(zip(found, places, strict=True)), SHOWN)
+    camera = ring(cube, angle=FIELD_OF_VIEW, size=PICTURE_SIDE)[-CAMERA_INDEX]
+    some = evenly(list(zip(found, places, strict=True)), MAX_SHOWN)
     ways = [(placed(one.instance, torch.eye(3)), place) for one, place in some]
     views = [
         [one.method.render(camera.transformed(way.inverse.matrix)).rgb.cpu() for way in both]
@@ -136,4 +136,4 @@ def before_and_after(found: Sequence[Found], places: Sequence[Similarity]) -> Im
     ]
     stood, canonical = zip(*views, strict=True)
     rows = Row("as they stood", stood), Row("in their canonical frame", canonical)
-    return contact_sheet("What these runs share", [one.name for one, _ in some], rows, PICTURE)
+    return contact_sheet("What these runs share", [one.name for one, _ in some], rows, PICTURE_SIDE)

@@ -13,15 +13,15 @@ from ...datasets.scene import Vector
 from ...errors import LumigraphError
 from ...geometry import Similarity
 
-LEAST = 0.1  # opacity of a cell below which it counts as empty
-CHUNK = 1 << 16  # points asked at once
+MIN_OPACITY = 0.1  # of a cell that counts as occupied
+CHUNK_POINTS = 1 << 16  # points per density query
 
 Density = Callable[[Float[Tensor, "point 3"]], Float[Tensor, " point"]]
 
 
 @dataclass(frozen=True)
 class Instance:
-    """What is opaque in a grid of cells, in a frame of its own: centred at the weighted mean, of spread one.
+    """Opaque cells of a grid as weighted points, normalised: weighted mean at the origin, spread one.
 
     points:  centres of the cells that are not empty
     weights: how much light each cell stops, 1 - exp(-density times its side); they add up to one
@@ -50,8 +50,8 @@ def sampled(density: Density, bounds: tuple[Vector, Vector], cells: int, name: s
     axes = [torch.arange(a + side / 2, b, side, dtype=torch.float64) for a, b in zip(low, high, strict=True)]
     points = torch.cartesian_prod(*axes).float()
     with torch.no_grad():
-        opacity = torch.cat([1 - (-side * density(some).float().cpu()).exp() for some in points.split(CHUNK)])
-    there = opacity > LEAST
+        opacity = torch.cat([1 - (-side * density(some).float().cpu()).exp() for some in points.split(CHUNK_POINTS)])
+    there = opacity > MIN_OPACITY
     if not there.any():
         raise LumigraphError(f"{name} is empty, nothing in it is opaque; leave it out, or train it for longer")
     weights = (opacity[there] / opacity[there].sum()).double()

@@ -32,7 +32,7 @@ def harmonics(directions: Float[Tensor, "*point 3"], bands: int) -> Float[Tensor
 
 
 def band(degree: int) -> slice:
-    """Where the coefficients of a band lie."""
+    """Slice of the coefficients of a band."""
     return slice(degree**2, (degree + 1) ** 2)
 
 

@@ -21,11 +21,11 @@ from .moments import moments
 from .rotations import near, spread
 
 SHELLS, BANDS = 8, 8  # of moments; finer ones tell no more of grids of some forty cells
-LATTICE = 4608  # rotations that are tried: any other one is within 13 degrees of one of them
-STEPS = (6.0, 3.0, 1.5, 0.75, 0.4)  # degrees, of the refinement, each as often as it helps, at most ROUNDS times
-ROUNDS = 4
-SETTLED = 1e-4  # by which the agreement must grow for another round of turning all instances
-TURNS = 12  # such rounds at most
+LATTICE_ROTATIONS = 4608  # rotations that are tried: any other one is within 13 degrees of one of them
+STEP_DEGREES = (6.0, 3.0, 1.5, 0.75, 0.4)  # of the refinement; each repeats while it helps, at most ROUNDS times
+STEP_ROUNDS = 4
+MIN_IMPROVEMENT = 1e-4  # of the agreement, for another round over all instances
+MAX_ROUNDS = 12  # rounds over all instances
 
 
 @dataclass(frozen=True)
@@ -50,9 +50,9 @@ def aligned(shapes: Float[Tensor, "some shell basis"], start: Float[Tensor, "som
     """Instances on their mean shape, from rotations to begin with: all are turned onto the mean of what they are then,
     by the best of all rotations, until that helps no more (congealing, Learned-Miller 2006)."""
     rotations, explained = start, 0.0
-    for _ in range(TURNS):
+    for _ in range(MAX_ROUNDS):
         mean = turn(shapes, rotations).mean(0)
-        if (now := float(mean.square().sum())) < explained + SETTLED:
+        if (now := float(mean.square().sum())) < explained + MIN_IMPROVEMENT:
             break
         explained = now
         rotations = best_rotations(mean, shapes)
@@ -63,7 +63,7 @@ def aligned(shapes: Float[Tensor, "some shell basis"], start: Float[Tensor, "som
 
 
 def best_alignment(shapes: Float[Tensor, "some shell basis"], starts: Sequence[Float[Tensor, "some 3 3"]]) -> Alignment:
-    """Of alignments from several beginnings, the one whose mean shape explains most."""
+    """Align from several initialisations; return the alignment whose mean shape explains most."""
     return max((aligned(shapes, start) for start in starts), key=lambda found: found.explained)
 
 
@@ -79,16 +79,16 @@ def best_rotations(
 def correlations(
     target: Float[Tensor, "shell basis"], shapes: Float[Tensor, "some shell basis"]
 ) -> Float[Tensor, "some entry"]:
-    """What the correlation of two shapes is linear in, the entries of D: sum over shells of g_l f_l^T for each band."""
+    """Coefficients of the entries of D in the correlation of two shapes: sum over shells of g_l f_l^T for each band."""
     parts = [target[:, band(n)].mT @ shapes[..., band(n)] for n in range(BANDS)]
     return torch.cat([part.flatten(-2) for part in parts], -1)
 
 
 def refined(found: Turns, entries: Float[Tensor, "some entry"]) -> Float[Tensor, "some 3 3"]:
     """Rotations a little further on, as long as the correlation grows."""
-    for degrees in STEPS:
+    for degrees in STEP_DEGREES:
         around = steps(degrees)
-        for _ in range(ROUNDS):
+        for _ in range(STEP_ROUNDS):
             tried = around.after(found)
             which = (tried.flat * entries[:, None]).sum(-1).argmax(-1)
             found = tried.pick(which)
@@ -117,7 +117,7 @@ class Turns:
         return Turns(self.rotations[which], [matrix[which] for matrix in self.matrices])
 
     def pick(self, which: Tensor) -> Turns:
-        """Of each row of rotations the one with this number."""
+        """Select one rotation per row, by number."""
         rows = torch.arange(len(which))
         return Turns(self.rotations[rows, which], [matrix[rows, which] for matrix in self.matrices])
 
@@ -129,7 +129,7 @@ class Turns:
 
 @cache
 def lattice() -> Turns:
-    return Turns.of(spread(LATTICE))
+    return Turns.of(spread(LATTICE_ROTATIONS))
 
 
 @cache

@@ -8,12 +8,12 @@ from torch import Tensor
 
 from .harmonics import harmonics
 
-FARTHEST = 2.2  # from the middle, spreads; hardly anything lies beyond
+MAX_RADIUS = 2.2  # spreads from the mean; hardly anything lies beyond
 
 
 def shells(distances: Float[Tensor, "*point"], count: int) -> Float[Tensor, "*point shell"]:
-    """How much a point belongs to each of several shells: bells about radii from 0 to FARTHEST, a step apart."""
-    step = FARTHEST / (count - 1)
+    """Weight of each point in each shell: bells about equidistant radii from 0 to MAX_RADIUS."""
+    step = MAX_RADIUS / (count - 1)
     radii = step * torch.arange(count, dtype=distances.dtype, device=distances.device)
     return (-0.5 * ((distances[..., None] - radii) / (0.7 * step)).square()).exp()
 

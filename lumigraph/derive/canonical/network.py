@@ -23,7 +23,7 @@ VECTORS = 4  # of degree one, of which frames and cross products are made
 
 @dataclass(frozen=True)
 class Canonical:
-    """What the network finds of instances.
+    """Output of the network for a batch of instances.
 
     frame:       three vectors each, as columns, that turn with the instance; learnt to be a rotation
     coordinates: of each point in the canonical frame; they stay when the instance is turned

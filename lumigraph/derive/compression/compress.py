@@ -21,18 +21,18 @@ from ...run import Run, check_new
 from ...run.checkpoint import Checkpoints
 from ...run.compressed import Compressed, bytes_in
 from ...system.progress import track
-from .ladder import LADDER, PLACES, Rung, rung_at
+from .ladder import LADDER, RUNG_POSITIONS, Rung, rung_at
 from .measure import Truth, truth_of
 from .model import Model
 
-LOOKED_AT = 6  # photographs that were learnt from, by which a rung is judged; held-out ones judge the outcome alone
-WEIGHED = 40  # photographs that say what is important
-TRIAL = 1 / 6  # of all tuning, for each rung that is tried; as much as is left goes to the one that stays
+JUDGED_VIEWS = 6  # training photographs that judge a rung; held-out ones judge the outcome alone
+IMPORTANCE_VIEWS = 40  # photographs from which importance is computed
+TRIAL_SHARE = 1 / 6  # of all tuning, per tried rung; the selected rung gets the rest
 
 
 @dataclass(frozen=True)
 class Aim:
-    """What is wanted, and what it may take; exactly one of size and loss.
+    """Target of a compression and its limit in time; exactly one of size and loss.
 
     size:     bytes of the model at most
     loss:     dB that photographs which were learnt from may lose at most
@@ -70,7 +70,7 @@ def compress(
     needs(before, CanCompress)
     if aim.codebook is not None:
         check_codebook(before, aim.codebook)
-    truth = truth_of(run, before, source, LOOKED_AT)
+    truth = truth_of(run, before, source, JUDGED_VIEWS)
     ladder = Ladder(run, truth, aim, device, important(before, truth))
     model = ladder.by_size(aim.size) if aim.size is not None else ladder.by_loss(aim.loss or 0.0)
     return written(run, before, model, truth, output, aim)
@@ -89,8 +89,8 @@ class Ladder:
         while low <= high:
             middle = (low + high) // 2
             model = self.at(middle)
-            self.tune(model, TRIAL)
-            if self.truth.loss(model.method, LOOKED_AT) <= most:
+            self.tune(model, TRIAL_SHARE)
+            if self.truth.loss(model.method, JUDGED_VIEWS) <= most:
                 low, best = middle + 1, model
             else:
                 high = middle - 1
@@ -101,8 +101,8 @@ class Ladder:
     def by_size(self, most: int) -> Model:
         """The lowest place that is as small, on a rung or between two. Tuning changes the size a little, so that it may
         take the next one."""
-        first = bisect_left(PLACES, True, key=lambda place: len(self.at(place).packed()) <= most)
-        for place in PLACES[first:]:
+        first = bisect_left(RUNG_POSITIONS, True, key=lambda place: len(self.at(place).packed()) <= most)
+        for place in RUNG_POSITIONS[first:]:
             model, self.tuned = self.at(place), 0.0
             self.tune(model, 1.0)
             if len(model.packed()) <= most:
@@ -135,8 +135,8 @@ class Ladder:
 
 
 def important(method: Method, truth: Truth) -> dict[str, Tensor]:
-    """What each row of the method's tensors adds to the photographs, or to many of them."""
-    train = evenly(truth.scene.splits["train"].tolist(), WEIGHED)
+    """Importance of each row of the method's tensors, over all photographs or a subset."""
+    train = evenly(truth.scene.splits["train"].tolist(), IMPORTANCE_VIEWS)
     total: dict[str, Tensor] = {}
     for i in track(train, "Weighing what matters", len(train)):
         camera = method.refined(truth.scene.cameras[i])

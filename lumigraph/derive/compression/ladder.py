@@ -28,8 +28,8 @@ LADDER: tuple[Rung, ...] = (
     Rung(0.15, Recipe(256, apart=0.0, coarser=4)),
 )
 
-BETWEEN = 4  # places on the way from a rung to the next
-PLACES = [i / BETWEEN for i in range(BETWEEN * (len(LADDER) - 1) + 1)]
+STEPS_BETWEEN_RUNGS = 4  # interpolated settings from one rung to the next
+RUNG_POSITIONS = [i / STEPS_BETWEEN_RUNGS for i in range(STEPS_BETWEEN_RUNGS * (len(LADDER) - 1) + 1)]
 
 
 def rung_at(place: float) -> Rung:

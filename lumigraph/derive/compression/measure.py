@@ -1,4 +1,4 @@
-"""What a compressed run is compared with: its photographs where they are at hand, else what it used to show."""
+"""References for a compressed run: its photographs where available, else renderings of the original."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ from ...run import Run
 from ...system.progress import track
 from ...training.verdict import last_psnr
 
-SEEN = 40  # photographs that renderings stand in for, evenly spread
-LIKELY = 30.0  # dB of a run that does not say how well it learnt its photographs
+RENDERED_VIEWS = 40  # renderings in place of photographs, evenly spread
+DEFAULT_PSNR = 30.0  # dB of a run without a recorded training PSNR
 
 
 @dataclass(frozen=True)
 class Truth:
-    """What is learnt from and compared with.
+    """References for tuning and for comparison.
 
     photographed: whether these are photographs; renderings of the run before it was compressed otherwise
     error:        mean squared error of the run before, on the photographs that it has learnt
@@ -53,7 +53,7 @@ def truth_of(run: Run, method: Method, source: str | None, views: int) -> Truth:
         if source is not None:
             raise
     learnt = last_psnr(run.metrics())
-    return Truth(rendered(run, method), False, 10 ** (-(LIKELY if learnt is None else learnt) / 10))
+    return Truth(rendered(run, method), False, 10 ** (-(DEFAULT_PSNR if learnt is None else learnt) / 10))
 
 
 def squared_error(method: Method, scene: Scene, split: str, views: int) -> float:
@@ -68,7 +68,7 @@ def decibels(error: float) -> float:
 def rendered(run: Run, method: Method) -> Scene:
     """A Scene whose photographs are what a method shows from where they were taken."""
     cameras = run.cameras()
-    some = {split: evenly(range(len(own)), SEEN) for split, own in cameras.items() if len(own)}
+    some = {split: evenly(range(len(own)), RENDERED_VIEWS) for split, own in cameras.items() if len(own)}
     chosen = [cameras[split][i] for split, index in some.items() for i in index]
     counts = torch.tensor([0, *(len(index) for index in some.values())]).cumsum(0).tolist()
     splits = {

@@ -17,8 +17,8 @@ from ...method.capabilities import CanCompress, needs
 from ...system.progress import counting
 from .ladder import Rung
 
-PACE = 0.1  # of the error that storing made: how far a step of tuning moves
-LAST_PACE = 0.1  # of that pace, at the end
+TUNING_RATE = 0.1  # step of tuning, as a share of the quantisation error
+FINAL_RATE_SCALE = 0.1  # of that rate, at the end
 BETAS = 0.9, 0.99
 
 
@@ -71,7 +71,7 @@ class Model:
         with counting("Tuning", total) as done:
             while (share := progress(taken, time.perf_counter() - begin, steps, seconds)) < 1:
                 for group in optimizer.param_groups:
-                    group["lr"] = PACE * LAST_PACE**share * group["unit"]
+                    group["lr"] = TUNING_RATE * FINAL_RATE_SCALE**share * group["unit"]
                 self._descend(self.method.batch(scene, generator), optimizer)
                 taken, self.steps = taken + 1, self.steps + 1
                 done(int(share * total))

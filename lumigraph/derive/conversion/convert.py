@@ -26,16 +26,16 @@ from .measure import likeness, shown
 from .renderings import rendered_scene
 from .ways import check, way
 
-SHARE = 0.5  # of a training that is over once a field has been taken over: schedules go on from there
-RENDERING = 0.5  # of the seconds to learn for, that rendering what to learn from may take beside
+INHERITED_PROGRESS = 0.5  # training progress at which schedules go on after a field was taken over
+RENDERING_SHARE = 0.5  # of the training time that rendering of training views may take in addition
 PHOTOGRAPHS: LearntFrom = "photographs"
 RENDERINGS: LearntFrom = "renderings of the source"
-VIEWS = 8  # held-out views that are compared
+COMPARED_VIEWS = 8  # held-out views that are compared
 
 
 @dataclass(frozen=True)
 class Aim:
-    """What is wanted, and what it may take; exactly one of steps, seconds and quality.
+    """Target of a conversion and its limit; exactly one of steps, seconds and quality.
 
     config:  the student's numbers; None takes its defaults for the device
     steps, seconds: of learning on, once the teacher is taken over
@@ -51,7 +51,7 @@ class Aim:
     quality: Quality | None = None
     distil: bool = False
     source: str | None = None
-    views: int = VIEWS
+    views: int = COMPARED_VIEWS
     seed: int = 0
 
 
@@ -75,7 +75,7 @@ def convert(
     around = teacher.refined(source.survey(cameras["train"]))
     distil = going_on[1].learnt_from == RENDERINGS if going_on else aim.distil
     if scene is None or distil:
-        allowed = math.inf if aim.seconds is None else RENDERING * aim.seconds
+        allowed = math.inf if aim.seconds is None else RENDERING_SHARE * aim.seconds
         learnt_from, data = RENDERINGS, rendered_scene(teacher, around, str(source.path), allowed)
     else:
         learnt_from, data = PHOTOGRAPHS, seen_as(teacher, student, scene)
@@ -132,8 +132,8 @@ def take_over(teacher: Method, student: Method, data: Scene, cameras: Camera, as
 
 
 def budget_of(student: Method, data: Scene, aim: Aim) -> Budget:
-    """How long to learn on. What began as a field is at SHARE of its schedules already."""
-    share, steps = SHARE if can(student, FromField) else 0.0, aim.steps
+    """Budget of further training. Schedules of a converted field begin at INHERITED_PROGRESS."""
+    share, steps = INHERITED_PROGRESS if can(student, FromField) else 0.0, aim.steps
     if aim.quality is not None:
         steps = max(1, round((1 - share) * student.steps_for(aim.quality, data)))
     return Budget(steps, aim.seconds, aim.quality, (0.0, share) if share else None)

@@ -1,4 +1,4 @@
-"""How alike two methods show a scene, how alike each shows it to its photographs, and how quickly."""
+"""Compare two methods' renderings with each other and with the photographs, and their speed."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a student learns from where there are no photographs: pictures that its teacher renders, as a Scene."""
+"""Training pictures for a student without photographs: renderings of its teacher, as a Scene."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from ...method import Method
 from ...system.progress import track
 from ..compression.measure import bytes_of
 
-MOST, FEWEST = 80, 8  # pictures, and however short the time
-LONGEST = 400  # pixels of their longer side
-ASIDE = 1 / 3  # of the way from a camera to its nearest neighbour, where another one stands
+MAX_VIEWS, MIN_VIEWS = 80, 8  # pictures, and however short the time
+MAX_SIDE = 400  # pixels of their longer side
+NEIGHBOUR_SHARE = 1 / 3  # position of an additional camera, as a share of the way to the nearest neighbour
 
 
 @torch.no_grad()
@@ -27,12 +27,12 @@ def rendered_scene(teacher: Method, cameras: Camera, source: str, seconds: float
 
     seconds: that rendering may take, about
     """
-    some = evenly(range(len(cameras)), MOST // 2)
+    some = evenly(range(len(cameras)), MAX_VIEWS // 2)
     own = Camera.cat([cameras[i] for i in some])
     both = own if len(own) < 2 else Camera.cat([own, between(own)])
-    both = both.resized(min(1.0, LONGEST / int(both.size.max())))
-    affordable = MOST if seconds == float("inf") else int(seconds / seconds_of_one(teacher, both[0]))
-    chosen = evenly(range(len(both)), max(affordable, FEWEST))
+    both = both.resized(min(1.0, MAX_SIDE / int(both.size.max())))
+    affordable = MAX_VIEWS if seconds == float("inf") else int(seconds / seconds_of_one(teacher, both[0]))
+    chosen = evenly(range(len(both)), max(affordable, MIN_VIEWS))
     frame, pictures = teacher.frame, []
     for i in track(chosen, "Rendering what to learn from", len(chosen)):
         pictures.append(bytes_of(teacher.render(both[i]).cpu(), frame.background if frame.has_alpha else None))
@@ -47,14 +47,14 @@ def between(cameras: Camera) -> Camera:
     other = apart.argmin(-1)
 
     def mixed(values: torch.Tensor) -> torch.Tensor:
-        return torch.lerp(values, values[other], ASIDE)
+        return torch.lerp(values, values[other], NEIGHBOUR_SHARE)
 
     pose = look_at(mixed(cameras.position), mixed(cameras.forward), -mixed(cameras.pose[:, :, 1]))
     return replace(cameras, pose=pose)
 
 
 def seconds_of_one(teacher: Method, camera: Camera) -> float:
-    """What rendering a picture takes; kernels are compiled before."""
+    """Seconds per rendered picture, without compilation of kernels."""
     teacher.render(camera.resized(min(1.0, 32 / int(camera.size.max()))))
     begin = time.perf_counter()
     teacher.render(camera)

@@ -1,4 +1,4 @@
-"""What goes into what, and how: told by what methods can do, so that a new one finds its place by itself."""
+"""Conversions between methods, by capability, so that a new method is supported without an entry here."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from ...method.capabilities import FromField, HasDensity, HasField, HasGaussians
 from ...run import Opened
 
 Way = Literal["field", "gaussians", "depth", "pictures"]
-SPATIAL = FromField, HasField, HasDensity, HasLooks, HasGaussians  # what holds a scene can do one of these
+SPATIAL_CAPABILITIES = FromField, HasField, HasDensity, HasLooks, HasGaussians  # one of them is needed
 
 
 def way(teacher: type[Method], student: type[Method]) -> Way | None:
-    """How a student can be made of a teacher: by the teacher's field at points, by its Gaussians as they are, by the
+    """Conversion of a teacher to a student: by the teacher's field at points, by its Gaussians as they are, by the
     depth of what it renders, or by learning from its pictures alone; None if not at all."""
     shows = issubclass(Scene, teacher.learns_from) or Scene in teacher.accepts  # a prior's runs are of scenes too
     if not (shows and issubclass(Scene, student.learns_from)):
@@ -26,7 +26,7 @@ def way(teacher: type[Method], student: type[Method]) -> Way | None:
         if can(teacher, HasGaussians) and can(student, HasGaussians):
             return "gaussians"
         return "field" if can(teacher, HasField) else "depth"
-    return "pictures" if any(can(student, capability) for capability in SPATIAL) else None
+    return "pictures" if any(can(student, capability) for capability in SPATIAL_CAPABILITIES) else None
 
 
 def ways() -> dict[str, dict[str, Way | None]]:
@@ -43,7 +43,7 @@ def check(source: Opened, student: type[Method]) -> None:
     if source.frame.times is not None:
         raise LumigraphError(f"{source.path} is of a scene that moves, and what is converted stands still")
     check_kind(name, student.learns_from, Scene, str(source.path), methods.learning_from(Scene))
-    if not any(can(student, capability) for capability in SPATIAL):
+    if not any(can(student, capability) for capability in SPATIAL_CAPABILITIES):
         raise LumigraphError(
             f"{name} holds pictures, and no scene in space; `lumigraph convert --list` says what goes into what"
         )

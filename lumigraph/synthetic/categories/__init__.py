@@ -15,8 +15,8 @@ from ..cameras import dome, pinhole, spiral
 from ..stage import Stage
 from ..world import Lamp, Object, Sky, Vector, World
 
-DISTANCE, ANGLE = 3.2, 34.0  # of cameras from the middle, scene units; of view, degrees
-LOWEST, HIGHEST = 8.0, 60.0  # that cameras stand above the horizon, degrees
+CAMERA_DISTANCE, FIELD_OF_VIEW = 3.2, 34.0  # scene units from the centre; field of view, degrees
+MIN_ELEVATION, MAX_ELEVATION = 8.0, 60.0  # degrees of the cameras above the horizon
 KEY = Lamp((-2.8, -1.5, 3.2), radius=0.42, power=16.0, colour=(1.0, 0.95, 0.87))
 FILL = Lamp((3.0, 0.6, 2.2), radius=0.8, power=4.0, colour=(0.86, 0.93, 1.0))
 SKY = Sky((0.84, 0.91, 1.0), (0.95, 0.94, 0.92), (0.70, 0.62, 0.54), light=0.45)
@@ -45,8 +45,10 @@ def surrounded(
     """Objects in the light of all categories, seen from a dome; held-out views climb around them."""
     world = World(objects, (KEY, FILL), SKY)
     cameras = {
-        "train": pinhole(dome(views, DISTANCE, random, LOWEST, HIGHEST), size, ANGLE),
-        "test": pinhole(spiral(max(views * 2 // 5, 1), DISTANCE, random, LOWEST, HIGHEST), size, ANGLE),
+        "train": pinhole(dome(views, CAMERA_DISTANCE, random, MIN_ELEVATION, MAX_ELEVATION), size, FIELD_OF_VIEW),
+        "test": pinhole(
+            spiral(max(views * 2 // 5, 1), CAMERA_DISTANCE, random, MIN_ELEVATION, MAX_ELEVATION), size, FIELD_OF_VIEW
+        ),
     }
     reach = max(abs(x) for corner in bounds for x in corner)
     return Stage(world, cameras, bounds, reach=reach, near=1.5)

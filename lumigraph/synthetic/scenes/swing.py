@@ -19,7 +19,7 @@ from ..textures import Checker, Plain, Sectors, Wood
 from ..world import Lamp, Material, Object, Pose, Sky, World
 
 PIVOT = (0.0, 0.0, 0.55)
-LENGTH, WIDEST = 0.75, 45.0  # scene units from the pivot to the ball's centre; degrees from the plumb line
+ROD_LENGTH, MAX_ANGLE = 0.75, 45.0  # scene units from the pivot to the ball's centre; degrees from the plumb line
 RED, CREAM, BLUE = (0.78, 0.22, 0.16), (0.95, 0.91, 0.82), (0.14, 0.28, 0.52)
 
 OAK = Material(Wood((0.80, 0.63, 0.42), (0.62, 0.43, 0.26), ring=0.06, seed=1.0), gloss=0.4, roughness=0.5)
@@ -38,7 +38,7 @@ def still() -> tuple[Object, ...]:
 
 def angle(time: float) -> float:
     """Degrees from the plumb line, towards +x: half a period, from -WIDEST at time 0 to WIDEST at time 1."""
-    return -WIDEST * math.cos(math.pi * time)
+    return -MAX_ANGLE * math.cos(math.pi * time)
 
 
 def world(time: float) -> World:
@@ -46,8 +46,8 @@ def world(time: float) -> World:
     swung = Pose(PIVOT) @ Pose.about((0.0, 1.0, 0.0), -angle(time))
     stripes = Material(Sectors(RED, CREAM, count=6, cap=0.2), gloss=1.0, roughness=0.25)
     pendulum = (
-        Object(Cylinder(0.012, LENGTH / 2), STEEL, swung @ Pose.at(0, 0, -LENGTH / 2), "rod"),
-        Object(Sphere(0.2), stripes, swung @ Pose.at(0, 0, -LENGTH), "ball"),
+        Object(Cylinder(0.012, ROD_LENGTH / 2), STEEL, swung @ Pose.at(0, 0, -ROD_LENGTH / 2), "rod"),
+        Object(Sphere(0.2), stripes, swung @ Pose.at(0, 0, -ROD_LENGTH), "ball"),
     )
     key = Lamp((-2.6, -1.8, 3.2), radius=0.4, power=18.0, colour=(1.0, 0.95, 0.87))
     fill = Lamp((3.0, 0.8, 2.0), radius=0.8, power=4.0, colour=(0.86, 0.93, 1.0))

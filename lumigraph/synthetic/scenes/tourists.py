@@ -41,9 +41,9 @@ CLOTHES = (
 )  # fmt: skip
 PAINTS = ((0.72, 0.10, 0.12), (0.85, 0.86, 0.88), (0.12, 0.18, 0.35), (0.93, 0.78, 0.15), (0.15, 0.16, 0.17))
 
-MOST_PASSING = 5  # people and cars in one photograph
-CLOSEST, FARTHEST = 1.5, 2.3  # cameras from the façade's middle
-SPREAD = 42.0  # degrees that they stand to either side
+MAX_PASSERS = 5  # people and cars in one photograph
+MIN_DISTANCE, MAX_DISTANCE = 1.5, 2.3  # cameras from the façade's centre
+MAX_AZIMUTH = 42.0  # degrees to either side
 
 
 @dataclass(frozen=True)
@@ -180,7 +180,7 @@ def car(place: Pose, paint: Colour) -> Iterator[Object]:
 def passing(camera: Camera, random: np.random.Generator) -> Iterator[Object]:
     """People and now and then a car between a camera and the façade, each before some other part of it."""
     eye = camera.position[0].numpy()
-    for _ in range(random.integers(1, MOST_PASSING + 1)):
+    for _ in range(random.integers(1, MAX_PASSERS + 1)):
         aim = np.array([random.uniform(-0.9, 0.9), WALL])
         drives = random.uniform() < 0.15
         way = random.uniform(0.45 if drives else 0.25, 0.65)  # from the camera to the façade
@@ -197,8 +197,8 @@ def visits(count: int, random: np.random.Generator, size: int) -> Camera:
     """Cameras of people who look at the façade from the square, with lenses of 45 to 70 degrees."""
     poses = []
     for _ in range(count):
-        azimuth = math.radians(random.uniform(-SPREAD, SPREAD))
-        distance = random.uniform(CLOSEST, FARTHEST)
+        azimuth = math.radians(random.uniform(-MAX_AZIMUTH, MAX_AZIMUTH))
+        distance = random.uniform(MIN_DISTANCE, MAX_DISTANCE)
         eye = (distance * math.sin(azimuth), WALL - distance * math.cos(azimuth), random.normal(0, 0.03))
         aim = (random.uniform(-0.35, 0.35), WALL, random.uniform(0.05, 0.45))
         poses.append(look_at(eye, aim))

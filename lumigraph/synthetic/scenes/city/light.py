@@ -9,11 +9,11 @@ from ...world import Sky, Sun
 from ..tourists import Day
 
 SWEEP = (-60.0, 75.0)  # azimuth of the sun as the drive begins and ends, degrees
-LOW, HIGH = 30.0, 58.0  # its elevation then, and half-way
+MIN_ELEVATION, MAX_ELEVATION = 30.0, 58.0  # of the sun at the ends of the drive, and half-way
 CLOUD = (0.45, 0.12, 0.75)  # when a cloud is before the sun, for how long (shares of the drive), what it takes
 WHITE = (1.0, 1.0, 1.0)
-STOPS = 0.55  # by which the cameras' exposure follows what is before them, up and down
-EBBS = 5  # how often, in one drive
+EXPOSURE_STOPS = 0.55  # amplitude by which the cameras' exposure follows the scene
+EXPOSURE_CYCLES = 5  # per drive
 
 
 def day(share: float, exposure: float) -> Day:
@@ -21,7 +21,7 @@ def day(share: float, exposure: float) -> Day:
     begin, end = SWEEP
     middle, width, most = CLOUD
     overcast = most * math.exp(-(((share - middle) / width) ** 2))
-    sun = begin + share * (end - begin), LOW + (HIGH - LOW) * math.sin(math.pi * share)
+    sun = begin + share * (end - begin), MIN_ELEVATION + (MAX_ELEVATION - MIN_ELEVATION) * math.sin(math.pi * share)
     return Day(sun, overcast, WHITE, exposure)
 
 
@@ -36,4 +36,4 @@ def sky(today: Day) -> Sky:
 
 def exposure(share: float, gain: float) -> float:
     """Light that one camera of the rig takes, of what it would take otherwise. gain: its own factor"""
-    return gain * 2 ** (STOPS * math.sin(2 * math.pi * EBBS * share))
+    return gain * 2 ** (EXPOSURE_STOPS * math.sin(2 * math.pi * EXPOSURE_CYCLES * share))

@@ -14,10 +14,10 @@ ROAD = 5.0  # half the width of a street, from its middle to the kerb
 PAVEMENT = 2.5  # from the kerb to the houses
 LANE = 1.5  # from the middle of the street to the middle of a lane; people drive on the right
 BEND = 0.55  # of the way across a crossing: where the handles of the curve through it stand (a quarter of a circle)
-ALONG = 0.5  # metres before and behind, by which the drive's direction is told
+TANGENT_STEP = 0.5  # metres before and behind, between which the drive's direction is measured
 
 OUTSKIRTS = 40.0  # how far asphalt goes beyond the outermost crossings
-TALLEST = 20.0  # no house is taller
+MAX_HEIGHT = 20.0  # of houses
 
 Crossing = tuple[int, int]  # column and row
 
@@ -32,7 +32,7 @@ def extent(count: int) -> tuple[Vector, Vector]:
     """Two corners of the box that holds such a city, the ground included."""
     places = crossings(count)
     columns, rows = (max(place[axis] for place in places) + 1 for axis in range(2))
-    out = (PITCH * (columns - 1) + OUTSKIRTS, PITCH * (rows - 1) + OUTSKIRTS, TALLEST)
+    out = (PITCH * (columns - 1) + OUTSKIRTS, PITCH * (rows - 1) + OUTSKIRTS, MAX_HEIGHT)
     return (-OUTSKIRTS, -OUTSKIRTS, -0.4), out
 
 
@@ -96,5 +96,5 @@ def stops(places: list[Crossing], count: int) -> tuple[Float[np.ndarray, "stop 2
         return np.stack([np.interp(way % gone[-1], gone, line[:, axis]) for axis in range(2)], -1)
 
     way = (np.arange(count) + 0.5) / count * gone[-1]
-    ahead = at(way + ALONG) - at(way - ALONG)
+    ahead = at(way + TANGENT_STEP) - at(way - TANGENT_STEP)
     return at(way), np.arctan2(ahead[:, 1], ahead[:, 0]), float(gone[-1])

@@ -12,10 +12,10 @@ from ...world import Object, Pose
 from .plan import LANE, OUTSKIRTS, PITCH, Crossing
 from .streets import car
 
-EVERY = 26.0  # metres of a lane to a car
-SLOWEST, FASTEST = 5.0, 11.0  # metres per second
-APART = 6.0  # between the middles of two cars, at least
-AWAY = 7.5  # from the one that photographs
+CAR_SPACING = 26.0  # metres of a lane per car
+MIN_SPEED, MAX_SPEED = 5.0, 11.0  # metres per second
+MIN_CAR_DISTANCE = 6.0  # between the centres of two cars
+MIN_CAMERA_DISTANCE = 7.5  # from the car with the cameras
 
 TRAFFIC = "traffic"
 
@@ -61,9 +61,9 @@ def drivers(places: list[Crossing], seed: int) -> list[Driver]:
     random = np.random.default_rng([seed, 0x7AFF])
     found = []
     for lane in lanes(places):
-        count = max(round(lane.length / EVERY), 1)
+        count = max(round(lane.length / CAR_SPACING), 1)
         starts = (np.arange(count) + random.uniform(0.2, 0.8, count)) * lane.length / count
-        speed = random.uniform(SLOWEST, FASTEST)  # nobody overtakes
+        speed = random.uniform(MIN_SPEED, MAX_SPEED)  # nobody overtakes
         found += [Driver(lane, float(s), speed, int(random.integers(1 << 30))) for s in starts]
     return found
 
@@ -75,7 +75,7 @@ def traffic(everybody: list[Driver], time: float, eye: np.ndarray) -> Iterator[O
         pose = driver.pose(time)
         place = np.array(pose.position[:2])
         gaps = np.linalg.norm(np.array(there) - place, axis=-1)
-        if gaps[0] > AWAY and gaps[1:].min(initial=np.inf) > APART:
+        if gaps[0] > MIN_CAMERA_DISTANCE and gaps[1:].min(initial=np.inf) > MIN_CAR_DISTANCE:
             there.append(place)
             yield from (replace(part, pose=pose @ part.pose) for part in parts(driver.seed))
 
