@@ -15,7 +15,7 @@ from ..errors import LumigraphError
 from ..gaussians import Gaussians, splatting
 from ..geometry import Similarity
 from ..method import Method
-from .composed import NEAR, compose
+from .composed import NEAR_PLANE_SCALE, compose
 from .placed import Placed
 
 
@@ -45,7 +45,7 @@ class PickedCloud(Method):
 
     @torch.no_grad()
     def render(self, camera: Camera) -> Rendering:
-        near = NEAR * self.frame.near
+        near = NEAR_PLANE_SCALE * self.frame.near
         return splatting.render(self.gaussians(), camera.to(self.device), self.frame.background, near)
 
     def batch(self, data: Any, generator: torch.Generator) -> NoReturn:

@@ -24,7 +24,7 @@ from ..run.budget import Budget
 from ..system.progress import clock, short
 from ..training.verdict import cameras_moved
 
-LARGEST_FILM = 12 << 20  # bytes; larger ones are named instead of embedded
+MAX_FILM_BYTES = 12 << 20  # bytes; larger ones are named instead of embedded
 STYLE = CHARTS + (Path(__file__).parent / "report.css").read_text("utf-8")
 
 
@@ -112,7 +112,7 @@ def films(run: Run) -> str:
         f"<figure><video src='{data_uri(path, 'video/mp4')}' autoplay loop muted playsinline controls></video>"
         f"<figcaption>{name}</figcaption></figure>"
         for path, name in ((found[0], "colour"), (found[0].with_stem(f"{found[0].stem}-depth"), "depth"))
-        if path.exists() and path.stat().st_size < LARGEST_FILM
+        if path.exists() and path.stat().st_size < MAX_FILM_BYTES
     )
     names = ", ".join(f"<code>{escape(str(path.relative_to(run.folder)))}</code>" for path in found)
     return section(found[0].stem.capitalize(), f"<div class='row'>{players}</div>", f"Films in the run: {names}")

@@ -21,11 +21,11 @@ from ..system.progress import clock, short
 from .announce import how_long, learner, learnt_from, machine
 
 REFRESH = 0.5  # seconds between looks at a bar
-FIRST = 3.0  # seconds to the first line with a time left
-LINES = 10.0, 60.0  # seconds between lines where there is no terminal: at least, and later at most
-SHARE = 0.1  # of the time so far that passes between lines, within these limits
-MEMORY = 0.8  # share of the smoothed PSNR that another value leaves
-TOLD_OTHERWISE = {"mse", "rays", "samples", "visible_samples"}  # statistics, as PSNR and by the second
+FIRST_LINE_SECONDS = 3.0  # seconds to the first line with a time left
+LINE_INTERVALS = 10.0, 60.0  # seconds between lines where there is no terminal: at least, and later at most
+LINE_SHARE = 0.1  # of the time so far that passes between lines, within these limits
+SMOOTHING = 0.8  # share of the smoothed PSNR that another value leaves
+OMITTED_STATISTICS = {"mse", "rays", "samples", "visible_samples"}  # statistics, as PSNR and by the second
 NAMES = {"gaussians": "Gaussians"}  # of statistics, for people
 
 
@@ -102,7 +102,7 @@ class TrainingDisplay:
         self._line(f"{learner(name, method)}, {machine(method.device)}, {how_long(budget, step, seconds)}")
         self.bar.update(self.task, description="Training", completed=budget.progress(step, seconds))
         self._begun = self._seen = step, seconds
-        self._next = time.perf_counter() + (REFRESH if self._live else FIRST)
+        self._next = time.perf_counter() + (REFRESH if self._live else FIRST_LINE_SECONDS)
 
     @property
     def due(self) -> bool:
@@ -117,12 +117,12 @@ class TrainingDisplay:
             return
         if "psnr" in row:
             now = row["psnr"]
-            self.psnr = now if self.psnr is None else MEMORY * self.psnr + (1 - MEMORY) * now
+            self.psnr = now if self.psnr is None else SMOOTHING * self.psnr + (1 - SMOOTHING) * now
         self._loss = row.get("loss")
         if self.due:
             self._look(step, seconds, budget, row["statistics"])
-            least, most = LINES
-            self._next = time.perf_counter() + (REFRESH if self._live else min(max(SHARE * seconds, least), most))
+            least, most = LINE_INTERVALS
+            self._next = time.perf_counter() + (REFRESH if self._live else min(max(LINE_SHARE * seconds, least), most))
 
     def _quality(self) -> list[str]:
         """The PSNR of what was learnt from; the loss, of methods that have none."""
@@ -162,7 +162,7 @@ class TrainingDisplay:
 
 def sizes(statistics: dict[str, float]) -> list[str]:
     """What a method says of itself: whole numbers as counts, others as they are."""
-    told = {NAMES.get(name, name): value for name, value in statistics.items() if name not in TOLD_OTHERWISE}
+    told = {NAMES.get(name, name): value for name, value in statistics.items() if name not in OMITTED_STATISTICS}
     return [f"{x:,.0f} {name}" if x == int(x) else f"{name} {short(x)}" for name, x in told.items() if math.isfinite(x)]
 
 

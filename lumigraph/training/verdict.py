@@ -15,9 +15,9 @@ from ..datasets.dataset import Dataset
 from ..datasets.scene import Photograph, Scene
 from ..method import Lesson, Method
 
-STRETCHES = 4, 30  # at least and at most, that the second half of training is divided into; fewer tell nothing
-FALLING = 0.05  # share of the loss, over the second half, from which on it still falls
-DEVIATIONS = 2.0  # of its own error that a fall must exceed
+STRETCH_COUNTS = 4, 30  # at least and at most, that the second half of training is divided into; fewer tell nothing
+FALLING_SHARE = 0.05  # share of the loss, over the second half, from which on it still falls
+FALL_DEVIATIONS = 2.0  # of its own error that a fall must exceed
 
 
 def shares_seen(data: Dataset) -> Callable[[Lesson], float]:
@@ -40,7 +40,7 @@ class Trend:
 
     @property
     def falling(self) -> bool:
-        return self.fall > max(FALLING, DEVIATIONS * self.error)
+        return self.fall > max(FALLING_SHARE, FALL_DEVIATIONS * self.error)
 
 
 def loss_trend(rows: Sequence[dict[str, Any]], by_photograph: bool) -> Trend | None:
@@ -52,7 +52,7 @@ def loss_trend(rows: Sequence[dict[str, Any]], by_photograph: bool) -> Trend | N
     """
     found = [row for row in rows if "mean_loss" in row]
     half = [row for row in found if row["step"] > found[-1]["step"] / 2]
-    least, most = STRETCHES
+    least, most = STRETCH_COUNTS
     passes = int(half[-1]["passes"] - half[0]["passes"]) if half and by_photograph else most
     stretches = min(len(half), passes, most)
     if stretches < least:

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from . import ALPHA, CHANNELS, Blocks
 
-LEAST = 1e-3  # of a stride's divisor, beyond which there is nothing more
+MIN_STRIDE_DIVISOR = 1e-3  # of a stride's divisor, beyond which there is nothing more
 
 
 def run(
@@ -47,7 +47,7 @@ def stride(along: Tensor, aside: Tensor, ball: float) -> Tensor:
     radius = (aside + along.square()).sqrt()
     share = ball / radius.clamp_min(ball)
     speed = (1 + 4 * aside / ball**2 * (1 - share)).sqrt() * share * ball
-    return torch.where(radius <= ball, 1, radius / (speed - along / radius).clamp_min(LEAST))
+    return torch.where(radius <= ball, 1, radius / (speed - along / radius).clamp_min(MIN_STRIDE_DIVISOR))
 
 
 def contracted(points: Tensor, ball: float) -> Tensor:
