@@ -173,7 +173,7 @@ def tell_done(output: Path, found: Any) -> None:
 
 
 def onward(run: Path, source: str | None = None) -> dict[str, str]:
-    """What to type next."""
+    """Command to type next."""
     from .outcome import NEXT
 
     again = ["--scene", source] if source else []

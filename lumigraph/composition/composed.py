@@ -48,7 +48,7 @@ def compose(frame: Frame, parts: Sequence[Placed]) -> Method:
 
 
 class Composed(Method):
-    """What all compositions share: parts, and that they do not learn."""
+    """Base of compositions: parts at places, not trainable."""
 
     def __init__(self, frame: Frame, parts: Sequence[Placed]):
         super().__init__(frame, None)
@@ -58,7 +58,7 @@ class Composed(Method):
 
     @property
     def controls(self) -> tuple[Control, ...]:
-        """What any part can be told; those that are about photographs only of the part that leads."""
+        """Controls of all parts; those that name photographs, of the leading part only."""
         found: dict[str, Control] = {}
         for part in self.parts:
             for control in part.method.controls:

@@ -20,7 +20,7 @@ from .placed import Placed
 
 
 def cropped(method: Method, crop: Crop) -> Method:
-    """What lies inside a crop of the method's frame, as a method. Ready to render, and nothing else.
+    """Method restricted to a crop in its frame, for rendering only.
 
     Along rays its samples end where the crop does; Gaussians are picked by their centres; of methods with neither,
     pixels are by their depth.

@@ -1,4 +1,4 @@
-"""Where parts stand: on one another, and the frame that holds them all."""
+"""Placement of parts on one another, and the frame that holds all of them."""
 
 from __future__ import annotations
 

@@ -88,7 +88,7 @@ def header(run: Run, evaluation: dict[str, Any] | None) -> str:
 
 
 def counted(run: Run) -> str:
-    """What a run learnt from, and how many of it."""
+    """Kind and number of the training inputs of a run."""
     count, one = run.settings.splits.get("train", 0), {"photographs": "photograph", "shapes": "shape"}.get(run.kind)
     return f"{count} {one}{'' if count == 1 else 's'}" if one else f"{run.kind} of {count}"
 
@@ -176,7 +176,7 @@ def views(run: Run, evaluation: dict[str, Any] | None) -> str:
 
 
 def cameras(run: Run) -> str:
-    """How far each camera was moved, where the method refines poses."""
+    """Displacement of each camera, where the method refines poses."""
     if not (run.has_state and run.settings.config.get("refine_cameras")):
         return ""
     moved = cameras_moved(run.method("cpu"), run.cameras()["train"])

@@ -1,4 +1,4 @@
-"""How fast each engine is, next to the reference on the same device, in one run."""
+"""Time of each engine and of the reference on the same device, in one run."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a person sees of training: a bar on a terminal, plain lines elsewhere, on stderr."""
+"""Progress of training on stderr: a bar on a terminal, plain lines elsewhere."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class Bar(Progress):
 
 
 class TrainingDisplay:
-    """What is learnt from, then how far training has come, how large a method has grown, and the time that is left.
+    """Training data, then progress, size of the method and remaining time.
 
     PSNR is that of the photographs learnt from, smoothed; it says little of held-out ones.
     """
@@ -91,14 +91,14 @@ class TrainingDisplay:
         self.bar.start()
 
     def begin(self, data: Dataset) -> None:
-        """What there is to learn from, and that kernels are compiled before anything is learnt."""
+        """Show the training data, and that kernels are compiled before the first step."""
         self._line(learnt_from(data))
         self.bar.update(self.task, description="Compiling kernels")
         if not self.terminal:
             self._line("Compiling kernels, which takes long the first time only")
 
     def ready(self, name: str, method: Method, budget: Budget, step: int, seconds: float) -> None:
-        """What begins to learn, on which machine, for how long."""
+        """Show the method, the machine and the budget."""
         self._line(f"{learner(name, method)}, {machine(method.device)}, {how_long(budget, step, seconds)}")
         self.bar.update(self.task, description="Training", completed=budget.progress(step, seconds))
         self._begun = self._seen = step, seconds
@@ -106,7 +106,7 @@ class TrainingDisplay:
 
     @property
     def due(self) -> bool:
-        """Whether the next step's figures are to be shown."""
+        """True if the figures of the next step are to be shown."""
         return time.perf_counter() >= self._next
 
     def update(self, step: int, seconds: float, budget: Budget, batch: Lesson, row: dict[str, Any]) -> None:
@@ -161,7 +161,7 @@ class TrainingDisplay:
 
 
 def sizes(statistics: dict[str, float]) -> list[str]:
-    """What a method says of itself: whole numbers as counts, others as they are."""
+    """Statistics of a method: whole numbers as counts, others unchanged."""
     told = {NAMES.get(name, name): value for name, value in statistics.items() if name not in OMITTED_STATISTICS}
     return [f"{x:,.0f} {name}" if x == int(x) else f"{name} {short(x)}" for name, x in told.items() if math.isfinite(x)]
 

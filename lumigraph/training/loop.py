@@ -36,7 +36,7 @@ MAX_SMALL_GRADIENT = (
 
 @dataclass(frozen=True)
 class Outcome:
-    """How training ended.
+    """Result of training.
 
     finished: whether the budget is spent
     signal:   number of the signal that stopped it, if one did
@@ -56,7 +56,7 @@ class Watch(Protocol):
 
     @property
     def asked(self) -> bool:
-        """Whether it wants to be given way before the next step. Asked before each step, so it must be quick."""
+        """True if training is to yield before the next step. Asked before each step, so it must be quick."""
 
     def give_way(self, stopping: Callable[[], object]) -> None:
         """Render, in eval mode; return at once where stopping() is true."""
@@ -315,7 +315,7 @@ def find_fault(method: Method, terms: dict[str, Tensor], batch: Lesson, step: in
 
 
 def finite(tensors: Iterable[Tensor]) -> bool:
-    """Whether every number is finite. Their sum tells: it reads each once, and passes NaN and infinity on."""
+    """True if all numbers are finite. The sum reads each number once and propagates NaN and infinity."""
     sums = [x.detach().sum(dtype=torch.float32) for x in tensors if x.is_floating_point()]
     return not sums or math.isfinite(torch.stack(sums).sum().item())
 

@@ -29,7 +29,7 @@ def shares_seen(data: Dataset) -> Callable[[Lesson], float]:
 
 @dataclass(frozen=True)
 class Trend:
-    """How the loss moved over the second half of training.
+    """Trend of the loss over the second half of training.
 
     fall:  from the half's beginning to its end, as a share of the loss; negative where it rose
     error: one standard deviation of that
@@ -44,7 +44,7 @@ class Trend:
 
 
 def loss_trend(rows: Sequence[dict[str, Any]], by_photograph: bool) -> Trend | None:
-    """How the loss moved, by the lines of metrics.jsonl; None where they are too few to tell.
+    """Trend of the loss from the lines of metrics.jsonl; None where there are too few lines.
 
     A straight line through its logarithm, by least squares; the scatter around it tells the error. Some photographs are
     harder than others: where a step learns from one (by_photograph), points on the line are means over at least a whole
@@ -69,7 +69,7 @@ def loss_trend(rows: Sequence[dict[str, Any]], by_photograph: bool) -> Trend | N
 
 
 def cameras_moved(method: Method, cameras: Camera) -> Moves | None:
-    """How far a method has moved the cameras that it learnt from, each against all of them; None where it learns no
+    """Displacement of the training cameras by a method, each against all of them; None where it learns no
     poses. cameras: those of training photographs as they were given"""
     refined = method.refined(cameras)
     return None if refined is cameras else moves(cameras, refined, method.frame)

@@ -42,7 +42,7 @@ def steps(origins: Tensor, directions: Tensor, enter: Tensor, leave: Tensor, bal
 
 
 def stride(along: Tensor, aside: Tensor, ball: float) -> Tensor:
-    """How far a ray goes that it comes one voxel onward. along: distance from where it is nearest to the middle of the
+    """Distance along a ray to the next voxel. along: distance from where it is nearest to the middle of the
     ball; aside: square of the middle's distance from there"""
     radius = (aside + along.square()).sqrt()
     share = ball / radius.clamp_min(ball)
@@ -51,7 +51,7 @@ def stride(along: Tensor, aside: Tensor, ball: float) -> Tensor:
 
 
 def contracted(points: Tensor, ball: float) -> Tensor:
-    """Where points lie in the grid."""
+    """Positions of points in the grid."""
     if not ball:
         return points
     middle = 2 * ball - 0.5

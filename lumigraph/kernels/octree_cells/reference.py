@@ -47,7 +47,7 @@ def run(
 
 
 def leaves(tree: Tree, place: Tensor) -> tuple[Tensor, Tensor]:
-    """What stands in `Tree.cells` for the undivided cells at places (x, y, z), whole numbers below 2^depth along each
+    """Entries of `Tree.cells` for the leaf cells at places (x, y, z), whole numbers below 2^depth along each
     axis; and the cells' sides, in the same unit."""
     cells = tree.cells.flatten().long()
     node, size = torch.zeros_like(place[:, 0]), torch.full_like(place[:, 0], 1 << tree.depth)

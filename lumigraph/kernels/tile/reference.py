@@ -19,7 +19,7 @@ def run(
 
 
 def touches(centres: Tensor, conics: Tensor, opacities: Tensor, size: tuple[int, int], side: int) -> Tensor:
-    """Whether the least q = d^T conic d over each tile's rectangle is at most 2 ln(255 opacity)."""
+    """True if the least q = d^T conic d over each tile's rectangle is at most 2 ln(255 opacity)."""
     width, height = size
     left, top = (torch.arange(0, n, side, device=centres.device).to(centres) + 0.5 for n in size)
     right, bottom = (left + side - 1).clamp(max=width - 0.5), (top + side - 1).clamp(max=height - 0.5)
