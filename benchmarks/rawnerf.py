@@ -27,7 +27,7 @@ from lumigraph.capture import open_scene
 from lumigraph.capture.raw.demosaic import demosaiced
 from lumigraph.components.fields.development import decoded, encoded
 from lumigraph.datasets.scene import Scene
-from lumigraph.evaluation.light import LIGHT, in_light
+from lumigraph.evaluation.light import LIGHT_LAYER, in_light
 from lumigraph.figures import Row, contact_sheet, save_picture
 from lumigraph.files import write_json
 from lumigraph.methods import find
@@ -58,7 +58,7 @@ def main(options: Options) -> None:
     device = torch.device(options.device)
     methods = {"rawnerf": "rawnerf", "same field, 8-bit pictures": "instant-ngp"}
     seen: dict[str, list[Rendering]] = {}
-    truths = [scene.photograph(index, (LIGHT,)).extra[LIGHT] for index in chosen]
+    truths = [scene.photograph(index, (LIGHT_LAYER,)).extra[LIGHT_LAYER] for index in chosen]
     seen["noisy photograph"] = [as_seen(developed(scene, index)) for index in chosen]
     seen["denoised photograph"] = [best(scene, i, truth) for i, truth in zip(chosen, truths, strict=True)]
     for name, kind in methods.items():
@@ -91,7 +91,7 @@ def scores(seen: list[Rendering], truths: list[Tensor]) -> tuple[float, float]:
 def as_seen(light: Float[np.ndarray, "height width 3"]) -> Rendering:
     """Linear sRGB as if it had been rendered."""
     found = torch.from_numpy(np.ascontiguousarray(light, np.float32))
-    return Rendering(encoded(found.clamp(0, 1)), found[..., 0], found[..., 0], {LIGHT: found})
+    return Rendering(encoded(found.clamp(0, 1)), found[..., 0], found[..., 0], {LIGHT_LAYER: found})
 
 
 def developed(scene: Scene, index: int, mosaic: np.ndarray | None = None) -> Float[np.ndarray, "height width 3"]:

@@ -18,7 +18,7 @@ from tyro.conf import Positional
 
 from lumigraph.datasets.scene import Scene
 from lumigraph.evaluation.halves import judged_by_halves, left_half
-from lumigraph.evaluation.light import LIGHT, in_light
+from lumigraph.evaluation.light import LIGHT_LAYER, in_light
 from lumigraph.figures import Row, colour_depth, contact_sheet, depth_range
 from lumigraph.geometry.choice import evenly
 from lumigraph.run import Run
@@ -48,12 +48,14 @@ def main(options: Options) -> None:
     methods = {title: run.method(torch.device("cpu")).eval() for title, run in runs.items()}
     rows = []
     for index in chosen:
-        shot = scene.photograph(index, [name for name in (LIGHT,) if name in scene.layers])
+        shot = scene.photograph(index, [name for name in (LIGHT_LAYER,) if name in scene.layers])
         pictures, depths = [shot.before(scene.frame.background)], []
         for method in methods.values():
             told = method.given(left_half(shot)) if judged_by_halves(method) else method
             seen = told.render(method.refined(shot.camera))
-            pictures.append(in_light(seen, shot.extra[LIGHT])[0] if LIGHT in shot.extra else seen.rgb.clamp(0, 1))
+            pictures.append(
+                in_light(seen, shot.extra[LIGHT_LAYER])[0] if LIGHT_LAYER in shot.extra else seen.rgb.clamp(0, 1)
+            )
             depths.append((seen.depth, seen.opacity))
         rows.append(Row(scene.names[index], pictures))
         if options.depth:

@@ -16,7 +16,7 @@ from lumigraph.benchmark.cell import Cell, Settings, train_command
 from lumigraph.benchmark.conduct import Patience, conduct
 from lumigraph.benchmark.curves import over_views
 from lumigraph.benchmark.pictures import draw_charts
-from lumigraph.benchmark.published import FEW
+from lumigraph.benchmark.published import FEW_VIEW_FIGURES
 from lumigraph.budget import Budget
 from lumigraph.commands.benches.views import BenchViews
 from lumigraph.commands.cli import main
@@ -67,7 +67,7 @@ def test_members_are_averaged_and_priors_told(balls, tmp_path, monkeypatch):
     mean = statistics.fmean(row["scores"][0]["value"] for row in rows if row["views"] == 2)
     assert f"| tinted-grid | {mean:.2f} |" in page
     assert "PSNR of 2 held-out members of balls" in page and f"by {prior.name}" in page
-    assert all(f"| {figure.method} | {figure.psnr} |" in page for figure in FEW)
+    assert all(f"| {figure.method} | {figure.psnr} |" in page for figure in FEW_VIEW_FIGURES)
     (chart,) = draw_charts([*rows, *(row | {"views": 5, "train_views": 5} for row in rows if row["prior"])], output)
     assert chart == "balls-members-psnr-over-views.svg" and (output / chart).read_text().count("<circle") == 2
     told = next(row["command"] for row in rows if row["prior"])

@@ -359,8 +359,8 @@ def test_it_can_be_told_what_it_says(taught):
 def lenient(taught, monkeypatch) -> Taught:
     """A method whose scene is but half solid counts as solid to exports."""
     monkeypatch.setattr(depth_map, "SURFACE_OPACITY", HALF_SOLID * float(taught.seen.opacity.max()))
-    monkeypatch.setattr(export_points, "SQUARELY", 0.0)
-    monkeypatch.setattr(export_points, "TOLERANCE", HALF_AGREED)
+    monkeypatch.setattr(export_points, "MIN_COSINE", 0.0)
+    monkeypatch.setattr(export_points, "DEPTH_TOLERANCE", HALF_AGREED)
     monkeypatch.setattr(export_points, "MIN_VIEWS", 1)
     return taught
 

@@ -26,7 +26,7 @@ from lumigraph.evaluation import evaluate
 from lumigraph.evaluation.report import write_report
 from lumigraph.export.film import film
 from lumigraph.export.video import open_video
-from lumigraph.figures import NOTHING, RAMP, colour_depth, colour_error, depth_range, hex_colour, save_picture
+from lumigraph.figures import EMPTY_COLOUR, RAMP, colour_depth, colour_error, depth_range, hex_colour, save_picture
 from lumigraph.geometry import look_at, unit
 from lumigraph.paths import (
     PATHS,
@@ -298,7 +298,7 @@ def test_depth_is_coloured_from_near_to_far():
     rgb = colour_depth(depth, opacity, (1.0, 100.0))
     light = rgb.mean(-1)[0]
     assert light[0] > light[1] > light[2] and rgb.isfinite().all()
-    for pixel, colour in ((0, RAMP[0]), (2, RAMP[-1]), (3, NOTHING), (4, NOTHING)):
+    for pixel, colour in ((0, RAMP[0]), (2, RAMP[-1]), (3, EMPTY_COLOUR), (4, EMPTY_COLOUR)):
         torch.testing.assert_close(rgb[0, pixel], hex_colour(colour), atol=1e-5, rtol=0)
     near, far = depth_range(torch.linspace(2, 4, 1001), torch.ones(1001))
     assert near == pytest.approx(2.04, abs=1e-3) and far == pytest.approx(3.96, abs=1e-3)

@@ -19,7 +19,7 @@ from lumigraph.capture import open_scene
 from lumigraph.commands.cli import main
 from lumigraph.components.fields.dense import Dense
 from lumigraph.datasets.scene import Frame
-from lumigraph.explain.encodings import GRID, compare, kernel_at_start, learn
+from lumigraph.explain.encodings import GRID_POINTS, compare, kernel_at_start, learn
 from lumigraph.explain.encodings_page import write_page
 from lumigraph.explain.tangent_kernel import spectrum, tangent_kernel
 from lumigraph.methods.fourier_features import Config, FourierFeatures, frequencies
@@ -118,7 +118,10 @@ def test_waves_make_the_kernel_stationary():
 
 def test_scale_makes_the_spectrum_level():
     """Section 5: the share of the smaller half of the eigenvalues, which detail needs."""
-    half, networks = GRID * GRID // 2, [{"encoding": "none"}, *({"scale": scale} for scale in (1.0, 4.0, 16.0))]
+    half, networks = (
+        GRID_POINTS * GRID_POINTS // 2,
+        [{"encoding": "none"}, *({"scale": scale} for scale in (1.0, 4.0, 16.0))],
+    )
     shares = [float(spectrum(kernel_at_start(painted(**numbers)))[half:].sum()) for numbers in networks]
     assert shares == sorted(shares) and shares[0] < 1e-4 < 0.02 < shares[1] and shares[3] > 0.2
 
@@ -170,7 +173,7 @@ def test_the_page_holds_everything(comparison, tmp_path):
     assert f"{comparison.gain:.2f} dB over no encoding" in page and "src='http" not in page
     figures = json.loads((tmp_path / "figures.json").read_text())
     assert [fit["psnr_held_out"] for fit in figures["fits"]] == [fit.held_out for fit in comparison.fits]
-    assert figures["resolution"] == "64x64" and len(figures["fits"][0]["eigenvalues"]) == GRID * GRID
+    assert figures["resolution"] == "64x64" and len(figures["fits"][0]["eigenvalues"]) == GRID_POINTS * GRID_POINTS
 
 
 def test_the_command(photograph, tmp_path, capsys):

@@ -141,7 +141,7 @@ def test_the_sphere_lies_as_it_should():
 def test_bands_of_rows_make_the_same_picture(monkeypatch):
     method = Hall()
     whole = panorama(method, HERE, NORTH, 64)
-    monkeypatch.setattr(panoramas, "AT_ONCE", 64 * 5)
+    monkeypatch.setattr(panoramas, "PIXELS_PER_CHUNK", 64 * 5)
     bands = panorama(method, HERE, NORTH, 64)
     assert len(method.cameras) == 1 + 7
     torch.testing.assert_close(bands.rgb, whole.rgb, atol=1e-5, rtol=0)

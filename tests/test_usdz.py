@@ -14,7 +14,7 @@ from PIL import Image
 
 from lumigraph.datasets.mesh import Mesh
 from lumigraph.export.mesh_file import write_mesh
-from lumigraph.export.usdz import ALIGNED, baked, z_curve
+from lumigraph.export.usdz import ALIGNMENT_BYTES, baked, z_curve
 
 UP = np.array([0.6, 0.0, 0.8])
 
@@ -38,7 +38,7 @@ def test_files_lie_as_they_are_at_multiples_of_64_bytes(cone, tmp_path):
         for entry in (layer, picture):
             name, extra = struct.unpack("<HH", data[entry.header_offset + 26 : entry.header_offset + 30])
             assert entry.compress_type == zipfile.ZIP_STORED
-            assert (entry.header_offset + 30 + name + extra) % ALIGNED == 0
+            assert (entry.header_offset + 30 + name + extra) % ALIGNMENT_BYTES == 0
         text = packed.read(layer).decode()
         assert text.startswith("#usda 1.0") and 'upAxis = "Y"' in text and f"@{picture.filename}@" in text
     assert names(tmp_path) == ["cone.usdz"]

@@ -26,7 +26,7 @@ from lumigraph.camera.crop import Box
 from lumigraph.camera.rays import Rendering
 from lumigraph.commands.cli import main
 from lumigraph.errors import LumigraphError, LumigraphWarning
-from lumigraph.figures import NOTHING, RAMP, hex_colour
+from lumigraph.figures import EMPTY_COLOUR, RAMP, hex_colour
 from lumigraph.gaussians import Gaussians, splatting
 from lumigraph.gaussians.cleaning import cleaned
 from lumigraph.method import Method, RayMethod
@@ -40,8 +40,8 @@ from lumigraph.viewer.flight import upwards
 from lumigraph.viewer.modes import along_axis, extra_modes, normals, picture
 from lumigraph.viewer.pace import Pace
 from lumigraph.viewer.painter import Painter
-from lumigraph.viewer.splats import ENLARGED, splats
-from lumigraph.viewer.turns import IDLE_SHARE, SHARE, NotWantedError, Turns
+from lumigraph.viewer.splats import UNIT_SCALE, splats
+from lumigraph.viewer.turns import IDLE_RENDER_SHARE, RENDER_SHARE, NotWantedError, Turns
 from lumigraph.viewer.view_request import ViewRequest
 
 WHITE = (1.0, 1.0, 1.0)
@@ -172,7 +172,7 @@ def test_extras_are_modes_by_their_names(learnt):
     seen = Labelled(scene.frame, None).render(camera)
     assert extra_modes(seen) == ["heat", "tint", "Labels"]
     heat, tint, labels = (picture(seen, camera, mode, WHITE, WHITE) for mode in extra_modes(seen))
-    nothing, dark, bright = (hex_colour(text) for text in (NOTHING, RAMP[-1], RAMP[0]))
+    nothing, dark, bright = (hex_colour(text) for text in (EMPTY_COLOUR, RAMP[-1], RAMP[0]))
     middle = seen.depth.shape[1] // 2
     assert torch.equal(heat[:, 0], nothing.expand_as(heat[:, 0]))  # the scene is not there
     assert torch.allclose(heat[0, 1], dark, atol=1e-6) and torch.allclose(heat[0, -1], bright, atol=1e-6)
@@ -191,7 +191,7 @@ def test_extras_without_a_range(learnt):
     scene, _ = learnt
     camera = scene.cameras[0]
     solid = torch.ones(tiny.SIZE, tiny.SIZE)
-    for value, colour in ((4.0, RAMP[-1]), (math.nan, NOTHING), (math.inf, NOTHING)):
+    for value, colour in ((4.0, RAMP[-1]), (math.nan, EMPTY_COLOUR), (math.inf, EMPTY_COLOUR)):
         seen = Rendering(torch.zeros(*solid.shape, 3), solid, solid, {"flat": value * solid})
         shown = picture(seen, camera, "flat", WHITE, WHITE)
         assert torch.allclose(shown, hex_colour(colour).expand_as(shown))
@@ -331,7 +331,7 @@ def test_splats_have_the_clouds_shapes_and_colours():
     seen = splatting.render(lone, camera, (0.0, 0.0, 0.0))
     assert np.allclose(seen.rgb[96, 96].clamp(0, 1).numpy(), told.colours[0], atol=0.02)
     rotation = camera.pose[0, :, :3]
-    across = rotation.T @ torch.tensor(told.covariances[0]) @ rotation / ENLARGED**2
+    across = rotation.T @ torch.tensor(told.covariances[0]) @ rotation / UNIT_SCALE**2
     focal = 8 * tiny.FOCAL / tiny.DISTANCE
     weight = seen.opacity / seen.opacity.sum()
     x = torch.arange(192) + 0.5 - 96
@@ -372,7 +372,7 @@ def test_renderings_have_no_more_than_their_share_of_training(now):
 
     thread = threading.Thread(target=render)
     thread.start()
-    for own_time in (0.0, 3.0 * (1 / SHARE - 1)):  # from one turn to the next
+    for own_time in (0.0, 3.0 * (1 / RENDER_SHARE - 1)):  # from one turn to the next
         now[0] += own_time - 0.1
         for _ in range(20):
             assert not (own_time and turns.asked)
@@ -417,9 +417,9 @@ def test_those_at_rest_ask_seldom(now):
     assert not turns.claim_refresh()  # someone is at it
     now[0] += 0.5
     turns.refreshed(0.5)
-    now[0] += 0.45 / IDLE_SHARE
+    now[0] += 0.45 / IDLE_RENDER_SHARE
     assert not turns.claim_refresh()
-    now[0] += 0.1 / IDLE_SHARE
+    now[0] += 0.1 / IDLE_RENDER_SHARE
     assert turns.claim_refresh()
 
 

@@ -22,7 +22,7 @@ from websockets.sync.client import connect
 from lumigraph.paths.keyframes import CameraPath, Keyframe
 from lumigraph.viewer import Viewer
 from lumigraph.viewer.address import Address, choose_address, free_port
-from lumigraph.viewer.frames import LARGEST, understood
+from lumigraph.viewer.frames import MAX_MESSAGE_BYTES, understood
 
 pytestmark = [budget("exports"), pytest.mark.filterwarnings("ignore:Queued a .* on a closed connection")]
 TOKEN = "a-token-nobody-guesses"
@@ -213,7 +213,7 @@ def test_nonsense_harms_nobody(viewer, capfd):
     rude.look_from((0.0, 3.0, 0.5))
     assert rude.picture().shape[2] == 3
     with pytest.raises(Exception, match="1009|close"):  # larger than any message of ours
-        rude.socket.send(bytes(LARGEST + 1))
+        rude.socket.send(bytes(MAX_MESSAGE_BYTES + 1))
         for _ in range(1000):
             rude.socket.recv(10)
     for junk in (b"\x16\x03\x01\x02\x00", b"GET\r\n\r\n", b"POST / HTTP/1.1\r\n\r\n", os.urandom(500) + b"\r\n\r\n"):

@@ -222,7 +222,7 @@ def test_a_page_says_its_size_and_has_a_limit(tmp_path, monkeypatch):
     size = re.search(r"Opening ([\d.]+) MB", path.read_text("utf-8"))
     assert size and float(size[1]) == pytest.approx(path.stat().st_size / 1e6, abs=0.06)
     path.unlink()
-    monkeypatch.setattr(pages, "LARGEST", 1000)
+    monkeypatch.setattr(pages, "MAX_PAGE_BYTES", 1000)
     with pytest.raises(LumigraphError, match="--degree 1"):
         volume_page(path, octree_for_browser(volumes.octree(4)), OPENING)
     with pytest.raises(LumigraphError, match="--as views"):

@@ -11,7 +11,7 @@ from ..errors import LumigraphError
 from ..files.locks import check_place, held
 from ..system.progress import clock, counting
 from .cell import Cell, Settings, claim, evaluation, training
-from .launch import STOPPED, Launch, claim_log, launch, reason
+from .launch import STOP_CODES, Launch, claim_log, launch, reason
 from .pictures import draw_charts, draw_views
 from .results import read_rows, row_of
 from .table import markdown
@@ -49,7 +49,7 @@ def carry_on(
         begin = time.monotonic()
         with counting(cell.title):
             code, failure = carry_out(cell, output, settings, launch)
-        if code in STOPPED:
+        if code in STOP_CODES:
             return code
         if cell in todo and not failure:
             patience.note(cell, time.monotonic() - begin)

@@ -14,9 +14,9 @@ from ..system.processes import start
 from ..system.signals import Interrupt
 
 Launch = Callable[[Sequence[str], Path], int]
-STOPPED = (130, 143)  # after Ctrl-C and SIGTERM
+STOP_CODES = (130, 143)  # after Ctrl-C and SIGTERM
 PROMPT = b"$ lumigraph "  # each command in a log begins so
-LOOKS = 0.2  # seconds between looks at whether to stop
+POLL_SECONDS = 0.2  # seconds between looks at whether to stop
 
 
 def launch(arguments: Sequence[str], log: Path) -> int:
@@ -58,7 +58,7 @@ def claim_log(log: Path) -> None:
 def ended(process: subprocess.Popen[bytes]) -> int | None:
     """A process's exit code; None if the process has not ended after a moment."""
     try:
-        return process.wait(LOOKS)
+        return process.wait(POLL_SECONDS)
     except subprocess.TimeoutExpired:
         return None
 

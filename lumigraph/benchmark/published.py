@@ -41,7 +41,7 @@ class Few:
 
 
 STUDY = "a study of few photographs by others, protocol not known"
-FEW: tuple[Few, ...] = (
+FEW_VIEW_FIGURES: tuple[Few, ...] = (
     Few("mip-nerf", 14.62, 3, "LLFF", "Niemeyer et al. 2022"),
     Few("regnerf", 19.08, 3, "LLFF", "Niemeyer et al. 2022"),
     Few("mip-nerf", 8.68, 3, "DTU", "Niemeyer et al. 2022"),

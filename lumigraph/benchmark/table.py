@@ -11,7 +11,7 @@ from typing import Any
 from ..metrics import named, scores_of
 from .cell import MEMBERS
 from .curves import learnt_for, over_views, places, together
-from .published import FEW
+from .published import FEW_VIEW_FIGURES
 from .results import Row
 
 NONE = "–"
@@ -51,7 +51,7 @@ def few_photographs(rows: Sequence[Row]) -> str:
         parts += [f"{scores_of(found[0])[0].name} of {of_what}, {resolution(found[0])}:", table(names, lines)]
     if not parts:
         return ""
-    figures = [[f.method, str(f.psnr), str(f.views or NONE), f.scenes, f.source] for f in FEW]
+    figures = [[f.method, str(f.psnr), str(f.views or NONE), f.scenes, f.source] for f in FEW_VIEW_FIGURES]
     told = table(["method", "PSNR", "photographs", "scenes", "source"], figures)
     return "\n\n".join(["## How many photographs", *parts, "What others report, by protocols of their own:", told])
 

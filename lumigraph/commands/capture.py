@@ -13,8 +13,15 @@ from ..errors import LumigraphError
 from ..files.ranges import Count, between
 from .common import needed, option, say, scene_name, show, typed
 
-NAMELESS = ("images", "photos", "photographs", "pictures", "input", "frames")  # folders named after what is in them
-NAMED = 12  # photographs at most that a list names; all are in capture.json and photographs.png
+GENERIC_FOLDERS = (
+    "images",
+    "photos",
+    "photographs",
+    "pictures",
+    "input",
+    "frames",
+)  # folders named after what is in them
+MAX_NAMED = 12  # photographs at most that a list names; all are in capture.json and photographs.png
 INDENT = " " * 13
 
 
@@ -100,7 +107,7 @@ def scene_folder(what: tuple[Path, ...]) -> Path:
     first = what[0].expanduser().resolve()
     if len(what) > 1 or first.suffix.lower() in (".jpg", ".jpeg", ".png"):
         first = Path(os.path.commonpath([path.expanduser().resolve().parent for path in what]))
-    if first.name.lower() in NAMELESS and first.parent.name:
+    if first.name.lower() in GENERIC_FOLDERS and first.parent.name:
         first = first.parent
     return Path("scenes") / scene_name(str(first.with_suffix("") if first.is_file() else first))
 
@@ -152,5 +159,5 @@ def rows(folder: Path, result: dict[str, Any]) -> dict[str, str]:
 
 def lines(items: list[str]) -> str:
     """One below the other, beside the names of the rows."""
-    more = [f"and {len(items) - NAMED} more, in photographs.png and capture.json"] if len(items) > NAMED else []
-    return f"\n{INDENT}".join(items[:NAMED] + more)
+    more = [f"and {len(items) - MAX_NAMED} more, in photographs.png and capture.json"] if len(items) > MAX_NAMED else []
+    return f"\n{INDENT}".join(items[:MAX_NAMED] + more)

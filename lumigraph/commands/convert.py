@@ -16,7 +16,7 @@ from .common import about_quality, choose_device, method_config, option, show, t
 from .compress import size
 
 DEFAULT_SECONDS = 30.0
-LONG = 4096  # letters; a table cuts its lines where the console ends
+TABLE_WIDTH = 4096  # letters; a table cuts its lines where the console ends
 ABOUT = " A conversion from a field trains for half of these steps."
 
 
@@ -64,7 +64,7 @@ class Convert:
         from ..run import open_any
 
         if self.list:
-            console(width=LONG, soft_wrap=True).print(listed())
+            console(width=TABLE_WIDTH, soft_wrap=True).print(listed())
             return 0
         if self.source is None or self.method is None or self.output is None:
             raise LumigraphError("Name a run, a method and a new folder: lumigraph convert RUN METHOD --output NEW")

@@ -14,7 +14,9 @@ from ..system.console import bold
 from .common import Overwrite, choose_device, needed, option, show
 from .controls import Set, tell
 
-MEMORISED = 4.0  # dB by which photographs learnt from are better than held-out ones, from which on they are remembered
+MEMORISED_DB = (
+    4.0  # dB by which photographs learnt from are better than held-out ones, from which on they are remembered
+)
 
 
 @dataclass(frozen=True)
@@ -80,7 +82,7 @@ class Eval:
 def beside_training(learnt: float, psnr: float) -> str:
     """The PSNR of the photographs learnt from, beside that of others, and what a gap means."""
     told, better = f"{learnt:.2f} dB while training", learnt - psnr
-    if better > MEMORISED:
+    if better > MEMORISED_DB:
         told += f", {better:.1f} dB better: it knows them by heart, so more photographs would help more than time"
     return told
 

@@ -12,7 +12,7 @@ from ..files.ranges import Downscale
 from ..system.console import console
 from .common import ReaderOption, needed, option
 
-LONG = 4096  # letters; a tree cuts its lines where the console ends, and folders have long names
+TREE_WIDTH = 4096  # letters; a tree cuts its lines where the console ends, and folders have long names
 
 
 @dataclass(frozen=True)
@@ -61,5 +61,5 @@ class Info:
         else:
             told: dict[str, Any] = {"downscale": self.downscale, "reader": self.reader}
             tree = dataset_tree(open_dataset(self.what, **told))
-        console(width=LONG, soft_wrap=True).print(tree)
+        console(width=TREE_WIDTH, soft_wrap=True).print(tree)
         return 0

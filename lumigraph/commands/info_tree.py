@@ -25,7 +25,7 @@ from ..run.inferred import Inferred
 from ..system.console import bold, dim
 from ..training.verdict import cameras_moved
 
-MEMBERS = 12  # of many shapes, that are told of one by one
+MAX_MEMBERS = 12  # of many shapes, that are told of one by one
 
 
 def run_tree(run: Run) -> Tree:
@@ -128,7 +128,7 @@ def dataset_tree(data: Dataset) -> Tree:
 def shapes_tree(shapes: Shapes) -> Tree:
     tree = Tree(bold(shapes.source) + f"  {len(shapes)} shape{'' if len(shapes) == 1 else 's'}")
     branch(tree, "splits", {name: len(index) for name, index in shapes.splits.items()})
-    for shape in evenly(shapes.members, MEMBERS):
+    for shape in evenly(shapes.members, MAX_MEMBERS):
         count = f"{len(shape.mesh.vertices):,} vertices, {len(shape.mesh.faces):,} triangles"
         surface = "points alone" if shape.is_cloud else "closed" if shape.closed else "not closed"
         unit = f"{shape.frame.to_source.scale:.4g} of the source's"

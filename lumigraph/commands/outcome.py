@@ -10,8 +10,8 @@ from ..datasets.scene import Scene
 from ..method import Method, RayMethod
 from .common import say, show, typed
 
-TOTALS = (10.0, 30.0, 60.0, 180.0, 600.0, 1800.0, 3600.0, 7200.0)  # seconds that are suggested
-MORE = 2.5  # times the budget so far that a suggestion has at least
+SUGGESTED_SECONDS = (10.0, 30.0, 60.0, 180.0, 600.0, 1800.0, 3600.0, 7200.0)  # seconds that are suggested
+MIN_GROWTH = 2.5  # times the budget so far that a suggestion has at least
 NEXT = {
     "eval": "compare with what it has not seen",
     "view": "look at it in the browser",
@@ -88,7 +88,7 @@ def more_time(folder: Any, budget: Budget) -> str:
         digits = 10 ** (int(math.log10(3 * budget.steps)) - 1) if budget.steps > 3 else 1
         longer = ["--steps", str(math.ceil(3 * budget.steps / digits) * digits)]
     else:
-        fitting = [total for total in TOTALS if total >= MORE * budget.total]
+        fitting = [total for total in SUGGESTED_SECONDS if total >= MIN_GROWTH * budget.total]
         longer = ["--seconds", f"{fitting[0] if fitting else 2 * budget.total:g}"]
     return typed("resume", folder, *longer)
 

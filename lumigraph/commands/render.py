@@ -14,8 +14,8 @@ from .common import Overwrite, needed, option, show
 from .controls import Animate, Set, animate, open_method
 
 # As in `paths.film`, which help must not import.
-PATHS = ("orbit", "sweep", "spiral", "interpolate", "held-out")
-LONGEST, AUTO = 480, "auto"
+PATH_KINDS = ("orbit", "sweep", "spiral", "interpolate", "held-out")
+DEFAULT_SIZE, AUTO = 480, "auto"
 CHOSEN = {
     "orbit": "orbit, for the photographs go round",
     "sweep": "sweep, for the photographs look the same way; --path orbit goes to and fro",
@@ -34,13 +34,13 @@ class Render:
 
     source: Annotated[Positional[Path], needed("RUN_OR_FILE")]
     """Folder of the run, a splat file (.ply, .spz, .sog, .glb, .splat), or a composition (.json)."""
-    path: Annotated[str, option("{" + ",".join((AUTO, *PATHS)) + ",FILE.json}")] = AUTO
+    path: Annotated[str, option("{" + ",".join((AUTO, *PATH_KINDS)) + ",FILE.json}")] = AUTO
     """Camera path: the name of one, or a JSON file."""
     frames: Annotated[Count | None, option("N", "120; for held-out every view; for keyframes by their seconds")] = None
     """Number of frames; more make a longer film."""
     fps: Annotated[FramesPerSecond | None, option("N", "30, or that of the path's file")] = None
     """Frames per second of the film."""
-    size: Annotated[Pixels | None, option("PIXELS", f"that of the photographs, at most {LONGEST}")] = None
+    size: Annotated[Pixels | None, option("PIXELS", f"that of the photographs, at most {DEFAULT_SIZE}")] = None
     """Longer side of the picture in pixels; larger renders slower."""
     output: Annotated[Path | None, option("FILE", "RUN/renders/PATH.mp4, or renders/FILE/PATH.mp4")] = None
     """The film: .mp4, .gif or .webp. Depth (FILE-depth), FILE.json and the folder FILE of pictures are beside it."""
@@ -57,7 +57,7 @@ class Render:
         from ..export.video import kind_of
         from ..paths import film_cameras, fitting
 
-        flight = None if self.path in (AUTO, *PATHS) else read_path(self.path, self.fps)
+        flight = None if self.path in (AUTO, *PATH_KINDS) else read_path(self.path, self.fps)
         fps = self.fps or (flight.fps if flight else 30.0)
         reads = [self.source, *([Path(self.path)] if flight else [])]
         if self.output is not None:
@@ -90,6 +90,6 @@ def read_path(name: str, fps: float | None) -> Any:
 
     file = Path(name)
     if not file.exists() and not file.suffix:
-        raise LumigraphError(f"There is no path called {name!r}; choose {', '.join(PATHS)}, or a JSON file")
+        raise LumigraphError(f"There is no path called {name!r}; choose {', '.join(PATH_KINDS)}, or a JSON file")
     flight = CameraPath.load(file)
     return replace(flight, fps=fps or flight.fps)

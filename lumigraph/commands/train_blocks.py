@@ -28,7 +28,7 @@ from .common import (
     typed,
 )
 
-MEMORY = 2 << 30  # bytes that a block asks of its machine
+MEMORY_BYTES = 2 << 30  # bytes that a block asks of its machine
 OPTIONS = "downscale", "reader", "scales"  # of `open_dataset`, for the whole scene
 
 
@@ -103,7 +103,7 @@ class Blocks:
         plan = begin(output, plan, places, None if here and self.workers is None else cpus)
         tell_plan(output, plan, budget)
         gpus = 1.0 if device.type == "cuda" else 0.0
-        memory = min(MEMORY, free_memory() // (2 * self.workers)) if here and self.workers else MEMORY
+        memory = min(MEMORY_BYTES, free_memory() // (2 * self.workers)) if here and self.workers else MEMORY_BYTES
         found = conduct(output, plan, Workers(self.workers, self.address, cpus, gpus, memory))
         if found.signal is not None:
             say(f"Stopped and saved, {len(found.done)} of {len(plan.blocks)} blocks done; the same command goes on")
@@ -173,7 +173,7 @@ def tell_done(output: Path, found: Any) -> None:
 
 
 def onward(run: Path, source: str | None = None) -> dict[str, str]:
-    """What to type next."""
+    """Command to type next."""
     from .outcome import NEXT
 
     again = ["--scene", source] if source else []

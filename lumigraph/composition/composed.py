@@ -28,10 +28,10 @@ from ..volume import composite, packed
 from .placed import Placed
 from .union import union
 
-NEAR = 0.1  # of the frame's near distance: how near to a camera Gaussians are still drawn
-THICKNESS = 1e-3  # of its distance: how thick a surface is that a rendered part stands as
-FAINT = 1e-3  # opacity below which there is no surface
-OPAQUE = 1 - 1e-6  # opacity that counts as fully so
+NEAR_PLANE_SCALE = 0.1  # of the frame's near distance: how near to a camera Gaussians are still drawn
+THICKNESS_SHARE = 1e-3  # of its distance: how thick a surface is that a rendered part stands as
+MIN_OPACITY = 1e-3  # opacity below which there is no surface
+OPAQUE_THRESHOLD = 1 - 1e-6  # opacity that counts as fully so
 
 
 def compose(frame: Frame, parts: Sequence[Placed]) -> Method:
@@ -48,7 +48,7 @@ def compose(frame: Frame, parts: Sequence[Placed]) -> Method:
 
 
 class Composed(Method):
-    """What all compositions share: parts, and that they do not learn."""
+    """Base of compositions: parts at places, not trainable."""
 
     def __init__(self, frame: Frame, parts: Sequence[Placed]):
         super().__init__(frame, None)
@@ -58,7 +58,7 @@ class Composed(Method):
 
     @property
     def controls(self) -> tuple[Control, ...]:
-        """What any part can be told; those that are about photographs only of the part that leads."""
+        """Controls of all parts; those that name photographs, of the leading part only."""
         found: dict[str, Control] = {}
         for part in self.pieces:
             for control in part.method.controls:
@@ -106,7 +106,7 @@ class ComposedCloud(Composed):
 
     @torch.no_grad()
     def render(self, camera: Camera) -> Rendering:
-        near = NEAR * self.frame.near
+        near = NEAR_PLANE_SCALE * self.frame.near
         return splatting.render(self.gaussians(), camera.to(self.device), self.frame.background, near)
 
 
@@ -136,15 +136,15 @@ class ComposedMixture(Composed):
         clouds = [part.gaussians() for part in rendered if can(part.method, HasGaussians)]
         seen = [part.rendering(camera) for part in rendered if not can(part.method, HasGaussians)]
         if clouds:
-            seen.append(splatting.render(joined(clouds), camera, (0.0, 0.0, 0.0), NEAR * self.frame.near))
+            seen.append(splatting.render(joined(clouds), camera, (0.0, 0.0, 0.0), NEAR_PLANE_SCALE * self.frame.near))
         return [(x.rgb.reshape(-1, 3), x.depth.reshape(-1), x.opacity.reshape(-1)) for x in seen]
 
 
 def surface(rgb: Float[Tensor, "ray 3"], depth: Float[Tensor, " ray"], opacity: Float[Tensor, " ray"]) -> Look:
     """A rendered part as a thin sample at its depth. rgb: over black."""
-    hit = (opacity > FAINT) & depth.isfinite()
+    hit = (opacity > MIN_OPACITY) & depth.isfinite()
     rgb, depth, opacity = rgb[hit], depth[hit], opacity[hit]
-    half = 0.5 * THICKNESS * depth
+    half = 0.5 * THICKNESS_SHARE * depth
     samples = Samples(depth - half, depth + half, packed(hit.long()))
-    density = -torch.log1p(-opacity.clamp_max(OPAQUE)) / samples.length
+    density = -torch.log1p(-opacity.clamp_max(OPAQUE_THRESHOLD)) / samples.length
     return Look("surface", samples, density, rgb / opacity[:, None])

@@ -15,12 +15,12 @@ from ..errors import LumigraphError
 from ..gaussians import Gaussians, splatting
 from ..geometry import Similarity
 from ..method import Method
-from .composed import NEAR, compose
+from .composed import NEAR_PLANE_SCALE, compose
 from .placed import Placed
 
 
 def cropped(method: Method, crop: Crop) -> Method:
-    """What lies inside a crop of the method's frame, as a method. Ready to render, and nothing else.
+    """Method restricted to a crop in its frame, for rendering only.
 
     Along rays its samples end where the crop does; Gaussians are picked by their centres; of methods with neither,
     pixels are by their depth.
@@ -45,7 +45,7 @@ class PickedCloud(Method):
 
     @torch.no_grad()
     def render(self, camera: Camera) -> Rendering:
-        near = NEAR * self.frame.near
+        near = NEAR_PLANE_SCALE * self.frame.near
         return splatting.render(self.gaussians(), camera.to(self.device), self.frame.background, near)
 
     def batch(self, data: Any, generator: torch.Generator) -> NoReturn:

@@ -62,7 +62,7 @@ class Placed:
         return cleaned(needs(self.method, HasGaussians).gaussians(), self.crop).transformed(self.place.matrix)
 
     def rendering(self, camera: Camera) -> Rendering:
-        """What a camera of the picture sees of any method, over black. A crop leaves out pixels by their depth."""
+        """Rendering of any method by a camera of the picture, over black. A crop removes pixels by their depth."""
         local = self.camera(camera)
         seen = self.method.render(local)
         background = torch.tensor(self.method.frame.background, device=seen.rgb.device)

@@ -1,4 +1,4 @@
-"""Where parts stand: on one another, and the frame that holds them all."""
+"""Placement of parts on one another, and the frame that holds all of them."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from ..camera.crop import Box
 from ..datasets.scene import Frame
 from ..geometry import Similarity
 
-LARGEST_REACH = 64.0
+MAX_REACH = 64.0
 
 
 def standing(
@@ -58,6 +58,6 @@ def frame_around(lead: Frame, others: Sequence[tuple[Frame, Similarity, Box | No
     points = torch.cat(corners)
     lower, upper = ((x, y, z) for x, y, z in (points.amin(0).tolist(), points.amax(0).tolist()))
     reach = lead.reach
-    while reach < min(farthest - 1e-6, LARGEST_REACH):
+    while reach < min(farthest - 1e-6, MAX_REACH):
         reach *= 2
     return replace(lead, bounds=(lower, upper), reach=reach)

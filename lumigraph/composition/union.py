@@ -54,7 +54,7 @@ def cut(looks: Sequence[Look]) -> Look:
 
 
 def edges(looks: Sequence[Look]) -> tuple[Float[Tensor, " edge"], Int[Tensor, " edge"], Int[Tensor, " edge"]]:
-    """Where samples begin and end: distance, ray, and the number of the look whose sample begins there, -1 for ends.
+    """Edges of samples: distance, ray, and the number of the look whose sample begins there, -1 for ends.
 
     By ray, then by distance.
     """

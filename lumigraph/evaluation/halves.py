@@ -14,7 +14,7 @@ from ..datasets.scene import Photograph, Scene
 from ..method import Method
 
 DEFINITION = "each photograph's code is found on its left half, and its right half is compared"
-RIGHT_ALONE = "right halves are compared; nothing is told of left ones"
+RIGHT_HALF_DEFINITION = "right halves are compared; nothing is told of left ones"
 
 
 def judged_by_halves(method: Method) -> bool:
@@ -26,7 +26,7 @@ def judged_by_halves(method: Method) -> bool:
 
 def definition(method: Method, right_halves: bool) -> str | None:
     """Definition of halves in an evaluation; None if photographs are compared as a whole."""
-    return DEFINITION if judged_by_halves(method) else RIGHT_ALONE if right_halves else None
+    return DEFINITION if judged_by_halves(method) else RIGHT_HALF_DEFINITION if right_halves else None
 
 
 def left_half(photograph: Photograph) -> Photograph:

@@ -23,7 +23,7 @@ from ..method.capabilities import RefinesPoses, can
 from ..metrics import Score
 
 STEPS = 100  # down the photograph's own loss, the scene frozen
-RATE = 5e-3  # radians by which the first step moves the picture
+LEARNING_RATE = 5e-3  # radians by which the first step moves the picture
 TRUE_POSE = "true_pose"  # of `Scene.about`: camera-to-world in the source's frame
 PROTOCOL = (
     "as the method refined them; held-out ones moved along by the similarity that aligns training poses before and "
@@ -52,7 +52,7 @@ class HeldOutPoses:
         if index in self.learnt:
             return self.method.refined(self.photographs[index])
         alone = replace(self.scene, splits={"train": torch.tensor([index])})
-        poses = PoseRefinement(self.scene.frame.image_count, RATE).to(self.method.device)
+        poses = PoseRefinement(self.scene.frame.image_count, LEARNING_RATE).to(self.method.device)
         poses.choose_axes(self.scene.cameras[index], self.scene.frame)
         self.frozen.poses = poses
         optimizer, generator = poses.optimizer(), torch.Generator().manual_seed(index)

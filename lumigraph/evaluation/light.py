@@ -10,7 +10,7 @@ from torch import Tensor
 from ..camera.rays import Rendering
 from ..components.fields.development import decoded, encoded
 
-LIGHT = "radiance"  # the layer that holds it, 1 for white
+LIGHT_LAYER = "radiance"  # the layer that holds it, 1 for white
 PROTOCOL = (
     "sRGB of light without noise, clipped at white; each rendering's linear light is aligned with it by a factor and "
     "an offset per colour, least squares, before both are encoded"
@@ -24,7 +24,7 @@ def in_light(seen: Rendering, truth: Picture) -> tuple[Picture, Picture]:
 
     Where the rendering holds no light of its own (`radiance`), its picture is decoded.
     """
-    light = seen.extra[LIGHT] if LIGHT in seen.extra else decoded(seen.rgb.clamp(0, 1))
+    light = seen.extra[LIGHT_LAYER] if LIGHT_LAYER in seen.extra else decoded(seen.rgb.clamp(0, 1))
     truth = truth.clamp(0, 1)
     return encoded(aligned(light.clamp(0, 1), truth).clamp(0, 1)), encoded(truth)
 

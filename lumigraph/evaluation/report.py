@@ -24,7 +24,7 @@ from ..run import Run
 from ..system.progress import clock, short
 from ..training.verdict import cameras_moved
 
-LARGEST_FILM = 12 << 20  # bytes; larger ones are named instead of embedded
+MAX_FILM_BYTES = 12 << 20  # bytes; larger ones are named instead of embedded
 STYLE = CHARTS + (Path(__file__).parent / "report.css").read_text("utf-8")
 
 
@@ -88,7 +88,7 @@ def header(run: Run, evaluation: dict[str, Any] | None) -> str:
 
 
 def counted(run: Run) -> str:
-    """What a run learnt from, and how many of it."""
+    """Kind and number of the training inputs of a run."""
     count, one = run.settings.splits.get("train", 0), {"photographs": "photograph", "shapes": "shape"}.get(run.kind)
     return f"{count} {one}{'' if count == 1 else 's'}" if one else f"{run.kind} of {count}"
 
@@ -112,7 +112,7 @@ def films(run: Run) -> str:
         f"<figure><video src='{data_uri(path, 'video/mp4')}' autoplay loop muted playsinline controls></video>"
         f"<figcaption>{name}</figcaption></figure>"
         for path, name in ((found[0], "colour"), (found[0].with_stem(f"{found[0].stem}-depth"), "depth"))
-        if path.exists() and path.stat().st_size < LARGEST_FILM
+        if path.exists() and path.stat().st_size < MAX_FILM_BYTES
     )
     names = ", ".join(f"<code>{escape(str(path.relative_to(run.folder)))}</code>" for path in found)
     return section(found[0].stem.capitalize(), f"<div class='row'>{players}</div>", f"Films in the run: {names}")
@@ -176,7 +176,7 @@ def views(run: Run, evaluation: dict[str, Any] | None) -> str:
 
 
 def cameras(run: Run) -> str:
-    """How far each camera was moved, where the method refines poses."""
+    """Displacement of each camera, where the method refines poses."""
     if not (run.has_state and run.settings.config.get("refine_cameras")):
         return ""
     moved = cameras_moved(run.method("cpu"), run.cameras()["train"])

@@ -17,7 +17,7 @@ from ..datasets.mesh import Mesh
 from ..datasets.scene import Frame
 from ..datasets.shapes import Shape, Shapes
 from ..errors import LumigraphError
-from ..export.mesh import AT_ONCE, TRUNCATION, extract_mesh, find_surface, make_grid
+from ..export.mesh import POINTS_PER_CHUNK, TRUNCATION_CELLS, extract_mesh, find_surface, make_grid
 from ..figures import Row, contact_sheet
 from ..geometry.choice import evenly
 from ..method import Method
@@ -29,8 +29,8 @@ from .reveal import reveal
 
 POINTS = 100_000  # in the volume, and on each surface (Mescheder 2019)
 CELLS = 128  # along the longest side, of the grid that the surface is found with
-SHOWN, PICTURE = 8, 256  # shapes of the contact sheet, and pixels of their pictures
-STEPS, TOUCHED, BEYOND = (
+SHEET_SHAPES, PICTURE_SIZE = 8, 256  # shapes of the contact sheet, and pixels of their pictures
+STEPS, TOUCHING_DISTANCE, MAX_OVERSHOOT = (
     200,
     2e-3,
     6.0,
@@ -106,7 +106,7 @@ def evaluate_shapes(
     most: int | None = None,
     points: int = POINTS,
     cells: int = CELLS,
-    size: int = PICTURE,
+    size: int = PICTURE_SIZE,
 ) -> ShapesEvaluation:
     """Compare a method's surface with the shapes of a split, each in its own scene units.
 
@@ -124,7 +124,7 @@ def evaluate_shapes(
         raise LumigraphError(f"{most} shapes cannot be compared; give --views a number above 0")
     compared = evenly(chosen.tolist(), most or len(chosen))
     method.eval()
-    shown, scores = set(evenly(compared, SHOWN)), []
+    shown, scores = set(evenly(compared, SHEET_SHAPES)), []
     pictured: dict[str, list[Tensor]] = {}
     for number in track(compared, "Comparing shapes", len(compared)):
         true = shapes.members[number]
@@ -167,7 +167,7 @@ def surface_of(method: Method, frame: Frame, cells: int) -> Mesh:
         return extract_mesh(method, dome(ring(frame.bounds)), cell=cell, smooth=0)
 
     def value(points: Float[Tensor, "point 3"]) -> Float[Tensor, " point"]:
-        return (-distances(method, points) / (TRUNCATION * cell)).clamp(-1, 1)
+        return (-distances(method, points) / (TRUNCATION_CELLS * cell)).clamp(-1, 1)
 
     vertices, faces = find_surface(make_grid(box, cell), 2, box.holds, value, -1.0)
     if not len(faces):
@@ -177,7 +177,7 @@ def surface_of(method: Method, frame: Frame, cells: int) -> Mesh:
 
 def distances(method: Any, points: Float[Tensor, "point 3"]) -> Float[Tensor, " point"]:
     """A method's distances, asked for on its device, some at a time."""
-    return torch.cat([method.distance(part.to(method.device)).cpu().float() for part in points.split(AT_ONCE)])
+    return torch.cat([method.distance(part.to(method.device)).cpu().float() for part in points.split(POINTS_PER_CHUNK)])
 
 
 def portrait(shape: Shape, camera: Camera) -> Float[Tensor, "height width 3"]:
@@ -187,9 +187,9 @@ def portrait(shape: Shape, camera: Camera) -> Float[Tensor, "height width 3"]:
     for _ in range(STEPS):
         away = shape.distance(rays[walking].at(depth[walking])).abs()
         depth[walking] += away
-        walking = walking[(away > TOUCHED) & (depth[walking] < BEYOND)]
-    depth[walking] = BEYOND  # along the surface for so long that nobody knows
-    rgb, hit = torch.ones(len(rays), 3), (depth < BEYOND).nonzero()[:, 0]
+        walking = walking[(away > TOUCHING_DISTANCE) & (depth[walking] < MAX_OVERSHOOT)]
+    depth[walking] = MAX_OVERSHOOT  # along the surface for so long that nobody knows
+    rgb, hit = torch.ones(len(rays), 3), (depth < MAX_OVERSHOOT).nonzero()[:, 0]
     rgb[hit] = 0.5 + 0.5 * shape.normals_near(rays[hit].at(depth[hit]))
     return rgb.reshape(height, width, 3)
 

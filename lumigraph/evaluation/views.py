@@ -25,11 +25,11 @@ from ..metrics.lpips import DEFINITION, Lpips
 from ..system.progress import counting, track
 from . import halves
 from .held_out_poses import PROTOCOL, held_out_poses, pose_scores
-from .light import LIGHT, in_light
+from .light import LIGHT_LAYER, in_light
 from .light import PROTOCOL as LIGHT_PROTOCOL
 
-SHOWN = 8  # views of the contact sheet, evenly spread; the worst one joins them
-CLEAN = "clean"  # the layer of photographs in their own light without whoever passes by
+SHEET_VIEWS = 8  # views of the contact sheet, evenly spread; the worst one joins them
+CLEAN_LAYER = "clean"  # the layer of photographs in their own light without whoever passes by
 WARM_UP_SIZE = 32  # pixels; the first rendering compiles kernels, which is not the view's fault
 
 
@@ -150,13 +150,13 @@ def evaluate(
     method.eval()
     with counting("Preparing to render"):
         compile_seconds = warm_up(method, scene.cameras[compared[0]])
-    spread, by_halves = set(evenly(compared, SHOWN)), halves.judged_by_halves(method)
+    spread, by_halves = set(evenly(compared, SHEET_VIEWS)), halves.judged_by_halves(method)
     found = held_out_poses(method, scene)
     scores: list[ViewScore] = []
     shown: dict[str, tuple[Tensor, Rendering]] = {}
     worst: dict[str, tuple[Tensor, Rendering]] = {}
     for index in track(compared, "Comparing views", len(compared)):
-        shot = scene.photograph(index, [name for name in (CLEAN, LIGHT) if name in scene.layers])
+        shot = scene.photograph(index, [name for name in (CLEAN_LAYER, LIGHT_LAYER) if name in scene.layers])
         camera = found.camera(index) if found else method.refined(shot.camera)
         columns = halves.right_half(shot) if by_halves or right_halves else slice(None)
         if shot.mask is not None and not shot.mask[:, columns].any():
@@ -167,8 +167,8 @@ def evaluate(
         seen = told.render(camera).cpu()
         seconds = time.perf_counter() - begin
         rgb = seen.rgb.clamp(0, 1)
-        if LIGHT in shot.extra:
-            rgb, photograph = in_light(seen, shot.extra[LIGHT])
+        if LIGHT_LAYER in shot.extra:
+            rgb, photograph = in_light(seen, shot.extra[LIGHT_LAYER])
             seen = replace(seen, rgb=rgb)
         score = compare(scene.names[index], rgb, shot, photograph, columns, seconds, lpips)
         keep(score.name, seen)
@@ -203,8 +203,8 @@ def compare(
     mask = None if shot.mask is None else shot.mask[:, columns]
     rgb, photograph = rgb[:, columns], photograph[:, columns]
     clean = None
-    if CLEAN in shot.extra:
-        truth = shot.extra[CLEAN][:, columns]
+    if CLEAN_LAYER in shot.extra:
+        truth = shot.extra[CLEAN_LAYER][:, columns]
         clean = psnr(rgb, truth) if mask is None else psnr(rgb[mask], truth[mask])
     likeness = ssim_map(rgb, photograph)
     if mask is None:
@@ -241,7 +241,7 @@ def protocol(
         "controls": dict(method.told),
         "halves": halves.definition(method, right_halves),
         "masked": any(scene.images.mask(i) is not None for i in compared),
-        "colours": LIGHT_PROTOCOL if LIGHT in scene.layers else "sRGB in [0, 1]; renderings clipped, not rounded",
+        "colours": LIGHT_PROTOCOL if LIGHT_LAYER in scene.layers else "sRGB in [0, 1]; renderings clipped, not rounded",
         "psnr": "per view, then averaged",
         "ssim": "Wang 2004: Gaussian window 11x11, deviation 1.5, K1 0.01, K2 0.03, windows inside the image",
         "lpips": DEFINITION if lpips else None,

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from ..errors import LumigraphError
 from ..files.ranges import shown
-from .checks import PLAUSIBLE, SMALL
+from .checks import MAX_RATIO, SMALL_BYTES
 
 DATE = (1980, 1, 1, 0, 0, 0)  # the earliest that an archive can say, so that like files have like bytes
 
@@ -38,7 +38,7 @@ class Bundle:
             return file.read_bytes()
         try:
             about = self._archive.getinfo(name)
-            if about.file_size > max(SMALL, PLAUSIBLE * self.size):
+            if about.file_size > max(SMALL_BYTES, MAX_RATIO * self.size):
                 raise LumigraphError(
                     f"{self.path}: {shown(name)} would unpack to {about.file_size:,} bytes; get it anew"
                 )

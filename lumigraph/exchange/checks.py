@@ -11,10 +11,15 @@ from ..errors import LumigraphError
 from ..gaussians import Gaussians
 from ..system.memory import free_memory
 
-SPOKEN = {"means": "means", "quaternions": "rotations", "log_scales": "scales", "harmonics": "colours"}
-CERTAIN = 20.0  # a logit whose sigmoid is 1 in float32
-WORKING = 28  # bytes that each number of a Gaussian takes while its file is read: itself, and what it is made from
-PLAUSIBLE, SMALL = 100, 1 << 26  # times that clouds can be packed, and unpacked bytes up to which any share is believed
+DISPLAY_NAMES = {"means": "means", "quaternions": "rotations", "log_scales": "scales", "harmonics": "colours"}
+MAX_LOGIT = 20.0  # a logit whose sigmoid is 1 in float32
+BYTES_PER_NUMBER = (
+    28  # bytes that each number of a Gaussian takes while its file is read: itself, and what it is made from
+)
+MAX_RATIO, SMALL_BYTES = (
+    100,
+    1 << 26,
+)  # times that clouds can be packed, and unpacked bytes up to which any share is believed
 
 
 def check_room(path: Path, count: int, harmonics: int = 1, packed: int | None = None, unpacked: int = 0) -> None:
@@ -23,12 +28,12 @@ def check_room(path: Path, count: int, harmonics: int = 1, packed: int | None = 
     count, harmonics: Gaussians that the file promises, and coefficients of each
     packed, unpacked: bytes of a compressed file, and what they would become
     """
-    if packed is not None and unpacked > max(SMALL, PLAUSIBLE * packed):
+    if packed is not None and unpacked > max(SMALL_BYTES, MAX_RATIO * packed):
         raise LumigraphError(
             f"{path} promises {count:,} Gaussians in {packed:,} bytes, which no cloud can be packed into; "
             "copy or download it again"
         )
-    needed, free = WORKING * (11 + 3 * harmonics) * count, free_memory()
+    needed, free = BYTES_PER_NUMBER * (11 + 3 * harmonics) * count, free_memory()
     if needed > free:
         raise LumigraphError(
             f"{path} promises {count:,} Gaussians, which take {needed / 1e9:.1f} GB to read, and {free / 1e9:.1f} GB "
@@ -43,7 +48,7 @@ def checked(gaussians: Gaussians, subject: str, way_out: str) -> Gaussians:
     """
     if (count := gaussians.harmonics.shape[1]) not in (1, 4, 9, 16):
         raise LumigraphError(f"{subject} has {count} harmonics per Gaussian; bring them to 1, 4, 9 or 16")
-    unsound = {what: ~getattr(gaussians, name).isfinite().flatten(1).all(-1) for name, what in SPOKEN.items()}
+    unsound = {what: ~getattr(gaussians, name).isfinite().flatten(1).all(-1) for name, what in DISPLAY_NAMES.items()}
     unsound["opacities"] = gaussians.opacities.isnan()
     faults = [f"{what}: {int(bad.sum())}" for what, bad in unsound.items() if bad.any()]
     if faults:
@@ -56,5 +61,5 @@ def checked(gaussians: Gaussians, subject: str, way_out: str) -> Gaussians:
     return replace(
         gaussians,
         quaternions=torch.where(nowhere, gaussians.quaternions.new_tensor([1, 0, 0, 0]), gaussians.quaternions),
-        opacities=gaussians.opacities.nan_to_num(float("nan"), CERTAIN, -CERTAIN),
+        opacities=gaussians.opacities.nan_to_num(float("nan"), MAX_LOGIT, -MAX_LOGIT),
     )

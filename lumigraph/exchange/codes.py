@@ -13,7 +13,7 @@ from ..gaussians import Gaussians
 _ALPHA = np.clip(np.arange(256) / 255, 0.5 / 255, 254.5 / 255)
 LOGITS = np.log(_ALPHA / (1 - _ALPHA)).astype(np.float32)
 OTHERS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])  # the components beside the i-th
-THIN, WIDE = np.finfo(np.float32).tiny, np.finfo(np.float32).max  # what a scale can be and have a logarithm
+MIN_SCALE, MAX_SCALE = np.finfo(np.float32).tiny, np.finfo(np.float32).max  # what a scale can be and have a logarithm
 
 
 def array(tensor: Float[Tensor, "*shape"]) -> Float[np.ndarray, "*shape"]:
@@ -52,13 +52,13 @@ def alpha_to_byte(logits: Float[np.ndarray, "*shape"]) -> UInt8[np.ndarray, "*sh
 def to_scales(log_scales: Float[np.ndarray, "gaussian 3"]) -> Float[np.ndarray, "gaussian 3"]:
     """Standard deviations, in double precision and within what float32 can say."""
     with np.errstate(over="ignore"):
-        return np.exp(log_scales.astype(np.float64)).clip(THIN, WIDE)
+        return np.exp(log_scales.astype(np.float64)).clip(MIN_SCALE, MAX_SCALE)
 
 
 def from_scales(scales: Float[np.ndarray, "gaussian 3"]) -> Float[np.ndarray, "gaussian 3"]:
     """Their logarithms: of 0 that of the least, and of negative ones none, which is found later."""
     with np.errstate(invalid="ignore"):
-        return np.log(np.where(scales == 0, THIN, scales.astype(np.float64)))
+        return np.log(np.where(scales == 0, MIN_SCALE, scales.astype(np.float64)))
 
 
 def unit(quaternions: Float[np.ndarray, "gaussian 4"]) -> Float[np.ndarray, "gaussian 4"]:

@@ -37,9 +37,9 @@ RANGES = {  # of chunks: lower and upper ends
     "scale": (["min_scale_x", "min_scale_y", "min_scale_z"], ["max_scale_x", "max_scale_y", "max_scale_z"]),
     "colour": (["min_r", "min_g", "min_b"], ["max_r", "max_g", "max_b"]),
 }
-LARGEST_SCALE = 20.0
+MAX_LOG_SCALE = 20.0
 SHIFTS, STEPS = np.array([21, 11, 0]), np.array([2047, 1023, 2047])
-HARMONICS = 4.0  # they span [-4, 4]
+MAX_HARMONIC = 4.0  # they span [-4, 4]
 
 
 def recognises(header: Header) -> bool:
@@ -88,7 +88,7 @@ def write(path: Path, gaussians: Gaussians) -> None:
     count, starts = len(gaussians), np.arange(0, len(gaussians), CHUNK)
     spread = {
         "mean": array(gaussians.means),
-        "scale": array(gaussians.log_scales).clip(-LARGEST_SCALE, LARGEST_SCALE),
+        "scale": array(gaussians.log_scales).clip(-MAX_LOG_SCALE, MAX_LOG_SCALE),
         "colour": array(gaussians.harmonics[:, 0]) * np.float32(K00) + np.float32(0.5),
     }
     chunks = np.empty(len(starts), [(name, "<f4") for span in RANGES.values() for end in span for name in end])
@@ -109,7 +109,7 @@ def write(path: Path, gaussians: Gaussians) -> None:
     elements = [plyfile.PlyElement.describe(chunks, "chunk"), plyfile.PlyElement.describe(vertices, "vertex")]
     if gaussians.degree:
         rest = by_channel(array(gaussians.harmonics[:, 1:]))
-        codes = np.floor(256 * (rest / (2 * HARMONICS) + 0.5)).clip(0, 255).astype(np.uint8)
+        codes = np.floor(256 * (rest / (2 * MAX_HARMONIC) + 0.5)).clip(0, 255).astype(np.uint8)
         table = codes.view([(f"f_rest_{i}", "u1") for i in range(codes.shape[1])])[:, 0]
         elements.append(plyfile.PlyElement.describe(table, "sh"))
     save(path, elements, gaussians.antialiased)
@@ -145,4 +145,4 @@ def _from_smallest_three(code: Int[np.ndarray, " gaussian"]) -> Float[np.ndarray
 def _from_bytes(codes: Float[np.ndarray, "gaussian rest 3"]) -> Float[np.ndarray, "gaussian rest 3"]:
     """The middle of each of 256 steps, but the very ends for the outermost."""
     shares = np.where(codes == 0, 0, np.where(codes == 255, 1, (codes + 0.5) / 256))
-    return 2 * HARMONICS * (shares - 0.5)
+    return 2 * MAX_HARMONIC * (shares - 0.5)

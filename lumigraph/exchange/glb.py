@@ -35,18 +35,18 @@ from .codes import array, cloud, from_scales, to_scales, unit
 EXTENSION = "KHR_gaussian_splatting"
 ROTATION, SCALE, OPACITY = (f"{EXTENSION}:{name}" for name in ("ROTATION", "SCALE", "OPACITY"))
 HARMONICS = [f"{EXTENSION}:SH_DEGREE_{band}_COEF_{i}" for band in range(4) for i in range(2 * band + 1)]
-SHAPED = {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}  # what is written, and all that is read
-KNOWN = {EXTENSION, "KHR_mesh_quantization"}
+KERNEL_PROPERTIES = {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}  # what is written, and all that is read
+KNOWN_EXTENSIONS = {EXTENSION, "KHR_mesh_quantization"}
 POINTS = 0
 ANTIALIASED = "antialiased"
-LONGEST = 1 << 24  # bytes of JSON
+MAX_JSON_BYTES = 1 << 24  # bytes of JSON
 
 
 def recognises(path: Path) -> bool:
     """True if a .glb file has Gaussians, not meshes: its JSON names the extension."""
     with open(path, "rb") as file:
         head = file.read(gltf.HEADER.size + gltf.CHUNK.size)
-        return head[:4] == gltf.MAGIC and f'"{EXTENSION}"'.encode() in file.read(min(LONGEST, _length(head)))
+        return head[:4] == gltf.MAGIC and f'"{EXTENSION}"'.encode() in file.read(min(MAX_JSON_BYTES, _length(head)))
 
 
 def _length(head: bytes) -> int:
@@ -59,7 +59,7 @@ def read(path: Path) -> Gaussians:
     Raises LumigraphError for extensions, kernels and colours that are not known, and for damaged files.
     """
     file = gltf.File(path)
-    if unknown := sorted({*file.about.extensions_required} - KNOWN):
+    if unknown := sorted({*file.about.extensions_required} - KNOWN_EXTENSIONS):
         raise LumigraphError(f"{path} needs {shown(', '.join(unknown))}, which is not read here; export it without")
     placed = [
         (primitive, matrix)
@@ -114,7 +114,7 @@ def _bands(file: gltf.File, primitive: gltf.Primitive) -> int:
     compressed or incomplete."""
     said = primitive.extensions[EXTENSION]
     said = said if isinstance(said, dict) else {}
-    if primitive.mode != POINTS or any(said.get(name) != value for name, value in SHAPED.items()):
+    if primitive.mode != POINTS or any(said.get(name) != value for name, value in KERNEL_PROPERTIES.items()):
         found = f"mode {primitive.mode}, kernel {shown(said.get('kernel'))}, colours {shown(said.get('colorSpace'))}"
         raise LumigraphError(
             f"{file.path} has Gaussians of another kind ({found}), where points, ellipse and srgb_rec709_display are "
@@ -201,7 +201,7 @@ def write(path: Path, gaussians: Gaussians) -> None:
     primitive = {
         "mode": POINTS,
         "attributes": {name: i for i, name in enumerate(columns)},
-        "extensions": {EXTENSION: SHAPED},
+        "extensions": {EXTENSION: KERNEL_PROPERTIES},
     }
     if gaussians.antialiased:
         primitive["extras"] = {ANTIALIASED: True}

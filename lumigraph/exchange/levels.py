@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float, UInt8
 
-COUNT = 256  # of levels, one for each byte
+LEVEL_COUNT = 256  # of levels, one for each byte
 PASSES = 12
 
 
@@ -18,11 +18,11 @@ def levels(values: Float[np.ndarray, "*shape"]) -> Float[np.ndarray, " level"]:
     """
     values = np.sort(values.astype(np.float64), axis=None)
     kinds, counts = np.unique(values, return_counts=True)
-    if len(kinds) <= COUNT:
-        return np.pad(kinds, (0, COUNT - len(kinds)), mode="edge")
+    if len(kinds) <= LEVEL_COUNT:
+        return np.pad(kinds, (0, LEVEL_COUNT - len(kinds)), mode="edge")
     parts = np.cbrt((counts[1:] + counts[:-1]) / 2 * np.diff(kinds) ** 2)
     shares = np.concatenate([[0], np.cumsum(parts)])
-    book = np.interp((np.arange(COUNT) + 0.5) / COUNT * shares[-1], shares, kinds)
+    book = np.interp((np.arange(LEVEL_COUNT) + 0.5) / LEVEL_COUNT * shares[-1], shares, kinds)
     sums = np.concatenate([[0], np.cumsum(values)])
     for _ in range(PASSES):
         ends = np.searchsorted(values, [-np.inf, *(book[1:] + book[:-1]) / 2, np.inf])

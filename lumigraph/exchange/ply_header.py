@@ -13,7 +13,7 @@ import plyfile
 
 from ..errors import LumigraphError
 
-LONGEST = 1 << 20  # bytes; headers of Gaussians have about 1500
+MAX_HEADER_BYTES = 1 << 20  # bytes; headers of Gaussians have about 1500
 END = re.compile(rb"(?<=[\r\n])end_header(\r\n|\r|\n)")
 COUNT = re.compile(rb"(?<=[\r\n])(element[ \t]+[^ \t\r\n]+[ \t]+)([0-9]+)")
 
@@ -43,7 +43,7 @@ def read_header(path: Path) -> Header:
     The rows of text are counted at two characters a number: what is promised beyond that cannot be there either.
     """
     with open(path, "rb") as file:
-        data = file.read(LONGEST)
+        data = file.read(MAX_HEADER_BYTES)
         size = file.seek(0, 2)
     if data[:3] != b"ply":
         raise LumigraphError(f"{path} is no PLY file, for it does not begin with 'ply'; name another one")

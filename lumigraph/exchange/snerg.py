@@ -40,12 +40,12 @@ from .baked import Atlas, ViewNetwork
 from .bundle import Bundle
 
 META, INDICES = "scene_params.json", "atlas_indices.png"
-NOWHERE = 255  # in atlas_indices.png
+EMPTY_INDEX = 255  # in atlas_indices.png
 LAYERS = 4  # of the atlas in one picture
-INPUTS = 34  # of the network: the direction's encoding, three colours, four features
+NETWORK_INPUTS = 34  # of the network: the direction's encoding, three colours, four features
 # The scene's axes in those of the viewer, and back: the same turn.
 AXES = ((-1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))
-WORKING = 4  # times the atlas, that reading takes
+READING_FACTOR = 4  # times the atlas, that reading takes
 
 Blocks = Annotated[int, between(1, 254)]
 Voxels = Annotated[int, between(1, 1 << 16)]
@@ -126,7 +126,7 @@ class Params:
         if self.bias_0 is None:
             return None
         said = (self.weights_0, self.bias_0), (self.weights_1, self.bias_1), (self.weights_2, self.bias_2)
-        weights, biases, inputs = [], [], INPUTS
+        weights, biases, inputs = [], [], NETWORK_INPUTS
         for number, (rows, bias) in enumerate(said):
             widths = {len(row) for row in rows or ()}
             if bias is None or len(rows or ()) != inputs or widths != {len(bias)} or (number == 2 and len(bias) != 3):
@@ -153,7 +153,7 @@ def write(folder: Path, atlas: Atlas) -> None:
     side = atlas.block + 2
     packed, blocks = arranged(atlas.values.numpy())
     x, y, z = blocks
-    if max(blocks) >= NOWHERE:
+    if max(blocks) >= EMPTY_INDEX:
         raise LumigraphError(
             f"The atlas has {len(atlas.values):,} blocks of {side} voxels, more than the format counts; "
             "bake with a larger --block-size or a smaller --resolution"
@@ -188,7 +188,7 @@ def indices(index: np.ndarray, blocks: tuple[int, int, int]) -> UInt8[np.ndarray
     """Position of each grid block in the atlas; rows are z, then y."""
     x, y, _ = blocks
     places = np.stack([index % x, index // x % y, index // (x * y)], -1)
-    places = np.where(index[..., None] < 0, NOWHERE, places).astype(np.uint8)
+    places = np.where(index[..., None] < 0, EMPTY_INDEX, places).astype(np.uint8)
     return np.ascontiguousarray(places.transpose(2, 1, 0, 3).reshape(-1, len(index), 3))
 
 
@@ -228,7 +228,7 @@ def read(folder: Path) -> Atlas:
     except LumigraphError as fault:
         raise LumigraphError(f"{META} of {folder}: {str(fault)[:1].lower()}{str(fault)[1:]}") from fault
     x, y, z = about.atlas_blocks
-    needed = WORKING * 8 * about.atlas_width * about.atlas_height * about.atlas_depth
+    needed = READING_FACTOR * 8 * about.atlas_width * about.atlas_height * about.atlas_depth
     if needed > (free := free_memory()):
         raise LumigraphError(
             f"{folder} promises an atlas that takes {gigabytes(needed)} to read, and {gigabytes(free)} are free; "
@@ -265,7 +265,7 @@ def read_indices(bundle: Bundle, about: Params) -> np.ndarray:
     places = (
         picture(bundle, INDICES, (gx, gz * gy), "RGB").reshape(gz, gy, gx, 3).transpose(2, 1, 0, 3).astype(np.int64)
     )
-    there = (places != NOWHERE).all(-1)
+    there = (places != EMPTY_INDEX).all(-1)
     if (places[there] >= np.array(about.atlas_blocks)).any():
         raise LumigraphError(f"{INDICES} of {bundle.path} names blocks beyond the atlas; copy the whole folder again")
     x, y, _ = about.atlas_blocks

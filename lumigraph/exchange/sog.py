@@ -42,12 +42,14 @@ from .packing.clusters import clustered
 
 VERSION = 2
 META = "meta.json"
-LARGEST = 252  # alpha of a rotation's pixel, and one more for each of w, x, y, z that is the largest component
-ROW = 64  # palette entries side by side
+LARGEST_COMPONENT_ALPHA = (
+    252  # alpha of a rotation's pixel, and one more for each of w, x, y, z that is the largest component
+)
+PALETTE_ROW = 64  # palette entries side by side
 WIDTHS = 3, 8, 15  # coefficients of one, for degrees 1, 2 and 3
-FEW, MOST = 1024, 65536  # palette entries
-PER_ENTRY = 8  # Gaussians at least for each, beyond a few: more entries cost more bytes than they save error
-EFFORT = 2  # of WebP, 0 to 6: 4 takes twice as long and saves 1 %
+MIN_ENTRIES, MAX_ENTRIES = 1024, 65536  # palette entries
+GAUSSIANS_PER_ENTRY = 8  # Gaussians at least for each, beyond a few: more entries cost more bytes than they save error
+WEBP_EFFORT = 2  # of WebP, 0 to 6: 4 takes twice as long and saves 1 %
 FORMATS = ("WEBP", "PNG")
 
 Ends = tuple[Coordinate, Coordinate, Coordinate]
@@ -81,7 +83,7 @@ class Coded:
 class Palette:
     """Harmonics beyond the plain colour: the pictures of entries and of labels."""
 
-    count: Annotated[int, between(1, MOST)]
+    count: Annotated[int, between(1, MAX_ENTRIES)]
     bands: Annotated[int, between(1, 3)]
     codebook: Book
     files: Two
@@ -243,9 +245,11 @@ class _Pictures:
 
     def rotations(self, name: str) -> Float[np.ndarray, "gaussian 4"]:
         pixels = self.of(name)
-        if (pixels[:, 3] < LARGEST).any():
+        if (pixels[:, 3] < LARGEST_COMPONENT_ALPHA).any():
             raise LumigraphError(f"{self.bundle.path}: {shown(name)} has pixels that are no rotations; export it again")
-        return with_largest(pixels[:, 3].astype(np.int64) - LARGEST, (pixels[:, :3] / 255 - 0.5) * math.sqrt(2))
+        return with_largest(
+            pixels[:, 3].astype(np.int64) - LARGEST_COMPONENT_ALPHA, (pixels[:, :3] / 255 - 0.5) * math.sqrt(2)
+        )
 
     def palette(
         self, files: tuple[str, str], count: int | None = None, width: int | None = None
@@ -253,14 +257,14 @@ class _Pictures:
         """Codes of each entry, and the entry of each Gaussian. count, width: of entries; None for what there is."""
         image, pixels = self.whole(files[0], 1), self.of(files[1]).astype(np.int64)
         labels = pixels[:, 1] << 8 | pixels[:, 0]
-        widths = [ROW * coefficients for coefficients in ([width] if width else WIDTHS)]
-        fits = image.shape[1] in widths and labels.max() < min(count or MOST, ROW * image.shape[0])
+        widths = [PALETTE_ROW * coefficients for coefficients in ([width] if width else WIDTHS)]
+        fits = image.shape[1] in widths and labels.max() < min(count or MAX_ENTRIES, PALETTE_ROW * image.shape[0])
         if not fits:
             raise LumigraphError(
                 f"{self.bundle.path}: {shown(files[0])} of {image.shape[1]} x {image.shape[0]} pixels does not hold "
                 f"the {labels.max() + 1:,} entries that {shown(files[1])} names; export it again"
             )
-        return image[..., :3].reshape(ROW * image.shape[0], -1, 3)[:count], labels
+        return image[..., :3].reshape(PALETTE_ROW * image.shape[0], -1, 3)[:count], labels
 
 
 def write(path: Path, gaussians: Gaussians) -> None:
@@ -289,7 +293,7 @@ def encode(gaussians: Gaussians, ordered: bool = False) -> dict[str, bytes]:
         rgba = np.full((4 * math.ceil(len(pixels) / width / 4) * width, 4), 255, np.uint8)
         rgba[: len(pixels), : pixels.shape[1]] = pixels
         held = io.BytesIO()
-        Image.fromarray(rgba.reshape(-1, width, 4)).save(held, "WEBP", lossless=True, exact=True, method=EFFORT)
+        Image.fromarray(rgba.reshape(-1, width, 4)).save(held, "WEBP", lossless=True, exact=True, method=WEBP_EFFORT)
         files[name] = held.getvalue()
         return name
 
@@ -313,7 +317,9 @@ def encode(gaussians: Gaussians, ordered: bool = False) -> dict[str, bytes]:
             "files": [picture("scales.webp", nearest_level(scales, scale_book))],
         },
         "quats": {
-            "files": [picture("quats.webp", to_byte(255 * (rest / math.sqrt(2) + 0.5)), LARGEST + largest)],
+            "files": [
+                picture("quats.webp", to_byte(255 * (rest / math.sqrt(2) + 0.5)), LARGEST_COMPONENT_ALPHA + largest)
+            ],
         },
         "sh0": {
             "codebook": colour_book.tolist(),
@@ -328,13 +334,13 @@ def encode(gaussians: Gaussians, ordered: bool = False) -> dict[str, bytes]:
         entries, labels = _palette(array(gaussians.harmonics[:, 1:]).reshape(count, -1))
         book = levels(entries)
         coefficients = entries.shape[1] // 3
-        padded = np.pad(nearest_level(entries, book), [(0, -len(entries) % ROW), (0, 0)]).reshape(-1, 3)
+        padded = np.pad(nearest_level(entries, book), [(0, -len(entries) % PALETTE_ROW), (0, 0)]).reshape(-1, 3)
         meta["shN"] = {
             "count": len(entries),
             "bands": gaussians.degree,
             "codebook": book.tolist(),
             "files": [
-                picture("shN_centroids.webp", padded, width=ROW * coefficients),
+                picture("shN_centroids.webp", padded, width=PALETTE_ROW * coefficients),
                 picture("shN_labels.webp", labels & 255, labels >> 8, np.zeros_like(labels)),
             ],
         }
@@ -345,7 +351,7 @@ def _palette(
     harmonics: Float[np.ndarray, "gaussian rest"],
 ) -> tuple[Float[np.ndarray, "entry rest"], np.ndarray]:
     """Entries, and which of them each Gaussian has: all that there are if they are few, else of k-means."""
-    size = max(FEW, min(MOST, 2 ** int(math.log2(max(len(harmonics) / PER_ENTRY, 1)))))
+    size = max(MIN_ENTRIES, min(MAX_ENTRIES, 2 ** int(math.log2(max(len(harmonics) / GAUSSIANS_PER_ENTRY, 1)))))
     kinds, labels = np.unique(harmonics, axis=0, return_inverse=True)
     if len(kinds) <= size:
         return kinds, labels.reshape(-1)

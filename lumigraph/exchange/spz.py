@@ -35,21 +35,20 @@ from ..gaussians import Gaussians
 from .axes import TURN_HARMONICS, TURN_MEAN, TURN_ROTATION
 from .checks import check_room
 from .codes import LOGITS, alpha_to_byte, array, cloud, to_byte, with_largest, without_largest
-from .packing.streams import DENSEST as DENSEST_ZSTD
-from .packing.streams import take
+from .packing.streams import MAX_ZSTD_RATIO, take
 
 HEADER = struct.Struct("<4sIIBBBB")  # magic, version, count, degree, bits behind the point, flags, reserved
-MAGIC, GZIPPED, NEWEST = b"NGSP", 3, 4
-TABLED = struct.Struct("<4sIIBBBBI12x")  # version 4: ..., flags, number of streams, where their table begins
+MAGIC, GZIP_VERSION, NEWEST_VERSION = b"NGSP", 3, 4
+HEADER_V4 = struct.Struct("<4sIIBBBBI12x")  # version 4: ..., flags, number of streams, where their table begins
 STREAM = struct.Struct("<QQ")  # packed and unpacked bytes
 ANTIALIASED, EXTENDED = 1, 2  # flags
-MOST_BITS = 16  # behind the binary point; Niantic's metres have 12, ours are units of a scene in [-1, 1]^3
-FARTHEST = 2**23 - 1
-COLOUR = 0.15  # instead of Y_00 = 0.28, so that colours outside [0, 1] have a place
-STEPS = 8, 16  # of 1/128, for harmonics of degree 1 and beyond: 5 and 4 bits
-DENSEST = 1032  # times that deflate can shrink what it is given
-LONGEST_EXTENSIONS = 1 << 20  # bytes
-LEVEL = 4  # of gzip; 6, the usual one, takes up to four times as long and saves 1% at most
+MAX_BITS = 16  # behind the binary point; Niantic's metres have 12, ours are units of a scene in [-1, 1]^3
+MAX_FIXED = 2**23 - 1
+COLOUR_SCALE = 0.15  # instead of Y_00 = 0.28, so that colours outside [0, 1] have a place
+HARMONICS_STEPS = 8, 16  # of 1/128, for harmonics of degree 1 and beyond: 5 and 4 bits
+MAX_DEFLATE_RATIO = 1032  # times that deflate can shrink what it is given
+MAX_EXTENSION_BYTES = 1 << 20  # bytes
+GZIP_LEVEL = 4  # of gzip; 6, the usual one, takes up to four times as long and saves 1% at most
 ZSTD_LEVEL = 12
 
 
@@ -57,7 +56,7 @@ def read(path: Path) -> Gaussians:
     """Versions 1 to 4. Extensions are passed over. Raises LumigraphError for others and for damaged files."""
     data = path.read_bytes()
     stream: io.BufferedIOBase
-    if data[:8] == MAGIC + struct.pack("<I", NEWEST):
+    if data[:8] == MAGIC + struct.pack("<I", NEWEST_VERSION):
         with _told(path):
             return _decode_tabled(path, data)
     if data[:4] == MAGIC:  # earlier ones, before gzip
@@ -67,7 +66,7 @@ def read(path: Path) -> Gaussians:
     else:
         raise LumigraphError(f"{path} is no .spz file, for it does not begin like one; name another one")
     with _told(path):
-        return _decode(path, stream, DENSEST * len(data))
+        return _decode(path, stream, MAX_DEFLATE_RATIO * len(data))
 
 
 @contextlib.contextmanager
@@ -81,19 +80,19 @@ def _told(path: Path) -> Iterator[None]:
 
 def write(path: Path, gaussians: Gaussians) -> None:
     """Version 4. Raises LumigraphError if the cloud is wider than 24 bits can say."""
-    (bits, flags), streams = _streams(gaussians, str(path), STEPS)
+    (bits, flags), streams = _streams(gaussians, str(path), HARMONICS_STEPS)
     raw = [stream.tobytes() for stream in streams if stream.shape[1]]
     packed = [zstandard.ZstdCompressor(ZSTD_LEVEL).compress(stream) for stream in raw]
-    about = NEWEST, len(gaussians), gaussians.degree, bits, flags, len(raw), TABLED.size
+    about = NEWEST_VERSION, len(gaussians), gaussians.degree, bits, flags, len(raw), HEADER_V4.size
     table = [STREAM.pack(len(few), len(many)) for few, many in zip(packed, raw, strict=True)]
-    write_bytes(path, b"".join([TABLED.pack(MAGIC, *about), *table, *packed]), "splats")
+    write_bytes(path, b"".join([HEADER_V4.pack(MAGIC, *about), *table, *packed]), "splats")
 
 
-def gzipped(gaussians: Gaussians, steps: tuple[int, int] = STEPS) -> bytes:
+def gzipped(gaussians: Gaussians, steps: tuple[int, int] = HARMONICS_STEPS) -> bytes:
     """Version 3. steps: of 1/128, to which harmonics of degree 1 and beyond are rounded; 1 is the finest."""
     (bits, flags), streams = _streams(gaussians, "a .spz file", steps)
-    header = HEADER.pack(MAGIC, GZIPPED, len(gaussians), gaussians.degree, bits, flags, 0)
-    return gzip.compress(b"".join([header, *(stream.tobytes() for stream in streams)]), LEVEL, mtime=0)
+    header = HEADER.pack(MAGIC, GZIP_VERSION, len(gaussians), gaussians.degree, bits, flags, 0)
+    return gzip.compress(b"".join([header, *(stream.tobytes() for stream in streams)]), GZIP_LEVEL, mtime=0)
 
 
 def _streams(
@@ -101,18 +100,18 @@ def _streams(
 ) -> tuple[tuple[int, int], list[UInt8[np.ndarray, "gaussian width"]]]:
     """Bits behind the point and flags, and the bytes of each quantity."""
     extent = float(np.abs(array(gaussians.means)).max()) if len(gaussians) else 0.0
-    if extent > FARTHEST:
+    if extent > MAX_FIXED:
         raise LumigraphError(
-            f"{name} cannot hold positions beyond {FARTHEST}; scale the cloud down or write it as .ply"
+            f"{name} cannot hold positions beyond {MAX_FIXED}; scale the cloud down or write it as .ply"
         )
-    bits = min(MOST_BITS, math.floor(math.log2(FARTHEST / extent))) if extent > FARTHEST / 2**MOST_BITS else MOST_BITS
+    bits = min(MAX_BITS, math.floor(math.log2(MAX_FIXED / extent))) if extent > MAX_FIXED / 2**MAX_BITS else MAX_BITS
     flags = ANTIALIASED if gaussians.antialiased else 0
-    fixed = np.rint(array(gaussians.means).astype(np.float64) * TURN_MEAN * 2**bits).clip(-FARTHEST, FARTHEST)
+    fixed = np.rint(array(gaussians.means).astype(np.float64) * TURN_MEAN * 2**bits).clip(-MAX_FIXED, MAX_FIXED)
     harmonics = array(gaussians.harmonics) * TURN_HARMONICS[: gaussians.harmonics.shape[1]]
     return (bits, flags), [
         fixed.astype("<i4").reshape(-1, 1).view(np.uint8)[:, :3],
         alpha_to_byte(array(gaussians.opacities))[:, None],
-        to_byte(255 * (COLOUR * harmonics[:, 0] + 0.5)),
+        to_byte(255 * (COLOUR_SCALE * harmonics[:, 0] + 0.5)),
         to_byte(16 * (array(gaussians.log_scales) + 10)),
         _smallest_three(array(gaussians.quaternions) * TURN_ROTATION),
         _in_buckets(harmonics[:, 1:], steps).reshape(len(fixed), 3 * (harmonics.shape[1] - 1)),
@@ -124,28 +123,28 @@ def _decode(path: Path, stream: io.BufferedIOBase, limit: int) -> Gaussians:
     magic, version = struct.unpack("<4sI", take(stream, 8))
     if magic != MAGIC:
         raise LumigraphError(f"{path} is no .spz file, for inside it does not begin with NGSP; name another one")
-    if not 1 <= version < NEWEST:
+    if not 1 <= version < NEWEST_VERSION:
         raise LumigraphError(
-            f"{path} is of version {version} of .spz, of which 1 to {NEWEST} can be read; "
-            f"save it as version {NEWEST} or as .ply, for instance with splat-transform"
+            f"{path} is of version {version} of .spz, of which 1 to {NEWEST_VERSION} can be read; "
+            f"save it as version {NEWEST_VERSION} or as .ply, for instance with splat-transform"
         )
     count, degree, bits, flags, _ = struct.unpack("<IBBBB", take(stream, 8))
     widths = _widths(path, version, degree)
     if count * sum(widths) > limit:
         raise EOFError(f"{count} Gaussians are promised and cannot be there")
-    check_room(path, count, (degree + 1) ** 2, limit // DENSEST, count * sum(widths))
+    check_room(path, count, (degree + 1) ** 2, limit // MAX_DEFLATE_RATIO, count * sum(widths))
     columns = [np.frombuffer(take(stream, count * width), np.uint8).reshape(count, width) for width in widths]
-    behind = stream.read(LONGEST_EXTENSIONS + 1)  # to the end, where gzip's checksum is
-    if len(behind) > (LONGEST_EXTENSIONS if flags & EXTENDED else 0):
+    behind = stream.read(MAX_EXTENSION_BYTES + 1)  # to the end, where gzip's checksum is
+    if len(behind) > (MAX_EXTENSION_BYTES if flags & EXTENDED else 0):
         raise LumigraphError(f"{path} goes on after the {count} Gaussians that it promises; copy or download it again")
     return _cloud(columns, version, bits, flags)
 
 
 def _decode_tabled(path: Path, data: bytes) -> Gaussians:
     """Version 4. Only as much is unpacked as the header's count makes of each stream."""
-    if len(data) < TABLED.size:
+    if len(data) < HEADER_V4.size:
         raise EOFError("it ends early")
-    _, version, count, degree, bits, flags, streams, table = TABLED.unpack_from(data)
+    _, version, count, degree, bits, flags, streams, table = HEADER_V4.unpack_from(data)
     widths = _widths(path, version, degree)
     if streams < len([width for width in widths if width]) or table + streams * STREAM.size > len(data):
         raise EOFError(f"it has no table of {streams} streams")
@@ -157,7 +156,7 @@ def _decode_tabled(path: Path, data: bytes) -> Gaussians:
             raise EOFError(f"{count} Gaussians are promised and cannot be there")
         found = b""
         if unpacked:
-            if unpacked > DENSEST_ZSTD * packed:
+            if unpacked > MAX_ZSTD_RATIO * packed:
                 raise EOFError(f"{count} Gaussians are promised and cannot be there")
             reader = zstandard.ZstdDecompressor().stream_reader(data[at : at + packed])
             found = take(reader, unpacked)
@@ -176,7 +175,7 @@ def _widths(path: Path, version: int, degree: int) -> list[int]:
 def _cloud(columns: list[np.ndarray], version: int, bits: int, flags: int) -> Gaussians:
     positions, alphas, colours, scales, rotations, rest = columns
     means = positions.view("<f2").astype(np.float64) if version == 1 else _fixed_point(positions) / 2.0**bits
-    plain = (colours / 255 - 0.5) / COLOUR
+    plain = (colours / 255 - 0.5) / COLOUR_SCALE
     harmonics = np.concatenate(
         [plain[:, None], (rest.reshape(*rest.shape[:1], rest.shape[1] // 3, 3) - 128.0) / 128], 1
     )

@@ -36,9 +36,9 @@ from .morton import morton_order
 
 VERSION = 1
 META = "lod-meta.json"
-PARTS = 4  # leaves in a file of the finest level, at least
-MIDDLE = 0.9  # of Gaussians tell how long a side is; the rest may be far out
-MOST_LEVELS = 64
+MIN_LEAVES_PER_FILE = 4  # leaves in a file of the finest level, at least
+EXTENT_QUANTILE = 0.9  # of Gaussians tell how long a side is; the rest may be far out
+MAX_LEVELS = 64
 
 Bounds = tuple[Float[np.ndarray, " 3"], Float[np.ndarray, " 3"]]
 
@@ -83,7 +83,7 @@ class Node:
 class Meta:
     """Content of lod-meta.json."""
 
-    lodLevels: Annotated[int, between(1, MOST_LEVELS)]  # noqa: N815
+    lodLevels: Annotated[int, between(1, MAX_LEVELS)]  # noqa: N815
     filenames: Annotated[list[Name], msgspec.Meta(min_length=1, max_length=10**6)]
     tree: Node
     version: int = VERSION
@@ -157,7 +157,7 @@ def write(path: Path, gaussians: Gaussians, detail: Detail | None = None) -> Non
     if not len(gaussians):
         raise LumigraphError(f"{path} cannot hold a cloud of no Gaussians; write it as .ply")
     detail, gaussians = detail or Detail(), gaussians.to("cpu")
-    parts = leaves(array(gaussians.means), max(1, detail.chunk // PARTS))
+    parts = leaves(array(gaussians.means), max(1, detail.chunk // MIN_LEAVES_PER_FILE))
     with replacing_folder(path.parent, "splats") as folder:
         leaf_by_leaf = track(parts, "Making levels of detail", len(parts))
         levels = [coarser(gaussians[torch.from_numpy(part)], detail) for part in leaf_by_leaf]
@@ -192,7 +192,7 @@ def leaves(points: Float[np.ndarray, "point 3"], most: int) -> list[Int[np.ndarr
 
 def halves(points: Float[np.ndarray, "point 3"], part: Int[np.ndarray, " some"]) -> list[Int[np.ndarray, " half"]]:
     """The nearer and the farther half along the axis in which the middle of them is longest, the first the larger."""
-    low, high = np.quantile(points[part], [0.5 - MIDDLE / 2, 0.5 + MIDDLE / 2], axis=0)
+    low, high = np.quantile(points[part], [0.5 - EXTENT_QUANTILE / 2, 0.5 + EXTENT_QUANTILE / 2], axis=0)
     order = np.argsort(points[part, (high - low).argmax()], kind="stable")
     return np.array_split(part[order], 2)
 

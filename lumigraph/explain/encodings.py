@@ -19,9 +19,9 @@ from ..system.signals import go_on_unless
 from ..training import fit
 from .tangent_kernel import spectrum, tangent_kernel
 
-FLAT: tuple[Encoding, ...] = ("none", "basic")
-SCALED: tuple[Encoding, ...] = ("positional", "gaussian")
-GRID = 24  # points along each side, at which the tangent kernel is taken
+UNSCALED_ENCODINGS: tuple[Encoding, ...] = ("none", "basic")
+SCALED_ENCODINGS: tuple[Encoding, ...] = ("positional", "gaussian")
+GRID_POINTS = 24  # points along each side, at which the tangent kernel is taken
 
 
 @dataclass(frozen=True)
@@ -67,7 +67,7 @@ class Comparison:
     @property
     def leading(self) -> list[Fit]:
         """The best of each encoding."""
-        return [self.best(encoding) for encoding in FLAT + SCALED]
+        return [self.best(encoding) for encoding in UNSCALED_ENCODINGS + SCALED_ENCODINGS]
 
     @property
     def gain(self) -> float:
@@ -114,8 +114,8 @@ def compare(
     config: the network's other numbers
     """
     config = config or FourierFeatures.preset(device)
-    todo = [replace(config, encoding=encoding) for encoding in FLAT]
-    todo += [replace(config, encoding=encoding, scale=scale) for encoding in SCALED for scale in scales]
+    todo = [replace(config, encoding=encoding) for encoding in UNSCALED_ENCODINGS]
+    todo += [replace(config, encoding=encoding, scale=scale) for encoding in SCALED_ENCODINGS for scale in scales]
     fits = [learn(scene, one, steps, device) for one in track(todo, "Fitting the picture", len(todo))]
     return Comparison(scene.source, truth(scene), steps, config, fits)
 
@@ -131,7 +131,7 @@ def learn(scene: Scene, config: Config, steps: int, device: torch.device) -> Fit
     rgb, picture = method.render(scene.cameras[0]).rgb.cpu(), truth(scene)
     masks = [scene.images.mask(int(scene.splits[split][0])) for split in ("train", "test")]
     learnt, held_out = (psnr(rgb[mask], picture[mask]) for mask in masks)
-    scale = None if config.encoding in FLAT else config.scale
+    scale = None if config.encoding in UNSCALED_ENCODINGS else config.scale
     return Fit(config.encoding, scale, learnt, held_out, seconds, rgb, eigenvalues)
 
 
@@ -142,6 +142,6 @@ def truth(scene: Scene) -> Float[Tensor, "height width 3"]:
 
 def kernel_at_start(method: FourierFeatures) -> Float[Tensor, "point point"]:
     """The tangent kernel of a network between a grid of places, ahead of its sigmoid."""
-    side = (torch.arange(GRID, device=method.device) + 0.5) / GRID
+    side = (torch.arange(GRID_POINTS, device=method.device) + 0.5) / GRID_POINTS
     places = torch.cartesian_prod(side, side)
     return tangent_kernel(method.layers, method.encoding(places)).cpu()

@@ -13,11 +13,11 @@ from ..evaluation.report import heading, jpeg, page, section
 from ..figures import Row, contact_sheet, save_picture
 from ..figures.charts import Series, line_chart, standalone
 from ..files import claim, write_bytes, write_json
-from .encodings import SCALED, Comparison, Fit
+from .encodings import SCALED_ENCODINGS, Comparison, Fit
 
-CROP, ENLARGED = 96, 3  # pixels a side of the picture's middle, and how many times larger the sheet shows them
-CELL = CROP * ENLARGED
-SMALLEST = 1e-10  # eigenvalue that is drawn, as a share of the trace
+CROP, ENLARGEMENT = 96, 3  # pixels a side of the picture's middle, and how many times larger the sheet shows them
+CELL = CROP * ENLARGEMENT
+MIN_EIGENVALUE = 1e-10  # eigenvalue that is drawn, as a share of the trace
 
 
 def write_page(folder: Path, comparison: Comparison) -> None:
@@ -62,7 +62,7 @@ def scale_chart(comparison: Comparison) -> str:
     """PSNR over scales; an encoding without one is a level line."""
     scales = [fit.scale for fit in comparison.of("gaussian") if fit.scale is not None]
     series = []
-    for encoding in SCALED:
+    for encoding in SCALED_ENCODINGS:
         fits = comparison.of(encoding)
         series.append(Series(f"{encoding}, held out", scales, [fit.held_out for fit in fits]))
         series.append(Series(f"{encoding}, learnt", scales, [fit.learnt for fit in fits]))
@@ -75,7 +75,7 @@ def spectrum_chart(comparison: Comparison) -> str:
     """Eigenvalues in falling order, those that are not lost in rounding."""
     series = []
     for fit in shown(comparison):
-        values = [value for value in fit.eigenvalues.tolist() if value > SMALLEST]
+        values = [value for value in fit.eigenvalues.tolist() if value > MIN_EIGENVALUE]
         series.append(Series(fit.name, range(1, len(values) + 1), values))
     return line_chart(
         series, "eigenvalue, by rank", "tangent kernel, share of the trace", log=True, log_x=True, smoothed=False
@@ -87,7 +87,7 @@ def comparison_sheet(comparison: Comparison):
     fits = shown(comparison)
     pictures = [comparison.picture, *(fit.rgb.clamp(0, 1) for fit in fits)]
     columns = ["picture", *(f"{fit.name} · {fit.held_out:.2f} dB" for fit in fits)]
-    rows = [Row("whole", pictures), Row(f"the middle, {ENLARGED} times larger", [middle(p) for p in pictures])]
+    rows = [Row("whole", pictures), Row(f"the middle, {ENLARGEMENT} times larger", [middle(p) for p in pictures])]
     height, width = comparison.picture.shape[:2]
     title = f"{Path(comparison.source).name} · {width}x{height} · {comparison.steps} steps · PSNR of held-out pixels"
     return contact_sheet(title, columns, rows, CELL)
@@ -107,7 +107,7 @@ def middle(picture: Float[Tensor, "height width 3"]) -> Float[Tensor, "tall wide
     """A square out of the middle, every pixel a square of its own."""
     top, left = (max(0, (size - CROP) // 2) for size in picture.shape[:2])
     crop = picture[top : top + CROP, left : left + CROP]
-    return torch.repeat_interleave(torch.repeat_interleave(crop, ENLARGED, 0), ENLARGED, 1)
+    return torch.repeat_interleave(torch.repeat_interleave(crop, ENLARGEMENT, 0), ENLARGEMENT, 1)
 
 
 def about_scales(comparison: Comparison) -> str:

@@ -16,8 +16,8 @@ from ..method import Method
 from ..method.capabilities import HasLooks, needs
 from ..volume import composite, weights_of
 
-SEEN = 1e-3  # weight from which on a sample shows in a picture of 256 levels
-INSET = 400  # pixels of the small picture's longer side, at most
+MIN_WEIGHT = 1e-3  # weight from which on a sample shows in a picture of 256 levels
+INSET_PIXELS = 400  # pixels of the small picture's longer side, at most
 
 
 @dataclass(frozen=True)
@@ -99,7 +99,7 @@ class Sight:
         return found | {
             "opacity": f"{self.opacity:.4f}",
             "depth": f"{self.depth:.4g} scene units, expected" if self.depth < float("inf") else "none",
-            "samples": f"{counts}; {int((last.weight > SEEN).sum())} with a weight above {SEEN:g}",
+            "samples": f"{counts}; {int((last.weight > MIN_WEIGHT).sum())} with a weight above {MIN_WEIGHT:g}",
         }
 
     def to_json(self) -> dict[str, Any]:
@@ -147,5 +147,5 @@ def along_ray(method: Method, camera: Camera, pixel: tuple[int, int]) -> Sight:
         seen.rgb[0].cpu(),
         float(seen.depth),
         float(seen.opacity),
-        method.render(camera.resized(min(1.0, INSET / max(width, height)))).rgb.cpu(),
+        method.render(camera.resized(min(1.0, INSET_PIXELS / max(width, height)))).rgb.cpu(),
     )

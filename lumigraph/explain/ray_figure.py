@@ -18,8 +18,8 @@ from .ray import Pass, Sight, triple
 WIDTH, LEFT, RIGHT = 988, 64, 700  # of the whole, and where the axis of distance begins and ends
 SIDE, RIGHT_EDGE = 730, 970  # of the column beside it
 TOP, STRIP, PANEL, LANE, GAP = 70, 26, 104, 16, 42  # heights
-DECADES = 5  # of density that are shown at most
-FINE = 8  # straight pieces that the curve of transmittance has within a sample
+MAX_DECADES = 5  # of density that are shown at most
+PIECES_PER_SAMPLE = 8  # straight pieces that the curve of transmittance has within a sample
 STYLE = """<style>
 .thin { stroke: currentColor; stroke-width: 1; }
 svg path.filled { fill: currentColor; fill-opacity: 0.2; }
@@ -97,7 +97,7 @@ def density_axis(sight: Sight, bottom: float, top: float) -> Axis:
     if not len(found):
         return Axis(-1, 1, bottom, top, log=True)
     high = math.ceil(math.log10(float(found.max())) + 0.05)
-    low = max(high - DECADES, math.floor(math.log10(float(found.min()))))
+    low = max(high - MAX_DECADES, math.floor(math.log10(float(found.min()))))
     return Axis(min(low, high - 1), high, bottom, top, log=True)
 
 
@@ -106,7 +106,10 @@ def falling_light(each: Pass, x: Axis) -> list[tuple[float, float]]:
     points = [(x.low, 1.0)]
     for i, (a, b, sigma) in enumerate(columns(each, "density")):
         T = float(each.transmittance[i])
-        points += [(a + s * (b - a), T * math.exp(-sigma * s * (b - a))) for s in (k / FINE for k in range(FINE + 1))]
+        points += [
+            (a + s * (b - a), T * math.exp(-sigma * s * (b - a)))
+            for s in (k / PIECES_PER_SAMPLE for k in range(PIECES_PER_SAMPLE + 1))
+        ]
     return [*points, (x.high, float(each.transmittance[-1]))]
 
 

@@ -15,11 +15,11 @@ from ..geometry.choice import evenly
 from ..method import Method
 
 VIEWS, SIZE = 12, 96  # pictures that are looked at, and the longer side of each in pixels
-CLOSED = 0.97  # share of them that must be opaque, or the scene's background is part of what it shows
-AROUND = math.sin(math.radians(10))  # of the horizon, above and below
-SEEN = 0.02  # share of pixels from which on something counts as seen
-HAZE, SKY = 0.5, 0.5  # of the way to white, where no photograph shows a horizon or a sky
-LOWEST = 0.02  # share of the surfaces in the box of interest that may lie below the floor
+MIN_OPAQUE_SHARE = 0.97  # share of them that must be opaque, or the scene's background is part of what it shows
+HORIZON_BAND = math.sin(math.radians(10))  # of the horizon, above and below
+MIN_SEEN_SHARE = 0.02  # share of pixels from which on something counts as seen
+HAZE_SHARE, SKY_SHARE = 0.5, 0.5  # of the way to white, where no photograph shows a horizon or a sky
+MAX_SHARE_BELOW_FLOOR = 0.02  # share of the surfaces in the box of interest that may lie below the floor
 
 
 @dataclass(frozen=True)
@@ -52,19 +52,19 @@ def backdrop(method: Method, cameras: Camera) -> Backdrop | None:
         heights.append(rays.directions[:, 2])
         opacities.append(seen.opacity.reshape(-1).cpu())
         places.append((rays.origins + depth[:, None] * rays.directions)[solid & (opacities[-1] > 0.5)])
-    if (torch.cat(opacities) > 0.5).float().mean() < CLOSED:
+    if (torch.cat(opacities) > 0.5).float().mean() < MIN_OPAQUE_SHARE:
         return None
     rgb, height, place = torch.cat(colours), torch.cat(heights), torch.cat(places)
     everything = torch.ones_like(height, dtype=torch.bool)
-    underfoot = median(rgb, height < -AROUND) or median(rgb, everything) or frame.background
-    horizon = median(rgb, height.abs() < AROUND) or lighter(underfoot, HAZE)
-    overhead = median(rgb, height > AROUND) or lighter(horizon, SKY)
+    underfoot = median(rgb, height < -HORIZON_BAND) or median(rgb, everything) or frame.background
+    horizon = median(rgb, height.abs() < HORIZON_BAND) or lighter(underfoot, HAZE_SHARE)
+    overhead = median(rgb, height > HORIZON_BAND) or lighter(horizon, SKY_SHARE)
     return Backdrop(overhead, horizon, underfoot, floor(place, torch.tensor(frame.bounds)))
 
 
 def median(rgb: Float[Tensor, "pixel 3"], chosen: Tensor) -> Vector | None:
     """The colour in the middle of the chosen ones, channel by channel; None where they are few."""
-    if chosen.float().mean() < SEEN:
+    if chosen.float().mean() < MIN_SEEN_SHARE:
         return None
     red, green, blue = rgb[chosen].median(0).values.tolist()
     return red, green, blue
@@ -79,4 +79,4 @@ def floor(places: Float[Tensor, "point 3"], bounds: Float[Tensor, "2 3"]) -> flo
     """The height that nearly all surfaces above or below the box of interest's middle are above."""
     low, high = bounds
     near = places[((places >= low) & (places <= high))[:, :2].all(-1)]
-    return float(near[:, 2].quantile(LOWEST)) if len(near) else float(low[2])
+    return float(near[:, 2].quantile(MAX_SHARE_BELOW_FLOOR)) if len(near) else float(low[2])

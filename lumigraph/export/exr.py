@@ -12,7 +12,7 @@ from torch import Tensor
 from ..camera.rays import Rendering
 from ..components.fields.development import decoded
 
-PIXELS = "gbrpf32le"  # planes of 32-bit floats
+PIXEL_FORMAT = "gbrpf32le"  # planes of 32-bit floats
 
 
 def light_of(seen: Rendering) -> Float[Tensor, "height width 3"]:
@@ -26,6 +26,6 @@ def exr(light: Float[Tensor, "height width 3"]) -> bytes:
     codec = av.CodecContext.create("exr", "w")
     assert isinstance(codec, av.VideoCodecContext)
     codec.height, codec.width = pixels.shape[:2]
-    codec.pix_fmt, codec.time_base, codec.options = PIXELS, Fraction(1), {"compression": "zip16"}
-    frame = av.VideoFrame.from_ndarray(pixels, format=PIXELS)
+    codec.pix_fmt, codec.time_base, codec.options = PIXEL_FORMAT, Fraction(1), {"compression": "zip16"}
+    frame = av.VideoFrame.from_ndarray(pixels, format=PIXEL_FORMAT)
     return b"".join(bytes(packet) for packet in [*codec.encode(frame), *codec.encode(None)])

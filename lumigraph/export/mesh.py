@@ -25,15 +25,15 @@ from ..system.progress import counting, track
 from .polygons import BLOCK, Grid, zero_level
 from .surface import larger_pieces, simplified, smoothed, vertex_normals
 
-CELLS = 256  # along the longest side of what is meshed, if nobody asks for more
+DEFAULT_CELLS = 256  # along the longest side of what is meshed, if nobody asks for more
 OPEN_BOX = 1.5  # times the box of interest, which holds the middle of what is looked at in a room or the open
-FEWEST, MOST = 8, 2048  # cells along it that make sense
-PROBES = 160  # looks along it that tell where the surface may be
+MIN_CELLS, MAX_CELLS = 8, 2048  # cells along it that make sense
+PROBE_CELLS = 160  # looks along it that tell where the surface may be
 SOFTNESS = 2.0  # logarithm of the density over its level at which it is as good as solid, or empty
-TRUNCATION = 5  # cells from the surface that depth maps are fused over
-INWARD, OUTWARD = 1, 2  # cells from the fused surface within which the density decides
-ONSET = 0.2  # share of a ray's light that is spent where the surface is said to be
-AT_ONCE = 1 << 18  # points
+TRUNCATION_CELLS = 5  # cells from the surface that depth maps are fused over
+INWARD_CELLS, OUTWARD_CELLS = 1, 2  # cells from the fused surface within which the density decides
+ONSET_SHARE = 0.2  # share of a ray's light that is spent where the surface is said to be
+POINTS_PER_CHUNK = 1 << 18  # points
 
 Way = Literal["auto", "density", "depth"]
 
@@ -77,7 +77,7 @@ def extract_mesh(
     holds = limits.holds if crop is None else lambda points: limits.holds(points) & crop.holds(points)
     grid = make_grid(limits, cell)
     depth_maps = render_depth_maps(method.render, cameras, method.frame.background, views, size)
-    step = max(2, math.ceil(max(grid.shape) / PROBES))
+    step = max(2, math.ceil(max(grid.shape) / PROBE_CELLS))
     seen = from_depth(depth_maps, grid.cell, closed)
     if way == "depth" or (way == "auto" and not can(method, HasDensity)):
         value = seen
@@ -131,11 +131,11 @@ def make_grid(box: Box, cell: float | None) -> Grid:
     """Cubes over a box and a little around it. Raises LumigraphError for cubes too small or too large."""
     longest = max(b - a for a, b in zip(box.lower, box.upper, strict=True))
     if cell is None:
-        cell = longest / CELLS
-    if not longest / MOST <= cell <= longest / FEWEST:
+        cell = longest / DEFAULT_CELLS
+    if not longest / MAX_CELLS <= cell <= longest / MIN_CELLS:
         raise LumigraphError(
             f"Cells of {cell / longest:.3g} times the longest side of the box make no mesh; give "
-            f"--cell-size something from 1/{MOST} to 1/{FEWEST} of it"
+            f"--cell-size something from 1/{MAX_CELLS} to 1/{MIN_CELLS} of it"
         )
     return Grid.around(box.lower, box.upper, cell, 1.5)
 
@@ -149,7 +149,7 @@ def from_depth(depth_maps: Sequence[DepthMap], cell: float, closed: bool) -> Val
 
     closed: whether what is pictured but hidden from all cameras counts as solid, rather than as unknown (NaN)
     """
-    fused = TSDF(depth_maps, Tolerance(TRUNCATION * cell))
+    fused = TSDF(depth_maps, Tolerance(TRUNCATION_CELLS * cell))
 
     def value(points: Float[Tensor, "point 3"]) -> Float[Tensor, " point"]:
         distance, _, pictured = fused(points)
@@ -165,7 +165,7 @@ def from_density(method: Method, level: float, depth: Value) -> Value:
     a cell. Farther from the surface that the cameras see than a few cells their word counts: so there are no caves
     inside of things, where nothing taught the field to be solid, and no mist that all see through.
     """
-    inward, outward = INWARD / TRUNCATION, OUTWARD / TRUNCATION
+    inward, outward = INWARD_CELLS / TRUNCATION_CELLS, OUTWARD_CELLS / TRUNCATION_CELLS
 
     def value(points: Float[Tensor, "point 3"]) -> Float[Tensor, " point"]:
         density = needs(method, HasDensity).density(points.to(method.device)).cpu().float()
@@ -189,15 +189,15 @@ def surface_level(method: Method, depth_maps: Sequence[DepthMap], holds: Holds) 
             "No camera sees a surface inside the box, so there is nothing to make a mesh of; train for "
             "longer, or give the density at which it is solid as --level"
         )
-    found = found[:: max(1, len(found) // AT_ONCE)]
+    found = found[:: max(1, len(found) // POINTS_PER_CHUNK)]
     at_depth = float(needs(method, HasDensity).density(found.to(method.device)).median())
-    return at_depth * math.log(1 - ONSET) / math.log(0.5)
+    return at_depth * math.log(1 - ONSET_SHARE) / math.log(0.5)
 
 
 def at_probes(value: Value, grid: Grid, step: int) -> Float[Tensor, "i j k"]:
     """A function at each step-th corner along each axis."""
     corners = grid.every(step)
-    batches = grid.points(corners.reshape(-1, 3)).split(AT_ONCE)
+    batches = grid.points(corners.reshape(-1, 3)).split(POINTS_PER_CHUNK)
     found = [value(x) for x in track(batches, "Looking for the surface", len(batches))]
     return torch.cat(found).reshape(corners.shape[:3])
 

@@ -13,8 +13,8 @@ from ..exchange.baked import Octree
 from ..files import replacing
 from ..geometry import Similarity
 
-HALF = 65504.0  # the largest number of float16
-STRAIGHT = 1e-4  # of a rotation's entries, below which there is none
+FLOAT16_MAX = 65504.0  # the largest number of float16
+ROTATION_TOLERANCE = 1e-4  # of a rotation's entries, below which there is none
 
 
 def write_octree(path: Path, octree: Octree, frame: Frame) -> bool:
@@ -23,7 +23,7 @@ def write_octree(path: Path, octree: Octree, frame: Frame) -> bool:
     A place p is at p · invradius3 + offset in the unit cube. The file knows no rotation: where the scene's frame is
     turned against that of the photographs, the octree stays in the scene's.
     """
-    straight = (frame.to_source.rotation - torch.eye(3, dtype=torch.float64)).abs().max() < STRAIGHT
+    straight = (frame.to_source.rotation - torch.eye(3, dtype=torch.float64)).abs().max() < ROTATION_TOLERANCE
     arrays = contents(octree, frame.to_source if straight else Similarity.make(1.0))
     with replacing(path, "octree") as new, open(new, "wb") as file:
         np.savez_compressed(file, **arrays)
@@ -39,7 +39,7 @@ def contents(octree: Octree, moved: Similarity) -> dict[str, Any]:
     scale = moved.scale
     corner, size = moved.points(octree.low.double().cpu()).numpy(), octree.size * scale
     colours = octree.harmonics.transpose(-1, -2).flatten(-2).half().cpu().numpy()
-    density = (octree.density / scale).clamp(0, HALF).half().cpu().numpy()
+    density = (octree.density / scale).clamp(0, FLOAT16_MAX).half().cpu().numpy()
     child = octree.child.int().cpu().numpy()
     return {
         "data_dim": np.int64(3 * basis + 1),

@@ -39,17 +39,20 @@ from ..system.progress import counting, track
 from .backdrop import Backdrop
 
 WEB = Path(__file__).parent / "web"
-NEAREST, FARTHEST = 0.1, 3.0  # times the first distance to what is looked at: how far zooming goes
-FARTHEST_OPEN = 1.5  # likewise, where the ground ends somewhere: from far outside it would be an island
-BELOW, BELOW_OPEN = 20.0, 5.0  # degrees below the lowest photograph that the camera may go, also under the open sky
-ARC = 0.8  # of the arc that photographs cover is shown
-FINE = 2, 4  # of 1/128: steps of the harmonics, a quarter of those that .spz files have by custom
-CROP = 1.45  # times larger than fits, at most, is a picture without a plain background, to fill the window
-QUALITY = 90  # of the pictures, as WebP
-LARGEST = 100e6  # bytes of a page with a volume
+MIN_DISTANCE, MAX_DISTANCE = 0.1, 3.0  # times the first distance to what is looked at: how far zooming goes
+MAX_OPEN_DISTANCE = 1.5  # likewise, where the ground ends somewhere: from far outside it would be an island
+DEGREES_BELOW, DEGREES_BELOW_OPEN = (
+    20.0,
+    5.0,
+)  # degrees below the lowest photograph that the camera may go, also under the open sky
+ARC_SHARE = 0.8  # of the arc that photographs cover is shown
+HARMONICS_STEPS = 2, 4  # of 1/128: steps of the harmonics, a quarter of those that .spz files have by custom
+MAX_CROP_SCALE = 1.45  # times larger than fits, at most, is a picture without a plain background, to fill the window
+WEBP_QUALITY = 90  # of the pictures, as WebP
+MAX_PAGE_BYTES = 100e6  # bytes of a page with a volume
 # How to move, with a mouse and with fingers.
-AROUND = "Drag to turn · scroll to zoom · right-drag to move", "Drag to turn · pinch to zoom"
-ON_THE_SPOT = "Drag to look around", "Drag to look around"
+ORBIT_HELP = "Drag to turn · scroll to zoom · right-drag to move", "Drag to turn · pinch to zoom"
+LOOK_HELP = "Drag to look around", "Drag to look around"
 
 
 @dataclass(frozen=True)
@@ -114,9 +117,9 @@ def opening_of_scene(
         math.degrees(angle_of_view(cameras)),
         frame.near,
         100 * frame.reach,
-        NEAREST * distance,
-        (FARTHEST if alone else FARTHEST_OPEN) * distance,
-        min(90 - elevation + (BELOW if alone else BELOW_OPEN), 175.0) if around.inward else 175.0,
+        MIN_DISTANCE * distance,
+        (MAX_DISTANCE if alone else MAX_OPEN_DISTANCE) * distance,
+        min(90 - elevation + (DEGREES_BELOW if alone else DEGREES_BELOW_OPEN), 175.0) if around.inward else 175.0,
         around.inward,
         (tuple(torch.minimum(low, target).tolist()), tuple(torch.maximum(high, target).tolist())),
         behind.floor if behind else None,
@@ -128,7 +131,7 @@ def splats_page(path: Path, gaussians: Gaussians, opening: Opening) -> None:
     """Write a page that draws a cloud in the scene's frame as splats with harmonics, held as .spz, with its loss."""
     settings = asdict(opening) | {"webgl": True, "packed": False, "antialiased": gaussians.antialiased}
     with counting(f"Packing {len(gaussians):,} Gaussians"):
-        packed = spz.gzipped(gaussians, steps=FINE)
+        packed = spz.gzipped(gaussians, steps=HARMONICS_STEPS)
     write_page(path, "splats", settings, packed)
 
 
@@ -146,7 +149,7 @@ def mesh_page(path: Path, mesh: Mesh, opening: Opening) -> None:
 def volume_page(path: Path, volume: Browsable, opening: Opening) -> None:
     """A baked volume in the scene's frame, which a browser's graphics look at along the ray of each pixel.
 
-    Raises LumigraphError if the page would have LARGEST bytes or more.
+    Raises LumigraphError if the page would have MAX_PAGE_BYTES bytes or more.
     """
     with counting(f"Packing {path.name}"):
         page = volume_bytes(volume, opening)
@@ -156,11 +159,10 @@ def volume_page(path: Path, volume: Browsable, opening: Opening) -> None:
 def volume_bytes(volume: Browsable, opening: Opening) -> bytes:
     """Bytes of the page of `volume_page`."""
     packed = gzip.compress(volume.data, 6, mtime=0)
-    if (size := len(packed) * 4 / 3) > LARGEST:
+    if (size := len(packed) * 4 / 3) > MAX_PAGE_BYTES:
         smaller = f"give --degree {volume.degree - 1}" if volume.degree else "bake larger voxels, or give --as views"
         raise LumigraphError(
-            f"The page would have {size / 1e6:.0f} MB, more than the {LARGEST / 1e6:.0f} that browsers open with ease; "
-            f"{smaller}"
+            f"The page would have {size / 1e6:.0f} MB; browsers open {MAX_PAGE_BYTES / 1e6:.0f} MB with ease; {smaller}"
         )
     return page_bytes("volumes", asdict(opening) | {"webgl": True, "packed": True} | volume.settings, packed)
 
@@ -184,7 +186,7 @@ def views_page(path: Path, method: Method, cameras: Camera, opening: Opening, co
         "webgl": False,
         "packed": False,
         "closed": closed,
-        "crop": 1.0 if method.frame.has_alpha else CROP,
+        "crop": 1.0 if method.frame.has_alpha else MAX_CROP_SCALE,
         "first": 0 if closed else len(seen_from) // 2,
         "pictures": list(zip(ends[:-1], ends[1:], strict=True)),
         "poses": seen_from.pose.tolist(),
@@ -198,13 +200,13 @@ def views(around: Surroundings, count: int, size: tuple[int, int]) -> Camera:
     middle, half = around.arc
     if half == math.pi:
         return path
-    azimuth = torch.linspace(middle - ARC * half, middle + ARC * half, count, dtype=torch.double)
+    azimuth = torch.linspace(middle - ARC_SHARE * half, middle + ARC_SHARE * half, count, dtype=torch.double)
     return dataclasses.replace(path, pose=around.poses(azimuth, *around.typical(azimuth)).float())
 
 
 def webp(rgb: Float[Tensor, "height width 3"]) -> bytes:
     held = io.BytesIO()
-    Image.fromarray(to_bytes(rgb.cpu()).numpy()).save(held, "WEBP", quality=QUALITY, method=4)
+    Image.fromarray(to_bytes(rgb.cpu()).numpy()).save(held, "WEBP", quality=WEBP_QUALITY, method=4)
     return held.getvalue()
 
 
@@ -215,7 +217,7 @@ def write_page(path: Path, program: str, settings: dict[str, Any], data: bytes) 
 
 def page_bytes(program: str, settings: dict[str, Any], data: bytes) -> bytes:
     """Bytes of the page of `write_page`."""
-    mouse, touch = AROUND if settings["inward"] else ON_THE_SPOT
+    mouse, touch = ORBIT_HELP if settings["inward"] else LOOK_HELP
     bright = float(np.dot(settings["background"], (0.299, 0.587, 0.114))) > 0.5
     ink, edge = ("#16181c", "#ffffff") if bright else ("#ffffff", "#000000")
     red, green, blue = (round(255 * value) for value in settings["background"])

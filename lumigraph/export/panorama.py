@@ -30,13 +30,13 @@ from ..paths import Surroundings
 from ..system.memory import ask_for_picture
 from ..system.progress import track
 
-AT_ONCE = 1 << 18  # pixels rendered between two looks at the progress
+PIXELS_PER_CHUNK = 1 << 18  # pixels rendered between two looks at the progress
 BANDS = 3  # of rows, each seen by flat pictures that are pitched towards it
 COLUMNS = 8  # flat pictures around the horizon, where one place sees all
-FINENESS = 1.25  # pixels of a flat picture's middle for one of the panorama's equator
-BORDER = 2  # pixels around what is read of a flat picture
+OVERSAMPLING = 1.25  # pixels of a flat picture's middle for one of the panorama's equator
+BORDER_PIXELS = 2  # pixels around what is read of a flat picture
 JPEG_QUALITY = 95
-NARROWEST, WIDEST = 64, 16_384  # pixels
+MIN_WIDTH, MAX_WIDTH = 64, 16_384  # pixels
 
 Vector = tuple[float, float, float]
 
@@ -59,7 +59,7 @@ def sphere(method: Method, camera: Camera, name: str, columns: int | None = None
     width, height = camera.size[0].tolist()
     ask_for_picture(width, height, method.device)
     if method.any_lens:
-        step = max(1, AT_ONCE // width)
+        step = max(1, PIXELS_PER_CHUNK // width)
         tops = range(0, height, step)
         parts = [method.render(rows_of(camera, top, min(step, height - top))) for top in track(tops, name, len(tops))]
         return Rendering.cat([Rendering(x.rgb.cpu(), x.depth.cpu(), x.opacity.cpu()) for x in parts])
@@ -113,11 +113,11 @@ def flat_camera(camera: Camera, pixels: Float[Tensor, "pixel 2"]) -> tuple[Camer
     z = camera.lens.unproject(middle)[0]
     turn = look_at(torch.zeros(3), z, torch.tensor([0.0, -1.0, 0.0]))[:, :3]  # level
     directions = camera.lens.unproject(pixels) @ turn
-    focal = FINENESS * camera.lens.size[0, 0] / (2 * math.pi)
+    focal = OVERSAMPLING * camera.lens.size[0, 0] / (2 * math.pi)
     at = focal * directions[:, :2] / directions[:, 2:]
     low, high = at.amin(0), at.amax(0)
-    corner = BORDER + 0.5 - low.floor()  # the axis goes through a pixel's centre
-    size = (high.ceil() - low.floor()).long() + 1 + 2 * BORDER
+    corner = BORDER_PIXELS + 0.5 - low.floor()  # the axis goes through a pixel's centre
+    size = (high.ceil() - low.floor()).long() + 1 + 2 * BORDER_PIXELS
     rotation = camera.pose[0, :, :3] @ turn
     begin = camera.rays(middle).origins[0]
     pose = torch.cat([rotation, begin[:, None]], -1)[None]
@@ -145,9 +145,9 @@ def rows_of(camera: Camera, top: int, count: int) -> Camera:
 
 def sphere_size(width: int) -> Float[Tensor, "1 2"]:
     """Pixels of a panorama. Raises LumigraphError for a width that none has."""
-    if width % 2 or not NARROWEST <= width <= WIDEST:
+    if width % 2 or not MIN_WIDTH <= width <= MAX_WIDTH:
         raise LumigraphError(
-            f"A panorama cannot be {width} pixels wide; give --size an even number from {NARROWEST} to {WIDEST}"
+            f"A panorama cannot be {width} pixels wide; give --size an even number from {MIN_WIDTH} to {MAX_WIDTH}"
         )
     return torch.tensor([[width, width / 2]])
 

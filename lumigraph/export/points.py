@@ -20,9 +20,9 @@ from ..files import replacing
 from ..method import Method
 from ..system.progress import counting, track
 
-CANDIDATES = 4  # as many pixels are looked at as points are wanted, times this
-SQUARELY = 0.2  # cosine between a surface's normal and the ray from which on its depth is trusted
-TOLERANCE = 0.01  # of the distance from the camera: depths that agree
+CANDIDATES_PER_POINT = 4  # as many pixels are looked at as points are wanted, times this
+MIN_COSINE = 0.2  # cosine between a surface's normal and the ray from which on its depth is trusted
+DEPTH_TOLERANCE = 0.01  # of the distance from the camera: depths that agree
 MIN_VIEWS = 2  # further cameras that must see a surface at the same place, where there are so many
 
 
@@ -65,7 +65,7 @@ def extract_points(
     method.eval()
     depth_maps = render_depth_maps(method.render, cameras, method.frame.background, views, size)
     good = [wanted(seen, crop) for seen in depth_maps]
-    share = min(1.0, CANDIDATES * count / max(1, sum(int(x.sum()) for x in good)))
+    share = min(1.0, CANDIDATES_PER_POINT * count / max(1, sum(int(x.sum()) for x in good)))
     chance = torch.Generator().manual_seed(0)
     found = []
     for seen, mask in zip(depth_maps, good, strict=True):
@@ -86,7 +86,7 @@ def extract_points(
 
 def wanted(seen: DepthMap, crop: Crop | None) -> Bool[Tensor, "height width"]:
     """Mask of pixels that show a surface squarely, inside the crop."""
-    good = seen.solid & (seen.facing > SQUARELY)
+    good = seen.solid & (seen.facing > MIN_COSINE)
     if crop is not None:
         good[good.clone()] = crop.holds(seen.positions(good))
     return good
@@ -97,9 +97,9 @@ def confirmed(points: Float[Tensor, "point 3"], depth_maps: list[DepthMap]) -> B
     agree, through = torch.zeros(len(points), dtype=torch.int64), torch.zeros(len(points), dtype=torch.int64)
     for depth_map in track(depth_maps, "Comparing depth maps", len(depth_maps)):
         away = (points - depth_map.camera.position).norm(dim=-1)
-        seen = depth_map.compare(points, Tolerance(TOLERANCE * float(away.median())))
-        agree += seen.smooth & (seen.ahead.abs() < TOLERANCE * away)
-        through += seen.ahead > TOLERANCE * away
+        seen = depth_map.compare(points, Tolerance(DEPTH_TOLERANCE * float(away.median())))
+        agree += seen.smooth & (seen.ahead.abs() < DEPTH_TOLERANCE * away)
+        through += seen.ahead > DEPTH_TOLERANCE * away
     return (agree > min(MIN_VIEWS, len(depth_maps) - 1)) & (through <= agree / 2)
 
 

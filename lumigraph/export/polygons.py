@@ -17,8 +17,8 @@ from torch import Tensor
 from ..system.progress import track
 
 BLOCK = 16  # corners of a block along each axis
-AT_ONCE = 64  # blocks whose corners are asked about together
-NUDGE = 0.01  # no corner's value is nearer to zero, so that no two vertices fall together
+BLOCKS_PER_BATCH = 64  # blocks whose corners are asked about together
+MIN_ABS_VALUE = 0.01  # no corner's value is nearer to zero, so that no two vertices fall together
 
 Values = Callable[[Float[Tensor, "point 3"]], Float[Tensor, " point"]]
 
@@ -92,15 +92,15 @@ def zero_level(
 def evaluate(
     grid: Grid, values: Values, where: Int[np.ndarray, "block 3"]
 ) -> Float[np.ndarray, "block BLOCK BLOCK BLOCK"]:
-    """The function at all corners of some blocks, never nearer to zero than NUDGE."""
+    """The function at all corners of some blocks, never nearer to zero than MIN_ABS_VALUE."""
     inside = torch.from_numpy(np.stack(np.meshgrid(*[np.arange(BLOCK)] * 3, indexing="ij"), -1).reshape(-1, 3))
     out = np.empty((len(where), BLOCK, BLOCK, BLOCK), np.float32)
-    batches = range(0, len(where), AT_ONCE)
+    batches = range(0, len(where), BLOCKS_PER_BATCH)
     for first in track(batches, "Looking at cells near the surface", len(batches)):
-        some = torch.from_numpy(where[first : first + AT_ONCE])
+        some = torch.from_numpy(where[first : first + BLOCKS_PER_BATCH])
         corners = (some[:, None] * BLOCK + inside).reshape(-1, 3)
         out[first : first + len(some)] = values(grid.points(corners)).reshape(-1, BLOCK, BLOCK, BLOCK).numpy()
-    return np.where(np.abs(out) < NUDGE, np.where(out < 0, -NUDGE, NUDGE), out)
+    return np.where(np.abs(out) < MIN_ABS_VALUE, np.where(out < 0, -MIN_ABS_VALUE, MIN_ABS_VALUE), out)
 
 
 def touched(active: Bool[np.ndarray, "i j k"]) -> Bool[np.ndarray, "i j k"]:
@@ -142,7 +142,7 @@ def edges(
     Neighbouring blocks find the same vertex to the last bits but one; its edge is the same to the last.
     """
     nearest = np.rint(vertices)
-    between = np.abs(vertices - nearest) > 0.4 * NUDGE
+    between = np.abs(vertices - nearest) > 0.4 * MIN_ABS_VALUE
     corner = np.where(between, np.floor(vertices), nearest).astype(np.int64)
     kind = np.where(between.sum(-1) == 1, between.argmax(-1), 3)
     sure = np.ones(len(vertices), bool)

@@ -16,11 +16,11 @@ from ..errors import LumigraphError
 from ..method import Method
 from .panorama import level_camera, sphere, sphere_size
 
-SHARE = 1 / 50  # of the distance to what is around: 64 mm in a room of some three metres
-PROBE = 256  # pixels of the small panorama that tells distances
-SHIFT = 0.1  # pixels by which a flat picture may be off at its edge, at what is near
-MOST_COLUMNS = 32
-SOLID = 0.5  # opacity from which on something is there
+EYE_DISTANCE_SHARE = 1 / 50  # of the distance to what is around: 64 mm in a room of some three metres
+PROBE_SIZE = 256  # pixels of the small panorama that tells distances
+MAX_SHIFT_PIXELS = 0.1  # pixels by which a flat picture may be off at its edge, at what is near
+MAX_COLUMNS = 32
+MIN_OPACITY = 0.5  # opacity from which on something is there
 
 
 def stereo_pair(
@@ -58,10 +58,10 @@ def surrounding_distances(
 
     Directions are weighted by solid angle. Raises LumigraphError if no surface is around.
     """
-    seen = sphere(method, level_camera(place, heading, Equirectangular(sphere_size(PROBE))), "Looking around")
-    rows = torch.arange(PROBE // 2) + 0.5
+    seen = sphere(method, level_camera(place, heading, Equirectangular(sphere_size(PROBE_SIZE))), "Looking around")
+    rows = torch.arange(PROBE_SIZE // 2) + 0.5
     weight = torch.sin(torch.pi * rows / len(rows))[:, None].expand_as(seen.depth)
-    solid = (seen.opacity > SOLID) & seen.depth.isfinite()
+    solid = (seen.opacity > MIN_OPACITY) & seen.depth.isfinite()
     if not solid.any():
         raise LumigraphError("Nothing is around that place; give --from another one, or --interpupillary")
     depth, order = seen.depth[solid].sort()
@@ -77,4 +77,4 @@ def columns_at_once(radius: float, nearest: float) -> int:
     further along the circle, which is ahead or behind by r k / 2 pixels' angle: points at a distance d and high up are
     off by up to r k / (2 d) pixels.
     """
-    return max(1, min(MOST_COLUMNS, int(2 * SHIFT * nearest / max(radius, 1e-9))))
+    return max(1, min(MAX_COLUMNS, int(2 * MAX_SHIFT_PIXELS * nearest / max(radius, 1e-9))))

@@ -19,8 +19,10 @@ from PIL import Image
 from ..datasets.mesh import Mesh
 from ..exchange.morton import morton_order
 
-ALIGNED = 64  # bytes: every file's data begins at a multiple of it (Usdz File Format Specification 1.3, "Layout")
-HEADER = 30  # bytes of a zip file's header before the name
+ALIGNMENT_BYTES = (
+    64  # bytes: every file's data begins at a multiple of it (Usdz File Format Specification 1.3, "Layout")
+)
+ZIP_HEADER_BYTES = 30  # bytes of a zip file's header before the name
 PADDING = b"\x19\x86"  # who an extra field belongs to; nobody reads it
 PICTURE = "colours.png"
 
@@ -155,8 +157,8 @@ def archive(parts: Mapping[str, bytes]) -> bytes:
     with zipfile.ZipFile(held, "w", zipfile.ZIP_STORED) as packed:
         for name, data in parts.items():
             about = zipfile.ZipInfo(name)
-            header = held.tell() + HEADER + len(name.encode()) + 4
-            room = -header % ALIGNED
+            header = held.tell() + ZIP_HEADER_BYTES + len(name.encode()) + 4
+            room = -header % ALIGNMENT_BYTES
             about.extra = PADDING + room.to_bytes(2, "little") + bytes(room)
             packed.writestr(about, data)
     return held.getvalue()

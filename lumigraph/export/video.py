@@ -25,9 +25,9 @@ from ..system.progress import counting, track
 
 CRF = 17  # x264's constant rate factor: 0 is lossless, 18 looks it, 28 is small
 WEBP_QUALITY = 85  # of 100
-COLOURS = 255  # of a GIF; its 256th says "as before"
-SAMPLES = 400_000  # pixels of all frames together that choose a GIF's colours
-MOST_FRAMES = 50  # per second, of a GIF: browsers slow quicker ones down to 10
+GIF_COLOURS = 255  # of a GIF; its 256th says "as before"
+PALETTE_SAMPLES = 400_000  # pixels of all frames together that choose a GIF's colours
+MAX_GIF_FPS = 50  # per second, of a GIF: browsers slow quicker ones down to 10
 
 
 @contextlib.contextmanager
@@ -54,9 +54,9 @@ def kind_of(path: Path, fps: float) -> type[Video]:
     kind = KINDS.get(path.suffix.lower())
     if kind is None:
         raise LumigraphError(f"{path} should end in {', '.join(KINDS)}, the kinds of film there are; rename it")
-    if kind is Gif and fps > MOST_FRAMES:
+    if kind is Gif and fps > MAX_GIF_FPS:
         raise LumigraphError(
-            f"{path} cannot show {fps:g} frames per second, a GIF's most is {MOST_FRAMES}; lower --fps or take .webp"
+            f"{path} cannot show {fps:g} frames per second, a GIF's most is {MAX_GIF_FPS}; lower --fps or take .webp"
         )
     return kind
 
@@ -191,8 +191,8 @@ KINDS: dict[str, type[Video]] = {".mp4": Mp4, ".gif": Gif, ".webp": WebP}
 def choose_colours(frames: UInt8[np.ndarray, "frame height width 3"]) -> UInt8[np.ndarray, "colour 3"]:
     """At most 255 colours for all frames, from evenly spread pixels: median cut (Heckbert 1982), then k-means."""
     pixels = frames.reshape(-1, 3)
-    some = np.array(pixels[:: max(1, len(pixels) // SAMPLES)])
-    chosen = Image.fromarray(some[None]).quantize(COLOURS, Image.Quantize.MEDIANCUT, kmeans=4)
+    some = np.array(pixels[:: max(1, len(pixels) // PALETTE_SAMPLES)])
+    chosen = Image.fromarray(some[None]).quantize(GIF_COLOURS, Image.Quantize.MEDIANCUT, kmeans=4)
     palette = np.array(chosen.getpalette(), np.uint8).reshape(-1, 3)
     return palette[np.unique(np.asarray(chosen))]
 

@@ -1,7 +1,7 @@
 """Figures: values as colours, contact sheets, charts."""
 
+from .pictures import EMPTY_COLOUR as EMPTY_COLOUR
 from .pictures import ERROR_GAIN as ERROR_GAIN
-from .pictures import NOTHING as NOTHING
 from .pictures import RAMP as RAMP
 from .pictures import Range as Range
 from .pictures import colour_depth as colour_depth

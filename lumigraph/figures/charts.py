@@ -11,13 +11,13 @@ from pathlib import Path
 WIDTH, HEIGHT = 480, 270
 LEFT, RIGHT, TOP, BOTTOM = 52, 14, 30, 40  # margins around the plot
 SMOOTHING = 0.06  # share of a curve over which its bold line averages
-POINTS = 600  # of a curve that are drawn; more cannot be seen
+MAX_CURVE_POINTS = 600  # of a curve that are drawn; more cannot be seen
 COLOURS, DASHES = 8, 4  # that charts.css knows
-LETTER, LINE = 7.2, 18  # width of a letter, about, and height of a line of names
-SAMPLE = 30  # width of the piece of line before the name of a dashed one, with the gap behind it
-APART = 24  # between two numbers below the plot, at least
-PLAIN = 1e-3, 1e6  # numbers from here to there are written out if all of a chart are
-RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
+LETTER_WIDTH, LINE_HEIGHT = 7.2, 18  # width of a letter, about, and height of a line of names
+DASH_SAMPLE_WIDTH = 30  # width of the piece of line before the name of a dashed one, with the gap behind it
+MIN_LABEL_GAP = 24  # between two numbers below the plot, at least
+PLAIN_RANGE = 1e-3, 1e6  # numbers from here to there are written out if all of a chart are
+SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 STYLE = (Path(__file__).parent / "charts.css").read_text("utf-8")
 
 
@@ -73,8 +73,8 @@ def line_chart(
         if marks or not lined:
             lines.append(dots(measured, x_axis, y_axis))
     rows = legend_rows(kept if len(kept) > 1 else [], y_label)
-    above = LINE * (len(rows) - 1)
-    names = (legend_row(row, 16 - above + LINE * i) for i, row in enumerate(rows))
+    above = LINE_HEIGHT * (len(rows) - 1)
+    names = (legend_row(row, 16 - above + LINE_HEIGHT * i) for i, row in enumerate(rows))
     parts = [axes(x_axis, y_axis, x_ticks or x_axis.ticks()), *lines, *names]
     parts.append(f"<text class='label' x='{LEFT}' y='{16 - above}'>{escape(y_label)}</text>")
     parts.append(f"<text class='label' x='{WIDTH - RIGHT}' y='{HEIGHT - 4}' text-anchor='end'>{escape(x_label)}</text>")
@@ -161,7 +161,7 @@ def axes(x_axis: Axis, y_axis: Axis, x_ticks: Sequence[float]) -> str:
         parts.append(f"<path class='grid' d='M{x_axis.start} {y_axis(y):.1f}H{x_axis.end}'/>")
         parts.append(f"<text x='{LEFT - 8}' y='{y_axis(y) + 4:.1f}' text-anchor='end'>{name}</text>")
     for x, name in zip(x_ticks, written[len(y_ticks) :], strict=True):
-        if x_axis(x) - taken >= APART:
+        if x_axis(x) - taken >= MIN_LABEL_GAP:
             taken = x_axis(x)
             parts.append(f"<text x='{taken:.1f}' y='{HEIGHT - BOTTOM + 18}' text-anchor='middle'>{name}</text>")
     return "".join(parts)
@@ -179,12 +179,12 @@ def look(series: Series) -> str:
 
 def letters(series: Series) -> float:
     """Width of a series' name in a legend, in letters, including the line sample of a dashed one."""
-    return len(series.name) + (SAMPLE / LETTER if series.dash else 0)
+    return len(series.name) + (DASH_SAMPLE_WIDTH / LETTER_WIDTH if series.dash else 0)
 
 
 def legend_rows(series: Sequence[Series], label: str) -> list[list[Series]]:
     """Names in rows: the first stands right of the label, and stays empty if they do not all fit there."""
-    room = (WIDTH - RIGHT - LEFT) / LETTER
+    room = (WIDTH - RIGHT - LEFT) / LETTER_WIDTH
     rows: list[list[Series]] = [[]]
     if len(label) + sum(letters(s) + 2 for s in series) > room:
         rows.append([])
@@ -199,9 +199,9 @@ def legend_row(row: Sequence[Series], y: float) -> str:
     parts, x = [], float(WIDTH - RIGHT)
     for s in reversed(row):
         parts.append(f"<text class='name c{s.colour}' x='{x:.0f}' y='{y}' text-anchor='end'>{escape(s.name)}</text>")
-        x -= LETTER * letters(s)
+        x -= LETTER_WIDTH * letters(s)
         if s.dash:
-            parts.append(f"<path class='sample {look(s)}' d='M{x:.0f} {y - 4}h{SAMPLE - 6}'/>")
+            parts.append(f"<path class='sample {look(s)}' d='M{x:.0f} {y - 4}h{DASH_SAMPLE_WIDTH - 6}'/>")
         x -= 14
     return "".join(parts)
 
@@ -244,7 +244,7 @@ def log_ticks(low: float, high: float, about: int = 8) -> list[float]:
 
 def numbers(values: Sequence[float]) -> list[str]:
     """Each as it is written at an axis, all alike: in full, or by powers of ten if one is too small or large."""
-    low, high = PLAIN
+    low, high = PLAIN_RANGE
     if all(not value or low <= abs(value) < high for value in values):
         return [f"{value:.6g}" for value in values]
     return [by_powers(value) for value in values]
@@ -255,7 +255,7 @@ def by_powers(value: float) -> str:
     if not value:
         return "0"
     digits, _, exponent = f"{value:.5e}".partition("e")
-    power = "10" + str(int(exponent)).translate(RAISED)
+    power = "10" + str(int(exponent)).translate(SUPERSCRIPTS)
     factor = f"{float(digits):g}"
     return power if factor == "1" else f"{factor}×{power}"
 
@@ -271,7 +271,7 @@ def drawable(series: Series, log_x: bool, log: bool) -> Series:
 
 
 def thinned(series: Series) -> Series:
-    every = -(-len(series.x) // POINTS)
+    every = -(-len(series.x) // MAX_CURVE_POINTS)
     return replace(series, x=series.x[::every], y=series.y[::every])
 
 

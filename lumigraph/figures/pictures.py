@@ -14,7 +14,7 @@ from ..files import Kind, replacing
 
 # Bright and warm to dark and cool, evenly falling in lightness.
 RAMP = ("fff6dc", "fbcf7f", "f39a5b", "db5f60", "a93b77", "6c2e80", "352a6e", "131a3e")
-NOTHING = "0a0c12"  # where a ray meets nothing
+EMPTY_COLOUR = "0a0c12"  # where a ray meets nothing
 ERROR_GAIN = 5
 
 Range = tuple[float, float]
@@ -55,7 +55,7 @@ def colour_depth(
     near, far = (torch.tensor(x).log() for x in within)
     share = (depth.clamp_min(1e-9).log() - near) / (far - near)
     colours = ramp(torch.where(share.isfinite(), share, 1.0))
-    return before(colours, opacity.clamp(0, 1), hex_colour(NOTHING).to(colours))
+    return before(colours, opacity.clamp(0, 1), hex_colour(EMPTY_COLOUR).to(colours))
 
 
 def colour_error(

@@ -14,13 +14,13 @@ from torch import Tensor
 from .pictures import fit_into, fitted, to_image
 
 SCREEN = 1920, 1200  # pixels
-CELL, SMALLEST = 256, 144  # pixels, a picture's largest width
-SHRINKING = 0.85
-NARROWEST_COLUMN = 120  # pixels, room for its name
-INK, FAINT, PAPER = "#1b1d22", "#6d717a", "#fbfaf8"
+CELL, MIN_CELL = 256, 144  # pixels, a picture's largest width
+SHRINK_FACTOR = 0.85
+MIN_COLUMN_WIDTH = 120  # pixels, room for its name
+INK, FAINT_INK, PAPER = "#1b1d22", "#6d717a", "#fbfaf8"
 GAP, MARGIN, LINE = 10, 28, 22
 HEAD = MARGIN + 2 * LINE + 2  # the title and the columns' names
-TITLE, SMALL = 17, 13  # sizes of letters
+TITLE_SIZE, SMALL_SIZE = 17, 13  # sizes of letters
 
 
 @dataclass(frozen=True)
@@ -50,8 +50,8 @@ def contact_sheet(title: str, columns: Sequence[str], rows: Sequence[Row], cell:
 def sizes(cell: int) -> list[int]:
     """Widths to try, the largest first."""
     found = [cell]
-    while found[-1] * SHRINKING > SMALLEST:
-        found.append(round(found[-1] * SHRINKING))
+    while found[-1] * SHRINK_FACTOR > MIN_CELL:
+        found.append(round(found[-1] * SHRINK_FACTOR))
     return found
 
 
@@ -78,12 +78,12 @@ class Layout:
     @cached_property
     def column(self) -> int:
         """From one column to the next."""
-        return GAP + max(NARROWEST_COLUMN, *(width for shapes in self.shapes for width, _ in shapes))
+        return GAP + max(MIN_COLUMN_WIDTH, *(width for shapes in self.shapes for width, _ in shapes))
 
     @cached_property
     def block(self) -> int:
         """From one block to the next: no label reaches into it."""
-        letters = ImageFont.load_default(SMALL)
+        letters = ImageFont.load_default(SMALL_SIZE)
         longest = max((round(letters.getlength(row.labels[0])) for row in self.rows if len(row.labels) == 1), default=0)
         return max(self.across, longest) + 3 * GAP
 
@@ -113,12 +113,12 @@ class Layout:
 
     def drawn(self, title: str) -> Image.Image:
         sheet = Image.new("RGB", self.size, PAPER)
-        draw, small = ImageDraw.Draw(sheet), ImageFont.load_default(SMALL)
-        draw.text((MARGIN, MARGIN - 10), title, INK, ImageFont.load_default(TITLE))
+        draw, small = ImageDraw.Draw(sheet), ImageFont.load_default(SMALL_SIZE)
+        draw.text((MARGIN, MARGIN - 10), title, INK, ImageFont.load_default(TITLE_SIZE))
         for number, block in enumerate(self.blocks):
             x, y = MARGIN + number * self.block, HEAD
             for i, name in enumerate(self.columns):
-                draw.text((x + i * self.column, y - LINE), name, FAINT, small)
+                draw.text((x + i * self.column, y - LINE), name, FAINT_INK, small)
             for row in block:
                 for i, picture in enumerate(self.rows[row].pictures):
                     sheet.paste(fit_into(to_image(picture), *self.shapes[row][i]), (x + i * self.column, y))

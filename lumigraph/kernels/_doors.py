@@ -1,4 +1,4 @@
-"""What the public doors of kernels ask of their inputs, before compiled loops trust them.
+"""Checks of the inputs of kernels, before compiled loops use them unchecked.
 
 Loops check no index. So `door` makes sure of the shapes and types that annotations state, and each function itself of
 whatever else an index is taken from: the starts of rays and tiles, the numbers of Gaussians. The values of samples are
@@ -21,7 +21,7 @@ Found = TypeVar("Found")
 
 
 class Stated(NamedTuple):
-    """What an annotation says of a tensor: names or sizes of its axes, and the types it may have."""
+    """Annotation of a tensor: names or sizes of its axes, and permitted types."""
 
     axes: tuple[str | int, ...]
     types: frozenset[torch.dtype]
@@ -55,7 +55,7 @@ def door(function: Callable[Given, Found]) -> Callable[Given, Found]:
 
 @cache
 def stated(function: Callable) -> dict[str, Stated]:
-    """What the annotations of a function say, by parameter; of tensors alone."""
+    """Annotations of the tensor parameters of a function, by name."""
     found = {}
     for name, kind in typing.get_type_hints(function).items():
         if name != "return" and hasattr(kind, "dim_str"):
@@ -66,7 +66,7 @@ def stated(function: Callable) -> dict[str, Stated]:
 
 
 def fits(tensor: Tensor, about: Stated, sizes: dict[str, int]) -> bool:
-    """Whether a tensor is as an annotation says. sizes: of the axes that have been seen, to which it adds its own."""
+    """Check a tensor against an annotation. sizes: of the axes that have been seen, to which it adds its own."""
     if tensor.ndim != len(about.axes) or tensor.dtype not in about.types:
         return False
     for axis, size in zip(about.axes, tensor.shape, strict=True):

@@ -1,4 +1,4 @@
-"""What each operation's folder says of itself, for the benchmark and the tests."""
+"""Facts of each operation, for the benchmark and the tests."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def operations() -> list[str]:
 
 
 def tensors(found: Any) -> tuple[Tensor, ...]:
-    """What an operation returned as a tuple: a tensor, several, or those that a dataclass holds."""
+    """Outputs of an operation as a tuple: a tensor, several, or those that a dataclass holds."""
     if is_dataclass(found):
         found = tuple(getattr(found, field.name) for field in fields(found))
     return tuple(x for x in found if isinstance(x, Tensor)) if isinstance(found, tuple) else (found,)

@@ -94,7 +94,7 @@ def fetch(array, at):
 
 
 def fetch_like(array, at, like):
-    """As many numbers of an array from `at` on as the tuple is long."""
+    """Numbers of an array from `at` on, one for each entry of the tuple."""
     return array[_places(array, at, len(like))].copy()
 
 
@@ -114,7 +114,7 @@ def scatter(array, at, stride, x):
 
 
 def filled(x, like):
-    """As many lanes as the tuple is long, all the same."""
+    """Lanes of one value, one for each entry of the tuple."""
     return np.full(len(like), x)
 
 
@@ -166,7 +166,7 @@ def root(x):
 
 
 def some(condition):
-    """Whether the mask holds anywhere."""
+    """True if the mask holds in any lane."""
     return bool(np.any(condition))
 
 

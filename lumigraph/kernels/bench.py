@@ -1,4 +1,4 @@
-"""How fast each engine is, next to the reference on the same device, in one run."""
+"""Time of each engine and of the reference on the same device, in one run."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from ._dispatch import Engine, using
 from ._facts import operations as all_operations
 from ._facts import tensors
 
-PATIENCE = 5.0  # seconds: what takes longer is repeated less often, but three times at least
+MAX_SECONDS = 5.0  # seconds: what takes longer is repeated less often, but three times at least
 
 
 def bench_kernels(
@@ -107,7 +107,7 @@ def _time(call: Callable[[], Any], device: torch.device, repeats: int) -> tuple[
         return time.perf_counter() - start
 
     first, times = once(), [once()]
-    while len(times) < repeats and (len(times) < 3 or sum(times) < PATIENCE):
+    while len(times) < repeats and (len(times) < 3 or sum(times) < MAX_SECONDS):
         times.append(once())
     return first, statistics.median(times)
 

@@ -34,8 +34,8 @@ LAYERS = (
     (10, (256, 256, 3, 3), 1, 1, False),
 )
 SHIFT, SCALE = (-0.030, -0.088, -0.188), (0.458, 0.448, 0.450)  # ImageNet's mean and deviation, for values in [-1, 1]
-SMALLEST = 31  # pixels; below, AlexNet's second pooling finds nothing
-TINY = 1e-10
+MIN_PIXELS = 31  # pixels; below, AlexNet's second pooling finds nothing
+EPSILON = 1e-10
 
 
 class Lpips:
@@ -50,9 +50,9 @@ class Lpips:
 
         Raises LumigraphError for pictures of less than 31 pixels.
         """
-        if min(a.shape[:2]) < SMALLEST:
+        if min(a.shape[:2]) < MIN_PIXELS:
             raise LumigraphError(
-                f"LPIPS needs pictures of at least {SMALLEST} x {SMALLEST} pixels, not {a.shape[1]} x {a.shape[0]}; "
+                f"LPIPS needs at least {MIN_PIXELS} x {MIN_PIXELS} pixels, not {a.shape[1]} x {a.shape[0]}; "
                 "leave --lpips out"
             )
         distance = 0.0
@@ -84,7 +84,7 @@ SHAPES: dict[str, tuple[int, ...]] = {
 
 def unit(x: Float[Tensor, "1 channel height width"]) -> Float[Tensor, "1 channel height width"]:
     """Features of length one at each place."""
-    return x / (x.norm(dim=1, keepdim=True) + TINY)
+    return x / (x.norm(dim=1, keepdim=True) + EPSILON)
 
 
 def named_files(given: Sequence[Path]) -> list[Path]:

@@ -7,12 +7,12 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import conv2d
 
-DARKEST_ERROR = 1e-10  # mean squared error below which images count as equal: 100 dB
+MIN_ERROR = 1e-10  # mean squared error below which images count as equal: 100 dB
 
 
 def psnr(a: Float[Tensor, "*shape"], b: Float[Tensor, "*shape"]) -> float:
     """Peak signal-to-noise ratio in dB, -10 log10 of the mean squared error, for values in [0, 1]. At most 100."""
-    error = (a.double() - b.double()).square().mean().clamp_min(DARKEST_ERROR)
+    error = (a.double() - b.double()).square().mean().clamp_min(MIN_ERROR)
     return float(-10 * error.log10())
 
 

@@ -7,7 +7,7 @@ from .automatic import angle_of_view as angle_of_view
 from .automatic import camera_path as camera_path
 from .automatic import film_size as film_size
 from .automatic import fitting as fitting
-from .film import WAYS as WAYS
+from .film import PATH_KINDS as PATH_KINDS
 from .film import film_cameras as film_cameras
 from .opening import best_centred as best_centred
 from .opening import pivot as pivot

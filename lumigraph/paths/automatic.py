@@ -28,13 +28,13 @@ Poses = Float[Tensor, "frame 3 4"]
 FULL_CIRCLE = math.radians(260)  # of azimuth that must be covered for a path to go all the way round
 UP = torch.tensor([0.0, 0.0, 1.0], dtype=torch.double)  # scenes stand upright
 SHARPNESS = 4.0  # of the weights with which nearby cameras set a path's height and distance (von Mises)
-OUTLYING = 4.0  # median deviations of log distance beyond which a camera does not count
+MAX_DEVIATIONS = 4.0  # median deviations of log distance beyond which a camera does not count
 FRAMES_PER_KEY = 6  # interpolated frames between two photographs, at least
-WIDEST, NARROWEST = 75.0, 20.0  # degrees, of a film's smaller angle of view
-FACING = 0.5  # cosine of the angle to the focus up to which a camera looks at it
-ALIKE = 0.9  # length of the mean of all gazes above which cameras look the same way
-SWEPT = 0.7  # of what the middle two thirds of the cameras span, how far a sweep goes
-ENOUGH = 0.4  # of the cameras that must look at the focus; gazes in all directions give a quarter to a third
+MAX_DEGREES, MIN_DEGREES = 75.0, 20.0  # degrees, of a film's smaller angle of view
+FACING_COSINE = 0.5  # cosine of the angle to the focus up to which a camera looks at it
+ALIKE_GAZE_LENGTH = 0.9  # length of the mean of all gazes above which cameras look the same way
+SWEEP_SHARE = 0.7  # of what the middle two thirds of the cameras span, how far a sweep goes
+MIN_FACING_SHARE = 0.4  # of the cameras that must look at the focus; gazes in all directions give a quarter to a third
 
 
 def camera_path(kind: str, cameras: Camera, frame: Frame, frames: int, size: tuple[int, int]) -> Camera:
@@ -67,7 +67,7 @@ def angle_of_view(cameras: Camera) -> float:
         x, y = (width / 2, 0.0) if height <= width else (0.0, height / 2)  # the middle of an edge, and of the other
         a, b = camera.lens.unproject(torch.tensor([[x, y], [width - x, height - y]]))
         angles.append(torch.acos((a @ b).clamp(-1, 1)).item())
-    return min(max(sorted(angles)[len(angles) // 2], math.radians(NARROWEST)), math.radians(WIDEST))
+    return min(max(sorted(angles)[len(angles) // 2], math.radians(MIN_DEGREES)), math.radians(MAX_DEGREES))
 
 
 @dataclass(frozen=True)
@@ -113,17 +113,17 @@ class Surroundings:
     def inward(self) -> bool:
         """True if most cameras look at a point between them. Some may look elsewhere: photographs of a courtyard may
         show both its fountain and its walls."""
-        return float((self.cosine > FACING).double().mean()) > ENOUGH
+        return float((self.cosine > FACING_COSINE).double().mean()) > MIN_FACING_SHARE
 
     @property
     def alike(self) -> bool:
         """True if all cameras look about the same way: at a front, or down from a drone."""
-        return float(self.forward.mean(0).norm()) > ALIKE
+        return float(self.forward.mean(0).norm()) > ALIKE_GAZE_LENGTH
 
     @cached_property
     def _offset(self) -> Float[Tensor, "camera 3"]:
         """From the focus to each camera that looks at it; of cameras that look outward, their directions."""
-        return (self.position - self.focus)[self.cosine > FACING] if self.inward else self.forward
+        return (self.position - self.focus)[self.cosine > FACING_COSINE] if self.inward else self.forward
 
     @cached_property
     def polar(self) -> Float[Tensor, "camera 3"]:
@@ -147,7 +147,7 @@ class Surroundings:
     def typical(self, azimuth: Float[Tensor, " frame"]) -> tuple[Tensor, Tensor]:
         """Elevation and log distance of the cameras near each azimuth."""
         away = (self.polar[:, 2] - self.polar[:, 2].median()).abs()
-        ordinary = away <= OUTLYING * away.median() + 0.1
+        ordinary = away <= MAX_DEVIATIONS * away.median() + 0.1
         near = ordinary * torch.exp(SHARPNESS * (torch.cos(azimuth[:, None] - self.polar[:, 0]) - 1)) + 1e-9
         near = near / near.sum(-1, keepdim=True)
         return near @ self.polar[:, 1], near @ self.polar[:, 2]
@@ -220,7 +220,7 @@ def sweep(around: Surroundings, frames: int) -> Poses:
     places = offset @ flat.T
     axes = torch.linalg.eigh(places.T @ places).eigenvectors
     low, high = torch.quantile(places @ axes, torch.tensor([1 / 6, 5 / 6], dtype=torch.double), dim=0)
-    oval = torch.stack([angle.cos(), angle.sin()], -1) * SWEPT * (high - low) / 2 + (low + high) / 2
+    oval = torch.stack([angle.cos(), angle.sin()], -1) * SWEEP_SHARE * (high - low) / 2 + (low + high) / 2
     wide = (high - low).norm().clamp_min(1e-9) / 4
     near = torch.exp(-torch.cdist(oval, places @ axes).square() / (2 * wide**2)) + 1e-9
     near = near / near.sum(-1, keepdim=True)

@@ -8,9 +8,9 @@ from ..errors import LumigraphError
 from .automatic import camera_path, film_size
 from .keyframes import CameraPath
 
-LONGEST = 480  # pixels of a film, if nobody asks for more
-FRAMES = 120  # of a film along a path that does not say how long it is
-WAYS = ("orbit", "sweep", "spiral", "interpolate", "held-out")
+DEFAULT_SIZE = 480  # pixels of a film, if nobody asks for more
+DEFAULT_FRAMES = 120  # of a film along a path that does not say how long it is
+PATH_KINDS = ("orbit", "sweep", "spiral", "interpolate", "held-out")
 
 
 def film_cameras(
@@ -23,21 +23,21 @@ def film_cameras(
     """The cameras of a film, one for each frame.
 
     cameras: of the photographs by split, as `Run.cameras` gives them; frame: theirs
-    path:   one of WAYS, or a CameraPath
+    path:   one of PATH_KINDS, or a CameraPath
     frames: as many as the path says if None: 120, every held-out view, as long as keyframes last
     size:   longer side; None as the photographs, up to a limit
     Raises LumigraphError for held-out views where there are none, or of several sizes.
     """
     if path != "held-out":
         train = cameras["train"]
-        shape = film_size(train, size or min(LONGEST, int(train.size[0].max())))
+        shape = film_size(train, size or min(DEFAULT_SIZE, int(train.size[0].max())))
         if isinstance(path, str):
-            return camera_path(path, train, frame, FRAMES if frames is None else frames, shape)
+            return camera_path(path, train, frame, DEFAULT_FRAMES if frames is None else frames, shape)
         return path.cameras(frame, shape, frames)
     views = cameras.get("test")
     if views is None or not len(views):
         raise LumigraphError("There are no held-out views here; choose another --path")
     if len(views.size.unique(dim=0)) > 1:
         raise LumigraphError("The held-out views are of several sizes, which no film holds; choose another --path")
-    longest = size or min(LONGEST, int(views.size.max()))
+    longest = size or min(DEFAULT_SIZE, int(views.size.max()))
     return views[: frames or len(views)].resized(longest / int(views.size.max()))

@@ -28,8 +28,8 @@ from ..files.ranges import Coordinate, Row, Side, between, typed
 from ..geometry import RIGID_TOLERANCE, is_similarity, to_matrix, to_quaternion
 
 FORMAT = "lumigraph camera path 1"
-NARROWEST, WIDEST = 1.0, 170.0  # degrees that a flat picture can show
-LONGEST = 100_000  # frames of a film
+MIN_DEGREES, MAX_DEGREES = 1.0, 170.0  # degrees that a flat picture can show
+MAX_FRAMES = 100_000  # frames of a film
 Fps = Annotated[float, between(1e-3, 1000)]
 
 
@@ -88,9 +88,9 @@ class CameraPath:
                 )
         if len({key.time is None for key in self.keyframes}) > 1:
             raise LumigraphError("Some keyframes have a time and others have none; give it to all of them or to none")
-        if self.duration * self.fps > LONGEST:
+        if self.duration * self.fps > MAX_FRAMES:
             raise LumigraphError(
-                f"The path takes {self.duration:g} s, more than {LONGEST} frames; bring its keyframes' times closer"
+                f"The path takes {self.duration:g} s, more than {MAX_FRAMES} frames; bring its keyframes' times closer"
             )
 
     @property
@@ -237,8 +237,10 @@ def check(key: Keyframe, name: str) -> None:
             f"{name} has a pose that is no rotation and a place; its first three columns must be unit length, "
             "at right angles and right-handed"
         )
-    if not NARROWEST <= key.fov <= WIDEST:
-        raise LumigraphError(f"{name} sees {key.fov:g} degrees; a flat picture shows from {NARROWEST:g} to {WIDEST:g}")
+    if not MIN_DEGREES <= key.fov <= MAX_DEGREES:
+        raise LumigraphError(
+            f"{name} sees {key.fov:g} degrees; a flat picture shows from {MIN_DEGREES:g} to {MAX_DEGREES:g}"
+        )
 
 
 def keys_of_film(film: Film, lens: Lens) -> tuple[Keyframe, ...]:

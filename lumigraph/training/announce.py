@@ -1,4 +1,4 @@
-"""What is said ahead of the first step: what is learnt from, what learns, on which machine, and how long."""
+"""Announcement before the first step: data, method, machine and budget."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from ..system import threads
 
 
 def learnt_from(data: Dataset) -> str:
-    """How many photographs, or whatever else, are learnt from and held out; photographs' size, and what it was."""
+    """Number of training and held-out inputs; size of photographs now and in the source."""
     held_out = len(data.splits.get("test", ()))
     aside = f", {held_out:,} held out"
     if not isinstance(data, Scene):
@@ -49,7 +49,7 @@ def machine(device: torch.device) -> str:
 
 
 def how_long(budget: Budget, step: int, seconds: float) -> str:
-    """What is left of a budget. How long steps take is only known once some are done."""
+    """Remaining budget. The time of a step is known only after some steps."""
     if budget.steps is None:
         return f"for {lasting(budget.total - seconds)}"
     done = f", {step:,} of them done" if step else ""

@@ -1,4 +1,4 @@
-"""What a person sees of training: a bar on a terminal, plain lines elsewhere, on stderr."""
+"""Progress of training on stderr: a bar on a terminal, plain lines elsewhere."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ from ..system.progress import clock, short
 from .announce import how_long, learner, learnt_from, machine
 
 REFRESH = 0.5  # seconds between looks at a bar
-FIRST = 3.0  # seconds to the first line with a time left
-LINES = 10.0, 60.0  # seconds between lines where there is no terminal: at least, and later at most
-SHARE = 0.1  # of the time so far that passes between lines, within these limits
-MEMORY = 0.8  # share of the smoothed PSNR that another value leaves
-TOLD_OTHERWISE = {"mse", "rays", "samples", "visible_samples"}  # statistics, as PSNR and by the second
+FIRST_LINE_SECONDS = 3.0  # seconds to the first line with a time left
+LINE_INTERVALS = 10.0, 60.0  # seconds between lines where there is no terminal: at least, and later at most
+LINE_SHARE = 0.1  # of the time so far that passes between lines, within these limits
+SMOOTHING = 0.8  # share of the smoothed PSNR that another value leaves
+OMITTED_STATISTICS = {"mse", "rays", "samples", "visible_samples"}  # statistics, as PSNR and by the second
 NAMES = {"gaussians": "Gaussians"}  # of statistics, for people
 
 
@@ -41,7 +41,7 @@ class Bar(Progress):
 
 
 class TrainingDisplay:
-    """What is learnt from, then how far training has come, how large a method has grown, and the time that is left.
+    """Training data, then progress, size of the method and remaining time.
 
     PSNR is that of the photographs learnt from, smoothed; it says little of held-out ones.
     """
@@ -91,22 +91,22 @@ class TrainingDisplay:
         self.bar.start()
 
     def begin(self, data: Dataset) -> None:
-        """What there is to learn from, and that kernels are compiled before anything is learnt."""
+        """Show the training data, and that kernels are compiled before the first step."""
         self._line(learnt_from(data))
         self.bar.update(self.task, description="Compiling kernels")
         if not self.terminal:
             self._line("Compiling kernels, which takes long the first time only")
 
     def ready(self, name: str, method: Method, budget: Budget, step: int, seconds: float) -> None:
-        """What begins to learn, on which machine, for how long."""
+        """Show the method, the machine and the budget."""
         self._line(f"{learner(name, method)}, {machine(method.device)}, {how_long(budget, step, seconds)}")
         self.bar.update(self.task, description="Training", completed=budget.progress(step, seconds))
         self._begun = self._seen = step, seconds
-        self._next = time.perf_counter() + (REFRESH if self._live else FIRST)
+        self._next = time.perf_counter() + (REFRESH if self._live else FIRST_LINE_SECONDS)
 
     @property
     def due(self) -> bool:
-        """Whether the next step's figures are to be shown."""
+        """True if the figures of the next step are to be shown."""
         return time.perf_counter() >= self._next
 
     def update(self, step: int, seconds: float, budget: Budget, batch: Lesson, row: dict[str, Any]) -> None:
@@ -117,12 +117,12 @@ class TrainingDisplay:
             return
         if "psnr" in row:
             now = row["psnr"]
-            self.psnr = now if self.psnr is None else MEMORY * self.psnr + (1 - MEMORY) * now
+            self.psnr = now if self.psnr is None else SMOOTHING * self.psnr + (1 - SMOOTHING) * now
         self._loss = row.get("loss")
         if self.due:
             self._look(step, seconds, budget, row["statistics"])
-            least, most = LINES
-            self._next = time.perf_counter() + (REFRESH if self._live else min(max(SHARE * seconds, least), most))
+            least, most = LINE_INTERVALS
+            self._next = time.perf_counter() + (REFRESH if self._live else min(max(LINE_SHARE * seconds, least), most))
 
     def _quality(self) -> list[str]:
         """The PSNR of what was learnt from; the loss, of methods that have none."""
@@ -161,8 +161,8 @@ class TrainingDisplay:
 
 
 def sizes(statistics: dict[str, float]) -> list[str]:
-    """What a method says of itself: whole numbers as counts, others as they are."""
-    told = {NAMES.get(name, name): value for name, value in statistics.items() if name not in TOLD_OTHERWISE}
+    """Statistics of a method: whole numbers as counts, others unchanged."""
+    told = {NAMES.get(name, name): value for name, value in statistics.items() if name not in OMITTED_STATISTICS}
     return [f"{x:,.0f} {name}" if x == int(x) else f"{name} {short(x)}" for name, x in told.items() if math.isfinite(x)]
 
 

@@ -25,16 +25,18 @@ from ..system.signals import Interrupt
 from .display import TrainingDisplay
 from .verdict import shares_seen
 
-FIRST_SAVE = 10.0  # seconds of training; a fault or a kill in the first minute should not cost all of it
-PREVIEWS = (0.01, 0.03, 0.1, 0.3, 1.0)  # shares of the budget at which a view is kept
+FIRST_SAVE_SECONDS = 10.0  # seconds of training; a fault or a kill in the first minute should not cost all of it
+PREVIEW_SHARES = (0.01, 0.03, 0.1, 0.3, 1.0)  # shares of the budget at which a view is kept
 PREVIEW_SIZE = 256  # pixels along the longer side
-DARKEST_ERROR = 1e-10  # mean squared error below which the PSNR stays 100 dB
-SMALL = 1 << 16  # gradients up to this many numbers are looked at in every step, larger ones in every logged step
+MIN_ERROR = 1e-10  # mean squared error below which the PSNR stays 100 dB
+MAX_SMALL_GRADIENT = (
+    1 << 16
+)  # gradients up to this many numbers are looked at in every step, larger ones in every logged step
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """How training ended.
+    """Result of training.
 
     finished: whether the budget is spent
     signal:   number of the signal that stopped it, if one did
@@ -54,7 +56,7 @@ class Watch(Protocol):
 
     @property
     def asked(self) -> bool:
-        """Whether it wants to be given way before the next step. Asked before each step, so it must be quick."""
+        """True if training is to yield before the next step. Asked before each step, so it must be quick."""
 
     def give_way(self, stopping: Callable[[], object]) -> None:
         """Render, in eval mode; return at once where stopping() is true."""
@@ -113,7 +115,7 @@ def fit(
             with display.aside():
                 method.begin(data, budget.seconds or math.inf)
         display.ready(methods.name_of(method), method, budget, step, clock.seconds)
-        next_save = clock.seconds + min(FIRST_SAVE, save_every)
+        next_save = clock.seconds + min(FIRST_SAVE_SECONDS, save_every)
 
         def spent(seconds: float | None = None) -> float:
             now = clock.seconds if seconds is None else seconds
@@ -214,7 +216,7 @@ def record(
     if own:
         row |= {"loss": sum(own.values()), "mean_loss": sum(losses) / len(losses), "passes": round(passes, 6)}
     if "mse" in statistics:
-        row["psnr"] = -10 * math.log10(max(statistics["mse"], DARKEST_ERROR))
+        row["psnr"] = -10 * math.log10(max(statistics["mse"], MIN_ERROR))
     return row | {"terms": own, "statistics": statistics}
 
 
@@ -252,7 +254,7 @@ class Previews:
         camera = data.preview() if run else None
         self.camera = camera and camera.resized(min(1.0, PREVIEW_SIZE / int(camera.size.max())))
         self.run, self.method = run, method
-        self.next = [share for share in PREVIEWS if share > progress] if camera else []
+        self.next = [share for share in PREVIEW_SHARES if share > progress] if camera else []
 
     def due(self, progress: float) -> bool:
         return bool(self.next) and progress >= self.next[0]
@@ -301,7 +303,7 @@ def find_fault(method: Method, terms: dict[str, Tensor], batch: Lesson, step: in
         if not math.isfinite(value.item()):
             return f"the loss term {name!r} is {value.item()}"
     named = [(n, p) for n, p in method.named_parameters() if p.grad is not None]
-    if finite(p.grad for _, p in named if p.grad is not None and (thorough or p.numel() <= SMALL)):
+    if finite(p.grad for _, p in named if p.grad is not None and (thorough or p.numel() <= MAX_SMALL_GRADIENT)):
         return None
     again = method.loss(batch, step) if type(method).step is Method.step else {}
     for term, value in again.items():  # one at a time
@@ -313,7 +315,7 @@ def find_fault(method: Method, terms: dict[str, Tensor], batch: Lesson, step: in
 
 
 def finite(tensors: Iterable[Tensor]) -> bool:
-    """Whether every number is finite. Their sum tells: it reads each once, and passes NaN and infinity on."""
+    """True if all numbers are finite. The sum reads each number once and propagates NaN and infinity."""
     sums = [x.detach().sum(dtype=torch.float32) for x in tensors if x.is_floating_point()]
     return not sums or math.isfinite(torch.stack(sums).sum().item())
 

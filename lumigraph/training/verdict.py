@@ -15,9 +15,9 @@ from ..datasets.dataset import Dataset
 from ..datasets.scene import Photograph, Scene
 from ..method import Lesson, Method
 
-STRETCHES = 4, 30  # at least and at most, that the second half of training is divided into; fewer tell nothing
-FALLING = 0.05  # share of the loss, over the second half, from which on it still falls
-DEVIATIONS = 2.0  # of its own error that a fall must exceed
+STRETCH_COUNTS = 4, 30  # at least and at most, that the second half of training is divided into; fewer tell nothing
+FALLING_SHARE = 0.05  # share of the loss, over the second half, from which on it still falls
+FALL_DEVIATIONS = 2.0  # of its own error that a fall must exceed
 
 
 def shares_seen(data: Dataset) -> Callable[[Lesson], float]:
@@ -29,7 +29,7 @@ def shares_seen(data: Dataset) -> Callable[[Lesson], float]:
 
 @dataclass(frozen=True)
 class Trend:
-    """How the loss moved over the second half of training.
+    """Trend of the loss over the second half of training.
 
     fall:  from the half's beginning to its end, as a share of the loss; negative where it rose
     error: one standard deviation of that
@@ -40,11 +40,11 @@ class Trend:
 
     @property
     def falling(self) -> bool:
-        return self.fall > max(FALLING, DEVIATIONS * self.error)
+        return self.fall > max(FALLING_SHARE, FALL_DEVIATIONS * self.error)
 
 
 def loss_trend(rows: Sequence[dict[str, Any]], by_photograph: bool) -> Trend | None:
-    """How the loss moved, by the lines of metrics.jsonl; None where they are too few to tell.
+    """Trend of the loss from the lines of metrics.jsonl; None where there are too few lines.
 
     A straight line through its logarithm, by least squares; the scatter around it tells the error. Some photographs are
     harder than others: where a step learns from one (by_photograph), points on the line are means over at least a whole
@@ -52,7 +52,7 @@ def loss_trend(rows: Sequence[dict[str, Any]], by_photograph: bool) -> Trend | N
     """
     found = [row for row in rows if "mean_loss" in row]
     half = [row for row in found if row["step"] > found[-1]["step"] / 2]
-    least, most = STRETCHES
+    least, most = STRETCH_COUNTS
     passes = int(half[-1]["passes"] - half[0]["passes"]) if half and by_photograph else most
     stretches = min(len(half), passes, most)
     if stretches < least:
@@ -69,7 +69,7 @@ def loss_trend(rows: Sequence[dict[str, Any]], by_photograph: bool) -> Trend | N
 
 
 def cameras_moved(method: Method, cameras: Camera) -> Moves | None:
-    """How far a method has moved the cameras that it learnt from, each against all of them; None where it learns no
+    """Displacement of the training cameras by a method, each against all of them; None where it learns no
     poses. cameras: those of training photographs as they were given"""
     refined = method.refined(cameras)
     return None if refined is cameras else moves(cameras, refined, method.frame)

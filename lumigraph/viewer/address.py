@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from ..errors import LumigraphError, LumigraphWarning
 
 HOST, PORT = "127.0.0.1", 8080
-TRIED = 100  # ports after the usual one
+MAX_PORT_TRIES = 100  # ports after the usual one
 
 
 @dataclass(frozen=True)
@@ -46,10 +46,10 @@ def choose_address(host: str = HOST, port: int | None = None) -> Address:
     """
     if port is not None and not 0 <= port <= 65535:
         raise LumigraphError(f"There is no port {port}; give --port a number from 1 to 65535")
-    wanted = range(PORT, PORT + TRIED) if port is None else [port]
+    wanted = range(PORT, PORT + MAX_PORT_TRIES) if port is None else [port]
     found = next((free for number in wanted if (free := free_port(host, number)) is not None), None)
     if found is None and port is None:
-        raise LumigraphError(f"Ports {PORT} to {PORT + TRIED - 1} are all in use; choose another by --port")
+        raise LumigraphError(f"Ports {PORT} to {PORT + MAX_PORT_TRIES - 1} are all in use; choose another by --port")
     if found is None:
         raise LumigraphError(f"Port {port} is in use; choose another by --port, or leave it out to get a free one")
     address = Address(host, found, "" if is_local(host) else secrets.token_urlsafe(16))

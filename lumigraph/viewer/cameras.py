@@ -13,7 +13,7 @@ from ..camera import Camera
 from ..camera.lens import Pinhole
 from ..geometry import to_matrix
 
-WIDEST = math.radians(120)  # of a view, and of a photograph that is drawn as a frustum
+MAX_FIELD_OF_VIEW = math.radians(120)  # of a view, and of a photograph that is drawn as a frustum
 
 
 def pose_of(wxyz, position) -> tuple[tuple[float, ...], ...]:
@@ -32,13 +32,13 @@ def rows(camera: Camera, first: int, last: int) -> Camera:
 
 
 def angles(camera: Camera) -> tuple[float, float]:
-    """Horizontal and vertical angle of view of one camera with any lens, in radians, at most WIDEST."""
+    """Horizontal and vertical angle of view of one camera with any lens, in radians, at most MAX_FIELD_OF_VIEW."""
     width, height = camera.size[0].tolist()
     x, y = width / 2, height / 2
     edges = torch.tensor([[x, y], [0.0, y], [width, y], [x, 0.0], [x, height]])
     middle, left, right, top, bottom = camera.to("cpu").lens.unproject(edges)
     across, down = (angle(middle, a) + angle(middle, b) for a, b in ((left, right), (top, bottom)))
-    return min(across, WIDEST), min(down, WIDEST)
+    return min(across, MAX_FIELD_OF_VIEW), min(down, MAX_FIELD_OF_VIEW)
 
 
 def angle(a: Float[Tensor, " 3"], b: Float[Tensor, " 3"]) -> float:
@@ -49,4 +49,4 @@ def angle(a: Float[Tensor, " 3"], b: Float[Tensor, " 3"]) -> float:
 def angle_for(camera: Camera, aspect: float) -> float:
     """Vertical angle of view, in radians, at which a window of an aspect (width / height) shows a whole photograph."""
     across, down = angles(camera)
-    return min(WIDEST, max(down, 2 * math.atan(math.tan(across / 2) / aspect)))
+    return min(MAX_FIELD_OF_VIEW, max(down, 2 * math.atan(math.tan(across / 2) / aspect)))

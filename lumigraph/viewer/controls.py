@@ -11,9 +11,9 @@ from .modes import MODES
 from .scenery import CAMERAS, POINTS
 from .serving import PAGE
 
-SHARPEST = 1024  # pixels along the longer side, unless the client wants another
-DRAWN_THERE = f'<a href="{PAGE}" target="_blank">Drawn by this browser, in a tab of its own</a>'
-NARROWEST, WIDEST = 10.0, 120.0  # degrees
+DEFAULT_RESOLUTION = 1024  # pixels along the longer side, unless the client wants another
+CLIENT_SIDE_LINK = f'<a href="{PAGE}" target="_blank">Drawn by this browser, in a tab of its own</a>'
+MIN_DEGREES, MAX_DEGREES = 10.0, 120.0  # degrees
 
 
 class Controls:
@@ -38,16 +38,21 @@ class Controls:
                 "Draw exactly", False, visible=cloud, hint="Drawn by our own renderer and sent, not by the browser"
             )
             self._angle = gui.add_slider(
-                "Angle of view", NARROWEST, WIDEST, 1.0, 50.0, hint="Degrees, from top to bottom"
+                "Angle of view", MIN_DEGREES, MAX_DEGREES, 1.0, 50.0, hint="Degrees, from top to bottom"
             )
             self._sharpest = gui.add_slider(
-                "Resolution", 240, 2048, 16, SHARPEST, hint="Pixels along the longer side, once the camera rests"
+                "Resolution",
+                240,
+                2048,
+                16,
+                DEFAULT_RESOLUTION,
+                hint="Pixels along the longer side, once the camera rests",
             )
             self._background = gui.add_rgb("Background", to_bytes(frame.background))
             self._cameras = gui.add_checkbox("Cameras", True, hint="Click on one to fly there")
             self._points = gui.add_checkbox("Sparse points", False, visible=False)
             if page:
-                gui.add_html(DRAWN_THERE)
+                gui.add_html(CLIENT_SIDE_LINK)
             self.status = gui.add_markdown("")
         for drawn in (self._mode, self._exact, self._sharpest, self._background):
             drawn.on_update(lambda _: self._update())
@@ -95,7 +100,7 @@ class Controls:
 
     def tell_angle(self, radians: float) -> None:
         """Show the camera's angle of view at the slider."""
-        degrees = float(min(max(round(math.degrees(radians)), NARROWEST), WIDEST))
+        degrees = float(min(max(round(math.degrees(radians)), MIN_DEGREES), MAX_DEGREES))
         if degrees != self._angle.value:
             self._angle.value = degrees
 

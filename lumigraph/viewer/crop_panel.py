@@ -15,13 +15,13 @@ from ..datasets.scene import Frame, Vector
 from ..errors import LumigraphError
 from ..gaussians.cleaning import ISOLATION, MAX_SCALE, MIN_OPACITY
 from .path_panel import code
-from .subject import NAME, NAMING, Keep
+from .subject import NAME, NAME_RULE, Keep
 
 ALL, BOX, SPHERE = "Everything", "Inside a box", "Inside a sphere"
 COLOUR = (240, 190, 80)
 HANDLE = 0.25  # length of a handle's arrows, in longest sides of the bounds
-ROUND = 64  # pieces of a drawn circle
-FINEST = 0.001  # scene units: step of the numbers
+CIRCLE_SEGMENTS = 64  # pieces of a drawn circle
+NUMBER_STEP = 0.001  # scene units: step of the numbers
 
 
 class CropPanel:
@@ -56,10 +56,10 @@ class CropPanel:
         self._size = longest
         with tab:
             self._shape = gui.add_dropdown("Show", (ALL, BOX, SPHERE))
-            self._lower = gui.add_vector3("Lower", lower, step=FINEST, visible=False)
-            self._upper = gui.add_vector3("Upper", upper, step=FINEST, visible=False)
-            self._middle = gui.add_vector3("Middle", middle, step=FINEST, visible=False)
-            self._radius = gui.add_number("Radius", longest / 2, min=FINEST, step=FINEST, visible=False)
+            self._lower = gui.add_vector3("Lower", lower, step=NUMBER_STEP, visible=False)
+            self._upper = gui.add_vector3("Upper", upper, step=NUMBER_STEP, visible=False)
+            self._middle = gui.add_vector3("Middle", middle, step=NUMBER_STEP, visible=False)
+            self._radius = gui.add_number("Radius", longest / 2, min=NUMBER_STEP, step=NUMBER_STEP, visible=False)
             self._clean = gui.add_checkbox("Leave out floaters", False, visible=cloud)
             self._floaters = {
                 "min_opacity": gui.add_slider(
@@ -92,7 +92,7 @@ class CropPanel:
             a, b = self._lower.value, self._upper.value
             return Box(vector(np.minimum(a, b)), vector(np.maximum(a, b)))
         if self._shape.value == SPHERE:
-            return Sphere(vector(self._middle.value), max(float(self._radius.value), FINEST))
+            return Sphere(vector(self._middle.value), max(float(self._radius.value), NUMBER_STEP))
         return None
 
     @property
@@ -172,7 +172,7 @@ class CropPanel:
         assert self._keep is not None
         name = self._name.value.strip()
         if not NAME.fullmatch(name):
-            self._tell("Not saved", NAMING)
+            self._tell("Not saved", NAME_RULE)
             return
         try:
             where = self._keep(name, self.crop, dict(self.floaters))
@@ -197,8 +197,8 @@ def edges(box: Box) -> Float[np.ndarray, "12 2 3"]:
 
 def circles(sphere: Sphere) -> Float[np.ndarray, "piece 2 3"]:
     """The ends of the pieces of three great circles, one across each axis."""
-    angle = np.linspace(0, 2 * math.pi, ROUND + 1)
-    across, along, none = np.cos(angle), np.sin(angle), np.zeros(ROUND + 1)
+    angle = np.linspace(0, 2 * math.pi, CIRCLE_SEGMENTS + 1)
+    across, along, none = np.cos(angle), np.sin(angle), np.zeros(CIRCLE_SEGMENTS + 1)
     rings = np.stack([np.roll(np.stack([across, along, none], -1), axis, -1) for axis in range(3)])
     pieces = np.stack([rings[:, :-1], rings[:, 1:]], 2).reshape(-1, 2, 3)
     return np.array(sphere.middle) + sphere.radius * pieces

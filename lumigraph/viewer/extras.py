@@ -7,14 +7,14 @@ from jaxtyping import Bool, Float, Int, Shaped
 from torch import Tensor
 
 from ..camera.rays import Rendering
-from ..figures import NOTHING, hex_colour, ramp
+from ..figures import EMPTY_COLOUR, hex_colour, ramp
 
 # Twenty colours that are told apart easily; labels beyond begin again at the first.
 PALETTE = (
     *("e6194b", "3cb44b", "ffe119", "4363d8", "f58231", "911eb4", "46f0f0", "f032e6", "bcf60c", "fabebe"),
     *("008080", "e6beff", "9a6324", "fffac8", "800000", "aaffc3", "808000", "ffd8b1", "000075", "a9a9a9"),
 )
-MOST = 1_000_000  # values that a range is found from; quantile() takes no more than 16 million
+MAX_QUANTILE_VALUES = 1_000_000  # values that a range is found from; quantile() takes no more than 16 million
 
 
 def drawable(rendering: Rendering) -> list[str]:
@@ -47,7 +47,7 @@ def draw_extra(
     else:
         drawn = (plane >= 0) & (opacity > 0)
         colours = label_colours(plane.long())
-    return torch.where(drawn[..., None], colours, hex_colour(NOTHING))
+    return torch.where(drawn[..., None], colours, hex_colour(EMPTY_COLOUR))
 
 
 def heat(values: Float[Tensor, "height width"], among: Bool[Tensor, "height width"]) -> Float[Tensor, "height width 3"]:
@@ -60,7 +60,7 @@ def percentiles(values: Float[Tensor, " value"]) -> tuple[float, float]:
     """The 2nd and the 98th percentile; 0 and 1 of no values."""
     if not len(values):
         return 0.0, 1.0
-    some = values[:: -(-len(values) // MOST)]
+    some = values[:: -(-len(values) // MAX_QUANTILE_VALUES)]
     low, high = torch.quantile(some, torch.tensor([0.02, 0.98])).tolist()
     return low, high
 

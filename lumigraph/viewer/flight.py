@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-STEP = 1 / 25  # seconds
-SECONDS = 0.6  # that a flight to a photograph takes
+STEP_SECONDS = 1 / 25  # seconds
+FLIGHT_SECONDS = 0.6  # that a flight to a photograph takes
 UP = np.array([0.0, 0.0, 1.0])
 
 
@@ -38,7 +38,7 @@ class Flight:
         number, camera = self._number, self._client.camera
         begin = np.array(camera.position), np.array(camera.look_at), np.array(camera.up_direction), camera.fov
         goal = pose[:, 3], pose[:, 3] + distance * pose[:, 2], upwards(pose), angle
-        count = round(SECONDS / STEP)
+        count = round(FLIGHT_SECONDS / STEP_SECONDS)
         for i in range(1, count):
             if number != self._number:
                 return
@@ -50,7 +50,7 @@ class Flight:
                 camera.position = position
                 camera.look_at = ahead
                 camera.fov = fov
-            time.sleep(STEP)
+            time.sleep(STEP_SECONDS)
         self.place(pose, distance, angle)
 
     def play(
@@ -73,7 +73,7 @@ class Flight:
             i = min(int(now / seconds * len(poses)), len(poses) - 1)
             self.place(poses[i], distance, angles[i])
             shown(i)
-            time.sleep(STEP)
+            time.sleep(STEP_SECONDS)
         self.place(poses[-1], distance, angles[-1])
         shown(len(poses) - 1)
         return True

@@ -11,17 +11,17 @@ from typing import Annotated, Any, Literal
 
 import msgspec
 
-LARGEST = 1 << 20  # bytes of a message; our page sends less than a thousandth
-FARTHEST = 1e9  # scene units
-LONGEST = 10_000  # letters of a text
-EDGE = 1e-6  # beyond a range: what a browser rounds
+MAX_MESSAGE_BYTES = 1 << 20  # bytes of a message; our page sends less than a thousandth
+MAX_COORDINATE = 1e9  # scene units
+MAX_TEXT_LENGTH = 10_000  # letters of a text
+RANGE_TOLERANCE = 1e-6  # beyond a range: what a browser rounds
 
-Number = Annotated[float, msgspec.Meta(ge=-FARTHEST, le=FARTHEST)]
+Number = Annotated[float, msgspec.Meta(ge=-MAX_COORDINATE, le=MAX_COORDINATE)]
 Triple = tuple[Number, Number, Number]
 Unit = Annotated[float, msgspec.Meta(ge=-1.001, le=1.001)]
 Quaternion = tuple[Unit, Unit, Unit, Unit]
 Pixels = Annotated[int, msgspec.Meta(ge=0, le=16_384)]
-Text = Annotated[str, msgspec.Meta(max_length=LONGEST)]
+Text = Annotated[str, msgspec.Meta(max_length=MAX_TEXT_LENGTH)]
 
 
 class Said(msgspec.Struct, tag_field="type", forbid_unknown_fields=True):
@@ -121,14 +121,18 @@ def fits(part: Any, value: Any) -> bool:
         return isinstance(value, bool)
     if isinstance(now, str):
         choices = getattr(part, "options", None)
-        return isinstance(value, str) and len(value) <= LONGEST and (choices is None or value in choices)
+        return isinstance(value, str) and len(value) <= MAX_TEXT_LENGTH and (choices is None or value in choices)
     if isinstance(now, (int, float)):
         low, high = (getattr(part, name, None) for name in ("min", "max"))
-        return is_number(value) and (low is None or value >= low - EDGE) and (high is None or value <= high + EDGE)
+        return (
+            is_number(value)
+            and (low is None or value >= low - RANGE_TOLERANCE)
+            and (high is None or value <= high + RANGE_TOLERANCE)
+        )
     if isinstance(now, tuple):
         return isinstance(value, list) and len(value) == len(now) and all(map(is_number, value))
     return False
 
 
 def is_number(value: Any) -> bool:
-    return isinstance(value, (int, float)) and not isinstance(value, bool) and abs(value) <= FARTHEST
+    return isinstance(value, (int, float)) and not isinstance(value, bool) and abs(value) <= MAX_COORDINATE

@@ -25,7 +25,7 @@ from .address import Address, is_wildcard
 
 LOOPBACK = ("localhost", "127.0.0.1", "::1")
 # What pages of ours tell a browser: nobody frames them, reads them from another site, or learns their address.
-ALOOF = {
+ISOLATION_HEADERS = {
     "Content-Security-Policy": "frame-ancestors 'self'",
     "Cross-Origin-Resource-Policy": "same-origin",
     "Referrer-Policy": "no-referrer",
@@ -84,7 +84,7 @@ class Guard:
             given = answer(connection, request)
             response = await given if isinstance(given, Awaitable) else given
             if response is not None:
-                response.headers.update(ALOOF)
+                response.headers.update(ISOLATION_HEADERS)
                 if self.token:
                     response.headers["Set-Cookie"] = f"{self._cookie}={self.token}; HttpOnly; SameSite=Strict; Path=/"
             return response
@@ -95,7 +95,7 @@ class Guard:
 def refused(why: str) -> Response:
     body = f"{why}.\n".encode()
     about = {"Content-Type": "text/plain; charset=utf-8", "Content-Length": str(len(body)), "Connection": "close"}
-    return Response(HTTPStatus.FORBIDDEN, "Forbidden", Headers(about | ALOOF), body)
+    return Response(HTTPStatus.FORBIDDEN, "Forbidden", Headers(about | ISOLATION_HEADERS), body)
 
 
 def own_names(address: Address) -> set[str]:

@@ -11,12 +11,12 @@ from ..camera.rays import Rendering
 from ..color.blending import before, over
 from ..datasets.scene import Vector
 from ..errors import LumigraphError
-from ..figures import NOTHING, colour_depth, depth_range, hex_colour
+from ..figures import EMPTY_COLOUR, colour_depth, depth_range, hex_colour
 from ..geometry import normals_from_depth
 from .extras import draw_extra, drawable
 
 MODES = ("colour", "depth", "opacity", "normals")  # of every method
-FAR = 1e4  # scene units; where nothing is
+EMPTY_DEPTH = 1e4  # scene units; where nothing is
 
 
 def picture(
@@ -40,7 +40,7 @@ def picture(
         if mode not in drawable(rendering):
             raise LumigraphError(f"The method gives no {mode} for this picture; choose something else under Show")
         return draw_extra(rendering.extra[mode], rendering.opacity)
-    return before(0.5 + 0.5 * normals(rendering, camera), rendering.opacity.clamp(0, 1), hex_colour(NOTHING))
+    return before(0.5 + 0.5 * normals(rendering, camera), rendering.opacity.clamp(0, 1), hex_colour(EMPTY_COLOUR))
 
 
 def extra_modes(rendering: Rendering) -> list[str]:
@@ -54,7 +54,7 @@ def normals(rendering: Rendering, camera: Camera) -> Float[Tensor, "height width
     if "normals" in rendering.extra:
         return rendering.extra["normals"]
     height, width = rendering.depth.shape
-    depth = rendering.depth.nan_to_num(FAR, FAR).clamp_max(FAR)
+    depth = rendering.depth.nan_to_num(EMPTY_DEPTH, EMPTY_DEPTH).clamp_max(EMPTY_DEPTH)
     points = camera.rays(camera.pixels()).at(depth.reshape(-1)).view(height, width, 3)
     return -normals_from_depth(points, depth)
 

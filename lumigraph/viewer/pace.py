@@ -6,8 +6,8 @@ import math
 
 import numpy as np
 
-SMALLEST = 80  # pixels along the longer side
-MEMORY = 0.7  # share of its weight that a picture keeps when the next has come
+MIN_RESOLUTION = 80  # pixels along the longer side
+SMOOTHING = 0.7  # share of its weight that a picture keeps when the next has come
 
 
 class Pace:
@@ -21,7 +21,7 @@ class Pace:
         """Take note of a picture's time. The first is ignored: something may have been compiled for it."""
         if self._noted:
             n, t = float(pixels), seconds
-            self._sums = MEMORY * self._sums + np.array([1, n, n * n, t, n * t])
+            self._sums = SMOOTHING * self._sums + np.array([1, n, n * n, t, n * t])
         self._noted = True
 
     @property
@@ -46,5 +46,5 @@ class Pace:
     def size(self, full: tuple[int, int], seconds: float) -> tuple[int, int]:
         """(width, height) with the aspect of `full` that can be rendered in a time; small while nothing is known."""
         share = math.sqrt(self.pixels(seconds) / (full[0] * full[1]))
-        share = min(1.0, max(share, SMALLEST / max(full)))
+        share = min(1.0, max(share, MIN_RESOLUTION / max(full)))
         return max(1, round(full[0] * share)), max(1, round(full[1] * share))

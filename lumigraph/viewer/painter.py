@@ -8,10 +8,13 @@ from collections.abc import Callable
 
 from .turns import NotWantedError, Turns
 
-MOVING, RESTING = 0.1, 0.5  # seconds that a picture may take while the camera moves, and the first one at rest
-STILL = 0.2  # seconds after the last request from which a client counts as resting
-FASTEST = 1 / 30  # seconds between pictures
-ENDLESS = float("inf")
+MOVING_SECONDS, RESTING_SECONDS = (
+    0.1,
+    0.5,
+)  # seconds that a picture may take while the camera moves, and the first one at rest
+REST_SECONDS = 0.2  # seconds after the last request from which a client counts as resting
+MIN_FRAME_SECONDS = 1 / 30  # seconds between pictures
+NO_DEADLINE = float("inf")
 
 Draw = Callable[[float, Callable[[], bool]], bool]
 
@@ -53,10 +56,10 @@ class Painter:
             asked, now = self._asked, time.perf_counter()
             if asked != drawn:
                 step, drawn = self._step(), asked
-                best = self._try(MOVING, lambda: not self._stopped)
-                self._sleep(FASTEST - (time.perf_counter() - now))
-            elif now < self._when + STILL:
-                self._sleep(self._when + STILL - now)
+                best = self._try(MOVING_SECONDS, lambda: not self._stopped)
+                self._sleep(MIN_FRAME_SECONDS - (time.perf_counter() - now))
+            elif now < self._when + REST_SECONDS:
+                self._sleep(self._when + REST_SECONDS - now)
             elif not best:
                 best = self._refine(asked)
             elif self._step() != step and self._turns.claim_refresh():
@@ -70,7 +73,7 @@ class Painter:
 
     def _refine(self, asked: int) -> bool:
         """Draw better pictures one after the other; whether the best was reached before another request came."""
-        for seconds in dict.fromkeys([RESTING, self._longest]):
+        for seconds in dict.fromkeys([RESTING_SECONDS, self._longest]):
             if self._try(seconds, self._while_asked(asked)):
                 return True
             if self._asked != asked:
@@ -84,7 +87,7 @@ class Painter:
     @property
     def _longest(self) -> float:
         """Seconds that a picture at rest may take: limited while training, when it is soon out of date."""
-        return RESTING if self._turns.training and not self._turns.paused else ENDLESS
+        return RESTING_SECONDS if self._turns.training and not self._turns.paused else NO_DEADLINE
 
     def _try(self, seconds: float, wanted: Callable[[], bool]) -> bool:
         try:

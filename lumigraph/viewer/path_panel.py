@@ -22,11 +22,11 @@ from ..geometry import to_quaternion
 from ..paths.keyframes import CameraPath, Keyframe
 from .cameras import pose_of
 from .flight import Flight
-from .subject import NAME, NAMING, Subject
+from .subject import NAME, NAME_RULE, Subject
 
 COLOUR = (200, 60, 150)
-FINENESS = 24  # points of the drawn path between two keyframes
-LEG = 2.0  # seconds from one keyframe to the next, unless something else is set
+POINTS_PER_LEG = 24  # points of the drawn path between two keyframes
+LEG_SECONDS = 2.0  # seconds from one keyframe to the next, unless something else is set
 NONE = "none yet"
 
 
@@ -35,7 +35,7 @@ class Stop:
     """A keyframe, and the seconds from it to the next."""
 
     key: Keyframe
-    leg: float = LEG
+    leg: float = LEG_SECONDS
 
 
 class PathPanel:
@@ -68,7 +68,7 @@ class PathPanel:
             gui.add_button("Add keyframe here").on_click(lambda _: self._add())
             self._chosen = gui.add_dropdown("Keyframe", [NONE])
             self._actions = gui.add_button_group("This one", ("Go", "Set", "◀", "▶", "✕"))
-            self._leg = gui.add_number("Seconds to next", LEG, min=0.05, max=600.0, step=0.05)
+            self._leg = gui.add_number("Seconds to next", LEG_SECONDS, min=0.05, max=600.0, step=0.05)
             self._loop = gui.add_checkbox("Loop", False)
             self._fps = gui.add_slider("Frames per second", 1, 120, 1, 30)
             play = gui.add_button_group("Preview", ("Play", "Stop"))
@@ -227,7 +227,7 @@ class PathPanel:
             )
             self._nodes.append(frustum)
         if len(keys) > 1:
-            line = path.cameras(self._subject.frame, (2, 2), FINENESS * len(keys)).position.numpy()
+            line = path.cameras(self._subject.frame, (2, 2), POINTS_PER_LEG * len(keys)).position.numpy()
             pieces = np.stack([line[:-1], line[1:]], 1)
             self._nodes.append(
                 scene.add_line_segments("/path/line", pieces, COLOUR, thickness=2.0, thickness_units="screen")
@@ -241,7 +241,7 @@ class PathPanel:
     def _save(self) -> None:
         name = self._name.value.strip()
         if not NAME.fullmatch(name):
-            self._tell("Not saved", NAMING)
+            self._tell("Not saved", NAME_RULE)
             return
         file = self._subject.paths / f"{name}.json"
         try:
@@ -265,7 +265,7 @@ class PathPanel:
             return
         times = [key.seconds for key in path.keyframes]
         legs = [b - a for a, b in zip(times, times[1:], strict=False)]
-        legs.append(path.duration - sum(legs) if path.loop and legs else LEG)
+        legs.append(path.duration - sum(legs) if path.loop and legs else LEG_SECONDS)
         self._stops = [Stop(key, leg) for key, leg in zip(path.keyframes, legs, strict=True)]
         self._filling = True
         self._loop.value, self._fps.value, self._name.value = path.loop, round(path.fps), name

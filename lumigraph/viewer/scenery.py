@@ -17,13 +17,13 @@ from ..geometry import to_quaternion
 from .cameras import angles
 
 CAMERAS, POINTS = "/cameras", "/points"
-MOST_CAMERAS, MOST_POINTS = 250, 200_000  # more only fill the browser
+MAX_CAMERAS, MAX_POINTS = 250, 200_000  # more only fill the browser
 THUMBNAIL = 96  # pixels along the longer side
 WHITE = (1.0, 1.0, 1.0)  # behind what is see-through
 TRAIN, TEST = (86, 134, 214), (232, 140, 60)
-SHARE = 0.4  # of the distance between neighbouring cameras, as the size of a frustum
-NEARBY = 8.0  # frustum sizes: nearer, a thumbnail fills a tenth of the window or more
-NARROWEST, WIDEST = 0.03, 0.05  # of the distance to the middle of all cameras
+FRUSTUM_SHARE = 0.4  # of the distance between neighbouring cameras, as the size of a frustum
+MIN_THUMBNAIL_DISTANCE = 8.0  # frustum sizes: nearer, a thumbnail fills a tenth of the window or more
+MIN_FRUSTUM_SHARE, MAX_FRUSTUM_SHARE = 0.03, 0.05  # of the distance to the middle of all cameras
 
 
 class Scenery:
@@ -41,7 +41,7 @@ class Scenery:
         server.scene.add_frame(CAMERAS, show_axes=False)
         server.scene.add_frame(POINTS, show_axes=False)
         everyone = Camera.cat(list(cameras.values()))
-        self.size, step = frustum_size(everyone), -(-len(everyone) // MOST_CAMERAS)
+        self.size, step = frustum_size(everyone), -(-len(everyone) // MAX_CAMERAS)
         self._names: list[str] = []
         for split, group in cameras.items():
             for i in range(0, len(group), step):
@@ -51,7 +51,7 @@ class Scenery:
     def around(self, place: tuple[float, ...]) -> set[str]:
         """Names of the frusta so near to a place that they would hide the view from it."""
         distance = (self._positions - torch.tensor(place, dtype=torch.double)).norm(dim=-1)
-        return {self._names[i] for i in (distance < NEARBY * self.size).nonzero()[:, 0].tolist()}
+        return {self._names[i] for i in (distance < MIN_THUMBNAIL_DISTANCE * self.size).nonzero()[:, 0].tolist()}
 
     def _add(self, split: str, camera: Camera, name: str, clicked: Callable[[Any, Camera], None]) -> None:
         across, down = angles(camera)
@@ -94,7 +94,7 @@ class Scenery:
     def show(self, scene: Scene) -> None:
         """Draw thumbnails and points of a scene."""
         if scene.points is not None and len(scene.points):
-            some = slice(None, None, -(-len(scene.points) // MOST_POINTS))
+            some = slice(None, None, -(-len(scene.points) // MAX_POINTS))
             colours = scene.point_colours
             spread = (scene.points - scene.points.median(0).values).norm(dim=-1).median()
             self._server.scene.add_point_cloud(
@@ -118,7 +118,7 @@ def frustum_size(cameras: Camera) -> float:
     spread = float((position - position.median(0).values).norm(dim=-1).median())
     spread = spread or 1.0
     nearest = distance.fill_diagonal_(torch.inf).amin(-1).median().item() if len(position) > 1 else spread
-    return min(max(SHARE * nearest, NARROWEST * spread), WIDEST * spread)
+    return min(max(FRUSTUM_SHARE * nearest, MIN_FRUSTUM_SHARE * spread), MAX_FRUSTUM_SHARE * spread)
 
 
 def thumbnail(rgb: Float[Tensor, "height width 3"]) -> UInt8[Tensor, "_ _ 3"]:

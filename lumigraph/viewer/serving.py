@@ -21,7 +21,7 @@ from websockets.http11 import Request, Response
 
 from ..errors import LumigraphError
 from .address import Address
-from .frames import LARGEST, understood
+from .frames import MAX_MESSAGE_BYTES, understood
 from .guard import Answers, Guard
 
 PAGE = "scene.html"  # where a scene that browsers draw by themselves is
@@ -61,7 +61,7 @@ class Door:
         def serve(handler: Any, host: Any, port: Any, *, process_request: Any, **options: Any) -> Any:
             built.append(True)
             asyncio.get_running_loop().set_exception_handler(self._swallow)
-            options |= {"max_size": LARGEST, "logger": silent_logger()}
+            options |= {"max_size": MAX_MESSAGE_BYTES, "logger": silent_logger()}
             answer = self._guard.answering(beside(process_request, self._page))
             return begin(self._hearing(handler), host, port, process_request=answer, **options)
 

@@ -15,13 +15,13 @@ from ..gaussians import Gaussians
 from ..geometry import to_matrix, unit
 
 # The browser's covariances are half-precision numbers: in units this much smaller, what is fine keeps its shape.
-ENLARGED = 16.0
-LARGEST = 250.0  # standard deviation in those units; its square still is a half-precision number
+UNIT_SCALE = 16.0
+MAX_SCALE = 250.0  # standard deviation in those units; its square still is a half-precision number
 
 
 @dataclass(frozen=True)
 class BrowserSplats:
-    """Arrays that viser sends to the browser, with lengths multiplied by ENLARGED."""
+    """Arrays that viser sends to the browser, with lengths multiplied by UNIT_SCALE."""
 
     centres: Float[np.ndarray, "gaussian 3"]
     covariances: Float[np.ndarray, "gaussian 3 3"]
@@ -32,10 +32,10 @@ class BrowserSplats:
 @torch.no_grad()
 def splats(cloud: Gaussians, eye: Float[Tensor, " 3"]) -> BrowserSplats:
     """A cloud for the browser, coloured as seen from an eye; both in the scene's frame."""
-    deviations = (ENLARGED * cloud.log_scales.detach().exp()).clamp_max(LARGEST)
+    deviations = (UNIT_SCALE * cloud.log_scales.detach().exp()).clamp_max(MAX_SCALE)
     axes = to_matrix(cloud.quaternions.detach()) * deviations[:, None, :]
     return BrowserSplats(
-        (ENLARGED * cloud.means.detach()).cpu().numpy(),
+        (UNIT_SCALE * cloud.means.detach()).cpu().numpy(),
         (axes @ axes.mT).cpu().numpy(),
         colours(cloud, eye).cpu().numpy(),
         cloud.opacities.detach().sigmoid()[:, None].cpu().numpy(),

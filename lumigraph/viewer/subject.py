@@ -15,7 +15,7 @@ from ..datasets.scene import Frame, Scene
 from ..paths import Surroundings, best_centred, pivot
 
 NAME = re.compile(r"\w[\w .-]{0,80}")  # of what somebody saves
-NAMING = "A name is made of letters, digits, spaces, dots and dashes"
+NAME_RULE = "A name is made of letters, digits, spaces, dots and dashes"
 Keep = Callable[[str, Crop | None, Mapping[str, float]], str]
 
 

@@ -11,8 +11,8 @@ from jaxtyping import Float
 from ..system.progress import clock, short
 from .turns import Turns
 
-EVERY = 1.0  # seconds between updates
-POINTS = 200  # of the curve
+UPDATE_SECONDS = 1.0  # seconds between updates
+CURVE_POINTS = 200  # of the curve
 INK = "#5686d6"
 Measure = Literal["psnr", "loss"]
 TITLES: dict[Measure, str] = {"psnr": "PSNR of training batches", "loss": "Loss of training batches"}
@@ -52,7 +52,7 @@ class TrainingPanel:
             self._rows.append((row["seconds"], row[self._measure]))
         self._last = describe(step, row)
         if (now := time.perf_counter()) >= self._next:
-            self._next = now + EVERY
+            self._next = now + UPDATE_SECONDS
             self._status.content = f"{100 * progress:.0f} % · {self._last}"
             self._draw()
 
@@ -87,9 +87,9 @@ def describe(step: int, row: dict[str, Any]) -> str:
 
 
 def curve(rows: list[tuple[float, float]]) -> tuple[Float[np.ndarray, " point"], Float[np.ndarray, " point"]]:
-    """Seconds and PSNR or loss of the curve: means over stretches of steps, at most POINTS of them."""
+    """Seconds and PSNR or loss of the curve: means over stretches of steps, at most CURVE_POINTS of them."""
     if not rows:
         return np.zeros(1), np.zeros(1)
     table = np.array(rows)
-    seconds, psnr = np.array([part.mean(0) for part in np.array_split(table, min(len(table), POINTS))]).T
+    seconds, psnr = np.array([part.mean(0) for part in np.array_split(table, min(len(table), CURVE_POINTS))]).T
     return seconds, psnr

@@ -8,9 +8,9 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterator
 
-SHARE = 0.5  # of the time that renderings may take from training while someone moves
-IDLE_SHARE = 0.03  # and while nobody does
-POLL = 0.1  # seconds between checks whether to stop waiting
+RENDER_SHARE = 0.5  # of the time that renderings may take from training while someone moves
+IDLE_RENDER_SHARE = 0.03  # and while nobody does
+POLL_SECONDS = 0.1  # seconds between checks whether to stop waiting
 
 
 class NotWantedError(Exception):
@@ -42,7 +42,7 @@ class Turns:
             self._waiting.append(ticket)
             try:
                 while not self._free_for(ticket):
-                    self._condition.wait(POLL)
+                    self._condition.wait(POLL_SECONDS)
                     if not wanted():
                         raise NotWantedError
                 self._busy = True
@@ -57,7 +57,7 @@ class Turns:
             with self._condition:
                 self._busy, self._served = False, self._served + 1
                 self._open = self._open and self.paused  # the next one has to wait until training gives way again
-                self._own_until = end + (end - begin) * (1 / SHARE - 1)
+                self._own_until = end + (end - begin) * (1 / RENDER_SHARE - 1)
                 self._condition.notify_all()
 
     def _free_for(self, ticket: object) -> bool:
@@ -79,7 +79,7 @@ class Turns:
             while (self.paused or (self._served == before and self._waiting) or self._busy) and not (
                 stopping() and not self._busy
             ):
-                self._condition.wait(POLL)
+                self._condition.wait(POLL_SECONDS)
             self._open = False
 
     def end_training(self) -> None:
@@ -99,4 +99,4 @@ class Turns:
     def refreshed(self, seconds: float) -> None:
         """Take note of a refresh that is over, and of how long it took."""
         with self._condition:
-            self._idle_until = time.perf_counter() + seconds / IDLE_SHARE
+            self._idle_until = time.perf_counter() + seconds / IDLE_RENDER_SHARE

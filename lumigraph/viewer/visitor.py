@@ -26,20 +26,20 @@ from .flight import Flight
 from .method_controls import MethodControls
 from .modes import along_axis, extra_modes, picture
 from .pace import Pace
-from .painter import MOVING, Painter
+from .painter import MOVING_SECONDS, Painter
 from .path_panel import PathPanel
 from .shared import Shared
-from .splats import ENLARGED, colours, splats
+from .splats import UNIT_SCALE, colours, splats
 from .turns import NotWantedError
 from .view_request import ViewRequest
 
 DEPTH_SIZE = 320  # pixels along the longer side of the depth that goes with a picture
 DEPTH_STEP = 256e-5  # scene units, to which that depth is rounded so that it packs well
-FEWEST_ROWS = 16  # of a band
+MIN_BAND_ROWS = 16  # of a band
 QUALITY, QUALITY_MOVING = 90, 70  # of JPEG
-MOST_RECOLOURED = 500_000  # Gaussians; more are too many to send again whenever the camera rests
-WIDER = 0.01  # radians: a difference of angles of view that is worth setting
-TURNED = 0.03  # how far the eye must move, as a share of its distance to the middle, for colours to change
+MAX_RECOLOURED_GAUSSIANS = 500_000  # Gaussians; more are too many to send again whenever the camera rests
+FIELD_OF_VIEW_TOLERANCE = 0.01  # radians: a difference of angles of view that is worth setting
+RECOLOUR_EYE_SHIFT = 0.03  # how far the eye must move, as a share of its distance to the middle, for colours to change
 Wanted = Callable[[], bool]
 
 
@@ -90,7 +90,7 @@ class Visitor:
         client.camera.on_update(self._moved)
         first = shared.subject.first
         angle, wide = angles(first)[1], angle_for(first, client.camera.aspect)
-        if wide > angle + WIDER:  # a narrow window shows the whole photograph too
+        if wide > angle + FIELD_OF_VIEW_TOLERANCE:  # a narrow window shows the whole photograph too
             client.camera.fov = angle = wide
         self.controls.tell_angle(angle)  # what the client's camera says may be from before it was told any
         if shared.scenery.has_points:
@@ -160,14 +160,14 @@ class Visitor:
         rendering, camera = self._render(request, size, wanted)
         took = time.perf_counter() - begin
         self._pace.note(size[0] * size[1], took)
-        self._show(rendering, camera, request, QUALITY_MOVING if seconds == MOVING else QUALITY)
+        self._show(rendering, camera, request, QUALITY_MOVING if seconds == MOVING_SECONDS else QUALITY)
         self._say(f"{size[0]} x {size[1]} in {1000 * took:.0f} ms")
         return size == request.full
 
     def _render(self, request: ViewRequest, size: tuple[int, int], wanted: Wanted) -> tuple[Rendering, Camera]:
         """A rendering and its camera, made in bands so that others get turns and it can be abandoned soon."""
         camera, (width, height) = request.camera(size), size
-        band = max(FEWEST_ROWS, int(self._bands.pixels(MOVING)) // width)
+        band = max(MIN_BAND_ROWS, int(self._bands.pixels(MOVING_SECONDS)) // width)
         band = height if band >= 0.7 * height else band
         parts = []
         for first in range(0, height, band):
@@ -204,13 +204,13 @@ class Visitor:
         if self._splats is not None:
             self._splats.visible = True
         now, eye = (self._shared.step, request.crop, request.told, request.floaters), torch.tensor(request.pose)[:, 3]
-        if self._splats is None or (seconds > MOVING and self._sent != now):
+        if self._splats is None or (seconds > MOVING_SECONDS and self._sent != now):
             self._send_splats(request, eye, wanted)
             self._sent, self._eye = now, eye
-        elif seconds > MOVING and self._turned(eye):
+        elif seconds > MOVING_SECONDS and self._turned(eye):
             self._recolour(request, eye, wanted)
             self._eye = eye
-        return seconds > MOVING
+        return seconds > MOVING_SECONDS
 
     def _send_splats(self, request: ViewRequest, eye: torch.Tensor, wanted: Wanted) -> None:
         with self._shared.turns.turn(wanted):
@@ -220,7 +220,7 @@ class Visitor:
             raise NotWantedError
         arrays = made.centres, made.covariances, made.colours, made.opacities
         if self._splats is None:
-            self._splats = self._client.scene.add_gaussian_splats("/gaussians", *arrays, scale=1 / ENLARGED)
+            self._splats = self._client.scene.add_gaussian_splats("/gaussians", *arrays, scale=1 / UNIT_SCALE)
         else:
             self._splats.set_gaussians(*arrays)
         self._say(f"{len(cloud)} Gaussians, drawn by the browser")
@@ -229,7 +229,7 @@ class Visitor:
         """Send the colours seen from where the eye rests now."""
         with self._shared.turns.turn(wanted):
             cloud = self._shared.cloud(request)
-            if cloud.degree == 0 or len(cloud) > MOST_RECOLOURED:
+            if cloud.degree == 0 or len(cloud) > MAX_RECOLOURED_GAUSSIANS:
                 return
             rgb = colours(cloud, eye).cpu().numpy()
         if self._here and len(rgb) == len(self._splats.buffer):
@@ -237,7 +237,7 @@ class Visitor:
 
     def _turned(self, eye: torch.Tensor) -> bool:
         middle = torch.tensor(self._shared.subject.frame.bounds).mean(0)
-        return float((eye - self._eye).norm()) > TURNED * max(float((self._eye - middle).norm()), 0.1)
+        return float((eye - self._eye).norm()) > RECOLOUR_EYE_SHIFT * max(float((self._eye - middle).norm()), 0.1)
 
     def _step_out(self, eye: tuple[float, ...]) -> None:
         """Hide frusta that the eye is in, from this client alone, by nodes of its own in the same places."""

@@ -9,7 +9,7 @@ import json
 from html import escape
 from typing import Any
 
-NARROW = 576  # pixels: viser's panel is a sheet at the bottom of windows up to this width
+NARROW_WINDOW_PIXELS = 576  # pixels: viser's panel is a sheet at the bottom of windows up to this width
 
 # A click on the sheet's handle folds it; what is clicked is the text of the title, inside the handle. The mark keeps it
 # from folding again when somebody opens it, for that makes the picture anew.
@@ -26,5 +26,5 @@ if (innerWidth <= {narrow} && sheet && !window.sheetFolded) {{
 
 def prepare(gui: Any, title: str) -> None:
     """Name the tab after the scene, and fold the panel of small windows once. gui: viser's, of the server."""
-    script = SCRIPT.format(title=json.dumps(title), narrow=NARROW)
+    script = SCRIPT.format(title=json.dumps(title), narrow=NARROW_WINDOW_PIXELS)
     gui.add_html(f'<img hidden alt="" src="data:," onerror="{escape(script)}">', order=1e9)

@@ -25,12 +25,12 @@ class ExportStereo(SphereExport):
 
     def run(self) -> int:
         from ...export.panorama import save_sphere
-        from ...export.stereo import SHARE, stereo_pair, surrounding_distances, top_bottom
+        from ...export.stereo import EYE_DISTANCE_SHARE, stereo_pair, surrounding_distances, top_bottom
 
         opened, method, place, heading, where = self.stand()
         unit = opened.frame.to_source.scale
         near, middle = surrounding_distances(method, place, heading)
-        apart = SHARE * middle if self.interpupillary is None else self.interpupillary / unit
+        apart = EYE_DISTANCE_SHARE * middle if self.interpupillary is None else self.interpupillary / unit
         if apart > near:
             raise LumigraphError(
                 f"Eyes {apart * unit:.4g} apart do not fit where things are {near * unit:.4g} away; "

@@ -17,9 +17,9 @@ from .octree import Octree
 
 EMPTY, LEAF, DIVIDED = 0, 1, 2
 ENTRY_LEVEL = 6  # of an octree: rays look cells of that level up at once and descend from there
-FINEST, MOST = 4, 128  # of an atlas: voxels along a cell of empty space at least, cells along an axis at most
-FARTHEST = 63  # cells that a ray leaps at most
-HALF = 65504.0  # the largest number that half precision has
+MIN_VOXELS, MAX_CELLS = 4, 128  # of an atlas: voxels along a cell of empty space at least, cells along an axis at most
+MAX_LEAP_CELLS = 63  # cells that a ray leaps at most
+FLOAT16_MAX = 65504.0  # the largest number that half precision has
 
 
 @dataclass(frozen=True)
@@ -49,8 +49,8 @@ def octree_for_browser(octree: Octree, degree: int = 3) -> Browsable:
     leaves = cells[kinds == LEAF]
     kept = min(octree.harmonics.shape[-2], (degree + 1) ** 2)
     harmonics = octree.harmonics.detach().cpu().flatten(0, 3)[leaves, :kept].flatten(1).float()
-    density = octree.density.detach().cpu().flatten()[leaves].float().clamp_max(HALF).half()
-    scale = harmonics.abs().amax(1).clamp(1e-4, HALF).half()
+    density = octree.density.detach().cpu().flatten()[leaves].float().clamp_max(FLOAT16_MAX).half()
+    scale = harmonics.abs().amax(1).clamp(1e-4, FLOAT16_MAX).half()
     codes = (127 * harmonics / scale.float()[:, None]).round().clamp(-127, 127).add(128).to(torch.uint8)
     far = clearance(filled(octree, level))
     settings = {
@@ -102,7 +102,7 @@ def atlas_for_browser(atlas: Atlas) -> Browsable:
     nearest that is not empty lies, and each channel's bytes of all blocks after another's: three colours, alpha, and
     with a network the features.
     """
-    cell = max(FINEST, -(-atlas.block * max(atlas.index.shape) // MOST))
+    cell = max(MIN_VOXELS, -(-atlas.block * max(atlas.index.shape) // MAX_CELLS))
     far = clearance(touched(atlas, cell))
     values = atlas.values.cpu()[..., : 8 if atlas.network else 4]
     settings = {
@@ -137,9 +137,9 @@ def touched(atlas: Atlas, cell: int) -> Bool[Tensor, "x y z"]:
 
 
 def clearance(occupied: Bool[Tensor, "x y z"]) -> UInt8[Tensor, "x y z"]:
-    """Chessboard distance of each cell to the nearest that is occupied, 0 there; FARTHEST at most."""
+    """Chessboard distance of each cell to the nearest that is occupied, 0 there; MAX_LEAP_CELLS at most."""
     grown, far = occupied[None].float(), torch.zeros(occupied.shape, dtype=torch.uint8)
-    for _ in range(FARTHEST):
+    for _ in range(MAX_LEAP_CELLS):
         if grown.all():
             break
         far += (grown[0] == 0).to(torch.uint8)

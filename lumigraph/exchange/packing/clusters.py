@@ -6,10 +6,10 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-LEARNT_FROM = 1 << 17  # rows at most; each then counts as much as its weight says
+MAX_TRAINING_ROWS = 1 << 17  # rows at most; each then counts as much as its weight says
 PASSES = 8  # over them; the error falls by less than 1 % in any further one
-CHUNK = 1 << 13  # rows whose distances to the whole codebook are held at once, fewer if it is long
-HELD = 1 << 26  # distances that are held at once
+CHUNK_ROWS = 1 << 13  # rows whose distances to the whole codebook are held at once, fewer if it is long
+MAX_DISTANCES = 1 << 26  # distances that are held at once
 
 
 @torch.no_grad()
@@ -22,9 +22,9 @@ def clustered(
     of the rows that are worst off.
     """
     weights = weights.double().clamp_min(0) + 1e-9 * (float(weights.max()) if len(weights) else 1.0) + 1e-30
-    if len(rows) > LEARNT_FROM:
-        some = torch.multinomial(weights, LEARNT_FROM, replacement=True, generator=generator)
-        learnt, counts = rows[some], torch.ones(LEARNT_FROM)
+    if len(rows) > MAX_TRAINING_ROWS:
+        some = torch.multinomial(weights, MAX_TRAINING_ROWS, replacement=True, generator=generator)
+        learnt, counts = rows[some], torch.ones(MAX_TRAINING_ROWS)
     else:
         learnt, counts = rows, (weights / weights.mean()).float()
     book = learnt[_drawn(counts, size, generator)].clone()
@@ -47,7 +47,7 @@ def nearest(
     """The code of each row, and its squared distance."""
     half = 0.5 * book.square().sum(-1)
     codes, errors = torch.empty(len(rows), dtype=torch.int64), torch.empty(len(rows))
-    chunk = min(CHUNK, max(1, HELD // max(1, len(book))))
+    chunk = min(CHUNK_ROWS, max(1, MAX_DISTANCES // max(1, len(book))))
     for i in range(0, len(rows), chunk):
         some = rows[i : i + chunk]
         least, codes[i : i + chunk] = torch.addmm(half, some, book.t(), alpha=-1).min(-1)

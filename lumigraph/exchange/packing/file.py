@@ -33,7 +33,7 @@ from .table import Table
 
 MAGIC = b"LUMIPACK"
 HEAD = struct.Struct("<8sI")  # magic, length of the head
-WORKING = 3  # times the bytes of all tensors that unpacking needs
+UNPACKING_FACTOR = 3  # times the bytes of all tensors that unpacking needs
 
 Which = Annotated[int, between(0, 1_000_000)]  # stream
 
@@ -123,7 +123,7 @@ def check_sizes(head: Head, there: int, path: Path) -> None:
     if (said := sum(stream.bytes for stream in head.streams)) != there:
         raise LumigraphError(f"{path} declares {said:,} bytes of tensors and holds {there:,}; restore it from a copy")
     sizes = [math.prod(entry.shape) * np.dtype(entry.dtype).itemsize for entry in head.tensors.values()]
-    needed, free = WORKING * (sum(sizes) + sum(stream.size for stream in head.streams)), free_memory()
+    needed, free = UNPACKING_FACTOR * (sum(sizes) + sum(stream.size for stream in head.streams)), free_memory()
     if needed > free:
         raise LumigraphError(
             f"{path} declares tensors that take {gigabytes(needed)} to unpack, and {gigabytes(free)} are free; "

@@ -16,9 +16,9 @@ from torch import Tensor
 
 from .clusters import clustered
 
-WIDEST = 8.0  # standard deviations that the levels of a whole number span; what lies beyond has more levels
-MOST = (1 << 16) - 1  # the largest whole number
-NOTICED = 0.02  # of a float16's typical size: what tuning takes for its unit
+MAX_DEVIATIONS = 8.0  # standard deviations that the levels of a whole number span; what lies beyond has more levels
+MAX_WHOLE_NUMBER = (1 << 16) - 1  # the largest whole number
+TUNING_UNIT = 0.02  # of a float16's typical size: what tuning takes for its unit
 
 
 class Form(ABC):
@@ -56,7 +56,7 @@ class Half(Form):
         return straight(self.exact, self.exact.half().float())
 
     def learning(self) -> list[tuple[Tensor, float]]:
-        return [(self.exact, NOTICED * rms(self.exact))]
+        return [(self.exact, TUNING_UNIT * rms(self.exact))]
 
     def streams(self) -> list[np.ndarray]:
         return [self.exact.detach().half().numpy()]
@@ -76,8 +76,8 @@ class Scaled(Form):
         self.exact, self.width = values.clone(), values.shape[1]
         filled = values if len(values) else values.new_zeros(1, self.width)
         self.low, high = filled.amin(0), filled.amax(0)
-        span = torch.minimum(high - self.low, WIDEST * filled.std(0, correction=0))
-        self.step = torch.maximum(span / ((1 << bits) - 1), (high - self.low) / MOST).clamp_min(1e-12)
+        span = torch.minimum(high - self.low, MAX_DEVIATIONS * filled.std(0, correction=0))
+        self.step = torch.maximum(span / ((1 << bits) - 1), (high - self.low) / MAX_WHOLE_NUMBER).clamp_min(1e-12)
 
     def values(self) -> Float[Tensor, "row column"]:
         return straight(self.exact, self.low + self.step * self._codes())
@@ -91,7 +91,7 @@ class Scaled(Form):
         return [torch.stack([self.low, self.step]).numpy(), codes.numpy().astype(kind)]
 
     def _codes(self) -> Float[Tensor, "row column"]:
-        return ((self.exact.detach() - self.low) / self.step).round_().clamp_(0, MOST)
+        return ((self.exact.detach() - self.low) / self.step).round_().clamp_(0, MAX_WHOLE_NUMBER)
 
     @staticmethod
     def read(streams: Sequence[np.ndarray]) -> Scaled:

@@ -14,8 +14,8 @@ from .forms import Coded, Form, Half, Scaled
 from .storage import Layout, Stored
 from .streams import Number, kind_of
 
-FEWEST = 8  # rows for each code; with fewer a codebook would be no smaller than what it stands for
-LEAST_BITS = 2
+MIN_ROWS_PER_CODE = 8  # rows for each code; with fewer a codebook would be no smaller than what it stands for
+MIN_BITS = 2
 
 
 @dataclass(frozen=True)
@@ -97,7 +97,7 @@ def packed(
     generator: torch.Generator,
 ) -> Table:
     """A tensor in the form that its method says. weights: importance of each of its rows; None where all are alike"""
-    shape, bits = tuple(tensor.shape), max(how.bits - recipe.coarser, LEAST_BITS)
+    shape, bits = tuple(tensor.shape), max(how.bits - recipe.coarser, MIN_BITS)
     if how.how == "nothing":
         return Table(shape, how.layout, how.fill, None, dtype=kind_of(tensor.detach().cpu().numpy()))
     rows = as_rows(tensor.detach().cpu().float().contiguous(), how.layout)
@@ -107,10 +107,10 @@ def packed(
     rows = rows[some]
     if how.how == "half":
         return Table(shape, how.layout, how.fill, kept, [Half(rows)])
-    if how.how == "scaled" or len(rows) < 2 * FEWEST:
+    if how.how == "scaled" or len(rows) < 2 * MIN_ROWS_PER_CODE:
         return Table(shape, how.layout, how.fill, kept, [Scaled(rows, bits)])
     weights = torch.ones(len(rows)) if weights is None else weights.cpu()[some]
-    size = min(recipe.codebook, max(len(rows) // FEWEST, 1))
+    size = min(recipe.codebook, max(len(rows) // MIN_ROWS_PER_CODE, 1))
     front = [Scaled(rows[:, : how.plain], bits)] if how.plain else []
     coded = Coded(rows[:, how.plain :].contiguous(), weights, size, recipe.apart, bits, generator)
     return Table(shape, how.layout, how.fill, kept, [*front, coded])

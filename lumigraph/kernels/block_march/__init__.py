@@ -16,8 +16,8 @@ FACTS = Facts(unit="rays", outputs=2, differentiable=(5,), typical=4, compiled=9
 
 CHANNELS = 8  # of a voxel: red, green, blue, alpha, four features
 ALPHA = 3
-FARTHEST = 6  # of an empty voxel's distance to what is not empty, that is told
-EMPTIEST = 64  # of an empty block's
+MAX_VOXEL_DISTANCE = 6  # of an empty voxel's distance to what is not empty, that is told
+MAX_BLOCK_DISTANCE = 64  # of an empty block's
 
 
 @dataclass(frozen=True)
@@ -74,8 +74,8 @@ class Blocks:
         x, y, z = (places[which].long() - block * own + 1).unbind(-1)
         rows[number, x, y, z] = which.int()
         require(int((rows >= 0).sum()) == len(which), "two rows belong to one voxel")
-        index = _with_distances(index.view(1, *blocks.tolist()), EMPTIEST, beyond=False)[0]
-        rows = _with_distances(rows, FARTHEST, beyond=True)  # beyond a block may be anything
+        index = _with_distances(index.view(1, *blocks.tolist()), MAX_BLOCK_DISTANCE, beyond=False)[0]
+        rows = _with_distances(rows, MAX_VOXEL_DISTANCE, beyond=True)  # beyond a block may be anything
         return cls(index, rows, len(places), shape[0] / 4 if contracted else 0.0)
 
     @property

@@ -7,14 +7,14 @@ from numba import njit, prange
 
 from .._dispatch import differentiable, empty
 from ..sparse_grid.cpu import slabs_of
-from .reference import LEAST
+from .reference import MIN_STRIDE_DIVISOR
 
 ZERO, HALF, ONE, TWO, FOUR = (np.float32(x) for x in (0, 0.5, 1, 2, 4))
-NARROWEST = np.float32(LEAST)
+MIN_DIVISOR = np.float32(MIN_STRIDE_DIVISOR)
 FAR = np.float32(1e30)
 CHUNK = 64  # rays a thread takes at a time
 C, A = 8, 3  # channels, and which of them is alpha
-SURE = np.float32(0.9)  # voxels of a step, in a count of steps that must not lead too far
+SURE_STEP = np.float32(0.9)  # voxels of a step, in a count of steps that must not lead too far
 
 
 @njit(inline="always")
@@ -54,7 +54,7 @@ def later(t, steps, along, aside, ball):
         else:
             share = ball / radius
             speed = np.sqrt(ONE + FOUR * aside / (ball * ball) * (ONE - share)) * share * ball
-            t += radius / max(speed - (along + t) / radius, NARROWEST)
+            t += radius / max(speed - (along + t) / radius, MIN_DIVISOR)
     return t
 
 
@@ -98,7 +98,7 @@ def past(x, y, z, d, bx, by, bz, number, block, ball):
         return beyond(x, y, z, d[0], d[1], d[2], bx, by, bz, block)
     clear = min(from_sides(x, bx, block), from_sides(y, by, block), from_sides(z, bz, block))
     clear += np.float32(block * (-1 - number))
-    return max(np.int64(1), np.int64(SURE * clear))
+    return max(np.int64(1), np.int64(SURE_STEP * clear))
 
 
 @njit(inline="always")

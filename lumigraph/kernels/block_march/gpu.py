@@ -10,12 +10,12 @@ from .._dispatch import differentiable, empty
 from .._rows_gpu import load_row
 from ..sparse_grid.gpu import corner_of, weight_of
 from . import ALPHA, CHANNELS, Blocks
-from .reference import LEAST
+from .reference import MIN_STRIDE_DIVISOR
 
 BLOCK = 32  # rays; they march together, so a program is as slow as its slowest
 C, A = tl.constexpr(CHANNELS), tl.constexpr(ALPHA)
-NARROWEST = tl.constexpr(LEAST)
-SURE = tl.constexpr(0.9)  # voxels of a step, in a count of steps that must not lead too far
+MIN_DIVISOR = tl.constexpr(MIN_STRIDE_DIVISOR)
+SURE_STEP = tl.constexpr(0.9)  # voxels of a step, in a count of steps that must not lead too far
 
 
 @triton.jit
@@ -49,7 +49,7 @@ def _later(t, steps, along, aside, ball, CURVED: tl.constexpr):
             radius = tl.maximum(tl.sqrt(aside + (along + t) * (along + t)), 1e-6)
             share = ball / tl.maximum(radius, ball)
             speed = tl.sqrt(1 + 4 * aside / (ball * ball) * (1 - share)) * share * ball
-            stride = radius / tl.maximum(speed - (along + t) / radius, NARROWEST)
+            stride = radius / tl.maximum(speed - (along + t) / radius, MIN_DIVISOR)
             t += tl.where(steps > 0, tl.where(radius <= ball, 1.0, stride), 0.0)
             steps -= 1
     else:
@@ -188,7 +188,7 @@ def _march(
         met += some.to(tl.int32)
         if CURVED:
             clear = tl.minimum(tl.minimum(_from_sides(x, bx, B), _from_sides(y, by, B)), _from_sides(z, bz, B))
-            out = ((clear + (B * (-1 - number)).to(tl.float32)) * SURE).to(tl.int32)
+            out = ((clear + (B * (-1 - number)).to(tl.float32)) * SURE_STEP).to(tl.int32)
         else:
             away = tl.minimum(tl.minimum(_to_side(x, dx, bx, B), _to_side(y, dy, by, B)), _to_side(z, dz, bz, B))
             out = tl.ceil(tl.minimum(away, 1e9)).to(tl.int32)

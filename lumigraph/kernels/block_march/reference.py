@@ -9,7 +9,7 @@ from torch import Tensor
 
 from . import ALPHA, CHANNELS, Blocks
 
-LEAST = 1e-3  # of a stride's divisor, beyond which there is nothing more
+MIN_STRIDE_DIVISOR = 1e-3  # of a stride's divisor, beyond which there is nothing more
 
 
 def run(
@@ -42,16 +42,16 @@ def steps(origins: Tensor, directions: Tensor, enter: Tensor, leave: Tensor, bal
 
 
 def stride(along: Tensor, aside: Tensor, ball: float) -> Tensor:
-    """How far a ray goes that it comes one voxel onward. along: distance from where it is nearest to the middle of the
+    """Distance along a ray to the next voxel. along: distance from where it is nearest to the middle of the
     ball; aside: square of the middle's distance from there"""
     radius = (aside + along.square()).sqrt()
     share = ball / radius.clamp_min(ball)
     speed = (1 + 4 * aside / ball**2 * (1 - share)).sqrt() * share * ball
-    return torch.where(radius <= ball, 1, radius / (speed - along / radius).clamp_min(LEAST))
+    return torch.where(radius <= ball, 1, radius / (speed - along / radius).clamp_min(MIN_STRIDE_DIVISOR))
 
 
 def contracted(points: Tensor, ball: float) -> Tensor:
-    """Where points lie in the grid."""
+    """Positions of points in the grid."""
     if not ball:
         return points
     middle = 2 * ball - 0.5

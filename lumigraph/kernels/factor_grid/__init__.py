@@ -18,7 +18,7 @@ FACTS = Facts(unit="samples", outputs=1, differentiable=(1,), typical=2, compile
 
 Kind = Literal["vm", "cp"]
 MODES = ((1, 2, 0), (0, 2, 1), (0, 1, 2))  # the two axes of a plane, and that of the line beside it
-LARGEST = 1 << 14  # nodes along an axis, so that the rows of a table are counted in 32 bits
+MAX_NODES = 1 << 14  # nodes along an axis, so that the rows of a table are counted in 32 bits
 
 
 @dataclass(frozen=True)
@@ -35,7 +35,7 @@ class Factors:
 
     def __post_init__(self) -> None:
         require(self.kind in ("vm", "cp"), f"factors are vm or cp, not {self.kind!r}")
-        require(all(2 <= n <= LARGEST for n in self.nodes), f"{self.nodes} nodes cannot be; 2 to {LARGEST:,} can")
+        require(all(2 <= n <= MAX_NODES for n in self.nodes), f"{self.nodes} nodes cannot be; 2 to {MAX_NODES:,} can")
 
     @property
     def shapes(self) -> list[tuple[int, ...]]:

@@ -9,7 +9,7 @@ import triton.language as tl
 from .._dispatch import differentiable, empty
 
 BLOCK = 64  # samples
-WIDEST = 32  # components taken together
+MAX_COMPONENTS = 32  # components taken together
 
 
 @triton.jit
@@ -158,7 +158,7 @@ def forward(ctx, points, table, factors, summed):
     out = empty(len(points), 1 if summed else factors.products * width, device=points.device)
     ctx.numbers = len(points), *factors.nodes
     ctx.shape = {"VM": vm, "SUMMED": summed, "R": width, "BLOCK": BLOCK}
-    ctx.shape["C"] = min(WIDEST, triton.next_power_of_2(width))
+    ctx.shape["C"] = min(MAX_COMPONENTS, triton.next_power_of_2(width))
     if len(points):
         _forward[(triton.cdiv(len(points), BLOCK),)](points, table, out, *ctx.numbers, **ctx.shape)
     ctx.save_for_backward(points, table)

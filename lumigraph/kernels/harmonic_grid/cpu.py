@@ -13,9 +13,9 @@ from ..spherical_harmonics import K00, K1, K20, K21, K22
 ZERO, ONE, THREE = np.float32(0), np.float32(1), np.float32(3)
 Y0, Y1, Y20, Y21, Y22 = (np.float32(k) for k in (K00, K1, K20, K21, K22))
 WIDTH = 27  # coefficients of a row, colours next to each other
-SECOND = 11  # where a row's second register begins
+SECOND_REGISTER = 11  # where a row's second register begins
 # Of the two registers: which lanes are of each colour, and in the last row, which are a row's own.
-_PLACES = np.stack([np.arange(16), np.arange(SECOND, WIDTH)])  # in a row, of each lane
+_PLACES = np.stack([np.arange(16), np.arange(SECOND_REGISTER, WIDTH)])  # in a row, of each lane
 _MASKS = [*(_PLACES % 3 == colour for colour in range(3)), _PLACES >= [[0], [16]]]
 LANES_OF = np.stack(_MASKS).astype(np.float32).reshape(-1)
 
@@ -66,7 +66,7 @@ def _look_up(points, directions, index, rows, density, harmonics, lanes_of, to_d
                 row, weight = at[k], weights[k]
                 total += weight * density[row]
                 v0 = v0 + weight * fetch(harmonics, row * WIDTH)
-                v1 = v1 + weight * fetch(harmonics, row * WIDTH + SECOND)
+                v1 = v1 + weight * fetch(harmonics, row * WIDTH + SECOND_REGISTER)
             v0, v1 = v0 * b0, v1 * b1
             put(colours, 0, totals((v0 * red0 + v1 * red1, v0 * green0 + v1 * green1, v0 * blue0 + v1 * blue1)))
             to_density[i] = total
@@ -96,7 +96,7 @@ def _gradient(d_density, d_rgb, points, directions, index, rows, order, starts, 
                 for k in range(corners(points, i, index, rows, at, weights)):
                     row, weight = at[k], weights[k]
                     to_density[row] += weight * d_density[i]
-                    first, second = row * WIDTH, row * WIDTH + SECOND
+                    first, second = row * WIDTH, row * WIDTH + SECOND_REGISTER
                     v0, v1 = fetch(to_harmonics, first) + weight * g0, fetch(to_harmonics, second) + weight * g1
                     put(to_harmonics, first, v0)
                     put_where(own, to_harmonics, second, v1)

@@ -11,5 +11,10 @@ FAULTS = {
 
 # These let an index leave its array.
 ASTRAY = {
-    "a register beyond the last row": ("cpu", "_look_up", "row * WIDTH + SECOND", "row * WIDTH + SECOND + 16"),
+    "a register beyond the last row": (
+        "cpu",
+        "_look_up",
+        "row * WIDTH + SECOND_REGISTER",
+        "row * WIDTH + SECOND_REGISTER + 16",
+    ),
 }

@@ -15,8 +15,8 @@ from .._facts import Facts
 
 FACTS = Facts(unit="rays", outputs=4, differentiable=(), typical=3, compiled=5)
 
-DEEPEST = 10  # levels: a code has three bits for each, and one more, in 32 bits
-SLOW = 1e-9  # of a direction along an axis, below which a ray is said to go forward so slowly
+MAX_LEVELS = 10  # levels: a code has three bits for each, and one more, in 32 bits
+MIN_SPEED = 1e-9  # of a direction along an axis, below which a ray is said to go forward so slowly
 
 
 @dataclass(frozen=True)
@@ -45,8 +45,8 @@ class Tree:
         codes = codes.long()
         levels = levels_of(codes)
         depth = int(levels.max()) if len(codes) else 1
-        sound = len(codes) == 0 or (int(codes.min()) >= 8 and int(codes.max()) < 8 ** (DEEPEST + 1))
-        require(sound, f"codes of cells have 1 to {DEEPEST} levels")
+        sound = len(codes) == 0 or (int(codes.min()) >= 8 and int(codes.max()) < 8 ** (MAX_LEVELS + 1))
+        require(sound, f"codes of cells have 1 to {MAX_LEVELS} levels")
         divided = [codes.new_ones(1)]  # codes of the nodes, level by level
         for level in range(1, depth):
             deeper = codes[levels > level] >> 3 * (levels[levels > level] - level)
@@ -124,14 +124,14 @@ def octree_cells(
 def check(tree: Tree, density: Tensor, near: float, stop: float) -> None:
     """Raise ValueError for what a traversal cannot bear."""
     require(len(density) == tree.count, f"{len(density)} densities, where a tree has {tree.count} rows")
-    require(1 <= tree.depth <= DEEPEST, f"a tree of {tree.depth} levels cannot be")
+    require(1 <= tree.depth <= MAX_LEVELS, f"a tree of {tree.depth} levels cannot be")
     require(near >= 0 and 0 <= stop <= 1, f"near {near} and stop {stop} cannot be")
 
 
 def levels_of(codes: Int[Tensor, " row"]) -> Int[Tensor, " row"]:
     """Number of levels below the cube of cells with these codes."""
     level = torch.zeros_like(codes)
-    for k in range(1, DEEPEST + 1):
+    for k in range(1, MAX_LEVELS + 1):
         level += (codes >= 8**k).to(level.dtype)
     return level
 

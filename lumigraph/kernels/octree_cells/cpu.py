@@ -8,9 +8,9 @@ import torch
 from numba import njit, prange
 
 from .._dispatch import empty
-from . import SLOW as _SLOW
+from . import MIN_SPEED as _MIN_SPEED
 
-ZERO, ONE, SLOW = np.float32(0), np.float32(1), np.float32(_SLOW)
+ZERO, ONE, MIN_SPEED = np.float32(0), np.float32(1), np.float32(_MIN_SPEED)
 CHUNK = 64  # rays that share the memory for their nodes
 FAST = {"cache": True, "error_model": "numpy"}
 
@@ -18,7 +18,7 @@ FAST = {"cache": True, "error_model": "numpy"}
 @njit(inline="always")
 def inverse_of(d, side):
     """One over the smallest cells that a ray passes along an axis in a unit of its length."""
-    return ONE / ((SLOW if abs(d) < SLOW else d) * side)
+    return ONE / ((MIN_SPEED if abs(d) < MIN_SPEED else d) * side)
 
 
 @njit(inline="always")

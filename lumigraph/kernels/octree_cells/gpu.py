@@ -12,10 +12,10 @@ from torch import Tensor
 
 from .._dispatch import empty
 from .._rows_gpu import load_row
-from . import SLOW as _SLOW
+from . import MIN_SPEED as _MIN_SPEED
 from . import Tree
 
-SLOW = tl.constexpr(_SLOW)
+MIN_SPEED = tl.constexpr(_MIN_SPEED)
 BLOCK = 32  # rays; they go together, so a program is as slow as its slowest
 
 
@@ -40,9 +40,9 @@ def enter(origins, directions, r, here, near, DEPTH: tl.constexpr):
     """Rays (origins, directions, one over these), where they enter the cube, which do, and their cells there."""
     ox, oy, oz = load_row(origins, r, here)
     dx, dy, dz = load_row(directions, r, here, 1.0)
-    ix = 1.0 / tl.where(tl.abs(dx) < SLOW, SLOW, dx)
-    iy = 1.0 / tl.where(tl.abs(dy) < SLOW, SLOW, dy)
-    iz = 1.0 / tl.where(tl.abs(dz) < SLOW, SLOW, dz)
+    ix = 1.0 / tl.where(tl.abs(dx) < MIN_SPEED, MIN_SPEED, dx)
+    iy = 1.0 / tl.where(tl.abs(dy) < MIN_SPEED, MIN_SPEED, dy)
+    iz = 1.0 / tl.where(tl.abs(dz) < MIN_SPEED, MIN_SPEED, dz)
     t, far = through_cube(ox, oy, oz, ix, iy, iz, near)
     x = cell_at(ox + t * dx, 0, 1 << DEPTH, 2.0**DEPTH)
     y = cell_at(oy + t * dy, 0, 1 << DEPTH, 2.0**DEPTH)

@@ -7,7 +7,7 @@ import math
 import torch
 from torch import Tensor
 
-from . import SLOW, Tree
+from . import MIN_SPEED, Tree
 
 
 @torch.no_grad()
@@ -15,7 +15,7 @@ def run(
     origins: Tensor, directions: Tensor, tree: Tree, density: Tensor, near: float, stop: float
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     side, rays = 1 << tree.depth, torch.arange(len(origins), device=origins.device)
-    inverse = 1 / torch.where(directions.abs() < SLOW, SLOW, directions)
+    inverse = 1 / torch.where(directions.abs() < MIN_SPEED, MIN_SPEED, directions)
     a, b = -origins * inverse, (1 - origins) * inverse
     t, far = torch.minimum(a, b).amax(-1).clamp_min(near), torch.maximum(a, b).amin(-1)
     place = ((origins + t[:, None] * directions) * side).floor().nan_to_num().clamp(0, side - 1).long()
@@ -47,7 +47,7 @@ def run(
 
 
 def leaves(tree: Tree, place: Tensor) -> tuple[Tensor, Tensor]:
-    """What stands in `Tree.cells` for the undivided cells at places (x, y, z), whole numbers below 2^depth along each
+    """Entries of `Tree.cells` for the leaf cells at places (x, y, z), whole numbers below 2^depth along each
     axis; and the cells' sides, in the same unit."""
     cells = tree.cells.flatten().long()
     node, size = torch.zeros_like(place[:, 0]), torch.full_like(place[:, 0], 1 << tree.depth)

@@ -12,7 +12,7 @@ from ..octree_cells.cpu import CHUNK, FAST, ONE, ZERO, cell_at, inverse_of, leaf
 from ..spherical_harmonics.cpu import basis
 
 HALF = np.float32(0.5)
-MET = 64  # cells of a ray whose colours are worked out together
+CELLS_PER_CHUNK = 64  # cells of a ray whose colours are worked out together
 
 
 def spread(rays):
@@ -56,7 +56,7 @@ def _forward(chunks, o, d, cells, named, density, harmonics, bands, depth, near,
     for i in prange(len(chunks)):
         chunk = chunks[i]
         path, y = np.zeros(depth + 1, np.int64), np.zeros(16, np.float32)
-        met, weights = np.zeros(MET, np.int64), np.zeros(MET, np.float32)
+        met, weights = np.zeros(CELLS_PER_CHUNK, np.int64), np.zeros(CELLS_PER_CHUNK, np.float32)
         asked = np.zeros(1, np.float32)  # a sum that nobody needs, or compilers would leave it out
         for r in range(chunk * CHUNK, min(n, (chunk + 1) * CHUNK)):
             ox, oy, oz = o[r, 0] * across, o[r, 1] * across, o[r, 2] * across
@@ -86,7 +86,7 @@ def _forward(chunks, o, d, cells, named, density, harmonics, bands, depth, near,
                             spent += weight
                             met[waiting], weights[waiting] = row, weight
                             waiting += weight > ZERO
-                            if waiting == MET:
+                            if waiting == CELLS_PER_CHUNK:
                                 r_, g_, b_ = _shown(met, weights, waiting, harmonics, y, asked)
                                 red, green, blue, waiting = red + r_, green + g_, blue + b_, 0
                     if u2 < 0 or v2 < 0 or w2 < 0 or u2 >= side or v2 >= side or w2 >= side or through < stop:

@@ -12,8 +12,8 @@ from .._facts import Facts
 
 FACTS = Facts(unit="pixels", unit_axes=2, outputs=1, differentiable=(), typical=2, compiled=2)
 
-VARIANCE = 1e-4  # of values in [0, 1]: a hundredth, squared; windows with less are flat and agree with nothing
-BEHIND = 1e-6  # third coordinate up to which a place is behind the neighbour
+MIN_VARIANCE = 1e-4  # of values in [0, 1]: a hundredth, squared; windows with less are flat and agree with nothing
+BEHIND_DEPTH = 1e-6  # third coordinate up to which a place is behind the neighbour
 
 
 @door

@@ -5,12 +5,12 @@ import numpy as np
 from numba import njit, prange
 
 from .._dispatch import empty
-from . import BEHIND, VARIANCE
+from . import BEHIND_DEPTH, MIN_VARIANCE
 
 BORDER = 3  # zeros around a neighbour: one pixel before, two behind, where two are looked up beside each other
 QUANTITIES = 6  # sums over a window of w, w a, w b, w a a, w b b, w a b
-E, LEAST = np.float32(VARIANCE), np.float32(BEHIND)
-BEYOND = np.float32(4)  # more than any cost
+E, MIN_DEPTH = np.float32(MIN_VARIANCE), np.float32(BEHIND_DEPTH)
+MAX_COST = np.float32(4)  # more than any cost
 ZERO, HALF, ONE, TINY = np.float32(0), np.float32(0.5), np.float32(1), np.float32(1e-12)
 
 
@@ -26,7 +26,7 @@ def _place(warp, h, y, rows, columns, u, v):
     for x in range(len(u)):
         centre = np.float32(x) + HALF
         s = across_s * centre + s0
-        before = s > LEAST
+        before = s > MIN_DEPTH
         inverse = ONE / s if before else ZERO
         u[x] = min(max((across_u * centre + u0) * inverse + HALF, ZERO), right) if before else ZERO
         v[x] = min(max((across_v * centre + v0) * inverse + HALF, ZERO), bottom)
@@ -128,7 +128,7 @@ def _sweep(reference, trust, pixels, rows, columns, warps, hypotheses, window, b
         least = np.empty((best, width), np.float32)
         for y in range(height + margin):
             middle = y - margin
-            least[:] = BEYOND
+            least[:] = MAX_COST
             for n in range(count):
                 sums = rings[n, y % len(window)]
                 if y < height:

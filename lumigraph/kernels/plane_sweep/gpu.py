@@ -7,9 +7,9 @@ import triton.language as tl
 from torch import Tensor
 
 from .._dispatch import empty
-from . import BEHIND, VARIANCE
+from . import BEHIND_DEPTH, MIN_VARIANCE
 
-E, LEAST = tl.constexpr(VARIANCE), tl.constexpr(BEHIND)
+E, MIN_DEPTH = tl.constexpr(MIN_VARIANCE), tl.constexpr(BEHIND_DEPTH)
 BLOCK = 128
 
 
@@ -68,7 +68,7 @@ def _costs(
         u = tl.load(warp) * centre_x + tl.load(warp + 1) * centre_y + tl.load(warp + 2) + h * tl.load(warp + 3)
         v = tl.load(warp + 4) * centre_x + tl.load(warp + 5) * centre_y + tl.load(warp + 6) + h * tl.load(warp + 7)
         s = tl.load(warp + 8) * centre_x + tl.load(warp + 9) * centre_y + tl.load(warp + 10) + h * tl.load(warp + 11)
-        before = s > LEAST
+        before = s > MIN_DEPTH
         inverse = 1 / tl.where(before, s, 1.0)
         u = tl.minimum(tl.maximum(u * inverse - 0.5, -1.0), columns.to(tl.float32))
         v = tl.minimum(tl.maximum(v * inverse - 0.5, -1.0), rows.to(tl.float32))

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, grid_sample
 
-from . import BEHIND, VARIANCE
+from . import BEHIND_DEPTH, MIN_VARIANCE
 
 
 def run(
@@ -36,7 +36,7 @@ def run(
         mean_a, mean_b = mean(w * a) / n, mean(w * b) / n
         variance_a, variance_b = mean(w * a * a) / n - mean_a**2, mean(w * b * b) / n - mean_b**2
         covariance = mean(w * a * b) / n - mean_a * mean_b
-        return 1 - share * covariance / ((variance_a + VARIANCE) * (variance_b + VARIANCE)).sqrt()
+        return 1 - share * covariance / ((variance_a + MIN_VARIANCE) * (variance_b + MIN_VARIANCE)).sqrt()
 
     costs = torch.stack([cost(*one) for one in zip(neighbours, neighbour_trust, warps, strict=True)])
     return costs.sort(0).values[:best].mean(0)
@@ -45,7 +45,7 @@ def run(
 def look_up(pictures: Tensor, places: Tensor) -> Tensor:
     """Values (picture, plane, height, width) at homogeneous places, between the four nearest pixels; zero outside."""
     planes, rows, columns = len(places), *pictures.shape[1:]
-    behind = places[..., 2:] <= BEHIND
+    behind = places[..., 2:] <= BEHIND_DEPTH
     at = places[..., :2] / torch.where(behind, 1, places[..., 2:]) * (2 / places.new_tensor([columns, rows])) - 1
     at = torch.where(behind, -4, at)  # from -1 to 1 is inside
     return grid_sample(pictures[:, None].expand(-1, planes, -1, -1).transpose(0, 1), at, align_corners=False).movedim(

@@ -15,8 +15,8 @@ from .._facts import Facts
 
 FACTS = Facts(unit="gaussians", outputs=5, differentiable=(0, 1, 2, 3, 4), typical=5, compiled=5, smooth=(5, 6))
 
-FAINTEST = 1 / 255  # what adds less than this to a pixel is nothing
-OPAQUEST = 0.99  # no Gaussian hides more than this of what is behind it (Kerbl 2023, appendix C)
+MIN_ALPHA = 1 / 255  # what adds less than this to a pixel is nothing
+MAX_ALPHA = 0.99  # no Gaussian hides more than this of what is behind it (Kerbl 2023, appendix C)
 
 
 @dataclass(frozen=True)

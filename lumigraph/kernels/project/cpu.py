@@ -7,11 +7,11 @@ from numba import njit, prange
 
 from .._dispatch import differentiable, empty
 from ..spherical_harmonics.cpu import basis, slope
-from . import FAINTEST
+from . import MIN_ALPHA
 
 FAST = {"cache": True, "fastmath": {"contract", "nsz", "arcp", "reassoc"}, "error_model": "numpy"}
 HALF, ONE, TWO = np.float32(0.5), np.float32(1), np.float32(2)
-NARROWEST = np.float32(1e-8)  # of a footprint's determinant to the blurred one's
+MIN_DETERMINANT_RATIO = np.float32(1e-8)  # of a footprint's determinant to the blurred one's
 # Where a view's numbers begin.
 EYE, FOCAL, CENTRE, LENS, LIMITS, WIDTH, HEIGHT, NEAR = 9, 12, 14, 16, 24, 28, 29, 30
 
@@ -151,7 +151,7 @@ def _forward(
         for i in range(len(means) * part // parts, len(means) * (part + 1) // parts):
             centres[i], conics[i], colours[i], depths[i], seen[i] = 0, 0, 0, 0, 0
             z, px, py, x, y = _onto_plane(means, i, v)
-            if not (z > v[NEAR] and opacities[i] > FAINTEST):
+            if not (z > v[NEAR] and opacities[i] > MIN_ALPHA):
                 continue
             bent_x, bent_y, xx, xy, yy = _lens(x, y, v)
             over, under = px - x, py - y
@@ -163,10 +163,10 @@ def _forward(
             a, b, c, det, narrow = _footprint(_row(A, Q, sx, sy, sz), _row(B, Q, sx, sy, sz), blur)
             opacity = opacities[i]
             if compensate:
-                opacity *= math.sqrt(max(narrow / det, NARROWEST))
-            if not opacity > FAINTEST:
+                opacity *= math.sqrt(max(narrow / det, MIN_DETERMINANT_RATIO))
+            if not opacity > MIN_ALPHA:
                 continue
-            reach = TWO * math.log(opacity / np.float32(FAINTEST))
+            reach = TWO * math.log(opacity / np.float32(MIN_ALPHA))
             wide, high = math.sqrt(reach * a), math.sqrt(reach * c)
             if u + wide < HALF or u - wide > v[WIDTH] - HALF or w + high < HALF or w - high > v[HEIGHT] - HALF:
                 continue
@@ -213,8 +213,8 @@ def _backward(
             gxx, gxy, gyy = g_conics[i, 0], HALF * g_conics[i, 1], g_conics[i, 2]
             to_opacity, fade, turn = g_seen[i], np.float32(0), np.float32(0)
             if compensate:
-                share = max(narrow / det, NARROWEST)
-                if share > NARROWEST:
+                share = max(narrow / det, MIN_DETERMINANT_RATIO)
+                if share > MIN_DETERMINANT_RATIO:
                     fade = g_seen[i] * opacities[i] / math.sqrt(share) * blur / det
                     turn = fade * (a + c - blur) / det
                     fade *= share

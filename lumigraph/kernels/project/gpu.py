@@ -24,9 +24,9 @@ import triton.language as tl
 from .._dispatch import differentiable, empty
 from .._rows_gpu import load_row, store_row
 from ..spherical_harmonics.gpu import harmonic, harmonic_slope
-from . import FAINTEST as _FAINTEST
+from . import MIN_ALPHA as _MIN_ALPHA
 
-FAINTEST, LEAST_SHARE = tl.constexpr(_FAINTEST), tl.constexpr(1e-8)
+MIN_ALPHA, MIN_SHARE = tl.constexpr(_MIN_ALPHA), tl.constexpr(1e-8)
 # Where the parts of a view begin in View.numbers()
 EYE, FOCAL, CENTRE, DISTORTION = tl.constexpr(9), tl.constexpr(12), tl.constexpr(14), tl.constexpr(16)
 LIMITS, SIZE, NEAR = tl.constexpr(24), tl.constexpr(28), tl.constexpr(30)
@@ -272,11 +272,11 @@ def _forward(
     a, b, c, det, n = _covariance(T, blur)
     opacity = tl.load(opacities + i, mask=here, other=0.0)
     if COMPENSATE:
-        opacity *= tl.sqrt(tl.maximum(_dot(n, n) / det, LEAST_SHARE))
-    reach = 2 * tl.log(tl.maximum(opacity / FAINTEST, 1.0))
+        opacity *= tl.sqrt(tl.maximum(_dot(n, n) / det, MIN_SHARE))
+    reach = 2 * tl.log(tl.maximum(opacity / MIN_ALPHA, 1.0))
     wide, high = tl.sqrt(tl.maximum(reach * a, 1e-12)), tl.sqrt(tl.maximum(reach * c, 1e-12))
     seen &= _reaches(u[0], wide, tl.load(view + SIZE)) & _reaches(u[1], high, tl.load(view + SIZE + 1))
-    seen &= opacity > FAINTEST
+    seen &= opacity > MIN_ALPHA
     d, _ = _direction(v)
     colour = _colour(harmonics, i, d, seen, K, BANDS)
     colour = tl.maximum(colour[0], 0.0), tl.maximum(colour[1], 0.0), tl.maximum(colour[2], 0.0)
@@ -335,9 +335,9 @@ def _backward(
     if COMPENSATE:
         _, _, _, det, n = _covariance(T, blur)
         share = _dot(n, n) / det
-        root = tl.sqrt(tl.maximum(share, LEAST_SHARE))
+        root = tl.sqrt(tl.maximum(share, MIN_SHARE))
         opacity = tl.load(opacities + i, mask=seen, other=0.0)
-        d_share = tl.where(share > LEAST_SHARE, 0.5 * d_opacity * opacity / root, 0.0)
+        d_share = tl.where(share > MIN_SHARE, 0.5 * d_opacity * opacity / root, 0.0)
         d_opacity *= root
     d_T = _covariance_backward(T, load_row(d_conics, i, seen), d_share, blur)
     d_L0 = _mix(N0[0], d_T[0], N1[0], d_T[1])

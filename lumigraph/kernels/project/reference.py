@@ -8,7 +8,7 @@ from torch import Tensor
 from ...camera.lens import bend
 from ...geometry import to_matrix
 from ..spherical_harmonics.reference import run as harmonics_of
-from . import FAINTEST, View
+from . import MIN_ALPHA, View
 
 
 def run(
@@ -49,11 +49,11 @@ def run(
     colours = (0.5 + (Y[:, :, None] * harmonics[:, : bands**2]).sum(1)).clamp_min(0)
 
     # Where opacity exp(-q / 2) is still 1/255, the offset along an axis is sqrt(q C_ii).
-    reach = 2 * (opacities / FAINTEST).clamp_min(1).log()
+    reach = 2 * (opacities / MIN_ALPHA).clamp_min(1).log()
     extent = (reach[:, None] * torch.stack([a, c], -1)).clamp_min(1e-12).sqrt()
     size = means.new_tensor(view.size)
     inside = ((centres + extent >= 0.5) & (centres - extent <= size - 0.5)).all(-1)
-    seen = front & (opacities > FAINTEST) & inside
+    seen = front & (opacities > MIN_ALPHA) & inside
     columns, one = seen[:, None], means.new_zeros(())
     return (
         torch.where(columns, centres, one),

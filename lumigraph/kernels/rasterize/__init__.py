@@ -9,7 +9,7 @@ from torch import Tensor
 from .._dispatch import implementation
 from .._doors import door, require, require_indices, require_starts
 from .._facts import Facts
-from ..project import FAINTEST, OPAQUEST
+from ..project import MAX_ALPHA, MIN_ALPHA
 from ..tile import Tiles, footprints, tile
 
 FACTS = Facts(unit="gaussians", outputs=3, differentiable=(0, 1, 2, 3, 4), typical=3, compiled=3, smooth=(3,))
@@ -86,7 +86,7 @@ def _steady(centres, conics, opacities, depths, size, side, stop, generator):
         bad = torch.zeros(len(centres), dtype=torch.bool)
         for numbers, _, raw, before in light(centres.double(), conics.double(), opacities.double(), tiles, stop):
             near = torch.zeros_like(raw, dtype=torch.bool)
-            for value, threshold in ((raw, FAINTEST), (raw, OPAQUEST), (before, stop)):
+            for value, threshold in ((raw, MIN_ALPHA), (raw, MAX_ALPHA), (before, stop)):
                 near |= (value / max(threshold, 1e-12) - 1).abs() < 1e-3
             bad[numbers] |= near.any(0)
         if not bad.any():

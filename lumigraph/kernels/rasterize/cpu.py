@@ -12,12 +12,12 @@ from numba import get_num_threads, njit, prange
 
 from .._dispatch import differentiable, empty
 from .._lanes import bytes_between, exp2, fetch, first_bit, highest, inverse, lowest, put, root, some, totals, where
-from ..project import FAINTEST as FAINTEST_
-from ..project import OPAQUEST as OPAQUEST_
+from ..project import MAX_ALPHA as _MAX_ALPHA
+from ..project import MIN_ALPHA as _MIN_ALPHA
 
 FAST = {"cache": True, "fastmath": {"contract", "nsz", "arcp"}, "error_model": "numpy"}  # without "reassoc": see `exp2`
 LANES, BLOCKS = 16, 64  # pixels of a block; blocks of the largest tile, in eight rows of eight
-FAINTEST, OPAQUEST = np.float32(FAINTEST_), np.float32(OPAQUEST_)
+MIN_ALPHA, MAX_ALPHA = np.float32(_MIN_ALPHA), np.float32(_MAX_ALPHA)
 ZERO, ONE, HALF = np.float32(0), np.float32(1), np.float32(0.5)
 TILE, PAIR = 8, 8  # about what a tile costs in pairs, and a pair in visits to a block, to share work out by
 LOG2_E, LOG2_255 = math.log2(math.e), math.log2(255)
@@ -28,7 +28,7 @@ TABLE[:16], TABLE[16:32] = np.tile(np.arange(4), 4), np.repeat(np.arange(4), 4)
 TABLE[32:48], TABLE[48:64] = np.tile(4 * np.arange(8), 2), np.repeat([1, -1], 8)
 
 # Columns of a Gaussian's row: exponent of 2 at (dx, dy) is BRIGHT - (ALONG (dx + SKEW dy))^2 - (DOWN dy)^2.
-X, Y, ALONG, SKEW, DOWN, BRIGHT, RED, GREEN, BLUE, DEPTH, WIDEST, LIMIT = range(12)
+X, Y, ALONG, SKEW, DOWN, BRIGHT, RED, GREEN, BLUE, DEPTH, MAX_REACH, LIMIT = range(12)
 
 
 @njit(parallel=True, **FAST)
@@ -45,7 +45,7 @@ def _pack(centres, conics, opacities, colours, depths, rows):
             row[BRIGHT] = math.log2(opacities[i])
             row[LIMIT] = row[BRIGHT] + LOG2_255
             # How far below the centre the ellipse reaches furthest to the right.
-            row[WIDEST] = -b / c * math.sqrt(max(row[LIMIT], ZERO) / (0.5 * LOG2_E * max(upright, 1e-30)) * c / a)
+            row[MAX_REACH] = -b / c * math.sqrt(max(row[LIMIT], ZERO) / (0.5 * LOG2_E * max(upright, 1e-30)) * c / a)
             for k in range(3):
                 row[RED + k] = colours[i, k]
             row[DEPTH] = depths[i]
@@ -59,7 +59,7 @@ def _blocks(rows, i, left, top, table):
     above = top + HALF - rows[i + Y]
     sign = fetch(table, 48)
     upper = fetch(table, 32) + above
-    y = lowest(highest(sign * rows[i + WIDEST], upper), upper + np.float32(3))
+    y = lowest(highest(sign * rows[i + MAX_REACH], upper), upper + np.float32(3))
     v = y * rows[i + DOWN]
     room = rows[i + LIMIT] - v * v
     edge = sign * root(highest(room, room * ZERO)) * (ONE / rows[i + ALONG]) - y * rows[i + SKEW]
@@ -89,7 +89,7 @@ def _bell(rows, i, frame, block):
 
 @njit(inline="always")
 def _alpha(raw, light, stop):
-    return where((raw >= FAINTEST) & (light >= stop), lowest(raw, OPAQUEST), ZERO)
+    return where((raw >= MIN_ALPHA) & (light >= stop), lowest(raw, MAX_ALPHA), ZERO)
 
 
 @njit(inline="always")
@@ -212,7 +212,7 @@ def _backward(
                     behind = fetch(state, at + LANES) - worth
                     put(state, at + LANES, behind)
                     slope = worth - alpha * behind * inverse(ONE - alpha)
-                    slope = where(raw < OPAQUEST, slope, ZERO)
+                    slope = where(raw < MAX_ALPHA, slope, ZERO)
                     dx, dy = columns + x, lines + y
                     gx, gy = slope * dx, slope * dy
                     s, sx, sy = s + slope, sx + gx, sy + gy

@@ -2,14 +2,14 @@
 
 FAULTS = {
     "light not lost": ("gpu", "_backward", "after / (1 - alpha)", "after"),
-    "cut off, yet with gradient": ("gpu", "_backward", " & (raw <= OPAQUEST)", ""),
+    "cut off, yet with gradient": ("gpu", "_backward", " & (raw <= MAX_ALPHA)", ""),
     "an opacity behind the stop": ("gpu", "_backward", " & (before >= stop)", ""),
     "all that is behind, again": ("gpu", "_backward", "rest -= tl.sum(w * worth, 0)", "rest -= 0"),
     "the other axis": ("gpu", "_backward", "conic[2] * sum_y", "conic[0] * sum_y"),
     "a block too few": ("cpu", "_blocks", "np.float32(1.5)", "np.float32(0.5)"),
     "spent blocks visited": ("cpu", "_alpha", "& (light >= stop)", "& (light >= ZERO)"),
     "light not lost on the cpu": ("cpu", "_backward", "behind * inverse(ONE - alpha)", "behind"),
-    "0.99, yet with gradient on the cpu": ("cpu", "_backward", "raw < OPAQUEST", "raw >= ZERO"),
+    "0.99, yet with gradient on the cpu": ("cpu", "_backward", "raw < MAX_ALPHA", "raw >= ZERO"),
     "half a square": ("cpu", "_gather", "-HALF * s[5]", "-s[5]"),
     "only one block's sums": ("cpu", "_gather", "and masks[p]", "and masks[p] == 1"),
 }

@@ -12,12 +12,12 @@ import triton.language as tl
 
 from .._dispatch import differentiable, empty
 from .._rows_gpu import load_row, store_row
-from ..project import FAINTEST as _FAINTEST
-from ..project import OPAQUEST as _OPAQUEST
+from ..project import MAX_ALPHA as _MAX_ALPHA
+from ..project import MIN_ALPHA as _MIN_ALPHA
 
-FAINTEST, OPAQUEST = tl.constexpr(_FAINTEST), tl.constexpr(_OPAQUEST)
+MIN_ALPHA, MAX_ALPHA = tl.constexpr(_MIN_ALPHA), tl.constexpr(_MAX_ALPHA)
 SQUARE = 16  # pixels along a program's share of a tile, at most
-DARK = 1e-37  # less light is none, and a program without any has ended
+MIN_TRANSMITTANCE = 1e-37  # less light is none, and a program without any has ended
 GAUSSIANS = 8  # looked at together; a matrix with a row for each and a column for each pixel must fit into registers
 
 
@@ -60,7 +60,7 @@ def _light(dx, dy, conic, opacity, through, stop):
     a, tilt, rest = _steady(conic)
     t = tl.fma(tilt[:, None], dy, dx)
     raw = opacity[:, None] * tl.exp(-0.5 * (a[:, None] * t * t + rest[:, None] * dy * dy))
-    alpha = tl.where(raw < FAINTEST, 0.0, tl.minimum(raw, OPAQUEST))
+    alpha = tl.where(raw < MIN_ALPHA, 0.0, tl.minimum(raw, MAX_ALPHA))
     behind = through[None, :] * tl.cumprod(1 - alpha, 0)
     before = behind / (1 - alpha)
     return raw, alpha, before, behind, tl.where(before < stop, 0.0, alpha * before)
@@ -162,7 +162,7 @@ def _backward(
         worth = v[0][:, None] * g[0][None, :] + v[1][:, None] * g[1][None, :] + v[2][:, None] * g[2][None, :]
         worth += v[3][:, None] * g[3][None, :] + g[4][None, :]
         after = rest[None, :] - tl.cumsum(w * worth, 0)
-        moves = (raw >= FAINTEST) & (raw <= OPAQUEST) & (before >= stop)
+        moves = (raw >= MIN_ALPHA) & (raw <= MAX_ALPHA) & (before >= stop)
         d_power = tl.where(moves, raw * (before * worth - after / (1 - alpha)), 0.0)
         _add(d_colours, 3 * n, tl.sum(w * g[0][None, :], 1), here)
         _add(d_colours, 3 * n + 1, tl.sum(w * g[1][None, :], 1), here)
@@ -186,7 +186,7 @@ def forward(ctx, centres, conics, opacities, colours, depths, tiles, stop):
     outputs = [empty(*shape, device=device) for shape in ((height, width, 3), (height, width), (height, width))]
     square = min(tiles.side, SQUARE)
     ctx.grid = (tiles.across * tiles.down * (tiles.side // square) ** 2,)
-    ctx.rest = width, height, max(float(stop), DARK)
+    ctx.rest = width, height, max(float(stop), MIN_TRANSMITTANCE)
     ctx.options = {"SIDE": tiles.side, "SQUARE": square, "GAUSSIANS": GAUSSIANS}
     _forward[ctx.grid](*inputs, *outputs, *ctx.rest, **ctx.options)
     ctx.save_for_backward(*inputs, *outputs)

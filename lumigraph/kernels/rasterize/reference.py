@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import torch
 from torch import Tensor
 
-from ..project import FAINTEST, OPAQUEST
+from ..project import MAX_ALPHA, MIN_ALPHA
 from ..tile import Tiles
 
 
@@ -18,7 +18,7 @@ def run(
     values = torch.cat([colours, depths[:, None], torch.ones_like(depths)[:, None]], -1)
     parts, places = [centres.new_zeros(0, 5)], [torch.zeros(0, dtype=torch.int64, device=centres.device)]
     for numbers, pixels, raw, before in light(centres, conics, opacities, tiles, stop):
-        alpha = torch.where(raw < FAINTEST, 0, raw.clamp(max=OPAQUEST))
+        alpha = torch.where(raw < MIN_ALPHA, 0, raw.clamp(max=MAX_ALPHA))
         weights = torch.where(before < stop, 0, alpha * before)
         parts.append(weights @ values[numbers])
         places.append(pixels[:, 1] * width + pixels[:, 0])
@@ -40,6 +40,6 @@ def light(
         d = pixels[:, None] + 0.5 - centres[numbers]
         (dx, dy), (a, b, c) = d.unbind(-1), conics[numbers].unbind(-1)
         raw = opacities[numbers] * torch.exp(-0.5 * (a * dx * dx + c * dy * dy) - b * dx * dy)
-        alpha = torch.where(raw < FAINTEST, 0, raw.clamp(max=OPAQUEST))
+        alpha = torch.where(raw < MIN_ALPHA, 0, raw.clamp(max=MAX_ALPHA))
         before = torch.nn.functional.pad(1 - alpha, (1, 0), value=1.0).cumprod(1)[:, :-1]
         yield numbers, pixels, raw, before

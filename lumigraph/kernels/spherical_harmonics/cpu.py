@@ -8,7 +8,7 @@ from numba import njit, prange
 from .._dispatch import differentiable, empty
 from . import K00, K1, K20, K21, K22, K30, K31, K32, K33
 
-MOST = 16  # coefficients
+MAX_COEFFICIENTS = 16  # coefficients
 BLOCK = 64  # directions whose coefficients go to their places together: far apart, these would not stay in a cache
 
 
@@ -60,7 +60,7 @@ def slope(x, y, z, bands, g):
 @njit(parallel=True, fastmath=True, cache=True)
 def _forward(directions, bands, out):
     for part in prange(-(-len(directions) // BLOCK)):
-        first, some = part * BLOCK, np.empty((MOST, BLOCK), np.float32)
+        first, some = part * BLOCK, np.empty((MAX_COEFFICIENTS, BLOCK), np.float32)
         count = min(BLOCK, len(directions) - first)
         for r in range(count):
             at = first + r

@@ -11,7 +11,7 @@ from torch import Tensor
 from .._dispatch import implementation
 from .._doors import door, require
 from .._facts import Facts
-from ..project import FAINTEST
+from ..project import MIN_ALPHA
 
 FACTS = Facts(unit="gaussians", outputs=2, differentiable=(), typical=2, compiled=6)
 
@@ -76,7 +76,7 @@ def cases(generator: torch.Generator):
         yield _steady(*footprints(count, size, generator), size, side)
     centres, conics, opacities, depths = footprints(60, (70, 45), generator)
     depths[10:50] = 2.0  # coincident
-    opacities[20:24], opacities[30:33] = 0.0, FAINTEST / 2
+    opacities[20:24], opacities[30:33] = 0.0, MIN_ALPHA / 2
     conics[:4] = torch.tensor([1e-6, 0.0, 1e-6])  # everywhere
     conics[4:8] = torch.tensor([0.5, 0.49999, 0.5])  # needles across the picture
     conics[8:10], centres[10:14] = torch.tensor([3.3, 0.0, 3.3]), -500.0

@@ -6,10 +6,10 @@ import numpy as np
 import torch
 from numba import get_num_threads, njit, prange
 
-from ..project import FAINTEST as FAINTEST_
+from ..project import MIN_ALPHA as _MIN_ALPHA
 
 FAST = {"cache": True, "fastmath": {"contract", "nsz", "arcp"}, "error_model": "numpy"}
-FAINTEST, LOG_FAINTEST = np.float32(FAINTEST_), math.log(FAINTEST_)
+MIN_ALPHA, LOG_MIN_ALPHA = np.float32(_MIN_ALPHA), math.log(_MIN_ALPHA)
 BITS = 11  # of a depth, in each of three passes of the sort
 HALF, ONE = np.float32(0.5), np.float32(1)
 
@@ -18,7 +18,7 @@ HALF, ONE = np.float32(0.5), np.float32(1)
 def _near_first(depths, opacities):
     """Numbers of the visible Gaussians by depth; equal depths keep their order. Bits of floats >= 0 sort as they do."""
     bits = depths.view(np.uint32)
-    order = np.flatnonzero(opacities > FAINTEST).astype(np.int32)
+    order = np.flatnonzero(opacities > MIN_ALPHA).astype(np.int32)
     other = np.empty_like(order)
     for shift in (0, BITS, 2 * BITS):
         counts = np.zeros(2**BITS + 1, np.int64)
@@ -42,7 +42,7 @@ def _measure(order, centres, conics, opacities, size, side, ellipses, rows):
         i = order[k]
         a, b, c = np.float64(conics[i, 0]), np.float64(conics[i, 1]), np.float64(conics[i, 2])
         upright = max(c - b * b / a, 1e-30)
-        limit = 2 * (math.log(opacities[i]) - LOG_FAINTEST)
+        limit = 2 * (math.log(opacities[i]) - LOG_MIN_ALPHA)
         high = math.sqrt(limit / upright)  # from the centre to the lowest point
         ellipses[k, 0], ellipses[k, 1] = centres[i, 0], centres[i, 1]
         ellipses[k, 2], ellipses[k, 3] = limit / a, upright / a

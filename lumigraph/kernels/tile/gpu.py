@@ -10,9 +10,9 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from ..project import FAINTEST as _FAINTEST
+from ..project import MIN_ALPHA as _MIN_ALPHA
 
-FAINTEST = tl.constexpr(_FAINTEST)
+MIN_ALPHA = tl.constexpr(_MIN_ALPHA)
 BLOCK = 32  # Gaussians; they go through their tiles together, so a program is as slow as its largest
 
 
@@ -70,9 +70,9 @@ def _tile(
     b = tl.load(conics + 3 * i + 1, mask=here, other=0.0)
     c = tl.load(conics + 3 * i + 2, mask=here, other=1.0)
     opacity = tl.load(opacities + i, mask=here, other=0.0)
-    bright = opacity > FAINTEST
+    bright = opacity > MIN_ALPHA
     a, c = tl.where(bright, a, 1.0), tl.where(bright, c, 1.0)
-    reach = 2 * tl.log(tl.maximum(opacity / FAINTEST, 1.0))
+    reach = 2 * tl.log(tl.maximum(opacity / MIN_ALPHA, 1.0))
 
     # q as sums of squares, a (x + b/a y)^2 + (det/a) y^2 and the like: its three terms would cancel along a needle
     det = tl.fma(a, c, -b * b) - tl.fma(b, b, -b * b)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from ..project import FAINTEST
+from ..project import MIN_ALPHA
 
 
 def run(
@@ -19,7 +19,7 @@ def run(
 
 
 def touches(centres: Tensor, conics: Tensor, opacities: Tensor, size: tuple[int, int], side: int) -> Tensor:
-    """Whether the least q = d^T conic d over each tile's rectangle is at most 2 ln(255 opacity)."""
+    """True if the least q = d^T conic d over each tile's rectangle is at most 2 ln(255 opacity)."""
     width, height = size
     left, top = (torch.arange(0, n, side, device=centres.device).to(centres) + 0.5 for n in size)
     right, bottom = (left + side - 1).clamp(max=width - 0.5), (top + side - 1).clamp(max=height - 0.5)
@@ -36,5 +36,5 @@ def touches(centres: Tensor, conics: Tensor, opacities: Tensor, size: tuple[int,
     for y in (y0, y1):
         x = (-b * y / a).clamp(x0, x1)
         least = torch.minimum(least, a * x * x + 2 * b * x * y + c * y * y)
-    bright = opacities[:, None] > FAINTEST
-    return bright & (least <= 2 * (opacities[:, None] / FAINTEST).clamp_min(1).log())
+    bright = opacities[:, None] > MIN_ALPHA
+    return bright & (least <= 2 * (opacities[:, None] / MIN_ALPHA).clamp_min(1).log())

@@ -13,7 +13,7 @@ from ..sparse_grid import Nodes, shell, some_nodes
 
 FACTS = Facts(unit="nodes", outputs=1, differentiable=(2,), typical=2, compiled=2, smooth=(4,))
 
-FLAT = 1e-9  # added to the square below, so that its root has a slope where all neighbours are alike
+EPSILON = 1e-9  # added to the square below, so that its root has a slope where all neighbours are alike
 
 
 @door

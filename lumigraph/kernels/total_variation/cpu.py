@@ -7,10 +7,10 @@ from numba import njit, prange
 
 from .._dispatch import differentiable
 from ..sparse_grid.cpu import row_of, slabs_of
-from . import FLAT
+from . import EPSILON
 
 ONE = np.float32(1)
-FLAT_ = np.float32(FLAT)
+EPSILON_ = np.float32(EPSILON)
 
 
 @njit(inline="always")
@@ -42,7 +42,7 @@ def _vary(chosen, index, rows, values, order, starts, sloped, sums, out):
                 for c in range(channels):
                     value = values[here, c]
                     dx, dy, dz = values[right, c] - value, values[down, c] - value, values[ahead, c] - value
-                    length = np.sqrt(dx * dx + dy * dy + dz * dz + FLAT_)
+                    length = np.sqrt(dx * dx + dy * dy + dz * dz + EPSILON_)
                     total += length
                     if sloped:
                         per = ONE / length

@@ -8,9 +8,9 @@ import triton.language as tl
 
 from .._dispatch import differentiable
 from ..sparse_grid.gpu import row_of
-from . import FLAT
+from . import EPSILON
 
-FLAT_ = tl.constexpr(FLAT)
+EPSILON_ = tl.constexpr(EPSILON)
 BLOCK = 64
 
 
@@ -52,7 +52,7 @@ def _vary(
     dx = tl.load(values + right[:, None] * C + c, mask=there, other=0.0) - value
     dy = tl.load(values + down[:, None] * C + c, mask=there, other=0.0) - value
     dz = tl.load(values + ahead[:, None] * C + c, mask=there, other=0.0) - value
-    length = tl.sqrt(dx * dx + dy * dy + dz * dz + FLAT_)
+    length = tl.sqrt(dx * dx + dy * dy + dz * dz + EPSILON_)
     tl.atomic_add(total, tl.sum(tl.where(there, length, 0.0)), sem="relaxed")
     if SLOPED:
         tl.atomic_add(out + row[:, None] * C + c, -(dx + dy + dz) / length, mask=there, sem="relaxed")

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from ..sparse_grid import Nodes
-from . import FLAT
+from . import EPSILON
 
 
 def run(chosen: Tensor, nodes: Nodes, values: Tensor) -> Tensor:
@@ -15,7 +15,7 @@ def run(chosen: Tensor, nodes: Nodes, values: Tensor) -> Tensor:
     )
     place = torch.stack(torch.unravel_index(chosen, rows.shape), -1)
     here = rows[tuple(place.T)]
-    square = values.new_full((len(chosen), values.shape[1]), FLAT)
+    square = values.new_full((len(chosen), values.shape[1]), EPSILON)
     for axis, size in enumerate(rows.shape):
         after = place.clone()
         after[:, axis] = (after[:, axis] + 1).clamp(max=size - 1)  # from the last node to itself
