@@ -31,9 +31,8 @@ from ..datasets.dataset import Dataset
 from ..datasets.scene import Frame, Scene
 from ..errors import LumigraphError
 from ..files import marks
-from ..files.locks import LOCK_FILE as LOCK
-from ..files.locks import check_place, held
-from ..files.marks import LOCK_FILE as RECORD
+from ..files.locks import LOCK_FILE, check_place, held
+from ..files.marks import MARKS_FILE
 from ..files.partials import PARTIAL_NAME
 from ..files.plain import understood
 from ..files.ranges import check
@@ -112,7 +111,7 @@ class Run(Trained):
             yield
         except LumigraphError:
             if not self.has_state:
-                for name in ("config.json", "cameras.json", "metrics.jsonl", LOCK):
+                for name in ("config.json", "cameras.json", "metrics.jsonl", LOCK_FILE):
                     files.remove(self.folder / name)
                 with contextlib.suppress(OSError):
                     self.folder.rmdir()
@@ -328,7 +327,7 @@ def check_new(folder: Path) -> None:
 
 def is_leftover(path: Path) -> bool:
     """True for leftovers of a run that was killed before its first step."""
-    return path.name in (LOCK, RECORD) or PARTIAL_NAME.fullmatch(path.name) is not None or marks.is_ours(path, "file")
+    return path.name in (LOCK_FILE, MARKS_FILE) or PARTIAL_NAME.fullmatch(path.name) is not None or marks.is_ours(path, "file")
 
 
 def versions() -> dict[str, str]:

@@ -6,8 +6,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from .factor_grid import FactorGrid
 from ...exchange.packing import most_important
+from .factor_grid import FactorGrid
 
 
 @torch.no_grad()
