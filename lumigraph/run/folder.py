@@ -33,7 +33,7 @@ from ..errors import LumigraphError
 from ..files import marks
 from ..files.locks import LOCK_FILE as LOCK
 from ..files.locks import check_place, held
-from ..files.marks import LOCK_FILE as RECORD
+from ..files.marks import MARKS_FILE as RECORD
 from ..files.partials import PARTIAL_NAME
 from ..files.plain import understood
 from ..files.ranges import check

@@ -20,7 +20,7 @@ from ...method.capabilities import FromField, RefinesPoses, can, needs
 from ...method.quality import Quality
 from ...run import Opened, Run, State, build, check_new
 from ...run.budget import Budget
-from ...run.converted import Begun, Converted, Held, LearntFrom
+from ...run.converted import ConversionStart, Converted, LearntFrom, MeasuredModel
 from ...system.signals import go_on_unless
 from ...training import fit
 from .measure import likeness, shown
@@ -35,7 +35,7 @@ COMPARED_VIEWS = 8  # held-out views that are compared
 
 
 @dataclass(frozen=True)
-class Aim:
+class ConversionTarget:
     """Target of a conversion and its limit; exactly one of steps, seconds and quality.
 
     config:  the student's numbers; None takes its defaults for the device
@@ -57,7 +57,12 @@ class Aim:
 
 
 def convert(
-    source: Opened, name: str, output: Path, aim: Aim, device: torch.device | str = "cpu", show: bool = False
+    source: Opened,
+    name: str,
+    output: Path,
+    aim: ConversionTarget,
+    device: torch.device | str = "cpu",
+    show: bool = False,
 ) -> Converted:
     """A run of the method of that name in a new folder, made of whatever was opened; gives what its convert.json says.
 
@@ -82,7 +87,7 @@ def convert(
         learnt_from, data = PHOTOGRAPHS, seen_as(teacher, student, scene)
     if going_on is None:
         seconds = take_over(teacher, student, data, around, as_taken=learnt_from == PHOTOGRAPHS)
-        begun = Begun(str(source.path.resolve()), learnt_from, round(seconds, 3))
+        begun = ConversionStart(str(source.path.resolve()), learnt_from, round(seconds, 3))
         going_on = (
             created(source, student, scene or data, output, budget_of(student, data, aim), aim.seed, begun),
             begun,
@@ -97,8 +102,8 @@ def convert(
         source=begun.source,
         how=how,
         learnt_from=begun.learnt_from,
-        teacher=Held(methods.name_of(teacher), source.model_bytes, seen[0].seconds, seen[0].psnr),
-        student=Held(name, run.model_bytes, seen[1].seconds, seen[1].psnr),
+        teacher=MeasuredModel(methods.name_of(teacher), source.model_bytes, seen[0].seconds, seen[0].psnr),
+        student=MeasuredModel(name, run.model_bytes, seen[1].seconds, seen[1].psnr),
         psnr=likeness(*seen),
         views=len(seen[0].views),
         taking_over=begun.taking_over,
@@ -109,7 +114,7 @@ def convert(
     return made
 
 
-def new_student(kind: type[Method], teacher: Method, aim: Aim, device: torch.device) -> Method:
+def new_student(kind: type[Method], teacher: Method, aim: ConversionTarget, device: torch.device) -> Method:
     """A method in the teacher's frame, before it has learnt anything."""
     config = kind.preset(device) if aim.config is None else aim.config
     return build(kind, teacher.frame, config, device, getattr(config, "seed", aim.seed), learning=True)
@@ -132,7 +137,7 @@ def take_over(teacher: Method, student: Method, data: Scene, cameras: Camera, as
     return time.perf_counter() - begin
 
 
-def budget_of(student: Method, data: Scene, aim: Aim) -> Budget:
+def budget_of(student: Method, data: Scene, aim: ConversionTarget) -> Budget:
     """Budget of further training. Schedules of a converted field begin at INHERITED_PROGRESS."""
     share, steps = INHERITED_PROGRESS if can(student, FromField) else 0.0, aim.steps
     if aim.quality is not None:
@@ -140,7 +145,9 @@ def budget_of(student: Method, data: Scene, aim: Aim) -> Budget:
     return Budget(steps, aim.seconds, aim.quality, (0.0, share) if share else None)
 
 
-def created(source: Opened, student: Method, data: Scene, output: Path, budget: Budget, seed: int, begun: Begun) -> Run:
+def created(
+    source: Opened, student: Method, data: Scene, output: Path, budget: Budget, seed: int, begun: ConversionStart
+) -> Run:
     """A run of the student as it begins, with the cameras and photographs of what it is made of.
 
     data: the photographs, or what stands in for them
@@ -161,12 +168,12 @@ def created(source: Opened, student: Method, data: Scene, output: Path, budget: 
     return run
 
 
-def unfinished(source: Opened, name: str, output: Path) -> tuple[Run, Begun] | None:
+def unfinished(source: Opened, name: str, output: Path) -> tuple[Run, ConversionStart] | None:
     """The run of the same conversion that was interrupted there; None if there is none."""
     if not files.is_file(output / "config.json"):
         return None
     run = Run(output)
-    begun = Begun.of(run.settings, output / "config.json")
+    begun = ConversionStart.of(run.settings, output / "config.json")
     if begun is None or (begun.source, run.method_name) != (str(source.path.resolve()), name):
         return None
     return (run, begun) if Converted.read(output) is None else None
