@@ -69,7 +69,7 @@ def holders(run: Path) -> list[tuple[str, int]]:
 
 def weights(run: Path) -> dict[str, bytes]:
     """Of all blocks that are done."""
-    done = sorted(path.parent for path in (run / BLOCKS_FOLDER).glob(f"*/{DONE}"))
+    done = sorted(path.parent for path in (run / BLOCKS_FOLDER).glob(f"*/{DONE_FILE}"))
     return {folder.name: next(folder.glob(WEIGHTS)).read_bytes() for folder in done}
 
 

@@ -15,7 +15,7 @@ from pathlib import Path
 import tyro
 from rich.table import Table
 
-from lumigraph.derive.compression import LADDER, Aim
+from lumigraph.derive.compression import LADDER, CompressionTarget
 from lumigraph.derive.compression.compress import Ladder, important
 from lumigraph.derive.compression.measure import truth_of
 from lumigraph.evaluation import evaluate
@@ -50,7 +50,11 @@ def rungs(run: Run, options: Options) -> list[dict]:
     truth = truth_of(run, before, None, 1)
     timed = None if options.steps else options.seconds
     ladder = Ladder(
-        run, truth, Aim(loss=0.0, steps=options.steps, seconds=timed), options.device, important(before, truth)
+        run,
+        truth,
+        CompressionTarget(loss=0.0, steps=options.steps, seconds=timed),
+        options.device,
+        important(before, truth),
     )
     psnr = evaluate(before, truth.scene, "test", views=options.views).psnr
     rows = [{"method": run.method_name, "scene": run.title, "rung": None, "bytes": run.model_bytes, "psnr": psnr}]

@@ -25,7 +25,7 @@ import tyro
 
 from lumigraph import methods
 from lumigraph.commands.compress import size
-from lumigraph.derive.conversion import Aim, convert
+from lumigraph.derive.conversion import ConversionTarget, convert
 from lumigraph.derive.conversion.convert import new_student
 from lumigraph.figures import Row, contact_sheet, save_picture
 from lumigraph.figures.charts import standalone
@@ -101,10 +101,12 @@ class Template:
         teacher = source.method(self.device)
         around = source.cameras()["train"]
         for name in self.into:
-            student = new_student(methods.find(name), teacher, Aim(), torch.device(self.device))
+            student = new_student(methods.find(name), teacher, ConversionTarget(), torch.device(self.device))
             needs(student, FromField).from_field(teacher, around)
             folder = self.output.with_suffix("") / name
-            made = Converted.read(folder) or convert(source, name, folder, Aim(seconds=self.seconds), self.device)
+            made = Converted.read(folder) or convert(
+                source, name, folder, ConversionTarget(seconds=self.seconds), self.device
+            )
             pictures = [x.render(camera).rgb.cpu() for x in (teacher, student.eval(), Run(folder).method(self.device))]
             rows.append(Row(("", f"{name}, {made.taking_over:.0f} s", f"{made.seconds:.0f} s"), pictures))
         columns = (f"train: {source.method_name}", "move", "continue")

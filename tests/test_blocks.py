@@ -55,7 +55,7 @@ def run(street, tmp_path_factory) -> Path:
 
 
 def planned(street: Path, folder: Path, wish: str = "3", method: str = "voxel-grid") -> Plan:
-    recipe = planning.Recipe(method, find(method).smallest(), {}, Budget(steps=3 * STEPS))
+    recipe = planning.BlockRecipe(method, find(method).smallest(), {}, Budget(steps=3 * STEPS))
     places = places_of(read_capture(street))
     plan = planning.make_plan(str(street), places, wish, recipe)
     return planning.begin(folder, plan, places, threads=1)

@@ -22,7 +22,7 @@ from views import draw, look_at, pattern, spoil, write_views
 from lumigraph.capture import open_scene
 from lumigraph.capture.colmap import read as read_colmap
 from lumigraph.capture.folds import jumps
-from lumigraph.capture.motion import Options, diagnosis, reconstruct, reconstruction
+from lumigraph.capture.motion import MotionOptions, diagnosis, reconstruct, reconstruction
 from lumigraph.capture.motion.diagnosis import Matches, coverage, folds, read_matches, why_not
 from lumigraph.capture.motion.georeference import georeference, upright
 from lumigraph.capture.motion.lenses import group_by_lens, prior
@@ -196,7 +196,7 @@ def test_all_at_once_with_chosen_pairs(captured, tmp_path):
     """The other mapper, or the usual one should it give up for guessed focal lengths, and pairs by likeness."""
     photos, poses, _, scene, _, _ = captured
     copied, told = copy_of(scene, tmp_path), Told()
-    result = reconstruct([photos], copied, Options(mapper="global", matching="retrieval"), told)
+    result = reconstruct([photos], copied, MotionOptions(mapper="global", matching="retrieval"), told)
     assert "Finding details" not in told.counts and told.counts["Comparing pairs"] <= 120
     assert set(poses) <= set(result["registered"])
     assert np.median(aligned_error(copied, poses)) < 0.005
@@ -498,7 +498,7 @@ def test_where_one_mapper_finds_nothing_the_other_is_tried(tmp_path, monkeypatch
     monkeypatch.setattr(reconstruction, "largest", placed)
     work = object.__new__(Reconstruction)
     work.stages, work.models, work.unfolded = Stages(tmp_path), tmp_path / "models", tmp_path / "unfolded"
-    work.database, work.options, work.map = tmp_path / "database.db", Options(mapper=asked), mapped
+    work.database, work.options, work.map = tmp_path / "database.db", MotionOptions(mapper=asked), mapped
     for _ in range(2):  # once it is there it stays
         work.place("key")
         assert tried == [asked, other] and (work.models / reconstruction.FALLBACK_MARK).exists()

@@ -13,7 +13,7 @@ from lumigraph.errors import LumigraphError
 from lumigraph.synthetic import Lamp, Material, Object, Pose, World, scenes
 from lumigraph.synthetic.rendering import render, signed_distance
 from lumigraph.synthetic.scenes.city import Drive, plan
-from lumigraph.synthetic.shapes import Box, Sphere
+from lumigraph.synthetic.shapes import Ball, Cuboid
 from lumigraph.synthetic.textures import Checker, Plain
 from lumigraph.synthetic.world import joined
 
@@ -120,9 +120,9 @@ def test_poses_are_off_by_shares_of_a_street():
 
 
 def test_joined_worlds_look_like_one():
-    ball = World((Object(Sphere(0.4), Material(Checker((0.9, 0.8, 0.7), (0.2, 0.3, 0.4))), name="ball"),))
-    box = Object(Box((0.3, 0.2, 0.5)), Material(Plain((0.8, 0.2, 0.1))), Pose.at(0.6, 0.2, 0, turn=30), "box")
-    plate = Object(Box((1.0, 1.0, 0.1)), Material(Plain((0.5, 0.5, 0.5))), Pose.at(0, 0, -0.6), "plate")
+    ball = World((Object(Ball(0.4), Material(Checker((0.9, 0.8, 0.7), (0.2, 0.3, 0.4))), name="ball"),))
+    box = Object(Cuboid((0.3, 0.2, 0.5)), Material(Plain((0.8, 0.2, 0.1))), Pose.at(0.6, 0.2, 0, turn=30), "box")
+    plate = Object(Cuboid((1.0, 1.0, 0.1)), Material(Plain((0.5, 0.5, 0.5))), Pose.at(0, 0, -0.6), "plate")
     lamp = Lamp((1.0, -2.0, 3.0), 0.1, 9.0)
     one = World((*ball.objects, box, plate), (lamp,))
     several = joined([ball, World(()), World((box, plate))], (lamp,), one.sky)

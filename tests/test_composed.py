@@ -23,7 +23,13 @@ from lumigraph.geometry import Similarity, to_matrix
 from lumigraph.method.capabilities import HasDensity, HasGaussians, HasLooks, can
 from lumigraph.method.controls import Control
 from lumigraph.run import open_any
-from lumigraph.run.composition import Part, place_from_json, place_to_json, read_composition, write_composition
+from lumigraph.run.composition import (
+    CompositionPart,
+    place_from_json,
+    place_to_json,
+    read_composition,
+    write_composition,
+)
 from lumigraph.volume import composite, packed
 
 pytestmark = budget("runs")
@@ -258,7 +264,10 @@ def folder(tmp_path_factory):
 
 
 def test_a_file_opens_as_it_was_written(folder):
-    parts = [Part("red.ply", HERE), Part("blue.ply", at(0, -0.75, 0), Box((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0)))]
+    parts = [
+        CompositionPart("red.ply", HERE),
+        CompositionPart("blue.ply", at(0, -0.75, 0), Box((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0))),
+    ]
     write_composition(folder / "two.json", parts, lead=1)
     read, lead = read_composition(folder / "two.json")
     assert lead == 1 and [(p.source, p.box) for p in read] == [(p.source, p.box) for p in parts]
@@ -301,8 +310,8 @@ def test_a_file_that_cannot_be_is_refused_in_a_sentence(folder, said, words):
 
 
 def test_a_circle_of_compositions_is_refused(folder):
-    write_composition(folder / "inner.json", [Part("outer.json", HERE)])
-    write_composition(folder / "outer.json", [Part("red.ply", HERE), Part("inner.json", HERE)])
+    write_composition(folder / "inner.json", [CompositionPart("outer.json", HERE)])
+    write_composition(folder / "outer.json", [CompositionPart("red.ply", HERE), CompositionPart("inner.json", HERE)])
     with pytest.raises(LumigraphError, match=r"outer\.json holds itself"):
         open_any(folder / "outer.json")
 

@@ -19,7 +19,7 @@ from lumigraph.commands.cli import main
 from lumigraph.components.fields.taken_over import OfDepthMaps, OfField, logit, taken_over
 from lumigraph.components.sampling.spaces import space_of
 from lumigraph.datasets.scene import Frame
-from lumigraph.derive.conversion import Aim, convert, ways
+from lumigraph.derive.conversion import ConversionTarget, convert, ways
 from lumigraph.derive.conversion.renderings import between, rendered_scene
 from lumigraph.errors import LumigraphError
 from lumigraph.export.splats import export_splats
@@ -210,7 +210,7 @@ def made(ball_run, tmp_path_factory) -> Run:
     """A run without photographs as splats."""
     folder = tmp_path_factory.mktemp("made") / "splats"
     kind = methods.find("gaussian-splatting")
-    convert(ball_run, "gaussian-splatting", folder, Aim(kind.smallest(), steps=72, views=3))
+    convert(ball_run, "gaussian-splatting", folder, ConversionTarget(kind.smallest(), steps=72, views=3))
     return Run(folder)
 
 
@@ -271,14 +271,17 @@ def test_a_splat_file_is_a_teacher(made, tmp_path, monkeypatch):
     export_splats(made.method().gaussians(), made.frame, tmp_path / "cloud.ply")
     kind = methods.find("plenoxels")
     said = convert(
-        open_any(tmp_path / "cloud.ply"), "plenoxels", tmp_path / "out", Aim(kind.smallest(), steps=4, views=1)
+        open_any(tmp_path / "cloud.ply"),
+        "plenoxels",
+        tmp_path / "out",
+        ConversionTarget(kind.smallest(), steps=4, views=1),
     )
     assert said.how == "depth" and said.teacher.bytes == (tmp_path / "cloud.ply").stat().st_size
     assert Run(tmp_path / "out").method().render(held_out(made)[0].resized(0.5)).rgb.isfinite().all()
 
 
 def test_the_same_command_goes_on_where_it_was_stopped(ball_run, tmp_path, monkeypatch):
-    aim = Aim(methods.find("plenoxels").smallest(), steps=12, views=1)
+    aim = ConversionTarget(methods.find("plenoxels").smallest(), steps=12, views=1)
     straight = convert(ball_run, "plenoxels", tmp_path / "straight", aim)
     stopping = lambda *told, **more: replace(fit(*told, **more, pause_at=5), signal=2)  # noqa: E731
     monkeypatch.setattr(

@@ -30,7 +30,7 @@ from lumigraph.gaussians import Gaussians
 from lumigraph.geometry import Similarity
 from lumigraph.paths.keyframes import CameraPath
 from lumigraph.run import Run, open_any
-from lumigraph.run.composition import Part, write_composition
+from lumigraph.run.composition import CompositionPart, write_composition
 
 pytestmark = budget("capture", 10)
 
@@ -161,7 +161,7 @@ def test_camera_paths(tmp_path):
 def test_compositions(tmp_path):
     for name in ("a.splat", "b.splat"):
         write_gaussians(tmp_path / name, cloud(torch.Generator().manual_seed(SEED)))
-    parts = [Part("a.splat", Similarity.make(1.0)), Part("b.splat", Similarity.make(2.0))]
+    parts = [CompositionPart("a.splat", Similarity.make(1.0)), CompositionPart("b.splat", Similarity.make(2.0))]
     write_composition(tmp_path / "both.json", parts)
     opened_or_told("composition", tmp_path, ("both.json",), 50, lambda folder: open_any(folder / "both.json").cameras())
 

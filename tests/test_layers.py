@@ -18,7 +18,7 @@ from PIL import Image
 from lumigraph import synthetic as procedural
 from lumigraph.camera.lens import Pinhole
 from lumigraph.capture import READERS, assemble, multiscale, open_scene
-from lumigraph.capture.capture import Capture, Plane, Shot
+from lumigraph.capture.capture import Capture, PixelPlane, Shot
 from lumigraph.color.blending import before, over
 from lumigraph.datasets.images import ImageStore, Layer, LayerSource, resized
 from lumigraph.datasets.scene import Photograph, Scene
@@ -302,7 +302,7 @@ def test_faults_of_layers_are_told(tiny, tmp_path):
         assert not open_scene(tmp_path / "mixed").layers
     lens = Pinhole(torch.tensor([[FOCAL, FOCAL]]), torch.tensor([[24.0, 18.0]]))
     shots = [
-        Shot(n, p[:3], lens, None, image, planes={"flow": Plane(np.zeros((36, 48, 2 + i % 2)), "pixels")})
+        Shot(n, p[:3], lens, None, image, planes={"flow": PixelPlane(np.zeros((36, 48, 2 + i % 2)), "pixels")})
         for i, (n, p, image) in enumerate(zip(tiny.names, tiny.poses, tiny.pictures, strict=True))
     ]
     with pytest.raises(LumigraphError, match="flow of view_01.png is of another kind than that of view_00.png"):

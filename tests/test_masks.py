@@ -19,7 +19,7 @@ from lumigraph.capture.motion.folder import copy_masks
 from lumigraph.capture.objects.masking import doubts, mask_object
 from lumigraph.capture.objects.region import find_table
 from lumigraph.capture.objects.segment import segment
-from lumigraph.capture.objects.view import View
+from lumigraph.capture.objects.view import ObjectView
 from lumigraph.capture.photos import gather
 from lumigraph.capture.photos.track import untracked
 from lumigraph.datasets.scene import Scene
@@ -152,7 +152,7 @@ def test_noise_holds_no_object():
     scene = tiny.scene()
     chance = torch.Generator().manual_seed(0)
     views = [
-        View.of(scene.names[i], scene.cameras[i], 0.5 + 0.001 * torch.rand(24, 24, 3, generator=chance))
+        ObjectView.of(scene.names[i], scene.cameras[i], 0.5 + 0.001 * torch.rand(24, 24, 3, generator=chance))
         for i in range(len(scene))
     ]
     with pytest.raises(LumigraphError, match="no object can be told from the rest"):
@@ -163,7 +163,7 @@ def test_what_is_unsure_is_told():
     scene = tiny.scene()
     rgb = [torch.from_numpy(photographed(pose)[0]) for pose in tiny.poses()[::2]]
     cameras = [scene.cameras[i].resized(SIDE / tiny.SIZE) for i in range(0, 12, 2)]
-    views = [View.of(f"{i}.jpg", camera, x) for i, (camera, x) in enumerate(zip(cameras, rgb, strict=True))]
+    views = [ObjectView.of(f"{i}.jpg", camera, x) for i, (camera, x) in enumerate(zip(cameras, rgb, strict=True))]
     sure = replace(segment(views, None, untracked), overlaps=np.full(6, 0.9))
     assert sure.distinct > 0.95
     assert [doubt[:8] for doubt in doubts(sure)] == ["no table"]

@@ -21,7 +21,7 @@ from lumigraph.geometry import Similarity
 from lumigraph.paths import film as films
 from lumigraph.paths import film_cameras
 from lumigraph.run import Run, State, open_any
-from lumigraph.run.composition import Part, write_composition
+from lumigraph.run.composition import CompositionPart, write_composition
 from lumigraph.run.settings import Settings
 
 pytestmark = budget("runs")
@@ -36,7 +36,8 @@ def folder(tmp_path_factory) -> Path:
     run.save(State(1, 0.1), method, method.optimizers(), torch.Generator())
     write_gaussians(folder / "red.compressed.ply", Splatted(RED).gaussians())
     write_composition(
-        folder / "both.json", [Part("ball", Similarity.make(1.0)), Part("red.compressed.ply", Similarity.make(0.5))]
+        folder / "both.json",
+        [CompositionPart("ball", Similarity.make(1.0)), CompositionPart("red.compressed.ply", Similarity.make(0.5))],
     )
     return folder
 

@@ -18,13 +18,24 @@ from lumigraph.errors import LumigraphError
 from lumigraph.synthetic import Lamp, Material, Object, Pose, Sky, Sun, World, scenes
 from lumigraph.synthetic.cameras import look_at, pinhole
 from lumigraph.synthetic.rendering import photograph, render, signed_distance, trace
-from lumigraph.synthetic.shapes import Arch, Box, Cone, Cylinder, Plane, Shape, Sphere, Torus, Triangle, triangle_of
+from lumigraph.synthetic.shapes import (
+    Arch,
+    Ball,
+    Cone,
+    Cuboid,
+    Cylinder,
+    Plane,
+    Primitive,
+    Torus,
+    Triangle,
+    triangle_of,
+)
 from lumigraph.synthetic.textures import Bricks, Checker, Marble, Mottle, Plain, Rings, Sectors, Stripes, Wood
 
 SHAPES = [
-    Sphere(0.5),
-    Box((0.5, 0.3, 0.4)),
-    Box((0.5, 0.3, 0.4), rounding=0.1),
+    Ball(0.5),
+    Cuboid((0.5, 0.3, 0.4)),
+    Cuboid((0.5, 0.3, 0.4), rounding=0.1),
     Cylinder(0.4, 0.5),
     Cylinder(0.4, 0.5, rounding=0.1),
     Cone(0.5, 0.2, 0.4),
@@ -65,7 +76,7 @@ def unfiltered(rays: Rays) -> Rays:
     return replace(rays, radius=rays.radius * 1e-3)
 
 
-def alone(shape: Shape, pose: Pose = LEANING, material: Material = CHALK) -> World:
+def alone(shape: Primitive, pose: Pose = LEANING, material: Material = CHALK) -> World:
     return World((Object(shape, material, pose),))
 
 
@@ -112,7 +123,7 @@ def test_depth_of_a_sphere_and_a_box_is_the_analytic_one():
     enter, leave = near.max(-1), far.min(-1)
     box = np.where(enter < leave, enter, np.inf)
 
-    for shape, expected in ((Sphere(0.5), sphere), (Box((0.5, 0.3, 0.4)), box)):
+    for shape, expected in ((Ball(0.5), sphere), (Cuboid((0.5, 0.3, 0.4)), box)):
         assert 0.1 < np.isfinite(expected).mean() < 0.9
         np.testing.assert_allclose(trace(alone(shape), rays).depth, expected, atol=1e-9)
 
@@ -169,7 +180,7 @@ def test_every_lens_sees_the_same_surface():
     fisheye = Fisheye(torch.full((1, 2), 20.0), torch.full((1, 2), 24.0), torch.tensor([[0.02, 0.0, 0.0, 0.0]]))
     camera = replace(pinhole(look_at((2.0, -1.5, 1.0), (0, 0, 0))[None], 48, 40.0), lens=fisheye)
     rays = camera.rays(camera.pixels())
-    seen = trace(alone(Sphere(0.5)), rays)
+    seen = trace(alone(Ball(0.5)), rays)
     hit = np.isfinite(seen.depth)
     reached = (rays.origins + rays.directions * torch.from_numpy(seen.depth).float()[:, None]).numpy()[hit]
     np.testing.assert_allclose(np.linalg.norm(reached - LEANING.position, axis=-1), 0.5, atol=1e-5)
@@ -202,8 +213,8 @@ def test_a_point_projects_to_its_pixel_and_other_views_see_the_same_point_and_co
 def test_chalk_looks_the_same_from_everywhere(texture):
     world = World(
         (
-            Object(Sphere(0.5), Material(texture), LEANING),
-            Object(Box((1, 1, 0.05)), Material(texture), Pose.at(0, 0, -0.6)),
+            Object(Ball(0.5), Material(texture), LEANING),
+            Object(Cuboid((1, 1, 0.05)), Material(texture), Pose.at(0, 0, -0.6)),
         ),
         (Lamp((1.0, -2.0, 2.0), radius=0.0, power=3.0),),
         Sky(light=0.3),
@@ -223,7 +234,7 @@ def test_chalk_looks_the_same_from_everywhere(texture):
 
 def test_gloss_depends_on_where_one_looks_from():
     world = World(
-        (Object(Sphere(0.5), Material(Plain((0.7, 0.2, 0.1)), gloss=1.0, roughness=0.3)),),
+        (Object(Ball(0.5), Material(Plain((0.7, 0.2, 0.1)), gloss=1.0, roughness=0.3)),),
         (Lamp((0, 0, 4), 0.2, 12.0),),
     )
     point = torch.tensor([[0.0, 0.0, 0.5]], dtype=torch.float64)
@@ -236,8 +247,8 @@ def test_gloss_depends_on_where_one_looks_from():
 
 def test_alpha_is_the_share_of_a_pixel_that_is_covered():
     camera, fine = camera_at((2.0, 0, 0), size=32), camera_at((2.0, 0, 0), size=32 * 16)
-    _, alpha = photograph(alone(Sphere(0.5), Pose()), camera)
-    covered = np.isfinite(trace(alone(Sphere(0.5), Pose()), fine.rays(fine.pixels())).depth)
+    _, alpha = photograph(alone(Ball(0.5), Pose()), camera)
+    covered = np.isfinite(trace(alone(Ball(0.5), Pose()), fine.rays(fine.pixels())).depth)
     expected = covered.reshape(32, 16, 32, 16).mean((1, 3))
     assert (alpha[expected == 0] == 0).all() and (alpha[expected == 1] == 1).all()
     edge = (expected > 0) & (expected < 1)
@@ -247,7 +258,7 @@ def test_alpha_is_the_share_of_a_pixel_that_is_covered():
 
 
 def test_colour_at_an_edge_is_not_mixed_with_the_background():
-    world = World((Object(Sphere(0.5), CHALK),), sky=Sky(light=0.5))
+    world = World((Object(Ball(0.5), CHALK),), sky=Sky(light=0.5))
     rgb, alpha = photograph(world, camera_at((2.0, 0, 0), size=32))
     inside = rgb[alpha == 1].mean(0)
     np.testing.assert_allclose(rgb[(alpha > 0) & (alpha < 1)].mean(0), inside, atol=0.02)
@@ -285,7 +296,7 @@ def test_a_turned_world_gives_the_turned_picture(still_life):
 
 def test_shadow_lies_where_geometry_says():
     toward = np.array([0.5, -0.3, 0.8]) / np.linalg.norm([0.5, -0.3, 0.8])
-    ball, centre = Object(Sphere(0.4), CHALK, Pose((0.0, 0.0, 0.7)), "ball"), np.array([0.0, 0.0, 0.7])
+    ball, centre = Object(Ball(0.4), CHALK, Pose((0.0, 0.0, 0.7)), "ball"), np.array([0.0, 0.0, 0.7])
     world = World((Object(Plane(), CHALK, name="floor"), ball), (Sun(tuple(toward), 0.0, 1.0),), Sky(light=0.0))
     camera = camera_at((1.5, -2.5, 2.0), target=(-0.3, 0.2, 0.0))
     rays = camera.rays(camera.pixels())
@@ -304,7 +315,7 @@ def test_shadow_lies_where_geometry_says():
 
 def test_a_wide_light_casts_a_shadow_whose_edge_is_half_lit():
     """A half-space hides half of a lamp from where its edge and the lamp's centre line up."""
-    wall = Object(Box((0.01, 4.0, 0.5)), CHALK, Pose((0.0, 0.0, 0.5)), "wall")
+    wall = Object(Cuboid((0.01, 4.0, 0.5)), CHALK, Pose((0.0, 0.0, 0.5)), "wall")
     sun = Sun((1.0, 0.0, 1.0), 0.2, 1.0)
     world = World((Object(Plane(), CHALK, name="floor"), wall), (sun,), Sky(light=0.0))
     camera = camera_at((-1.0, 0.0, 3.0), target=(-1.0, 0.01, 0.0), size=64, field_of_view=36.0)

@@ -14,7 +14,7 @@ from rich.tree import Tree
 from lumigraph.commands.common import show
 from lumigraph.system import progress
 from lumigraph.system.console import bold, console
-from lumigraph.system.progress import Stage, counting, track
+from lumigraph.system.progress import ProgressStage, counting, track
 
 pytestmark = budget("runs")
 
@@ -55,7 +55,7 @@ def test_a_stage_within_another_is_not_shown_and_a_fault_is_not_called_done(hurr
             time.sleep(0.1)
         raise ValueError
     lines = capsys.readouterr().err.splitlines()
-    assert lines and set(lines) == {"Outer: 0 of 3"} and Stage._shown is None
+    assert lines and set(lines) == {"Outer: 0 of 3"} and ProgressStage._shown is None
 
 
 def test_lines_come_soon_and_then_rarely():

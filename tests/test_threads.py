@@ -136,7 +136,7 @@ def test_threads_sleep_for_a_while_when_others_hold_them_up(monkeypatch):
 
 @pytest.mark.skipif(not threads.TASKS_FOLDER.exists(), reason="tells what threads wait for by /proc")
 def test_who_waits_behind_another_thread_is_held_up():
-    held, end = threads.Held(), time.monotonic() + 0.3
+    held, end = threads.Contention(), time.monotonic() + 0.3
     before = os.sched_getaffinity(0)
     os.sched_setaffinity(0, {min(before)})
     program = f"import os\nwhile os.getppid() == {os.getpid()}: pass"
@@ -154,9 +154,9 @@ def test_who_waits_behind_another_thread_is_held_up():
 def test_who_hardly_runs_is_not_held_up(monkeypatch):
     second = 10**9
     states = iter([{"1": [0, 0], "2": [5, 5]}, {"1": [second // 1000, second // 1000], "3": [second, second]}])
-    monkeypatch.setattr(threads.Held, "_now", staticmethod(lambda: next(states)))
+    monkeypatch.setattr(threads.Contention, "_now", staticmethod(lambda: next(states)))
     assert (
-        threads.Held()() < threads.MAX_WAITING_SHARE
+        threads.Contention()() < threads.MAX_WAITING_SHARE
     )  # half of very little; threads that came or went between do not count
 
 

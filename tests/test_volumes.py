@@ -20,7 +20,7 @@ import lumigraph.methods
 from lumigraph.camera import Camera
 from lumigraph.camera.rays import Rays
 from lumigraph.commands.cli import main
-from lumigraph.derive.conversion import Aim, convert
+from lumigraph.derive.conversion import ConversionTarget, convert
 from lumigraph.errors import LumigraphError
 from lumigraph.exchange.baked import Octree
 from lumigraph.exchange.baked.browser import atlas_for_browser, breadth_first, clearance, octree_for_browser
@@ -121,8 +121,8 @@ def grid(ball_run, tmp_path_factory):
     return folder
 
 
-def small(name: str, steps: int = 24) -> Aim:
-    return Aim(config=lumigraph.methods.find(name).smallest(), steps=steps, views=1)
+def small(name: str, steps: int = 24) -> ConversionTarget:
+    return ConversionTarget(config=lumigraph.methods.find(name).smallest(), steps=steps, views=1)
 
 
 @pytest.mark.parametrize(("name", "holds"), [("plenoctrees", "leaves of an octree"), ("snerg", "blocks of")])

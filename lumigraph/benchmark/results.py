@@ -14,7 +14,7 @@ from ..budget import Budget
 from ..files.ranges import Lasted, Tally, typed
 from ..metrics import Score
 from ..run import Run
-from ..run.measured import Protocol, View
+from ..run.measured import Protocol, ViewScores
 from .cell import Cell, Settings, train_command
 from .published import Published, published
 
@@ -68,7 +68,7 @@ class Measured:
     lpips: float | None = None
     scores: list[Score] = field(default_factory=list)
     seconds_per_view: Lasted | None = None
-    shown: View | None = None
+    shown: ViewScores | None = None
     published: Published | None = None
 
 

@@ -26,7 +26,7 @@ from .capture import Shot as Shot
 from .fewer import with_all_views, with_fewer_views
 from .masks import with_masks
 from .multiscale import multiscale as multiscale
-from .part import Part as Part
+from .part import CapturePart as CapturePart
 from .part import part_of
 from .pictures import list_images
 from .places import Places as Places
@@ -121,7 +121,7 @@ def open_scene(
     scales: int = 1,
     before: Before | None = None,
     whole: bool | None = None,
-    part: Part | dict[str, Any] | None = None,
+    part: CapturePart | dict[str, Any] | None = None,
 ) -> Scene:
     """The Scene in a folder of posed photographs, a single picture as a scene, or a procedural one.
 
@@ -144,7 +144,7 @@ def open_scene(
     else:
         capture = read_capture(source, reader)
     if part is not None:
-        capture = part_of(capture, typed(Part, part, str(source)) if isinstance(part, dict) else part)
+        capture = part_of(capture, typed(CapturePart, part, str(source)) if isinstance(part, dict) else part)
     scene = assemble(capture, downscale, memory, cache, before)
     if whole and not any(shot.split for shot in capture.shots):
         scene = with_all_views(scene)

@@ -23,7 +23,7 @@ from ..system.progress import counting
 from .beside import make_about, make_layers
 from .capture import Capture, Shot
 from .forward import find_forward
-from .normalise import Place, find_place
+from .normalise import ScenePlacement, find_place
 from .oddities import oddities
 from .pictures import Chosen, check_downscale, choose
 
@@ -192,7 +192,7 @@ def make_cameras(
 
 
 def make_frame(
-    place: Place,
+    place: ScenePlacement,
     scene_from_source: np.ndarray,
     images: ImageStore,
     forward: Forward | None,

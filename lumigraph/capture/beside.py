@@ -20,7 +20,7 @@ from ..datasets.images.layer import known
 from ..depth_maps import back_project
 from ..errors import LumigraphError
 from ..geometry.choice import evenly
-from .capture import Capture, Plane, Shot
+from .capture import Capture, PixelPlane, Shot
 from .numbers import kind_of, read_numbers
 from .photos.exif import exposure
 from .pictures import Chosen, read_image, readable, same_shape, stat
@@ -62,12 +62,12 @@ def make_layers(
     return layers, told
 
 
-def own_bits(plane: Plane | None) -> dict[str, Plane]:
+def own_bits(plane: PixelPlane | None) -> dict[str, PixelPlane]:
     """A photograph of more than eight bits: `colours` as they are encoded, or `raw` light."""
     return {} if plane is None else {"colours" if plane.encoding == "sRGB" else "raw": plane}
 
 
-def settled(plane: Plane, name: str) -> Plane:
+def settled(plane: PixelPlane, name: str) -> PixelPlane:
     """The plane with the type and number of channels that its values have, and what they depend on."""
     dtype, channels, identity = plane.dtype, plane.channels, plane.identity
     if isinstance(plane.values, np.ndarray):
@@ -84,10 +84,10 @@ def settled(plane: Plane, name: str) -> Plane:
     return replace(plane, dtype=dtype, channels=channels, identity=identity)
 
 
-def agreed(name: str, shots: list[Shot], planes: list[Plane | None]) -> Plane:
+def agreed(name: str, shots: list[Shot], planes: list[PixelPlane | None]) -> PixelPlane:
     """The first plane, to which all others are alike."""
 
-    def meaning(plane: Plane) -> tuple[Any, ...]:
+    def meaning(plane: PixelPlane) -> tuple[Any, ...]:
         return plane.encoding, plane.scale, plane.channels, plane.unknown, plane.empty, plane.names
 
     (first, shot), *others = [(p, s) for p, s in zip(planes, shots, strict=True) if p is not None]
@@ -101,7 +101,9 @@ def agreed(name: str, shots: list[Shot], planes: list[Plane | None]) -> Plane:
     return first
 
 
-def source_of(plane: Plane, name: str, dtype: np.dtype, chosen: Chosen, turn: Float[np.ndarray, "3 3"]) -> LayerSource:
+def source_of(
+    plane: PixelPlane, name: str, dtype: np.dtype, chosen: Chosen, turn: Float[np.ndarray, "3 3"]
+) -> LayerSource:
     size = chosen.picture.size
     identity = None if plane.identity is None else f"{plane.identity} {size} {dtype.str} {plane.encoding}"
     if identity is not None and plane.encoding == "direction":
@@ -110,7 +112,7 @@ def source_of(plane: Plane, name: str, dtype: np.dtype, chosen: Chosen, turn: Fl
 
 
 def read_plane(
-    plane: Plane, name: str, dtype: np.dtype, size: tuple[int, int], turn: Float[np.ndarray, "3 3"]
+    plane: PixelPlane, name: str, dtype: np.dtype, size: tuple[int, int], turn: Float[np.ndarray, "3 3"]
 ) -> np.ndarray:
     """Stored numbers at the size of the photograph; directions turned to the scene's frame."""
     if isinstance(plane.values, Path):

@@ -16,7 +16,7 @@ Pixels = np.ndarray  # uint8, (height, width, 3) or (height, width, 4); alpha la
 
 
 @dataclass(frozen=True)
-class Plane:
+class PixelPlane:
     """Values of one layer beside one photograph, as a reader found them. See `images.Layer`.
 
     values:   stored numbers, (height, width) or (height, width, channels), a function that makes them, or a file; in
@@ -71,7 +71,7 @@ class Shot:
     split: str | None = None
     time: float | None = None
     depths: tuple[float, float] | None = None
-    planes: dict[str, Plane] = field(default_factory=dict)
+    planes: dict[str, PixelPlane] = field(default_factory=dict)
     about: dict[str, Any] = field(default_factory=dict)
     identity: str | None = None
 

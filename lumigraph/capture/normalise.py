@@ -36,7 +36,7 @@ SAMPLED_POINTS, SAMPLED_CAMERAS = 5000, 64
 
 
 @dataclass(frozen=True)
-class Place:
+class ScenePlacement:
     """The frame of a scene: scene_from_source is the similarity x_scene = M x_source; the rest as in `Frame`."""
 
     scene_from_source: Float[np.ndarray, "4 4"]
@@ -57,7 +57,7 @@ def find_place(
     images: ImageStore,
     views: list[int],
     upright: Float[np.ndarray, "4 4"] | None = None,
-) -> Place:
+) -> ScenePlacement:
     """Placement of the capture.
 
     cameras: in the source's frame
@@ -89,7 +89,7 @@ def upright_of(capture: Capture, cameras: Camera) -> Float[np.ndarray, "4 4"]:
     return find_upright(cameras, None if cloud is None else cloud.points)
 
 
-def part_place(capture: Capture, cameras: Camera, upright: np.ndarray, background: Vector) -> Place:
+def part_place(capture: Capture, cameras: Camera, upright: np.ndarray, background: Vector) -> ScenePlacement:
     """A part of a larger capture: a cube around its middle, and cubes around it as far as the points go.
 
     cameras: in the turned frame
@@ -105,10 +105,12 @@ def part_place(capture: Capture, cameras: Camera, upright: np.ndarray, backgroun
     elif cloud is not None:
         reach = power_of_two(quantile(np.abs(cloud.points - centre).max(-1), cloud.weights, REACH_QUANTILE) / half)
     near = near if capture.near is None else capture.near
-    return Place(similarity(upright, centre, half), UNIT_CUBE, max(2.0, reach), max(near / half, MIN_NEAR), background)
+    return ScenePlacement(
+        similarity(upright, centre, half), UNIT_CUBE, max(2.0, reach), max(near / half, MIN_NEAR), background
+    )
 
 
-def stated_place(capture: Capture, cameras: Camera, background: Vector) -> Place:
+def stated_place(capture: Capture, cameras: Camera, background: Vector) -> ScenePlacement:
     """Placement that the source states: bounds, and reach and near if it states them."""
     assert capture.bounds is not None
     low, high = np.array(capture.bounds, np.float64)
@@ -116,16 +118,20 @@ def stated_place(capture: Capture, cameras: Camera, background: Vector) -> Place
     bounds = box_in_scene(low, high, centre, half)
     reach = 1.0 if capture.reach is None else power_of_two(capture.reach / half)
     near = nearest_to_box(cameras, low, high) if capture.near is None else capture.near
-    return Place(similarity(np.eye(4), centre, half), bounds, reach, max(near / half, MIN_NEAR), background)
+    return ScenePlacement(similarity(np.eye(4), centre, half), bounds, reach, max(near / half, MIN_NEAR), background)
 
 
-def object_place(upright: np.ndarray, box: tuple[np.ndarray, np.ndarray], cameras: Camera, background: Vector) -> Place:
+def object_place(
+    upright: np.ndarray, box: tuple[np.ndarray, np.ndarray], cameras: Camera, background: Vector
+) -> ScenePlacement:
     """An object alone: its box fills the scene."""
     low, high = box
     centre, half = 0.5 * (low + high), 0.5 * BOX_MARGIN * float((high - low).max())
     low, high = centre - 0.5 * BOX_MARGIN * (high - low), centre + 0.5 * BOX_MARGIN * (high - low)
     near = max(nearest_to_box(cameras, low, high) / half, MIN_NEAR)
-    return Place(similarity(upright, centre, half), box_in_scene(low, high, centre, half), 1.0, near, background)
+    return ScenePlacement(
+        similarity(upright, centre, half), box_in_scene(low, high, centre, half), 1.0, near, background
+    )
 
 
 def nearest_to_box(cameras: Camera, low: np.ndarray, high: np.ndarray) -> float:
@@ -187,7 +193,7 @@ def find_gaze(capture: Capture, cameras: Camera, upright: np.ndarray) -> Gaze:
     return Gaze(centre, distance, converging, half, float(nearest), cloud)
 
 
-def open_place(capture: Capture, upright: np.ndarray, gaze: Gaze, background: Vector) -> Place:
+def open_place(capture: Capture, upright: np.ndarray, gaze: Gaze, background: Vector) -> ScenePlacement:
     """A room or the open: a box in the middle of what is looked at, and cubes around it as far as the points go."""
     centre, half = gaze.centre, gaze.half
     reach = DEFAULT_REACH
@@ -201,7 +207,7 @@ def open_place(capture: Capture, upright: np.ndarray, gaze: Gaze, background: Ve
     if capture.reach is not None:
         reach = power_of_two(capture.reach / half)
     near = NEAR_SCALE * gaze.nearest if capture.near is None else capture.near
-    return Place(similarity(upright, centre, half), UNIT_CUBE, reach, max(near / half, MIN_NEAR), background)
+    return ScenePlacement(similarity(upright, centre, half), UNIT_CUBE, reach, max(near / half, MIN_NEAR), background)
 
 
 def settle(cloud: WeightedPoints, centre: np.ndarray, half: float) -> tuple[np.ndarray, float]:

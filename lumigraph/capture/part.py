@@ -15,7 +15,7 @@ MAX_POINT_RADII = 16.0  # radii of a part within which sparse points are kept: b
 
 
 @dataclass(frozen=True)
-class Part:
+class CapturePart:
     """Some photographs of a capture, and where the place is that they are of.
 
     photographs: their names; those held out of the whole capture are held out here
@@ -27,7 +27,7 @@ class Part:
     radius: Positive
 
 
-def part_of(capture: Capture, part: Part) -> Capture:
+def part_of(capture: Capture, part: CapturePart) -> Capture:
     """The capture with these photographs alone, and a box of interest of that radius around that centre.
 
     Raises LumigraphError where some of the photographs are not there.

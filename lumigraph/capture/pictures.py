@@ -16,7 +16,7 @@ from PIL import Image, ImageOps
 from ..datasets.images import ImageSource, resized
 from ..errors import LumigraphError
 from ..files import is_file
-from .capture import Plane, Shot
+from .capture import PixelPlane, Shot
 from .numbers import TIFF_SUFFIXES, Kind, as_bytes, check_pixels, colours, kind_of, read_numbers, tiff_tags, turned
 
 DEFAULT_MAX_SIDE = 1100  # pixels of the longer side of a photograph
@@ -93,7 +93,7 @@ class Chosen:
     picture: ImageSource
     calibrated: Size
     wanted: Size
-    plane: Plane | None = None
+    plane: PixelPlane | None = None
 
 
 def choose(shot: Shot, downscale: int | None) -> Chosen:
@@ -224,13 +224,13 @@ def read_deep(path: Path, turn: bool) -> np.ndarray:
         return turned(values, measure(path)[1]) if turn else values
 
 
-def deep_plane(path: Path, turn: bool, identity: str) -> Plane | None:
+def deep_plane(path: Path, turn: bool, identity: str) -> PixelPlane | None:
     """All bits of a photograph as values of a layer; None where eight hold it."""
     kind = deep(path)
     if kind is None:
         return None
     whole = kind.dtype.kind == "f"
-    return Plane(
+    return PixelPlane(
         partial(read_deep, path, turn),
         kind.encoding,
         scale=1.0 if whole else 1 / np.iinfo(kind.dtype).max,

@@ -16,7 +16,7 @@ import torch
 from ..camera.lens import Pinhole
 from ..errors import LumigraphError
 from .beside import with_depth_points
-from .capture import Capture, Plane, Shot
+from .capture import Capture, PixelPlane, Shot
 from .pictures import find_file, measure
 
 EXPECTED_FILES = "frame-*.color and frame-*.pose.txt (7-Scenes, 3DMatch)"
@@ -52,7 +52,7 @@ def read(folder: Path) -> Capture:
             continue
         if not np.isfinite(pose).all():
             continue
-        planes = {"depth": Plane(depth, "z-depth", 1e-3, unknown=(0, 65535))} if depth.is_file() else {}
+        planes = {"depth": PixelPlane(depth, "z-depth", 1e-3, unknown=(0, 65535))} if depth.is_file() else {}
         shots.append(Shot(name, pose[:3], lens, measure(picture)[0], {1: picture}, planes=planes))
     return with_depth_points(Capture(str(folder), shots, missing=missing))
 

@@ -19,7 +19,7 @@ from ..errors import LumigraphError
 from ..files import is_file, read_json
 from ..files.ranges import Coordinate, Name, Point, Positive, Row, between, typed
 from . import colmap
-from .capture import Capture, Plane, Shot
+from .capture import Capture, PixelPlane, Shot
 from .pictures import EXIF_SIDEWAYS, find_file, measure, reductions, versions
 from .points import SparsePoints, read_ply, similarity
 
@@ -201,7 +201,7 @@ def fact(value: Any, name: str, where: str) -> np.ndarray:
     return numbers
 
 
-def read_planes(folder: Path, about: Posed, lens: Lens, missing: list[str]) -> dict[str, Plane]:
+def read_planes(folder: Path, about: Posed, lens: Lens, missing: list[str]) -> dict[str, PixelPlane]:
     """Depth, labels and normals whose files a frame names; what it names and is not there joins `missing`."""
     found = {}
     for kind, keys in PLANES.items():
@@ -215,18 +215,18 @@ def read_planes(folder: Path, about: Posed, lens: Lens, missing: list[str]) -> d
         elif kind == "depth":
             found[kind] = depth_plane(file, key, about, lens)
         else:
-            found[kind] = Plane(file, {"labels": "index", "normals": "direction"}[kind])
+            found[kind] = PixelPlane(file, {"labels": "index", "normals": "direction"}[kind])
     return found
 
 
-def depth_plane(file: Path, key: str, about: Posed, lens: Lens) -> Plane:
+def depth_plane(file: Path, key: str, about: Posed, lens: Lens) -> PixelPlane:
     """Depth as nerfstudio stores it, thousandths of a unit unless the file says otherwise, or as instant-ngp does."""
     stated = about.integer_depth_scale if key == "depth_path" else about.depth_unit_scale_factor
     scale = stated if stated is not None else 1.0 if file.suffix.lower() == ".exr" else 1e-3
     along_ray = isinstance(lens, Equirectangular) or bool(about.is_euclidean_depth)
     whole = file.suffix.lower() in (".png", ".tif", ".tiff")
     unknown, empty = ((0.0, 65535.0), ()) if whole else ((0.0,), BLENDER_EMPTY_DEPTHS)
-    return Plane(file, "distance" if along_ray else "z-depth", scale, unknown, empty)
+    return PixelPlane(file, "distance" if along_ray else "z-depth", scale, unknown, empty)
 
 
 def find_versions(folder: Path, names: list[str]) -> list[dict[int, Path]]:

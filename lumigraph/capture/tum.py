@@ -18,7 +18,7 @@ from ..errors import LumigraphError
 from ..files import is_file
 from ..geometry import to_matrix
 from .beside import with_depth_points
-from .capture import Capture, Plane, Shot
+from .capture import Capture, PixelPlane, Shot
 
 EXPECTED_FILES = "rgb.txt and groundtruth.txt (TUM's RGB-D benchmark)"
 MAX_TIME_DIFFERENCE = 0.02  # seconds between two entries that belong together, as in the benchmark's own tools
@@ -58,7 +58,7 @@ def read(folder: Path) -> Capture:
         if depth is not None:
             path = folder / depths[depth][1]
             if is_file(path):
-                planes["depth"] = Plane(path, "z-depth", 1 / DEPTH_PER_METRE, unknown=(0, 65535))
+                planes["depth"] = PixelPlane(path, "z-depth", 1 / DEPTH_PER_METRE, unknown=(0, 65535))
             else:
                 missing.append(depths[depth][1])
         shots.append(

@@ -53,11 +53,11 @@ class CaptureCommand:
     into the scene; check that picture before you train."""
 
     def run(self) -> int:
-        from ..capture.motion import Options
+        from ..capture.motion import MotionOptions
 
         if not self.what:
             raise LumigraphError("Nothing to capture; name a folder of photographs, image files or a video")
-        options = Options(self.frames, self.mapper, self.matching, self.camera, self.max_size)
+        options = MotionOptions(self.frames, self.mapper, self.matching, self.camera, self.max_size)
         folder = self.output or scene_folder(self.what)
         onward = typed("train", "gaussian-splatting", folder)
         tell(folder, find_cameras(self.what, folder, options), None if self.mask_object else onward)

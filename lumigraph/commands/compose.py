@@ -50,7 +50,7 @@ class Compose:
         from ..composition import standing
         from ..geometry import Similarity
         from ..run import open_any
-        from ..run.composition import Part, relative, write_composition
+        from ..run.composition import CompositionPart, relative, write_composition
 
         if self.output.suffix.lower() != ".json":
             raise LumigraphError(f"{self.output} should end in .json, as compositions do; rename it")
@@ -62,8 +62,8 @@ class Compose:
         if any(told is not None for told in (self.at, self.scale, self.turn)):
             spot = None if self.at is None else torch.tensor(self.at, dtype=torch.float64)
             place = standing(part.frame, lead.frame, spot, self.scale or 1.0, self.turn or 0.0)
-        named = [Part(relative(self.lead, self.output), Similarity.make(1.0))]
-        named.append(Part(relative(self.part, self.output), place, self.box and Box(*self.box)))
+        named = [CompositionPart(relative(self.lead, self.output), Similarity.make(1.0))]
+        named.append(CompositionPart(relative(self.part, self.output), place, self.box and Box(*self.box)))
         write_composition(self.output, named)
         opened = open_any(self.output)
         low, high = opened.frame.bounds

@@ -56,7 +56,7 @@ class Compress:
     """Device to compute on: auto (a GPU if there is one), cpu, cuda, cuda:1."""
 
     def run(self) -> int:
-        from ..derive.compression import Aim, compress
+        from ..derive.compression import CompressionTarget, compress
         from ..run import Run
 
         if sum(told is not None for told in (self.to, self.quality, self.max_loss)) > 1:
@@ -66,7 +66,7 @@ class Compress:
         size = None if self.to is None else bytes_in(self.to)
         loss = None if size is not None else LOSSES[self.quality or DEFAULT] if self.max_loss is None else self.max_loss
         seconds = None if self.steps is not None else self.seconds or DEFAULT_SECONDS
-        aim = Aim(size, loss, self.codebook, self.steps, seconds, self.views)
+        aim = CompressionTarget(size, loss, self.codebook, self.steps, seconds, self.views)
         made = compress(Run(self.run_folder), self.output, aim, self.scene, choose_device(self.device))
         console().print(table(made))
         against = str(made.compared_with)

@@ -60,7 +60,7 @@ class Convert:
 
     def run(self) -> int:
         from .. import methods
-        from ..derive.conversion import Aim, convert
+        from ..derive.conversion import ConversionTarget, convert
         from ..run import open_any
 
         if self.list:
@@ -71,7 +71,7 @@ class Convert:
         told_budget(self.steps, self.seconds, self.quality)
         name, device = methods.check(self.method), choose_device(self.device)
         counted = self.steps is not None or self.quality is not None
-        aim = Aim(
+        aim = ConversionTarget(
             config=method_config(self, name),
             steps=self.steps,
             seconds=None if counted else self.seconds or DEFAULT_SECONDS,

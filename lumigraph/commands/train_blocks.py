@@ -81,7 +81,7 @@ class Blocks:
         import torch
 
         from ..large.on_ray import Workers
-        from ..large.planning import Recipe, begin, make_plan
+        from ..large.planning import BlockRecipe, begin, make_plan
         from ..large.training import conduct, finish
         from ..system.memory import free_memory
 
@@ -95,7 +95,7 @@ class Blocks:
         config = method_config(train, method)
         seed = getattr(config, "seed", train.seed)
         options = {name: getattr(train, name) for name in OPTIONS}
-        recipe = Recipe(method, config, options, budget, train.quality, seed, str(device), here)
+        recipe = BlockRecipe(method, config, options, budget, train.quality, seed, str(device), here)
         plan = make_plan(source, places, self.blocks or "auto", recipe)
         output = train.output or unfinished(f"runs/{scene_name(source)}-{methods.check(train.method)}", plan)
         cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

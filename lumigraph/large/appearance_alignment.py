@@ -100,7 +100,7 @@ def patch(
 
 
 @dataclass(frozen=True)
-class View:
+class BlockView:
     """Colours that one block shows a camera, the camera in the frame of another, and how well both saw each pixel."""
 
     rgb: Float[Tensor, "height width 3"]
@@ -125,13 +125,13 @@ class View:
         return Batch(rays, self.rgb.flatten(0, 1)[chosen].clamp(0, 1))
 
 
-def looked(known: Placed, other: Placed, camera: Camera) -> View:
+def looked(known: Placed, other: Placed, camera: Camera) -> BlockView:
     """One block looked at through a small picture, and by how much the less seeing of both saw each pixel."""
     small = camera.resized(min(1.0, PICTURE_SIDE / int(camera.size.max())))
     seen, theirs = known.rendering(small), other.rendering(small)
     both = torch.minimum(saw(known, small, seen), saw(other, small, theirs))
     background = torch.tensor(other.method.frame.background, device=seen.rgb.device)
-    return View(seen.rgb + (1 - seen.opacity)[..., None] * background, other.camera(small), both)
+    return BlockView(seen.rgb + (1 - seen.opacity)[..., None] * background, other.camera(small), both)
 
 
 def between(centres: Float[Tensor, "2 3"], radii: Float[Tensor, 2], cameras: Camera) -> list[Camera]:

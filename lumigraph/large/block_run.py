@@ -21,7 +21,7 @@ from torch import Tensor
 
 from .. import files, methods
 from ..camera import Camera
-from ..capture import Before, Part, open_dataset
+from ..capture import Before, CapturePart, open_dataset
 from ..composition import PickedCloud, Placed
 from ..datasets.scene import Frame, Scene
 from ..errors import LumigraphError, LumigraphWarning
@@ -82,14 +82,14 @@ class BlockRun(Trained):
         return torch.tensor([block.radius for block in self.blocks]) / self.frame.to_source.scale
 
     @cached_property
-    def _around(self) -> Part:
+    def _around(self) -> CapturePart:
         """A ball on the ground that holds all blocks of the plan, in the source's frame."""
         upright = np.array(self.plan.upright)
         centres = np.array([block.centre for block in self.plan.blocks]) @ upright.T
         radii = np.array([[block.radius] for block in self.plan.blocks])
         low, high = (centres - radii).min(0), (centres + radii).max(0)
         x, y, z = (0.5 * (low + high) @ upright).tolist()
-        return Part([], (x, y, z), 0.5 * float((high - low)[:2].max()))
+        return CapturePart([], (x, y, z), 0.5 * float((high - low)[:2].max()))
 
     def _frame(self) -> Frame:
         around, upright = self._around, np.array(self.plan.upright)
@@ -189,7 +189,7 @@ class BlockRun(Trained):
 
     @property
     def conversion_fault(self) -> str:
-        return f"is a run in blocks; convert each by itself: {self.folder / FOLDER / self.blocks[0].name}"
+        return f"is a run in blocks; convert each by itself: {self.folder / BLOCKS_FOLDER / self.blocks[0].name}"
 
     def dataset(self, source: str | None = None, split: str | None = None) -> Scene:
         """The photographs again, in the frame.

@@ -20,7 +20,7 @@ from typing import Annotated, Any
 import msgspec
 
 from .. import files
-from ..capture import Part
+from ..capture import CapturePart
 from ..errors import LumigraphError
 from ..files.ranges import Point, Positive, between, typed
 from ..run.settings import Source
@@ -156,6 +156,6 @@ class Plan:
     def task(self, block: Block) -> Task:
         """The task of a block."""
         scene = block.scene or self.scene
-        part = asdict(Part(block.photographs, block.centre, block.radius))
+        part = asdict(CapturePart(block.photographs, block.centre, block.radius))
         told = replace(scene, options={**scene.options, "part": part})
         return Task(self.method, self.config, told, self.upright, block.budget or self.budget, self.seed, self.device)

@@ -31,7 +31,7 @@ def survey(source: str, reader: str | None = None) -> Places:
 
 
 @dataclass(frozen=True)
-class Recipe:
+class BlockRecipe:
     """Training of every block.
 
     options: what `open_dataset` is told of the whole scene
@@ -59,7 +59,7 @@ class Recipe:
         return {"seconds": self.budget.total / blocks}
 
 
-def make_plan(source: str, places: Places, wish: str, recipe: Recipe) -> Plan:
+def make_plan(source: str, places: Places, wish: str, recipe: BlockRecipe) -> Plan:
     """The plan of a scene: its blocks, see `lay_out`, and what each of them learns."""
     blocks = lay_out(places, wish, source)
     turn: Any = tuple(tuple(float(x) for x in row) for row in places.upright)

@@ -38,7 +38,7 @@ FORMAT = "lumigraph canonical 1"
 
 
 @dataclass(frozen=True)
-class Said:
+class CanonicalRecord:
     """The file."""
 
     source: Name
@@ -54,7 +54,7 @@ class Canonicalised(Opened):
 
     def __init__(self, path: Path | str):
         self.path = Path(path)
-        said = typed(Said, files.read_json(self.path), self.path, closed=True)
+        said = typed(CanonicalRecord, files.read_json(self.path), self.path, closed=True)
         box_of(said.bounds, self.path)
         self.agreement = said.agreement
         self.run = Run(self.path.parent / files.expanded(said.source))

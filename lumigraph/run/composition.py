@@ -43,7 +43,7 @@ FORMAT = "lumigraph composition 1"
 
 
 @dataclass(frozen=True)
-class Part:
+class CompositionPart:
     """A part as the file says it. source: a path as it stands there; place and box: see above."""
 
     source: str
@@ -79,7 +79,7 @@ class Composition(Opened):
         del others[self.lead]
         self.frame = replace(frame_around(first, others), source_from_scene=to_source.rows)
 
-    def _found(self, part: Part) -> Path:
+    def _found(self, part: CompositionPart) -> Path:
         path = self.path.parent / files.expanded(part.source)
         if not files.exists(path):
             raise LumigraphError(f"{self.path} names {part.source} as a part, but there is no {path}; correct its path")
@@ -134,7 +134,7 @@ class PartSaid:
 
 
 @dataclass(frozen=True)
-class Said:
+class CompositionRecord:
     """The file."""
 
     parts: list[PartSaid]
@@ -142,21 +142,23 @@ class Said:
     format: str = FORMAT
 
 
-def read_composition(path: Path) -> tuple[list[Part], int]:
+def read_composition(path: Path) -> tuple[list[CompositionPart], int]:
     """The parts that a file names, and the number of the one that leads. Opens none of them."""
     said = files.read_json(path)
     if not isinstance(said, dict) or said.get("format") != FORMAT:
         raise LumigraphError(f"{path} is no composition: it does not say {FORMAT!r}; `lumigraph compose` makes one")
-    found = typed(Said, said, path, closed=True)
+    found = typed(CompositionRecord, said, path, closed=True)
     if found.lead not in range(len(found.parts)):
         raise LumigraphError(f"{path}: part {found.lead} should lead, and there are {len(found.parts)}; correct it")
     return [
-        Part(part.source, place_from_json(part.place, path), None if part.box is None else box_of(part.box, path))
+        CompositionPart(
+            part.source, place_from_json(part.place, path), None if part.box is None else box_of(part.box, path)
+        )
         for part in found.parts
     ], found.lead
 
 
-def write_composition(path: Path, parts: Sequence[Part], lead: int = 0) -> None:
+def write_composition(path: Path, parts: Sequence[CompositionPart], lead: int = 0) -> None:
     """Write a composition's file."""
     said = {"format": FORMAT, "lead": lead, "parts": [part_to_json(part) for part in parts]}
     files.write_json(path, said, "composition")
@@ -170,7 +172,7 @@ def relative(source: Path, file: Path) -> str:
         return str(source.resolve())
 
 
-def part_to_json(part: Part) -> dict[str, Any]:
+def part_to_json(part: CompositionPart) -> dict[str, Any]:
     said: dict[str, Any] = {"source": part.source}
     if place := place_to_json(part.place):
         said["place"] = place

@@ -15,7 +15,7 @@ LearntFrom = Literal["photographs", "renderings of the source"]
 
 
 @dataclass(frozen=True)
-class Begun:
+class ConversionStart:
     """A conversion that is under way, as `converted` in config.json.
 
     source:      the run or file that is converted
@@ -32,14 +32,14 @@ class Begun:
         return replace(settings, said=settings.said | {"converted": asdict(self)})
 
     @staticmethod
-    def of(settings: Settings, file: Path) -> Begun | None:
+    def of(settings: Settings, file: Path) -> ConversionStart | None:
         """Read from settings; None for a run that was trained from scratch. file: to name what is damaged in it"""
         told = settings.said.get("converted")
-        return None if told is None else typed(Begun, told, f"{file}: converted")
+        return None if told is None else typed(ConversionStart, told, f"{file}: converted")
 
 
 @dataclass(frozen=True)
-class Held:
+class MeasuredModel:
     """One of the two.
 
     bytes:   of the model, as it is stored
@@ -69,8 +69,8 @@ class Converted:
     source: str
     how: Literal["field", "gaussians", "depth", "pictures"]
     learnt_from: LearntFrom
-    teacher: Held
-    student: Held
+    teacher: MeasuredModel
+    student: MeasuredModel
     psnr: float
     views: Count
     taking_over: Lasted

@@ -327,7 +327,8 @@ def check_new(folder: Path) -> None:
 
 def is_leftover(path: Path) -> bool:
     """True for leftovers of a run that was killed before its first step."""
-    return path.name in (LOCK_FILE, MARKS_FILE) or PARTIAL_NAME.fullmatch(path.name) is not None or marks.is_ours(path, "file")
+    own = path.name in (LOCK_FILE, MARKS_FILE) or PARTIAL_NAME.fullmatch(path.name) is not None
+    return own or marks.is_ours(path, "file")
 
 
 def versions() -> dict[str, str]:

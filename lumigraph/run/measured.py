@@ -45,7 +45,7 @@ class Protocol:
 
 
 @dataclass(frozen=True)
-class View:
+class ViewScores:
     """The scores of one view."""
 
     name: str
@@ -67,12 +67,12 @@ class Size:
 
 
 @dataclass(frozen=True)
-class Evaluation:
+class EvaluationRecord:
     """Contents of eval.json, the fields in use. scores: means of all, by name"""
 
     protocol: Protocol
     steps: Tally
-    views: list[View] = field(default_factory=list)
+    views: list[ViewScores] = field(default_factory=list)
     by_resolution: dict[str, Size] = field(default_factory=dict)
     scores: list[Score] = field(default_factory=list)
     psnr: float | None = None
@@ -104,5 +104,5 @@ def read_rows(path: Path) -> list[dict[str, Any]]:
 def read_evaluation(path: Path) -> dict[str, Any]:
     """Read eval.json. Raises LumigraphError, naming the file, if it is invalid."""
     said = files.read_json(path)
-    typed(Evaluation, said, path)
+    typed(EvaluationRecord, said, path)
     return {"lpips": None, "evaluated_on": "unknown"} | {key: x for key, x in said.items() if x is not None}

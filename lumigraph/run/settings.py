@@ -8,7 +8,7 @@ from typing import Annotated, Any
 
 from .. import files
 from ..budget import Budget
-from ..capture import Part
+from ..capture import CapturePart
 from ..datasets.scene import Frame, Scene
 from ..errors import LumigraphError
 from ..files.plain import alike
@@ -19,7 +19,7 @@ RUN_FORMAT = "lumigraph run 1"
 
 
 @dataclass(frozen=True)
-class Options:
+class SourceOptions:
     """Options of a run for `open_dataset`: see `capture.open_scene`."""
 
     downscale: Downscale | None = None
@@ -27,7 +27,7 @@ class Options:
     views: Count | None = None
     scales: Scales | None = None
     whole: bool | None = None
-    part: Part | None = None
+    part: CapturePart | None = None
 
 
 @dataclass(frozen=True)
@@ -76,7 +76,7 @@ class Settings:
             raise LumigraphError(f"{file} was not written by this version of Lumigraph; open it with the one that did")
         settings = typed(Settings, said, file)
         frame = Frame.from_json(said["frame"], f"{file}: frame")
-        typed(Options, settings.scene.options, f"{file}: scene.options", closed=True)
+        typed(SourceOptions, settings.scene.options, f"{file}: scene.options", closed=True)
         if settings.budget:
             Budget.from_json(settings.budget, f"{file}: budget")
         return replace(settings, frame=frame, said=said)

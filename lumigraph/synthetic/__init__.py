@@ -26,7 +26,7 @@ from typing import Any
 import numpy as np
 
 from ..camera import Camera
-from ..capture.capture import Capture, Plane, Shot
+from ..capture.capture import Capture, PixelPlane, Shot
 from ..capture.raw import RawPhoto, facts, planes
 from . import categories as categories
 from . import scenes as scenes
@@ -41,7 +41,7 @@ from .rendering import eight_bits, photograph, radiance
 from .rendering import render as render
 from .rendering import signed_distance as signed_distance
 from .rendering import trace as trace
-from .stage import Stage as Stage
+from .stage import SyntheticStage as SyntheticStage
 from .world import Lamp as Lamp
 from .world import Material as Material
 from .world import Object as Object
@@ -76,7 +76,7 @@ def read(request: str) -> Capture:
     return capture(stage, f"procedural:{request}", off, kept=stage.differing is None or stage.called is not None)
 
 
-def capture(stage: Stage, source: str, found: dict[str, Camera] | None = None, kept: bool = False) -> Capture:
+def capture(stage: SyntheticStage, source: str, found: dict[str, Camera] | None = None, kept: bool = False) -> Capture:
     """A stage as photographs with known poses.
 
     found: the cameras as they are said to be, where that differs; `about` has each `true_pose` then
@@ -106,7 +106,7 @@ def capture(stage: Stage, source: str, found: dict[str, Camera] | None = None, k
     )
 
 
-def identity(stage: Stage, camera: Camera) -> str:
+def identity(stage: SyntheticStage, camera: Camera) -> str:
     """All that a picture depends on."""
     if stage.called is not None and camera.image_index is not None:
         world = stage.called(int(camera.image_index))
@@ -116,20 +116,22 @@ def identity(stage: Stage, camera: Camera) -> str:
     return f"traced {TRACER} {world} {camera.pose.tolist()} {camera.lens.to_json()} {camera.size.tolist()}{taken}"
 
 
-def known_planes(stage: Stage, camera: Camera) -> dict[str, Plane]:
+def known_planes(stage: SyntheticStage, camera: Camera) -> dict[str, PixelPlane]:
     """The layers of one photograph, of which nothing is traced before somebody asks."""
 
-    def plane(name: str, encoding: str, dtype: type, channels: int = 1, names: Sequence[str] = ()) -> Plane:
+    def plane(name: str, encoding: str, dtype: type, channels: int = 1, names: Sequence[str] = ()) -> PixelPlane:
         values = partial(known, stage, camera, name)
-        return Plane(values, encoding, dtype=np.dtype(dtype), channels=channels, names=tuple(names))
+        return PixelPlane(values, encoding, dtype=np.dtype(dtype), channels=channels, names=tuple(names))
 
     clean = partial(without_passers_by, stage, camera)
     lasting = (
-        {} if stage.lasting is None else {"clean": Plane(clean, "sRGB", 1 / 255, dtype=np.dtype(np.uint8), channels=3)}
+        {}
+        if stage.lasting is None
+        else {"clean": PixelPlane(clean, "sRGB", 1 / 255, dtype=np.dtype(np.uint8), channels=3)}
     )
     if stage.sensor is not None:
         light = partial(radiance, stage.world_of(camera), camera)
-        truth = Plane(light, "linear", dtype=np.dtype(np.float32), channels=3)
+        truth = PixelPlane(light, "linear", dtype=np.dtype(np.float32), channels=3)
         lasting |= planes(taken_raw(stage, camera)) | {"radiance": truth}
     return lasting | {
         "depth": plane("depth", "distance", np.float32),
@@ -139,7 +141,7 @@ def known_planes(stage: Stage, camera: Camera) -> dict[str, Plane]:
     }
 
 
-def known_facts(stage: Stage, camera: Camera, jittered: bool) -> dict[str, Any]:
+def known_facts(stage: SyntheticStage, camera: Camera, jittered: bool) -> dict[str, Any]:
     """Facts of one photograph. jittered: whether its pose is perturbed; the true one is then included"""
     known = {TRUE_POSE: camera.pose[0].double().numpy()} if jittered else {}
     if stage.facts is not None and camera.image_index is not None:
@@ -151,7 +153,7 @@ def known_facts(stage: Stage, camera: Camera, jittered: bool) -> dict[str, Any]:
     return known | facts(taken_raw(stage, camera), stage.sensor.brightness(int(camera.image_index)))
 
 
-def taken_raw(stage: Stage, camera: Camera) -> RawPhoto:
+def taken_raw(stage: SyntheticStage, camera: Camera) -> RawPhoto:
     """The photograph as the stage's sensor takes it; nothing is traced before its pixels are read."""
     assert stage.sensor is not None and camera.image_index is not None
     width, height = camera.size[0].tolist()
@@ -159,13 +161,13 @@ def taken_raw(stage: Stage, camera: Camera) -> RawPhoto:
     return stage.sensor.photograph(light, (width, height), int(camera.image_index))
 
 
-def without_passers_by(stage: Stage, camera: Camera) -> np.ndarray:
+def without_passers_by(stage: SyntheticStage, camera: Camera) -> np.ndarray:
     """The photograph as it would be in its own light with nobody there, bytes (height, width, 3)."""
     assert stage.lasting is not None and camera.image_index is not None
     return eight_bits(*photograph(stage.lasting(int(camera.image_index)), camera), alpha=False)
 
 
-def known(stage: Stage, camera: Camera, name: str) -> np.ndarray:
+def known(stage: SyntheticStage, camera: Camera, name: str) -> np.ndarray:
     """Ground-truth layers along the rays through pixel centres, from `render`."""
     width, height = camera.size[0].tolist()
     seen = trace(stage.world_of(camera), camera.rays(camera.pixels()), shaded=False)
@@ -174,7 +176,7 @@ def known(stage: Stage, camera: Camera, name: str) -> np.ndarray:
     return values.reshape(height, width, *values.shape[1:])
 
 
-def picture(stage: Stage, camera: Camera) -> np.ndarray:
+def picture(stage: SyntheticStage, camera: Camera) -> np.ndarray:
     """Bytes (height, width, 3), or (height, width, 4) with straight alpha where the background is transparent."""
     if stage.sensor is not None and camera.image_index is not None:
         return taken_raw(stage, camera).developed(stage.sensor.brightness(int(camera.image_index)))

@@ -18,12 +18,12 @@ from PIL import Image
 from ..camera import Camera
 from ..camera.lens import Pinhole
 from .rendering import eight_bits, render
-from .stage import Stage
+from .stage import SyntheticStage
 
 OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
-def write_blender(stage: Stage, folder: Path, truth: bool = True) -> None:
+def write_blender(stage: SyntheticStage, folder: Path, truth: bool = True) -> None:
     """Render every camera of a stage into a new folder.
 
     truth: also write what is exactly known about every pixel

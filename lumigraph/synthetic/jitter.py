@@ -8,11 +8,11 @@ import numpy as np
 import torch
 
 from ..camera import Camera
-from .stage import Stage
+from .stage import SyntheticStage
 from .world import rotation_about
 
 
-def jittered(stage: Stage, amount: float, seed: int) -> dict[str, Camera]:
+def jittered(stage: SyntheticStage, amount: float, seed: int) -> dict[str, Camera]:
     """The stage's cameras, those to learn from each turned by `amount` degrees about an axis of its own and moved by
     `amount` percent of the longest side of the box of interest, or of `Stage.error`, any way. Held-out ones stay where
     they are."""

@@ -18,7 +18,7 @@ from ..files.ranges import Seed, between
 from . import categories
 from .meshes import mesh_stage
 from .options import told
-from .stage import Stage
+from .stage import SyntheticStage
 from .turned import turned
 
 Number = Annotated[int, between(0, 99_999)]
@@ -82,7 +82,7 @@ def members_of(request: str) -> dict[str, str]:
     return {meshes.name_of(path, folder.resolve()): f"{path},{shared}" for path in found[: many.count]}
 
 
-def member_stage(request: str) -> Stage:
+def member_stage(request: str) -> SyntheticStage:
     """One object and the cameras around it."""
     name, one = told(Member, request)
     if (path := path_of(request)) is not None:

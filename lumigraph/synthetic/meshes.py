@@ -12,7 +12,7 @@ from ..capture import meshes
 from ..errors import LumigraphError
 from .categories import surrounded
 from .shapes import triangle_of
-from .stage import Stage
+from .stage import SyntheticStage
 from .textures import Plain
 from .world import Material, Object, Pose, Vector, nested
 
@@ -21,7 +21,7 @@ THICKNESS = 4e-3  # of its triangles
 BOUNDS: tuple[Vector, Vector] = ((-RADIUS,) * 3, (RADIUS,) * 3)
 
 
-def mesh_stage(path: Path, size: int, views: int, seed: int) -> Stage:
+def mesh_stage(path: Path, size: int, views: int, seed: int) -> SyntheticStage:
     """Stage with one file's mesh, centred at the origin, photographed like members of categories. seed: of the cameras
 
     Raises LumigraphError for a file that holds no surface.

@@ -24,7 +24,7 @@ FILM_HEADROOM = 64.0  # radiance relative to white that stays below the film's s
 MAX_CONTRAST = 0.08  # between samples of a pixel; above it more are taken (0 is black, 1 white, sRGB-encoded)
 
 
-class Seen(NamedTuple):
+class RayHits(NamedTuple):
     """Hits of single rays; arrays with leading axis ray."""
 
     radiance: np.ndarray
@@ -86,11 +86,11 @@ def eight_bits(rgb: np.ndarray, opacity: np.ndarray, alpha: bool) -> np.ndarray:
     return (channels.clip(0, 1) * 255 + 0.5).astype(np.uint8)
 
 
-def trace(world: World, rays: Rays, shaded: bool = True) -> Seen:
+def trace(world: World, rays: Rays, shaded: bool = True) -> RayHits:
     """Hits of rays. `radiance` is linear light after the film's response, in [0, 1]; black unless shaded."""
     n = len(rays)
     origins, directions, radius = _arrays(rays)
-    seen = Seen(np.empty((n, 3)), np.empty(n), np.empty((n, 3)), np.empty(n, np.int64), np.empty((n, 3)))
+    seen = RayHits(np.empty((n, 3)), np.empty(n), np.empty((n, 3)), np.empty(n, np.int64), np.empty((n, 3)))
 
     def work(first: int) -> None:
         part = slice(first, first + RAYS_PER_TASK)

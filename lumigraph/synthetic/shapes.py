@@ -22,7 +22,7 @@ NEAR_SURFACE = 5e-3  # within this distance the march around a shape that is not
 MAX_STEPS = 400
 
 
-class Shape:
+class SolidShape:
     """Interface of all shapes: `describe` for the tracer, `reach` for the tree of boxes around objects."""
 
     def describe(self) -> tuple[int, tuple[float, ...], float, tuple[float, float, float]]:
@@ -34,7 +34,7 @@ class Shape:
         return np.abs(rotation) @ np.array(self.describe()[3])
 
 
-class Turned(Shape):
+class Turned(SolidShape):
     """A shape of revolution about z."""
 
     def reach(self, rotation: np.ndarray) -> np.ndarray:
@@ -45,7 +45,7 @@ class Turned(Shape):
 
 
 @dataclass(frozen=True)
-class Sphere(Shape):
+class Ball(SolidShape):
     radius: float
 
     def reach(self, rotation: np.ndarray) -> np.ndarray:
@@ -56,7 +56,7 @@ class Sphere(Shape):
 
 
 @dataclass(frozen=True)
-class Box(Shape):
+class Cuboid(SolidShape):
     half: tuple[float, float, float]
     rounding: float = 0.0
 
@@ -105,7 +105,7 @@ class Torus(Turned):
 
 
 @dataclass(frozen=True)
-class Arch(Shape):
+class Arch(SolidShape):
     """A box with a gateway along y: `opening` is the gate's half-width and the radius of its vault, which begins
     `spring` above the floor. The gate must stay inside the box: spring + opening < 2 half[2]."""
 
@@ -121,7 +121,7 @@ class Arch(Shape):
 
 
 @dataclass(frozen=True)
-class Plane(Shape):
+class Plane(SolidShape):
     """The half-space z < 0."""
 
     def describe(self):
@@ -132,7 +132,7 @@ class Plane(Shape):
 
 
 @dataclass(frozen=True)
-class Triangle(Shape):
+class Triangle(SolidShape):
     """A plate, of twice `rounding` thick and rounded all around: (-base, -height), (base, -height) and (apex, height)
     before rounding, in the plane z = 0. The longest side lies along x, so that |apex| <= base; see `triangle_of`."""
 

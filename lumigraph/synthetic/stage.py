@@ -12,7 +12,7 @@ from .world import Rotation, Vector, World
 
 
 @dataclass(frozen=True)
-class Stage:
+class SyntheticStage:
     """A procedural scene ready to be photographed.
 
     world:   at the first moment, where things move

@@ -8,7 +8,7 @@ import numpy as np
 
 from .cameras import dome, pinhole, spiral
 from .categories import FIELD_OF_VIEW
-from .stage import Stage
+from .stage import SyntheticStage
 from .world import Pose, nested
 
 BALL_RADIUS = 1.2  # contains every member in every rotation
@@ -16,7 +16,7 @@ CAMERA_DISTANCE = 4.1  # from the centre, at which that ball just fits into the 
 MAX_ELEVATION = 60.0  # degrees of the cameras above and below the horizon: no side is the lower one
 
 
-def turned(stage: Stage, size: int, seed: tuple[int, int]) -> Stage:
+def turned(stage: SyntheticStage, size: int, seed: tuple[int, int]) -> SyntheticStage:
     """The stage with its objects turned about the origin by a random rotation; light and horizon stay. Cameras stand
     all around. `Stage.turn` is the rotation since the object stood upright, where that is known.
 

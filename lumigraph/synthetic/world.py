@@ -16,7 +16,7 @@ import numpy as np
 
 from ..color.srgb import linear_from_srgb
 from .boxes import hierarchy
-from .shapes import Shape
+from .shapes import SolidShape
 from .textures import Colour, Texture
 
 Vector = tuple[float, float, float]
@@ -114,7 +114,7 @@ class Material:
 class Object:
     """A shape somewhere. Objects of one name are parts of one thing: they share its mask and move together."""
 
-    shape: Shape
+    shape: SolidShape
     material: Material
     pose: Pose = Pose()
     name: str = "object"

@@ -36,7 +36,7 @@ def counting(description: str, total: int | None = None) -> Iterator[Callable[[i
     What takes longer than a moment is seen: as a bar on a terminal, in a log as a line now and then. A stage within
     another one is not shown.
     """
-    stage = Stage(description, total)
+    stage = ProgressStage(description, total)
     try:
         yield stage.done
     except BaseException:
@@ -45,17 +45,17 @@ def counting(description: str, total: int | None = None) -> Iterator[Callable[[i
     stage.end(well=True)
 
 
-class Stage:
+class ProgressStage:
     """One piece of work, watched by a thread of its own: so it is seen even where its first item takes long."""
 
-    _shown: Stage | None = None  # one at a time
+    _shown: ProgressStage | None = None  # one at a time
 
     def __init__(self, description: str, total: int | None):
         self.description, self.total, self.count = description, total, 0
         self._begin, self._over, self._told = time.monotonic(), threading.Event(), False
         self._watcher = threading.Thread(target=self._watch, name="progress", daemon=True)
-        if Stage._shown is None:
-            Stage._shown = self
+        if ProgressStage._shown is None:
+            ProgressStage._shown = self
             self._watcher.start()
 
     def done(self, count: int) -> None:
@@ -63,9 +63,9 @@ class Stage:
 
     def end(self, well: bool) -> None:
         """Stop watching. well: whether the work came to its end"""
-        if Stage._shown is not self:
+        if ProgressStage._shown is not self:
             return
-        Stage._shown = None
+        ProgressStage._shown = None
         self._over.set()
         self._watcher.join()
         if self._told and well:

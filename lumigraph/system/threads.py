@@ -59,7 +59,7 @@ def considerate() -> Iterator[None]:
         yield
         return
     over = threading.Event()
-    watch = threading.Thread(target=make_way, args=(over, Held()), name="considerate", daemon=True)
+    watch = threading.Thread(target=make_way, args=(over, Contention()), name="considerate", daemon=True)
     watch.start()
     try:
         yield
@@ -68,7 +68,7 @@ def considerate() -> Iterator[None]:
         watch.join()
 
 
-class Held:
+class Contention:
     """Calling it tells the share of the time that our threads could have run, since the last call or since it was made,
     in which others had the processor."""
 

@@ -1,5 +1,5 @@
 """Structure from motion: where bare photographs were taken from."""
 
-from .reconstruction import Options, reconstruct
+from .reconstruction import MotionOptions, reconstruct
 
-__all__ = ["Options", "reconstruct"]
+__all__ = ["MotionOptions", "reconstruct"]

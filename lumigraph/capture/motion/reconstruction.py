@@ -58,7 +58,7 @@ OUTPUT_VERSION = 2  # another number makes all outputs be written again
 
 
 @dataclass(frozen=True)
-class Options:
+class MotionOptions:
     """Options of a reconstruction.
 
     frames:   how many to take of a video; None: by its length
@@ -76,7 +76,7 @@ class Options:
 
 
 def reconstruct(
-    sources: Sequence[Path], folder: Path, options: Options | None = None, track: Track = untracked
+    sources: Sequence[Path], folder: Path, options: MotionOptions | None = None, track: Track = untracked
 ) -> dict[str, Any]:
     """Find the cameras of bare photographs and write a scene's folder; gives what its capture.json holds.
 
@@ -86,7 +86,7 @@ def reconstruct(
     Raises LumigraphError if there are too few photographs, if none fit together, and for a folder of something else or
     that another process works in.
     """
-    options = options or Options()
+    options = options or MotionOptions()
     check(options)
     for source in sources:
         if not source.exists():
@@ -104,7 +104,7 @@ def reconstruct(
         return finished(folder, work_to_do.keys["result"]) or work_to_do.run()
 
 
-def taken_in(sources: Sequence[Path], work: Path, options: Options, track: Track) -> tuple[Intake, list[Photo]]:
+def taken_in(sources: Sequence[Path], work: Path, options: MotionOptions, track: Track) -> tuple[Intake, list[Photo]]:
     """Gather photographs, and list those that are no duplicates. Raises LumigraphError if there are too few."""
     intake = with_safe_names(gather(sources, work, options.frames, track))
     photos = [photo for photo in intake.photos if photo.name not in intake.duplicates]
@@ -116,7 +116,7 @@ def taken_in(sources: Sequence[Path], work: Path, options: Options, track: Track
     return intake, photos
 
 
-def check(options: Options) -> None:
+def check(options: MotionOptions) -> None:
     if options.max_size < 200:
         raise LumigraphError(f"--max-size {options.max_size} leaves no details to find; give at least 200 pixels")
     if options.frames is not None and options.frames < MIN_VIEWS:
@@ -163,7 +163,7 @@ class Reconstruction:
     sources: Sequence[Path]
     folder: Path
     work: Path
-    options: Options
+    options: MotionOptions
     intake: Intake
     photos: list[Photo]
     track: Track

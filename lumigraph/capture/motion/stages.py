@@ -28,7 +28,7 @@ def key_of(*parts: Any) -> str:
 
 
 @dataclass(frozen=True)
-class Mark:
+class StageMark:
     """Record of a stage: its inputs, whether it is done, and its duration."""
 
     key: str
@@ -42,7 +42,7 @@ class Stages:
     def __init__(self, folder: Path):
         self.path = folder / "stages.json"
         self.log = folder / "colmap.log"
-        self.marks: dict[str, Mark] = read_json(self.path, dict[str, Mark]) if self.path.is_file() else {}
+        self.marks: dict[str, StageMark] = read_json(self.path, dict[str, StageMark]) if self.path.is_file() else {}
 
     def is_done(self, stage: str, key: str) -> bool:
         return self.was_begun(stage, key) and self.marks[stage].done
@@ -69,7 +69,7 @@ class Stages:
         self.mark(stage, key, True, spent + time.perf_counter() - begun)
 
     def mark(self, stage: str, key: str, done: bool, seconds: float) -> None:
-        self.marks[stage] = Mark(key, done, round(seconds, 2))
+        self.marks[stage] = StageMark(key, done, round(seconds, 2))
         write_json(self.path, {name: asdict(mark) for name, mark in self.marks.items()}, ours=True)
 
     def colmap(self, total: int, **job: Any) -> Generator[int, None, None]:

@@ -7,14 +7,14 @@ from jaxtyping import Bool, Float
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import breadth_first_order, maximum_flow
 
-from .view import View
+from .view import ObjectView
 
 CAPACITY_SCALE = 1000  # of capacity to one of cost: the flow counts in whole numbers
 SMOOTHNESS = 3.0  # cost of an outline along one pixel where colours do not change
 MAX_COST = 30.0  # the largest of these costs
 
 
-def cut(view: View, costs: Float[np.ndarray, " patch"]) -> Bool[np.ndarray, " patch"]:
+def cut(view: ObjectView, costs: Float[np.ndarray, " patch"]) -> Bool[np.ndarray, " patch"]:
     """Mask of the superpixels that belong to the object.
 
     costs: of taking each into it, in logarithms of likelihood; negative ones speak for it. They count by the width of a

@@ -22,7 +22,7 @@ from ..capture import Capture
 from ..masks import OBJECT_MASKS, inner_names
 from .guided import guided
 from .segment import Segmentation, segment
-from .view import View
+from .view import ObjectView
 
 SHEET_FILE = "object.png"
 MAX_SHOWN, ROW_LENGTH = 16, 4  # photographs on the sheet, and on a line of it
@@ -73,8 +73,8 @@ def mask_object(folder: Path, capture: Capture, track: Track) -> Masked:
     return Masked(len(scene), folder / SHEET_FILE, doubts(found))
 
 
-def view_of(scene: Scene, index: int) -> View:
-    return View.of(scene.names[index], scene.cameras[index], scene.photograph(index).rgb)
+def view_of(scene: Scene, index: int) -> ObjectView:
+    return ObjectView.of(scene.names[index], scene.cameras[index], scene.photograph(index).rgb)
 
 
 def refined(

@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from .view import View
+from .view import ObjectView
 
 GRID_SIDE = 56  # cells along each side of the searched cube
 MIN_VIEW_SHARE = 0.7  # share of the views whose picture must contain a cell of the object
@@ -22,7 +22,7 @@ RANSAC_TRIALS = 500  # of three points each (RANSAC, Fischler and Bolles 1981)
 
 
 @dataclass(frozen=True)
-class Table:
+class TablePlane:
     """A plane below the object: points with normal . x > height are above it."""
 
     normal: Float[Tensor, " 3"]
@@ -44,7 +44,7 @@ class Region:
 
     cells: Float[Tensor, "cell 3"]
     size: float
-    table: Table | None
+    table: TablePlane | None
 
     def holds(self, points: Float[Tensor, "point 3"]) -> Bool[Tensor, " point"]:
         """Mask of the points that lie in one of the cells."""
@@ -58,7 +58,7 @@ class Region:
         return inside & filled[index.clamp(0, GRID_SIDE + 1).unbind(-1)]
 
 
-def find_region(views: Sequence[View], points: Float[Tensor, "point 3"] | None) -> Region:
+def find_region(views: Sequence[ObjectView], points: Float[Tensor, "point 3"] | None) -> Region:
     """The cells of [-1, 1]^3 that most pictures hold and that are above the table, if sparse points show one."""
     size = 2 / GRID_SIDE
     axis = torch.linspace(-1 + 0.5 * size, 1 - 0.5 * size, GRID_SIDE)
@@ -71,7 +71,7 @@ def find_region(views: Sequence[View], points: Float[Tensor, "point 3"] | None) 
     return Region(cells, size, table)
 
 
-def find_table(points: Float[Tensor, "point 3"]) -> Table | None:
+def find_table(points: Float[Tensor, "point 3"]) -> TablePlane | None:
     """The level plane that most points nearby lie on and hardly any below; None where there is none."""
     near = points[points.abs().amax(-1) < 1.5].double()
     if len(near) < 50:
@@ -92,4 +92,4 @@ def find_table(points: Float[Tensor, "point 3"]) -> Table | None:
     middle = some.mean(0)
     normal = torch.linalg.svd(some - middle, full_matrices=False).Vh[2]
     normal = normal * normal[2].sign()
-    return Table(normal.float(), float(normal @ middle))
+    return TablePlane(normal.float(), float(normal @ middle))

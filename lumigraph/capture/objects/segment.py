@@ -21,7 +21,7 @@ from ...errors import LumigraphError
 from .colours import Mixture
 from .cut import MAX_COST, cut
 from .region import GRID_SIDE, Region, find_region
-from .view import View
+from .view import ObjectView
 
 MAX_DISAGREEMENTS = (0.35, 0.3, 0.25, 0.2, 0.15, 0.15)  # share of the views that may see past a cell, round by round
 CORE_RADIUS = 0.35  # of the region's radius: where colours are first learnt, without sparse points
@@ -50,7 +50,7 @@ class Segmentation:
     distinct: share of superpixels whose colour alone says on which side they are; 0.5 is as good as chance
     """
 
-    views: list[View]
+    views: list[ObjectView]
     inside: list[Patches]
     body: Float[Tensor, "cell 3"]
     region: Region
@@ -64,7 +64,7 @@ class Segmentation:
 
 
 def segment(
-    views: Sequence[View],
+    views: Sequence[ObjectView],
     points: Float[Tensor, "point 3"] | None,
     track: Callable[[Sequence[float], str, int], Iterable[float]],
 ) -> Segmentation:
@@ -96,7 +96,7 @@ def segment(
     return Segmentation(list(views), inside, body, region, overlaps, distinctness(views, inside, own, around))
 
 
-def distinctness(views: Sequence[View], inside: Sequence[Patches], own: Mixture, around: Mixture) -> float:
+def distinctness(views: Sequence[ObjectView], inside: Sequence[Patches], own: Mixture, around: Mixture) -> float:
     """The share of superpixels that colour alone puts on their side, the object's and the others counted alike."""
     likely = [own.log_likelihood(view.colours) > around.log_likelihood(view.colours) for view in views]
     told, true = np.concatenate(likely), np.concatenate(list(inside))
@@ -116,7 +116,7 @@ def first_guess(region: Region, points: Float[Tensor, "point 3"] | None) -> Floa
     return region.cells[away <= CORE_RADIUS * away.max()]
 
 
-def learn_colours(views: Sequence[View], inside: Sequence[Patches]) -> tuple[Mixture, Mixture]:
+def learn_colours(views: Sequence[ObjectView], inside: Sequence[Patches]) -> tuple[Mixture, Mixture]:
     """The colours of the object, and of what is around it: all that is not inside."""
     own = np.concatenate([view.colours[i] for view, i in zip(views, inside, strict=True)])
     around = np.concatenate([view.colours[~i] for view, i in zip(views, inside, strict=True)])
@@ -136,7 +136,7 @@ def shaded(colours: Float[np.ndarray, "patch 3"]) -> Float[np.ndarray, "shaded 3
     return some * np.random.default_rng(0).uniform(SHADOW_BRIGHTNESS, 1, (len(some), 1))
 
 
-def behind(region: Region, view: View) -> Int[np.ndarray, " cell"]:
+def behind(region: Region, view: ObjectView) -> Int[np.ndarray, " cell"]:
     """The superpixel that shows each cell; -1 for those outside the picture."""
     places, pictured = view.at(region.cells)
     return np.where(pictured, view.patches[tuple(places.T)], -1).astype(np.int32)
@@ -167,7 +167,7 @@ def carved(
     return body
 
 
-def overlap(view: View, a: Bool[np.ndarray, " patch"], b: Bool[np.ndarray, " patch"]) -> float:
+def overlap(view: ObjectView, a: Bool[np.ndarray, " patch"], b: Bool[np.ndarray, " patch"]) -> float:
     """Intersection over union of two sets of superpixels, by pixels; 1 where both are empty."""
     union = view.sizes[a | b].sum()
     return float(view.sizes[a & b].sum() / union) if union else 1.0

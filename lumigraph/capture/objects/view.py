@@ -19,7 +19,7 @@ COMPACTNESS = 8.0
 
 
 @dataclass
-class View:
+class ObjectView:
     """A small photograph.
 
     lab:     colours in CIELAB
@@ -55,7 +55,7 @@ class View:
         self.lengths = lengths.astype(np.float64)
 
     @staticmethod
-    def of(name: str, camera: Camera, rgb: Float[torch.Tensor, "height width 3"]) -> View:
+    def of(name: str, camera: Camera, rgb: Float[torch.Tensor, "height width 3"]) -> ObjectView:
         """A view of a photograph of any size."""
         share = min(1.0, MAX_SIDE / max(rgb.shape[:2]))
         small = camera.resized(share)
@@ -63,7 +63,7 @@ class View:
         shrunk = torch.nn.functional.interpolate(rgb.permute(2, 0, 1)[None].float(), (height, width), mode="area")[
             0
         ].permute(1, 2, 0)
-        return View(name, small, rgb2lab(shrunk.clamp(0, 1).numpy()))
+        return ObjectView(name, small, rgb2lab(shrunk.clamp(0, 1).numpy()))
 
     def mean(self, values: Float[np.ndarray, "height width"]) -> Float[np.ndarray, " patch"]:
         """The mean of pixels' values in each superpixel."""

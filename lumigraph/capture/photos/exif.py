@@ -18,7 +18,7 @@ ASPECT_TOLERANCE = 0.02  # relative difference of aspect ratios that rounding ex
 
 
 @dataclass(frozen=True)
-class Facts:
+class ExifFacts:
     """Facts of one exposure; None where the file has none, or an invalid one.
 
     device, focal, time: as in Photo
@@ -31,13 +31,13 @@ class Facts:
     time: float | None = None
 
 
-def read_facts(exif: Image.Exif, size: tuple[int, int]) -> Facts:
+def read_facts(exif: Image.Exif, size: tuple[int, int]) -> ExifFacts:
     """The facts in an image's EXIF.
 
     size: (width, height) in pixels as stored
     """
     details = {**exif, **exif.get_ifd(ExifTags.IFD.Exif)}
-    return Facts(
+    return ExifFacts(
         device(details, size),
         focal_length(details, size),
         position(exif.get_ifd(ExifTags.IFD.GPSInfo)),

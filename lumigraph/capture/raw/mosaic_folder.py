@@ -27,7 +27,7 @@ Vector = tuple[Coordinate, Coordinate, Coordinate]
 
 
 @dataclass(frozen=True)
-class About:
+class MosaicRecord:
     """Description of one mosaic, or of all in a folder.
 
     pattern:  colours of the filters over the first two pixels of the first row, then of the second
@@ -52,8 +52,8 @@ class About:
 class Listing:
     """mosaics.json. What a photograph says itself counts for more than what is said of all."""
 
-    photographs: dict[Name, About]
-    all: About = field(default_factory=About)
+    photographs: dict[Name, MosaicRecord]
+    all: MosaicRecord = field(default_factory=MosaicRecord)
 
 
 def is_listed(path: Path) -> bool:
@@ -72,7 +72,7 @@ def open_mosaic(path: Path) -> RawPhoto:
     listing = path.parent / LISTING_FILE
     found = listed(listing, listing.stat().st_mtime_ns)
     own, common = found.photographs[path.name], found.all
-    about = About(**{x.name: x_of(own, common, x.name) for x in fields(About)})
+    about = MosaicRecord(**{x.name: x_of(own, common, x.name) for x in fields(MosaicRecord)})
     size = size_of(path, about)
     black, white, pattern = (needed(about, name, path) for name in ("black", "white", "pattern"))
     if white <= black:
@@ -91,12 +91,12 @@ def open_mosaic(path: Path) -> RawPhoto:
     )
 
 
-def x_of(own: About, common: About, name: str):
+def x_of(own: MosaicRecord, common: MosaicRecord, name: str):
     value = getattr(own, name)
     return getattr(common, name) if value is None else value
 
 
-def needed(about: About, name: str, path: Path):
+def needed(about: MosaicRecord, name: str, path: Path):
     """Fields that a mosaic's description must have."""
     value = getattr(about, name)
     if value is None:
@@ -106,7 +106,7 @@ def needed(about: About, name: str, path: Path):
     return value
 
 
-def size_of(path: Path, about: About) -> tuple[int, int]:
+def size_of(path: Path, about: MosaicRecord) -> tuple[int, int]:
     """Width and height, which the file must hold."""
     if path.suffix.lower() != MOSAIC_SUFFIX:
         with readable(path):

@@ -17,7 +17,7 @@ import numpy as np
 from ...errors import LumigraphError
 from ...files import exists, read_json
 from ...files.ranges import Name, between
-from ..capture import Capture, Plane, Shot
+from ..capture import Capture, PixelPlane, Shot
 from ..masks import inner_names
 from ..pictures import same_shape, stat
 from .demosaic import repeated
@@ -98,12 +98,12 @@ def with_its_raw(shot: Shot, developed: Developed) -> Shot:
     return replace(shot, planes=shot.planes | planes(photo, f"{path} {stat(path)}"), about=shot.about | about)
 
 
-def planes(photo: RawPhoto, identity: str | None = None) -> dict[str, Plane]:
+def planes(photo: RawPhoto, identity: str | None = None) -> dict[str, PixelPlane]:
     """The layers of a raw photograph: what each pixel measured, and behind which filter."""
     filters = partial(repeated, photo.pattern, photo.size)
     return {
-        "mosaic": Plane(photo.read, "mosaic", dtype=np.dtype(np.float32), identity=identity),
-        "filter": Plane(
+        "mosaic": PixelPlane(photo.read, "mosaic", dtype=np.dtype(np.float32), identity=identity),
+        "filter": PixelPlane(
             filters,
             "filter",
             unknown=(UNKNOWN_VALUE,),

@@ -44,11 +44,11 @@ def can_be_baked(opened: Any, method: Any) -> bool:
 
 def converted(opened: Any, seconds: float, device: Any) -> tuple[Any, str]:
     """The opened method converted to an octree, and the cost as text. seconds: training time after initialisation"""
-    from ...derive.conversion import Aim, convert
+    from ...derive.conversion import ConversionTarget, convert
     from ...run import open_any
 
     begin = time.monotonic()
     with tempfile.TemporaryDirectory(prefix="lumigraph-") as folder:
-        made = convert(opened, INTO, Path(folder) / INTO, Aim(seconds=seconds), device, show=True)
+        made = convert(opened, INTO, Path(folder) / INTO, ConversionTarget(seconds=seconds), device, show=True)
         method = open_any(Path(folder) / INTO).method(device)
     return method, f"{time.monotonic() - begin:.0f} s, {made.psnr:.1f} dB to {made.teacher.method}"

@@ -26,7 +26,7 @@ MIN_PIECE, MAX_PIECE = 64, 1024  # pixels; the longest fills a page
 
 
 @dataclass(frozen=True)
-class Mark:
+class StoreMark:
     """Contents of the mark of a store in a file."""
 
     has_alpha: bool
@@ -124,7 +124,7 @@ class ImageStore:
         folder = (cache or cache_folder() / "images") / called
         if not (folder / MARK_FILE).exists():
             write_store(folder, total, pictures, progress)
-        about = read_json(folder / MARK_FILE, Mark)
+        about = read_json(folder / MARK_FILE, StoreMark)
         check_size(folder / "pixels", 4 * total)
         trusted = None
         if about.trusted:

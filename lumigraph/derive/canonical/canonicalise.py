@@ -37,7 +37,7 @@ SHEET_FILE = "canonical.png"
 
 
 @dataclass(frozen=True)
-class Found:
+class RunInstance:
     """A run with its method and what is opaque in it, in a frame of its own that leads to the run's scene."""
 
     run: Run
@@ -49,7 +49,7 @@ class Found:
         return self.run.folder.name
 
 
-def found_in(folder: Path, cells: int, device: torch.device) -> list[Found]:
+def found_in(folder: Path, cells: int, device: torch.device) -> list[RunInstance]:
     """The runs in a folder whose fields have a density. Others are named in a warning and passed over.
 
     cells: of density grids along the longest side
@@ -75,7 +75,7 @@ def found_in(folder: Path, cells: int, device: torch.device) -> list[Found]:
     return found
 
 
-def opened(place: Path, cells: int, device: torch.device) -> Found:
+def opened(place: Path, cells: int, device: torch.device) -> RunInstance:
     """A run and its density grid. Raises LumigraphError for one that has none."""
     run = Run(place)
     method = run.method(device)
@@ -85,10 +85,10 @@ def opened(place: Path, cells: int, device: torch.device) -> Found:
             "train a field on it, instant-ngp for example"
         )
     dense = needs(method, HasDensity)
-    return Found(run, method, sampled(lambda x: dense.density(x.to(device)), run.frame.bounds, cells, str(place)))
+    return RunInstance(run, method, sampled(lambda x: dense.density(x.to(device)), run.frame.bounds, cells, str(place)))
 
 
-def canonicalise(found: Sequence[Found], config: Config, output: Path, like: str | None = None) -> Solution:
+def canonicalise(found: Sequence[RunInstance], config: Config, output: Path, like: str | None = None) -> Solution:
     """Write a file for each run, NAME.json, that opens as this run in the canonical frame, and a picture before and
     after. The runs stay as they are.
 
@@ -124,7 +124,7 @@ def bounds_of(instance: Instance, place: Similarity) -> tuple[Vector, Vector]:
     return (a, b, c), (d, e, f)
 
 
-def before_and_after(found: Sequence[Found], places: Sequence[Similarity]) -> Image.Image:
+def before_and_after(found: Sequence[RunInstance], places: Sequence[Similarity]) -> Image.Image:
     """Some of the runs from one side, as they stood in their scenes, and in the canonical frame."""
     cube = (-1.0, -1.0, -1.0), (1.0, 1.0, 1.0)
     camera = ring(cube, angle=FIELD_OF_VIEW, size=PICTURE_SIDE)[-CAMERA_INDEX]

@@ -84,7 +84,7 @@ def correlations(
     return torch.cat([part.flatten(-2) for part in parts], -1)
 
 
-def refined(found: Turns, entries: Float[Tensor, "some entry"]) -> Float[Tensor, "some 3 3"]:
+def refined(found: BandRotations, entries: Float[Tensor, "some entry"]) -> Float[Tensor, "some 3 3"]:
     """Rotations a little further on, as long as the correlation grows."""
     for degrees in STEP_DEGREES:
         around = steps(degrees)
@@ -98,43 +98,43 @@ def refined(found: Turns, entries: Float[Tensor, "some entry"]) -> Float[Tensor,
 
 
 @dataclass(frozen=True)
-class Turns:
+class BandRotations:
     """Rotations, and their matrices in each band."""
 
     rotations: Float[Tensor, "*some 3 3"]
     matrices: Sequence[Float[Tensor, "*some _ _"]]
 
     @staticmethod
-    def of(rotations: Float[Tensor, "*some 3 3"]) -> Turns:
-        return Turns(rotations, turning(rotations, BANDS))
+    def of(rotations: Float[Tensor, "*some 3 3"]) -> BandRotations:
+        return BandRotations(rotations, turning(rotations, BANDS))
 
     @property
     def flat(self) -> Float[Tensor, "*some entry"]:
         """All entries of the matrices side by side, as `correlations` has them."""
         return torch.cat([matrix.flatten(-2) for matrix in self.matrices], -1)
 
-    def take(self, which: Tensor) -> Turns:
-        return Turns(self.rotations[which], [matrix[which] for matrix in self.matrices])
+    def take(self, which: Tensor) -> BandRotations:
+        return BandRotations(self.rotations[which], [matrix[which] for matrix in self.matrices])
 
-    def pick(self, which: Tensor) -> Turns:
+    def pick(self, which: Tensor) -> BandRotations:
         """Select one rotation per row, by number."""
         rows = torch.arange(len(which))
-        return Turns(self.rotations[rows, which], [matrix[rows, which] for matrix in self.matrices])
+        return BandRotations(self.rotations[rows, which], [matrix[rows, which] for matrix in self.matrices])
 
-    def after(self, others: Turns) -> Turns:
+    def after(self, others: BandRotations) -> BandRotations:
         """Each of these rotations (columns) after each of the others (rows)."""
         every = zip(self.matrices, others.matrices, strict=True)
-        return Turns(self.rotations @ others.rotations[:, None], [a @ b[:, None] for a, b in every])
+        return BandRotations(self.rotations @ others.rotations[:, None], [a @ b[:, None] for a, b in every])
 
 
 @cache
-def lattice() -> Turns:
-    return Turns.of(spread(LATTICE_ROTATIONS))
+def lattice() -> BandRotations:
+    return BandRotations.of(spread(LATTICE_ROTATIONS))
 
 
 @cache
-def steps(degrees: float) -> Turns:
-    return Turns.of(near(degrees))
+def steps(degrees: float) -> BandRotations:
+    return BandRotations.of(near(degrees))
 
 
 def turn(shapes: Float[Tensor, "some shell basis"], rotations: Float[Tensor, "some 3 3"]) -> Tensor:

@@ -1,6 +1,6 @@
 """Compression: a trained run becomes a smaller one, tuned to look the same (Li 2023, VQRF)."""
 
-from .compress import Aim as Aim
+from .compress import CompressionTarget as CompressionTarget
 from .compress import compress as compress
 from .ladder import LADDER as LADDER
 from .ladder import Rung as Rung

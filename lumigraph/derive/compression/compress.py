@@ -31,7 +31,7 @@ TRIAL_SHARE = 1 / 6  # of all tuning, per tried rung; the selected rung gets the
 
 
 @dataclass(frozen=True)
-class Aim:
+class CompressionTarget:
     """Target of a compression and its limit in time; exactly one of size and loss.
 
     size:     bytes of the model at most
@@ -54,7 +54,7 @@ class Aim:
 
 
 def compress(
-    run: Run, output: Path, aim: Aim, source: str | None = None, device: torch.device | str = "cpu"
+    run: Run, output: Path, aim: CompressionTarget, source: str | None = None, device: torch.device | str = "cpu"
 ) -> Compressed:
     """A smaller run in a new folder, which opens like any other; gives what compress.json says.
 
@@ -79,7 +79,9 @@ def compress(
 class Ladder:
     """Rungs that are tried, each from the run's own weights."""
 
-    def __init__(self, run: Run, truth: Truth, aim: Aim, device: torch.device | str, importance: dict[str, Tensor]):
+    def __init__(
+        self, run: Run, truth: Truth, aim: CompressionTarget, device: torch.device | str, importance: dict[str, Tensor]
+    ):
         self.run, self.truth, self.aim, self.device, self.importance = run, truth, aim, device, importance
         self.tuned = 0.0  # share of all tuning
 
@@ -168,7 +170,7 @@ def row_width(tensor: Tensor, layout: str) -> int:
     ]
 
 
-def written(run: Run, before: Method, model: Model, truth: Truth, output: Path, aim: Aim) -> Compressed:
+def written(run: Run, before: Method, model: Model, truth: Truth, output: Path, aim: CompressionTarget) -> Compressed:
     """Write the run; what it says of itself is measured on what was written, opened again."""
     views = min(aim.views or len(truth.scene.splits["test"]), len(truth.scene.splits["test"]))
     settings = replace(run.settings, said=run.settings.said | {"compressed": {"source": str(run.folder.resolve())}})

@@ -19,7 +19,7 @@ from ...errors import LumigraphError, LumigraphWarning
 from ...method import Method
 from ...method.capabilities import FromField, RefinesPoses, can, needs
 from ...run import Opened, Run, State, build, check_new
-from ...run.converted import Begun, Converted, Held, LearntFrom
+from ...run.converted import ConversionStart, Converted, LearntFrom, MeasuredModel
 from ...system.signals import go_on_unless
 from ...training import fit
 from .measure import likeness, shown
@@ -34,7 +34,7 @@ COMPARED_VIEWS = 8  # held-out views that are compared
 
 
 @dataclass(frozen=True)
-class Aim:
+class ConversionTarget:
     """Target of a conversion and its limit; exactly one of steps, seconds and quality.
 
     config:  the student's numbers; None takes its defaults for the device
@@ -56,7 +56,12 @@ class Aim:
 
 
 def convert(
-    source: Opened, name: str, output: Path, aim: Aim, device: torch.device | str = "cpu", show: bool = False
+    source: Opened,
+    name: str,
+    output: Path,
+    aim: ConversionTarget,
+    device: torch.device | str = "cpu",
+    show: bool = False,
 ) -> Converted:
     """A run of the method of that name in a new folder, made of whatever was opened; gives what its convert.json says.
 
@@ -81,7 +86,7 @@ def convert(
         learnt_from, data = PHOTOGRAPHS, seen_as(teacher, student, scene)
     if going_on is None:
         seconds = take_over(teacher, student, data, around, as_taken=learnt_from == PHOTOGRAPHS)
-        begun = Begun(str(source.path.resolve()), learnt_from, round(seconds, 3))
+        begun = ConversionStart(str(source.path.resolve()), learnt_from, round(seconds, 3))
         going_on = (
             created(source, student, scene or data, output, budget_of(student, data, aim), aim.seed, begun),
             begun,
@@ -96,8 +101,8 @@ def convert(
         source=begun.source,
         how=how,
         learnt_from=begun.learnt_from,
-        teacher=Held(methods.name_of(teacher), source.model_bytes, seen[0].seconds, seen[0].psnr),
-        student=Held(name, run.model_bytes, seen[1].seconds, seen[1].psnr),
+        teacher=MeasuredModel(methods.name_of(teacher), source.model_bytes, seen[0].seconds, seen[0].psnr),
+        student=MeasuredModel(name, run.model_bytes, seen[1].seconds, seen[1].psnr),
         psnr=likeness(*seen),
         views=len(seen[0].views),
         taking_over=begun.taking_over,
@@ -108,7 +113,7 @@ def convert(
     return made
 
 
-def new_student(kind: type[Method], teacher: Method, aim: Aim, device: torch.device) -> Method:
+def new_student(kind: type[Method], teacher: Method, aim: ConversionTarget, device: torch.device) -> Method:
     """A method in the teacher's frame, before it has learnt anything."""
     config = kind.preset(device) if aim.config is None else aim.config
     return build(kind, teacher.frame, config, device, getattr(config, "seed", aim.seed), learning=True)
@@ -131,7 +136,7 @@ def take_over(teacher: Method, student: Method, data: Scene, cameras: Camera, as
     return time.perf_counter() - begin
 
 
-def budget_of(student: Method, data: Scene, aim: Aim) -> Budget:
+def budget_of(student: Method, data: Scene, aim: ConversionTarget) -> Budget:
     """Budget of further training. Schedules of a converted field begin at INHERITED_PROGRESS."""
     share, steps = INHERITED_PROGRESS if can(student, FromField) else 0.0, aim.steps
     if aim.quality is not None:
@@ -139,7 +144,9 @@ def budget_of(student: Method, data: Scene, aim: Aim) -> Budget:
     return Budget(steps, aim.seconds, aim.quality, (0.0, share) if share else None)
 
 
-def created(source: Opened, student: Method, data: Scene, output: Path, budget: Budget, seed: int, begun: Begun) -> Run:
+def created(
+    source: Opened, student: Method, data: Scene, output: Path, budget: Budget, seed: int, begun: ConversionStart
+) -> Run:
     """A run of the student as it begins, with the cameras and photographs of what it is made of.
 
     data: the photographs, or what stands in for them
@@ -160,12 +167,12 @@ def created(source: Opened, student: Method, data: Scene, output: Path, budget: 
     return run
 
 
-def unfinished(source: Opened, name: str, output: Path) -> tuple[Run, Begun] | None:
+def unfinished(source: Opened, name: str, output: Path) -> tuple[Run, ConversionStart] | None:
     """The run of the same conversion that was interrupted there; None if there is none."""
     if not files.is_file(output / "config.json"):
         return None
     run = Run(output)
-    begun = Begun.of(run.settings, output / "config.json")
+    begun = ConversionStart.of(run.settings, output / "config.json")
     if begun is None or (begun.source, run.method_name) != (str(source.path.resolve()), name):
         return None
     return (run, begun) if Converted.read(output) is None else None

@@ -12,7 +12,7 @@ from dataclasses import replace
 import numpy as np
 
 from ..cameras import dome, pinhole, spiral
-from ..stage import Stage
+from ..stage import SyntheticStage
 from ..world import Lamp, Object, Sky, Vector, World
 
 CAMERA_DISTANCE, FIELD_OF_VIEW = 3.2, 34.0  # scene units from the centre; field of view, degrees
@@ -26,7 +26,7 @@ def available() -> list[str]:
     return sorted(module.name.replace("_", "-") for module in pkgutil.iter_modules(__path__) if module.name != "parts")
 
 
-def stage(name: str, member: int, size: int, views: int, seed: int) -> Stage:
+def stage(name: str, member: int, size: int, views: int, seed: int) -> SyntheticStage:
     """One object of a category, seen from a dome; held-out views climb around it. The same seed and member always give
     the same object, however many there are.
 
@@ -41,7 +41,7 @@ def stage(name: str, member: int, size: int, views: int, seed: int) -> Stage:
 
 def surrounded(
     objects: tuple[Object, ...], bounds: tuple[Vector, Vector], size: int, views: int, random: np.random.Generator
-) -> Stage:
+) -> SyntheticStage:
     """Objects in the light of all categories, seen from a dome; held-out views climb around them."""
     world = World(objects, (KEY, FILL), SKY)
     cameras = {
@@ -51,4 +51,4 @@ def surrounded(
         ),
     }
     reach = max(abs(x) for corner in bounds for x in corner)
-    return Stage(world, cameras, bounds, reach=reach, near=1.5)
+    return SyntheticStage(world, cameras, bounds, reach=reach, near=1.5)

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from ..shapes import Box, Cone, Cylinder, Shape, Sphere, Torus
+from ..shapes import Ball, Cone, Cuboid, Cylinder, SolidShape, Torus
 from ..world import Material, Object, Pose
 from .parts import RUBBER, colour, finish, paint, timber
 
@@ -23,13 +23,13 @@ def objects(random: np.random.Generator) -> Iterator[Object]:
 
 
 def figure(random: np.random.Generator) -> Iterator[Object]:
-    def part(shape: Shape, material: Material, x: float, y: float, z: float, turn: Pose | None = None) -> Object:
+    def part(shape: SolidShape, material: Material, x: float, y: float, z: float, turn: Pose | None = None) -> Object:
         place = Pose.at(x, y, z)
         return Object(shape, material, place @ turn if turn else place, "figure")
 
     foot, thick = random.uniform(0.34, 0.52), random.uniform(0.04, 0.08)
     square = random.uniform() < 0.4
-    base = Box((foot * 0.9, foot * 0.9, thick), 0.02) if square else Cylinder(foot, thick, rounding=0.02)
+    base = Cuboid((foot * 0.9, foot * 0.9, thick), 0.02) if square else Cylinder(foot, thick, rounding=0.02)
     yield part(base, finish(random), 0, 0, thick)
     z, count = 2 * thick, int(random.integers(2, 5))
     width, slim = random.uniform(0.24, 0.38), random.uniform(0.86, 1.06)
@@ -39,11 +39,11 @@ def figure(random: np.random.Generator) -> Iterator[Object]:
         half = 0.5 * total / count * random.uniform(0.85, 1.15)
         kind = random.uniform()
         if kind < 0.4:
-            shape: Shape = Cylinder(width, half, rounding=0.025)
+            shape: SolidShape = Cylinder(width, half, rounding=0.025)
         elif kind < 0.6:
             shape = Torus(max(width - half, 0.05), half)
         elif kind < 0.8:
-            shape = Box((0.86 * width, 0.86 * width, half), 0.025)
+            shape = Cuboid((0.86 * width, 0.86 * width, half), 0.025)
         else:
             shape = Cone(width, 0.75 * width, half, rounding=0.02)
         yield part(shape, finish(random), 0, 0, z + half)
@@ -51,12 +51,12 @@ def figure(random: np.random.Generator) -> Iterator[Object]:
     arm, reach, skin = random.uniform(0.05, 0.08), random.uniform(0.10, 0.2), finish(random)
     for side in (-1, 1):
         yield part(Cylinder(arm * 0.7, reach), skin, side * (width + 0.6 * reach), 0, shoulder, LYING)
-        yield part(Sphere(arm * 1.35), skin, side * (width + 1.6 * reach), 0, shoulder)
+        yield part(Ball(arm * 1.35), skin, side * (width + 1.6 * reach), 0, shoulder)
     head, face = random.uniform(0.17, 0.25), paint(colour(random, (0.15, 0.5)))
-    yield part(Sphere(head), face, 0, 0, z + 0.92 * head)
+    yield part(Ball(head), face, 0, 0, z + 0.92 * head)
     for side in (-1, 1):
-        yield part(Sphere(0.2 * head), RUBBER, side * 0.38 * head, -0.86 * head, z + 1.1 * head)
-    yield part(Sphere(0.24 * head), paint(colour(random)), 0, -1.0 * head, z + 0.85 * head)
+        yield part(Ball(0.2 * head), RUBBER, side * 0.38 * head, -0.86 * head, z + 1.1 * head)
+    yield part(Ball(0.24 * head), paint(colour(random)), 0, -1.0 * head, z + 0.85 * head)
     top, wide, tall = z + 1.6 * head, head * random.uniform(0.8, 1.2), random.uniform(0.06, 0.14)
     hat = random.uniform()
     if hat < 0.4:
@@ -66,4 +66,4 @@ def figure(random: np.random.Generator) -> Iterator[Object]:
         yield part(Cylinder(1.35 * wide, 0.02, rounding=0.01), cloth, 0, 0, top - 0.02)
         yield part(Cylinder(0.8 * wide, tall, rounding=0.01), cloth, 0, 0, top + tall)
     else:
-        yield part(Sphere(0.35 * head), timber(random), 0, 0, top + 0.35 * head)
+        yield part(Ball(0.35 * head), timber(random), 0, 0, top + 0.35 * head)

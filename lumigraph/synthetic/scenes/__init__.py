@@ -9,7 +9,7 @@ from types import ModuleType
 from ...errors import LumigraphError
 from .. import categories
 from ..options import Pictures
-from ..stage import Stage
+from ..stage import SyntheticStage
 
 
 def available() -> list[str]:
@@ -21,7 +21,7 @@ def options(name: str) -> type[Pictures]:
     return getattr(scene(name), "Options", Pictures)
 
 
-def stage(name: str, size: int = 200, views: int = 100, seed: int = 0, **further: int) -> Stage:
+def stage(name: str, size: int = 200, views: int = 100, seed: int = 0, **further: int) -> SyntheticStage:
     """Build a scene. size: of the pictures, pixels; views: for training; seed: fixes where cameras stand; further: what
     else its `Options` have.
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from ..cameras import pinhole, stroll, walk
-from ..shapes import Arch, Box, Cone, Cylinder, Plane, Sphere, Torus
-from ..stage import Stage
+from ..shapes import Arch, Ball, Cone, Cuboid, Cylinder, Plane, Torus
+from ..stage import SyntheticStage
 from ..textures import Bricks, Mottle, Plain, Stripes, Wood
 from ..world import Material, Object, Pose, Sky, Sun, World
 
@@ -38,7 +38,7 @@ def fountain():
     yield Object(Cone(0.06, 0.20, 0.045, rounding=0.01), STONE, Pose.at(0, 0, FLOOR + 0.46), "fountain")
     yield Object(Cylinder(0.18, 0.004), WATER, Pose.at(0, 0, FLOOR + 0.503), "fountain")
     yield Object(Cone(0.045, 0.02, 0.05, rounding=0.01), STONE, Pose.at(0, 0, FLOOR + 0.55), "fountain")
-    yield Object(Sphere(0.05), STONE, Pose.at(0, 0, FLOOR + 0.63), "fountain")
+    yield Object(Ball(0.05), STONE, Pose.at(0, 0, FLOOR + 0.63), "fountain")
 
 
 def arcade(y: float):
@@ -48,51 +48,51 @@ def arcade(y: float):
         yield Object(gate, SANDSTONE, Pose.at(x, y, FLOOR + 0.60), "arcade")
     for i in range(6):
         x = 0.86 * (i - 2.5)
-        yield Object(Box((0.15, 0.12, 0.03), 0.008), STONE, Pose.at(x, y, FLOOR + 0.62), "arcade")
-        yield Object(Box((0.15, 0.12, 0.04), 0.008), STONE, Pose.at(x, y, FLOOR + 0.04), "arcade")
-    yield Object(Box((2.20, 0.13, 0.04), 0.01), STONE, Pose.at(0, y, FLOOR + 1.23), "arcade")
-    yield Object(Box((2.25, 0.03, 0.62)), TILES, Pose.at(0, y + 0.42, FLOOR + 1.49, tilt=-62), "arcade")
-    yield Object(Box((2.20, 0.05, 0.90)), ROSE, Pose.at(0, y + 0.95, FLOOR + 0.90), "arcade")
+        yield Object(Cuboid((0.15, 0.12, 0.03), 0.008), STONE, Pose.at(x, y, FLOOR + 0.62), "arcade")
+        yield Object(Cuboid((0.15, 0.12, 0.04), 0.008), STONE, Pose.at(x, y, FLOOR + 0.04), "arcade")
+    yield Object(Cuboid((2.20, 0.13, 0.04), 0.01), STONE, Pose.at(0, y, FLOOR + 1.23), "arcade")
+    yield Object(Cuboid((2.25, 0.03, 0.62)), TILES, Pose.at(0, y + 0.42, FLOOR + 1.49, tilt=-62), "arcade")
+    yield Object(Cuboid((2.20, 0.05, 0.90)), ROSE, Pose.at(0, y + 0.95, FLOOR + 0.90), "arcade")
 
 
 def house(place: Pose):
     def at(x, y, z, **turned):
         return place @ Pose.at(x, y, z, **turned)
 
-    yield Object(Box((1.10, 0.55, 0.72)), OCHRE, at(0, 0, 0.72), "house")
+    yield Object(Cuboid((1.10, 0.55, 0.72)), OCHRE, at(0, 0, 0.72), "house")
     for side in (-1, 1):
-        yield Object(Box((1.20, 0.03, 0.40)), TILES, at(0, -0.32 * side, 1.60, tilt=-56 * side), "house")
-    yield Object(Box((1.10, 0.30, 0.06)), OCHRE, at(0, 0, 1.48), "house")
-    yield Object(Box((1.10, 0.13, 0.09)), OCHRE, at(0, 0, 1.62), "house")
-    yield Object(Box((0.16, 0.02, 0.30)), TIMBER, at(0.10, -0.55, 0.30), "house")
+        yield Object(Cuboid((1.20, 0.03, 0.40)), TILES, at(0, -0.32 * side, 1.60, tilt=-56 * side), "house")
+    yield Object(Cuboid((1.10, 0.30, 0.06)), OCHRE, at(0, 0, 1.48), "house")
+    yield Object(Cuboid((1.10, 0.13, 0.09)), OCHRE, at(0, 0, 1.62), "house")
+    yield Object(Cuboid((0.16, 0.02, 0.30)), TIMBER, at(0.10, -0.55, 0.30), "house")
     yield Object(Arch((0.21, 0.03, 0.36), 0.16, spring=0.50, rounding=0.0), STONE, at(0.10, -0.56, 0.36), "house")
     for x in (-0.70, 0.10, 0.75):
         for z in (0.48, 1.10):
             if (x, z) != (0.10, 0.48):
-                yield Object(Box((0.14, 0.015, 0.17)), SHUTTER, at(x, -0.56, z), "house")
-                yield Object(Box((0.18, 0.035, 0.016)), STONE, at(x, -0.56, z - 0.19), "house")
-    yield Object(Box((0.09, 0.09, 0.20)), SANDSTONE, at(-0.6, 0.15, 1.75), "house")
+                yield Object(Cuboid((0.14, 0.015, 0.17)), SHUTTER, at(x, -0.56, z), "house")
+                yield Object(Cuboid((0.18, 0.035, 0.016)), STONE, at(x, -0.56, z - 0.19), "house")
+    yield Object(Cuboid((0.09, 0.09, 0.20)), SANDSTONE, at(-0.6, 0.15, 1.75), "house")
 
 
 def pergola(x: float):
     for y in (-1.2, -0.4, 0.4, 1.2):
         for shift in (0.0, 0.8):
             yield Object(Cylinder(0.055, 0.42), STONE, Pose.at(x + shift, y, FLOOR + 0.50), "pergola")
-            yield Object(Box((0.085, 0.085, 0.04), 0.01), STONE, Pose.at(x + shift, y, FLOOR + 0.04), "pergola")
-            yield Object(Box((0.075, 0.075, 0.025), 0.008), STONE, Pose.at(x + shift, y, FLOOR + 0.94), "pergola")
+            yield Object(Cuboid((0.085, 0.085, 0.04), 0.01), STONE, Pose.at(x + shift, y, FLOOR + 0.04), "pergola")
+            yield Object(Cuboid((0.075, 0.075, 0.025), 0.008), STONE, Pose.at(x + shift, y, FLOOR + 0.94), "pergola")
     for shift in (0.0, 0.8):
-        yield Object(Box((1.45, 0.035, 0.04)), TIMBER, Pose.at(x + shift, 0, FLOOR + 1.0, turn=90), "pergola")
+        yield Object(Cuboid((1.45, 0.035, 0.04)), TIMBER, Pose.at(x + shift, 0, FLOOR + 1.0, turn=90), "pergola")
     for i in range(9):
-        yield Object(Box((0.58, 0.022, 0.03)), TIMBER, Pose.at(x + 0.4, 0.32 * (i - 4), FLOOR + 1.07), "pergola")
+        yield Object(Cuboid((0.58, 0.022, 0.03)), TIMBER, Pose.at(x + 0.4, 0.32 * (i - 4), FLOOR + 1.07), "pergola")
 
 
 def low_wall(y: float):
     for x in (-1.42, 1.42):
-        yield Object(Box((0.78, 0.08, 0.13)), SANDSTONE, Pose.at(x, y, FLOOR + 0.13), "wall")
-        yield Object(Box((0.81, 0.11, 0.02), 0.006), STONE, Pose.at(x, y, FLOOR + 0.28), "wall")
+        yield Object(Cuboid((0.78, 0.08, 0.13)), SANDSTONE, Pose.at(x, y, FLOOR + 0.13), "wall")
+        yield Object(Cuboid((0.81, 0.11, 0.02), 0.006), STONE, Pose.at(x, y, FLOOR + 0.28), "wall")
     for x in (-0.60, 0.60):
-        yield Object(Box((0.11, 0.11, 0.22)), SANDSTONE, Pose.at(x, y, FLOOR + 0.22), "wall")
-        yield Object(Sphere(0.10), STONE, Pose.at(x, y, FLOOR + 0.53), "wall")
+        yield Object(Cuboid((0.11, 0.11, 0.22)), SANDSTONE, Pose.at(x, y, FLOOR + 0.22), "wall")
+        yield Object(Ball(0.10), STONE, Pose.at(x, y, FLOOR + 0.53), "wall")
 
 
 def pots():
@@ -106,7 +106,7 @@ def pots():
         pot, bush = 0.13 * size, 0.19 * size
         yield Object(Cone(0.7 * pot, pot, pot), TERRACOTTA, Pose.at(x, y, FLOOR + pot), "pots")
         yield Object(Torus(pot, 0.018), TERRACOTTA, Pose.at(x, y, FLOOR + 2 * pot), "pots")
-        yield Object(Sphere(bush), LEAVES, Pose.at(x, y, FLOOR + 2 * pot + 0.75 * bush, turn=70 * x), "pots")
+        yield Object(Ball(bush), LEAVES, Pose.at(x, y, FLOOR + 2 * pot + 0.75 * bush, turn=70 * x), "pots")
 
 
 def trees():
@@ -130,7 +130,7 @@ def trees():
             (-0.33, 0.2, 0.90, 0.38),
             (0.05, -0.35, 0.88, 0.36),
         ):
-            yield Object(Sphere(r), LEAVES, Pose.at(x + dx, y + dy, FLOOR + z, turn=turn), "trees")
+            yield Object(Ball(r), LEAVES, Pose.at(x + dx, y + dy, FLOOR + z, turn=turn), "trees")
 
 
 def hills():
@@ -147,7 +147,7 @@ def hills():
     for i, (x, y, radius, height, colour) in enumerate(places):
         shade = (0.55 * colour[0], 0.55 * colour[1], 0.55 * colour[2])
         woods = Mottle(colour, shade, size=3.0, contrast=1.2, seed=float(i))
-        yield Object(Sphere(radius), Material(woods), Pose.at(x, y, FLOOR + height - radius), "hills")
+        yield Object(Ball(radius), Material(woods), Pose.at(x, y, FLOOR + height - radius), "hills")
     tower = Pose.at(13.2, -24.8, FLOOR + 3.2)
     yield Object(Cylinder(0.55, 1.2), SANDSTONE, tower @ Pose.at(0, 0, 0.9), "hills")
     yield Object(Cone(0.75, 0.0, 0.5), TILES, tower @ Pose.at(0, 0, 2.6), "hills")
@@ -157,7 +157,7 @@ def world() -> World:
     """Everything within 64 units, on a plain that reaches the horizon."""
     objects = (
         Object(Plane(), GRASS, Pose.at(0, 0, FLOOR - 0.03), "ground"),
-        Object(Box((2.6, 2.6, 0.1)), PAVING, Pose.at(0, 0, FLOOR - 0.1), "terrace"),
+        Object(Cuboid((2.6, 2.6, 0.1)), PAVING, Pose.at(0, 0, FLOOR - 0.1), "terrace"),
         *fountain(),
         *arcade(2.0),
         *house(Pose.at(-2.35, 0.1, FLOOR, turn=90)),
@@ -181,11 +181,11 @@ def world() -> World:
     return World(objects, (sun,), sky)
 
 
-def stage(size: int = 200, views: int = 100, seed: int = 0) -> Stage:
+def stage(size: int = 200, views: int = 100, seed: int = 0) -> SyntheticStage:
     """The courtyard, walking around its fountain; held-out views are one stroll around it."""
     random = np.random.default_rng(seed)
     cameras = {
         "train": pinhole(walk(views, 0.75, 1.15, random), size, 75.0),
         "test": pinhole(stroll(max(views * 2 // 5, 1), 0.95, random), size, 75.0),
     }
-    return Stage(world(), cameras, ((-1.0,) * 3, (1.0,) * 3), reach=32.0, near=0.1)
+    return SyntheticStage(world(), cameras, ((-1.0,) * 3, (1.0,) * 3), reach=32.0, near=0.1)

@@ -11,7 +11,7 @@ import torch
 
 from ..cameras import look_at, pinhole
 from ..sensor import Sensor
-from ..stage import Stage
+from ..stage import SyntheticStage
 from ..world import Lamp, Sky, World
 from . import room
 
@@ -37,13 +37,13 @@ def held(count: int, random: np.random.Generator) -> np.ndarray:
     return np.stack(poses)
 
 
-def stage(size: int = 200, views: int = 100, seed: int = 0) -> Stage:
+def stage(size: int = 200, views: int = 100, seed: int = 0) -> SyntheticStage:
     """So many photographs, and a fifth as many held out."""
     random = np.random.default_rng(seed)
     held_out = max(views // 5, 1)
     cameras = pinhole(held(views + held_out, random), size, FIELD_OF_VIEW)
     cameras = replace(cameras, image_index=torch.arange(len(cameras)))
-    return Stage(
+    return SyntheticStage(
         world(),
         {"train": cameras[:views], "test": cameras[views:]},
         ((-1.0, -0.8, -0.56), (1.0, 0.8, 0.5)),

@@ -7,8 +7,8 @@ import math
 import numpy as np
 
 from ..cameras import GOLDEN_ANGLE, look_at, pinhole, sphere_point
-from ..shapes import Box, Cone, Cylinder, Sphere, Torus
-from ..stage import Stage
+from ..shapes import Ball, Cone, Cuboid, Cylinder, Torus
+from ..stage import SyntheticStage
 from ..textures import Bricks, Checker, Marble, Mottle, Plain, Rings, Sectors, Stripes, Wood
 from ..world import Lamp, Material, Object, Pose, Sky, World
 
@@ -31,20 +31,20 @@ def shell():
     up, middle = (CEILING - FLOOR) / 2, (CEILING + FLOOR) / 2
     boards = Material(Stripes((0.60, 0.43, 0.27), (0.45, 0.30, 0.18), period=0.11, share=0.5))
     on_side = Pose.about((1, 0, 0), 90)
-    yield Object(Box((HALF_X, WALL, HALF_Y)), boards, Pose.at(0, 0, FLOOR - WALL) @ on_side, "floor")
-    yield Object(Box((HALF_X, HALF_Y, WALL)), PLASTER, Pose.at(0, 0, CEILING + WALL), "ceiling")
+    yield Object(Cuboid((HALF_X, WALL, HALF_Y)), boards, Pose.at(0, 0, FLOOR - WALL) @ on_side, "floor")
+    yield Object(Cuboid((HALF_X, HALF_Y, WALL)), PLASTER, Pose.at(0, 0, CEILING + WALL), "ceiling")
     for i in range(6):
-        beam = Box((HALF_X, 0.03, 0.025), 0.006)
+        beam = Cuboid((HALF_X, 0.03, 0.025), 0.006)
         yield Object(beam, WALNUT, Pose.at(0, 0.26 * (i - 2.5), CEILING - 0.02), "ceiling")
     lying = Pose.about((0, 1, 0), 90)  # stripes upright
     for side, material in ((-1, BRICK), (1, PLASTER)):
-        yield Object(Box((WALL, HALF_Y, up)), material, Pose.at(side * (HALF_X + WALL), 0, middle), "walls")
+        yield Object(Cuboid((WALL, HALF_Y, up)), material, Pose.at(side * (HALF_X + WALL), 0, middle), "walls")
     for side, material in ((-1, PAPER), (1, PAPER)):
         wall = Pose.at(0, side * (HALF_Y + WALL), middle) @ lying
-        yield Object(Box((up, WALL, HALF_X)), material, wall, "walls")
+        yield Object(Cuboid((up, WALL, HALF_X)), material, wall, "walls")
     for side in (-1, 1):
         for half, x, y in (((0.008, HALF_Y, 0.03), HALF_X, 0.0), ((HALF_X, 0.008, 0.03), 0.0, HALF_Y)):
-            yield Object(Box(half), OAK, Pose.at(side * x, side * y, FLOOR + 0.03), "walls")
+            yield Object(Cuboid(half), OAK, Pose.at(side * x, side * y, FLOOR + 0.03), "walls")
 
 
 def shelf(place: Pose):
@@ -52,14 +52,14 @@ def shelf(place: Pose):
     random = np.random.default_rng(4)
     colours = (CREAM, RUST, PETROL, OCHRE, INK, (0.42, 0.50, 0.36))
     for side in (-1, 1):
-        yield Object(Box((0.012, 0.08, 0.36)), WALNUT, place @ Pose.at(0.32 * side, 0, 0.36), "shelf")
+        yield Object(Cuboid((0.012, 0.08, 0.36)), WALNUT, place @ Pose.at(0.32 * side, 0, 0.36), "shelf")
     for row in range(5):
-        yield Object(Box((0.32, 0.08, 0.01)), WALNUT, place @ Pose.at(0, 0, 0.01 + 0.175 * row), "shelf")
+        yield Object(Cuboid((0.32, 0.08, 0.01)), WALNUT, place @ Pose.at(0, 0, 0.01 + 0.175 * row), "shelf")
         x = -0.29
         while row < 4 and x < 0.27:
             thick, high = random.uniform(0.010, 0.026), random.uniform(0.045, 0.070)
             cover = Material(Stripes(colours[random.integers(6)], colours[random.integers(6)], 0.05, share=0.15))
-            book = Box((thick, 0.055, high), 0.003)
+            book = Cuboid((thick, 0.055, high), 0.003)
             yield Object(book, cover, place @ Pose.at(x + thick, 0.01, 0.02 + 0.175 * row + high), "shelf")
             x += 2 * thick + 0.004
 
@@ -69,21 +69,21 @@ def table(place: Pose):
     yield Object(Cylinder(0.022, 0.13), OAK, place @ Pose.at(0, 0, 0.14), "table")
     yield Object(Cylinder(0.13, 0.012, rounding=0.005), OAK, place @ Pose.at(0, 0, 0.012), "table")
     globe = Material(Marble((0.25, 0.45, 0.60), (0.80, 0.74, 0.52), vein=0.12, turbulence=1.5), gloss=0.5)
-    yield Object(Sphere(0.075), globe, place @ Pose.at(0.04, 0.05, 0.385, tilt=23), "table")
+    yield Object(Ball(0.075), globe, place @ Pose.at(0.04, 0.05, 0.385, tilt=23), "table")
     yield Object(Cylinder(0.04, 0.008), WALNUT, place @ Pose.at(0.04, 0.05, 0.30), "table")
     checks = Material(Checker(CREAM, INK, size=0.026, shift=0.013))
-    yield Object(Box((0.10, 0.10, 0.008)), checks, place @ Pose.at(-0.07, -0.08, 0.30, turn=25), "table")
+    yield Object(Cuboid((0.10, 0.10, 0.008)), checks, place @ Pose.at(-0.07, -0.08, 0.30, turn=25), "table")
 
 
 def sofa(place: Pose):
     cloth = Material(Mottle(PETROL, (0.09, 0.27, 0.31), size=0.05, contrast=0.8))
-    yield Object(Box((0.36, 0.15, 0.07), 0.02), cloth, place @ Pose.at(0, 0, 0.10), "sofa")
-    yield Object(Box((0.36, 0.05, 0.11), 0.02), cloth, place @ Pose.at(0, 0.12, 0.25, tilt=-10), "sofa")
+    yield Object(Cuboid((0.36, 0.15, 0.07), 0.02), cloth, place @ Pose.at(0, 0, 0.10), "sofa")
+    yield Object(Cuboid((0.36, 0.05, 0.11), 0.02), cloth, place @ Pose.at(0, 0.12, 0.25, tilt=-10), "sofa")
     for side in (-1, 1):
-        yield Object(Box((0.045, 0.15, 0.12), 0.02), cloth, place @ Pose.at(0.38 * side, 0, 0.14), "sofa")
+        yield Object(Cuboid((0.045, 0.15, 0.12), 0.02), cloth, place @ Pose.at(0.38 * side, 0, 0.14), "sofa")
         cushion = Material(Stripes(OCHRE if side < 0 else RUST, CREAM, period=0.03, share=0.3))
         yield Object(
-            Box((0.075, 0.03, 0.075), 0.02), cushion, place @ Pose.at(0.22 * side, 0.03, 0.24, 12, -25), "sofa"
+            Cuboid((0.075, 0.03, 0.075), 0.02), cushion, place @ Pose.at(0.22 * side, 0.03, 0.24, 12, -25), "sofa"
         )
 
 
@@ -92,17 +92,17 @@ def pictures():
     motifs = (Sectors(RUST, CREAM, count=8), Rings(PETROL, OCHRE, period=0.04), Mottle(OCHRE, INK, size=0.06))
     for i, motif in enumerate(motifs):
         place = Pose.at(-0.52 + 0.5 * i, HALF_Y - 0.01, 0.12 - 0.03 * (i % 2))
-        yield Object(Box((0.13, 0.012, 0.16)), WALNUT, place, "pictures")
-        yield Object(Box((0.11, 0.018, 0.14)), Material(motif), place, "pictures")
+        yield Object(Cuboid((0.13, 0.012, 0.16)), WALNUT, place, "pictures")
+        yield Object(Cuboid((0.11, 0.018, 0.14)), Material(motif), place, "pictures")
     window = Material(Checker((0.96, 0.98, 1.0), (0.70, 0.82, 0.94), size=0.16, shift=0.08))
-    yield Object(Box((0.012, 0.26, 0.22)), OAK, Pose.at(HALF_X - 0.012, 0.08, 0.08), "window")
-    yield Object(Box((0.016, 0.24, 0.20)), window, Pose.at(HALF_X - 0.012, 0.08, 0.08), "window")
+    yield Object(Cuboid((0.012, 0.26, 0.22)), OAK, Pose.at(HALF_X - 0.012, 0.08, 0.08), "window")
+    yield Object(Cuboid((0.016, 0.24, 0.20)), window, Pose.at(HALF_X - 0.012, 0.08, 0.08), "window")
     for side in (-1, 1):
         curtain = Material(Stripes(CREAM, RUST, period=0.05, share=0.25))
         hanging = Pose.at(HALF_X - 0.03, 0.08 + 0.31 * side, 0.02) @ Pose.about((1, 0, 0), 90)
-        yield Object(Box((0.015, 0.32, 0.06), 0.01), curtain, hanging, "window")
-    yield Object(Box((0.15, 0.012, 0.37)), OAK, Pose.at(0.55, -HALF_Y, FLOOR + 0.37), "door")
-    yield Object(Sphere(0.016), Material(Plain(OCHRE), metal=1.0), Pose.at(0.44, -HALF_Y + 0.03, FLOOR + 0.36), "door")
+        yield Object(Cuboid((0.015, 0.32, 0.06), 0.01), curtain, hanging, "window")
+    yield Object(Cuboid((0.15, 0.012, 0.37)), OAK, Pose.at(0.55, -HALF_Y, FLOOR + 0.37), "door")
+    yield Object(Ball(0.016), Material(Plain(OCHRE), metal=1.0), Pose.at(0.44, -HALF_Y + 0.03, FLOOR + 0.36), "door")
 
 
 def plants():
@@ -111,7 +111,7 @@ def plants():
         yield Object(Cone(0.05 * size, 0.075 * size, 0.07), clay, Pose.at(x, y, FLOOR + 0.07), "plants")
         for turn, lift in ((0, 0.22), (120, 0.29), (240, 0.25)):
             leaf = Pose.at(x, y, FLOOR + lift * size, turn=turn, tilt=30) @ Pose.at(0, -0.05 * size, 0)
-            yield Object(Sphere(0.07 * size), LEAVES, leaf, "plants")
+            yield Object(Ball(0.07 * size), LEAVES, leaf, "plants")
 
 
 def world() -> World:
@@ -151,11 +151,11 @@ def inside(count: int, random: np.random.Generator, reach: float = 0.28):
     return np.stack(poses)[order]
 
 
-def stage(size: int = 200, views: int = 100, seed: int = 0) -> Stage:
+def stage(size: int = 200, views: int = 100, seed: int = 0) -> SyntheticStage:
     """The room from near its middle, in all directions; held-out views likewise."""
     random = np.random.default_rng(seed)
     cameras = {
         "train": pinhole(inside(views, random), size, 80.0),
         "test": pinhole(inside(max(views * 2 // 5, 1), random, 0.22), size, 80.0),
     }
-    return Stage(world(), cameras, ((-1.0, -0.8, -0.56), (1.0, 0.8, 0.5)), reach=1.0, near=0.1)
+    return SyntheticStage(world(), cameras, ((-1.0, -0.8, -0.56), (1.0, 0.8, 0.5)), reach=1.0, near=0.1)

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from ..cameras import dome, pinhole, spiral
-from ..shapes import Arch, Box, Cone, Cylinder, Sphere, Torus
-from ..stage import Stage
+from ..shapes import Arch, Ball, Cone, Cuboid, Cylinder, Torus
+from ..stage import SyntheticStage
 from ..textures import Checker, Marble, Plain, Rings, Sectors, Stripes, Wood
 from ..world import Lamp, Material, Object, Pose, Sky, World
 
@@ -43,7 +43,7 @@ def stacking_rings(place: Pose):
         shift = 0.006 * np.cos(2.4 * i), 0.006 * np.sin(2.4 * i)
         yield Object(Torus(0.20 - 0.025 * i, tube), paint(colour), place @ Pose.at(*shift, z + tube), "rings")
         z += 1.96 * tube
-    yield Object(Sphere(0.08), paint(CREAM), place @ Pose.at(0, 0, z + 0.065), "rings")
+    yield Object(Ball(0.08), paint(CREAM), place @ Pose.at(0, 0, z + 0.065), "rings")
 
 
 def castle(place: Pose):
@@ -57,13 +57,13 @@ def castle(place: Pose):
 def cubes(place: Pose):
     checks = Material(Checker(CREAM, CHARCOAL, size=0.085, shift=0.0425), gloss=0.6, roughness=0.4)
     stripes = Material(Stripes(MUSTARD, CREAM, period=0.05), gloss=0.6, roughness=0.4)
-    yield Object(Box((0.17,) * 3, rounding=0.018), checks, place @ Pose.at(0, 0, 0.17), "checks")
-    yield Object(Box((0.095,) * 3, rounding=0.014), stripes, place @ Pose.at(-0.02, 0.01, 0.435, turn=38), "stripes")
+    yield Object(Cuboid((0.17,) * 3, rounding=0.018), checks, place @ Pose.at(0, 0, 0.17), "checks")
+    yield Object(Cuboid((0.095,) * 3, rounding=0.014), stripes, place @ Pose.at(-0.02, 0.01, 0.435, turn=38), "stripes")
 
 
 def ball(place: Pose):
     leather = Material(Sectors(TERRACOTTA, CREAM, count=5, cap=0.165), gloss=1.0, roughness=0.25)
-    yield Object(Sphere(0.175), leather, place @ Pose.at(0, 0, 0.175, turn=20, tilt=38), "ball")
+    yield Object(Ball(0.175), leather, place @ Pose.at(0, 0, 0.175, turn=20, tilt=38), "ball")
 
 
 def spinning_top(place: Pose):
@@ -76,9 +76,9 @@ def spinning_top(place: Pose):
 
 def abacus(place: Pose):
     for side in (-1, 1):
-        yield Object(Box((0.02, 0.03, 0.19), 0.006), WALNUT, place @ Pose.at(0.26 * side, 0, 0.22), "abacus")
-    yield Object(Box((0.31, 0.075, 0.018), 0.008), WALNUT, place @ Pose.at(0, 0, 0.018), "abacus")
-    yield Object(Box((0.29, 0.035, 0.018), 0.008), WALNUT, place @ Pose.at(0, 0, 0.42), "abacus")
+        yield Object(Cuboid((0.02, 0.03, 0.19), 0.006), WALNUT, place @ Pose.at(0.26 * side, 0, 0.22), "abacus")
+    yield Object(Cuboid((0.31, 0.075, 0.018), 0.008), WALNUT, place @ Pose.at(0, 0, 0.018), "abacus")
+    yield Object(Cuboid((0.29, 0.035, 0.018), 0.008), WALNUT, place @ Pose.at(0, 0, 0.42), "abacus")
     lying = Pose.about((0, 1, 0), 90)
     rows = (
         (TERRACOTTA, (-0.20, -0.13, -0.06, 0.13, 0.20)),
@@ -96,7 +96,7 @@ def marbles():
     places = ((-0.10, -0.24, 0.062, TEAL), (-0.28, -0.44, 0.05, TERRACOTTA), (0.60, -0.42, 0.064, NAVY))
     for i, (x, y, radius, colour) in enumerate(places):
         glass = Material(Marble(colour, CREAM, vein=0.11, turbulence=1.2, seed=4.0 + i), gloss=1.0, roughness=0.2)
-        yield Object(Sphere(radius), glass, Pose.at(x, y, radius), "marbles")
+        yield Object(Ball(radius), glass, Pose.at(x, y, radius), "marbles")
 
 
 def world() -> World:
@@ -119,11 +119,11 @@ def world() -> World:
     return upright.transformed(Pose((0.0, 0.0, -0.5 * float(low[2] + high[2]))))
 
 
-def stage(size: int = 200, views: int = 100, seed: int = 0) -> Stage:
+def stage(size: int = 200, views: int = 100, seed: int = 0) -> SyntheticStage:
     """The toys seen from a dome; held-out views climb around them."""
     random = np.random.default_rng(seed)
     cameras = {
         "train": pinhole(dome(views, 3.6, random), size, 36.0),
         "test": pinhole(spiral(max(views * 2 // 5, 1), 3.6, random), size, 36.0),
     }
-    return Stage(world(), cameras, ((-1.0, -1.0, -0.5), (1.0, 1.0, 0.5)), reach=1.0, near=1.5)
+    return SyntheticStage(world(), cameras, ((-1.0, -1.0, -0.5), (1.0, 1.0, 0.5)), reach=1.0, near=1.5)

@@ -13,8 +13,8 @@ import torch
 
 from ...camera import Camera
 from ..cameras import dome, pinhole, spiral
-from ..shapes import Box, Cylinder, Sphere
-from ..stage import Stage
+from ..shapes import Ball, Cuboid, Cylinder
+from ..stage import SyntheticStage
 from ..textures import Checker, Plain, Sectors, Wood
 from ..world import Lamp, Material, Object, Pose, Sky, World
 
@@ -30,10 +30,10 @@ def still() -> tuple[Object, ...]:
     """The board and the gallows, which stand still."""
     board = Material(Checker(CREAM, BLUE, size=0.2), gloss=0.6, roughness=0.4)
     posts = (
-        Object(Box((0.03, 0.03, 0.60), 0.01), OAK, Pose.at(0, side * 0.42, -0.02), "gallows") for side in (-1.0, 1.0)
+        Object(Cuboid((0.03, 0.03, 0.60), 0.01), OAK, Pose.at(0, side * 0.42, -0.02), "gallows") for side in (-1.0, 1.0)
     )
-    beam = Object(Box((0.03, 0.45, 0.03), 0.01), OAK, Pose.at(0, 0, 0.58), "gallows")
-    return (Object(Box((0.9, 0.55, 0.03), 0.01), board, Pose.at(0, 0, -0.65), "board"), *posts, beam)
+    beam = Object(Cuboid((0.03, 0.45, 0.03), 0.01), OAK, Pose.at(0, 0, 0.58), "gallows")
+    return (Object(Cuboid((0.9, 0.55, 0.03), 0.01), board, Pose.at(0, 0, -0.65), "board"), *posts, beam)
 
 
 def angle(time: float) -> float:
@@ -47,7 +47,7 @@ def world(time: float) -> World:
     stripes = Material(Sectors(RED, CREAM, count=6, cap=0.2), gloss=1.0, roughness=0.25)
     pendulum = (
         Object(Cylinder(0.012, ROD_LENGTH / 2), STEEL, swung @ Pose.at(0, 0, -ROD_LENGTH / 2), "rod"),
-        Object(Sphere(0.2), stripes, swung @ Pose.at(0, 0, -ROD_LENGTH), "ball"),
+        Object(Ball(0.2), stripes, swung @ Pose.at(0, 0, -ROD_LENGTH), "ball"),
     )
     key = Lamp((-2.6, -1.8, 3.2), radius=0.4, power=18.0, colour=(1.0, 0.95, 0.87))
     fill = Lamp((3.0, 0.8, 2.0), radius=0.8, power=4.0, colour=(0.86, 0.93, 1.0))
@@ -55,7 +55,7 @@ def world(time: float) -> World:
     return World((*still(), *pendulum), (key, fill), sky)
 
 
-def stage(size: int = 200, views: int = 100, seed: int = 0) -> Stage:
+def stage(size: int = 200, views: int = 100, seed: int = 0) -> SyntheticStage:
     """The pendulum seen from a dome, each photograph at a moment of its own; held-out views climb around it."""
     random = np.random.default_rng(seed)
     held_out = max(views * 2 // 5, 1)
@@ -63,7 +63,7 @@ def stage(size: int = 200, views: int = 100, seed: int = 0) -> Stage:
         "train": timed(pinhole(dome(views, 3.6, random), size, 36.0), random.permutation(np.linspace(0, 1, views))),
         "test": timed(pinhole(spiral(held_out, 3.6, random), size, 36.0), np.linspace(0, 1, held_out)),
     }
-    return Stage(world(0.0), cameras, ((-1.0, -0.6, -0.7), (1.0, 0.6, 0.7)), reach=1.0, near=1.5, moving=world)
+    return SyntheticStage(world(0.0), cameras, ((-1.0, -0.6, -0.7), (1.0, 0.6, 0.7)), reach=1.0, near=1.5, moving=world)
 
 
 def timed(cameras: Camera, times: np.ndarray) -> Camera:

@@ -16,8 +16,8 @@ import torch
 
 from ...camera import Camera
 from ..cameras import look_at, pinhole
-from ..shapes import Arch, Box, Cone, Cylinder, Plane, Sphere, Torus
-from ..stage import Stage
+from ..shapes import Arch, Ball, Cone, Cuboid, Cylinder, Plane, Torus
+from ..stage import SyntheticStage
 from ..textures import Bricks, Checker, Colour, Mottle, Plain, Stripes
 from ..world import Material, Object, Pose, Sky, Sun, World
 
@@ -106,30 +106,30 @@ class Day:
 
 
 def tower(x: float) -> Iterator[Object]:
-    yield Object(Box((0.22, 0.22, 0.62)), STONE, Pose.at(x, WALL, GROUND + 0.62), "tower")
-    yield Object(Box((0.25, 0.25, 0.03), 0.01), TRIM, Pose.at(x, WALL, GROUND + 1.26), "tower")
+    yield Object(Cuboid((0.22, 0.22, 0.62)), STONE, Pose.at(x, WALL, GROUND + 0.62), "tower")
+    yield Object(Cuboid((0.25, 0.25, 0.03), 0.01), TRIM, Pose.at(x, WALL, GROUND + 1.26), "tower")
     yield Object(Cone(0.27, 0.0, 0.24), ROOF, Pose.at(x, WALL, GROUND + 1.53), "tower")
     for z in (0.40, 0.85):
-        yield Object(Box((0.07, 0.01, 0.12)), GLASS, Pose.at(x, WALL - 0.225, GROUND + z), "tower")
-        yield Object(Box((0.10, 0.03, 0.015)), TRIM, Pose.at(x, WALL - 0.23, GROUND + z - 0.14), "tower")
+        yield Object(Cuboid((0.07, 0.01, 0.12)), GLASS, Pose.at(x, WALL - 0.225, GROUND + z), "tower")
+        yield Object(Cuboid((0.10, 0.03, 0.015)), TRIM, Pose.at(x, WALL - 0.23, GROUND + z - 0.14), "tower")
 
 
 def front() -> Iterator[Object]:
     """The wall between the towers: gates, windows, cornices, a gable with a round window."""
-    yield Object(Box((0.72, 0.10, 0.46)), PLASTER, Pose.at(0, WALL + 0.06, GROUND + 0.46), "front")
-    yield Object(Box((0.74, 0.14, 0.03), 0.01), TRIM, Pose.at(0, WALL + 0.05, GROUND + 0.94), "front")
-    yield Object(Box((0.72, 0.13, 0.02), 0.006), TRIM, Pose.at(0, WALL + 0.05, GROUND + 0.50), "front")
+    yield Object(Cuboid((0.72, 0.10, 0.46)), PLASTER, Pose.at(0, WALL + 0.06, GROUND + 0.46), "front")
+    yield Object(Cuboid((0.74, 0.14, 0.03), 0.01), TRIM, Pose.at(0, WALL + 0.05, GROUND + 0.94), "front")
+    yield Object(Cuboid((0.72, 0.13, 0.02), 0.006), TRIM, Pose.at(0, WALL + 0.05, GROUND + 0.50), "front")
     gable = Pose.at(0, WALL + 0.06, GROUND + 0.96) @ Pose.about((0, 1, 0), 45)
-    yield Object(Box((0.30, 0.09, 0.30)), PLASTER, gable, "front")
+    yield Object(Cuboid((0.30, 0.09, 0.30)), PLASTER, gable, "front")
     yield Object(Torus(0.09, 0.02), TRIM, Pose.at(0, WALL - 0.03, GROUND + 1.12, tilt=90), "windows")
     yield Object(Cylinder(0.085, 0.012), GLASS, Pose.at(0, WALL - 0.03, GROUND + 1.12, tilt=90), "windows")
     for x in (-0.44, 0.0, 0.44):
         gate = Arch((0.19, 0.08, 0.23), 0.11, spring=0.24)
         yield Object(gate, STONE, Pose.at(x, WALL - 0.10, GROUND + 0.23), "gates")
-        yield Object(Box((0.12, 0.01, 0.20)), DOOR, Pose.at(x, WALL - 0.045, GROUND + 0.20), "gates")
-        yield Object(Box((0.08, 0.01, 0.13)), GLASS, Pose.at(x, WALL - 0.045, GROUND + 0.70), "windows")
-        yield Object(Box((0.11, 0.035, 0.015)), TRIM, Pose.at(x, WALL - 0.06, GROUND + 0.555), "windows")
-        yield Object(Box((0.11, 0.035, 0.02)), TRIM, Pose.at(x, WALL - 0.06, GROUND + 0.85), "windows")
+        yield Object(Cuboid((0.12, 0.01, 0.20)), DOOR, Pose.at(x, WALL - 0.045, GROUND + 0.20), "gates")
+        yield Object(Cuboid((0.08, 0.01, 0.13)), GLASS, Pose.at(x, WALL - 0.045, GROUND + 0.70), "windows")
+        yield Object(Cuboid((0.11, 0.035, 0.015)), TRIM, Pose.at(x, WALL - 0.06, GROUND + 0.555), "windows")
+        yield Object(Cuboid((0.11, 0.035, 0.02)), TRIM, Pose.at(x, WALL - 0.06, GROUND + 0.85), "windows")
     for x in (-0.63, -0.22, 0.22, 0.63):
         yield Object(Cylinder(0.03, 0.19), TRIM, Pose.at(x, WALL - 0.07, GROUND + 0.70), "columns")
 
@@ -138,22 +138,22 @@ def square() -> Iterator[Object]:
     """Paving, steps, a statue on its pedestal, trees in tubs, houses behind."""
     yield Object(Plane(), PAVING, Pose.at(0, 0, GROUND), "square")
     for i in range(3):
-        step = Box((0.80 + 0.06 * i, 0.05, 0.012), 0.004)
+        step = Cuboid((0.80 + 0.06 * i, 0.05, 0.012), 0.004)
         yield Object(step, TRIM, Pose.at(0, WALL - 0.22 - 0.09 * i, GROUND + 0.012 * (3 - i)), "steps")
-    yield Object(Box((0.11, 0.11, 0.11), 0.01), STONE, Pose.at(-0.36, -0.10, GROUND + 0.11), "statue")
-    yield Object(Box((0.13, 0.13, 0.02), 0.008), TRIM, Pose.at(-0.36, -0.10, GROUND + 0.23), "statue")
+    yield Object(Cuboid((0.11, 0.11, 0.11), 0.01), STONE, Pose.at(-0.36, -0.10, GROUND + 0.11), "statue")
+    yield Object(Cuboid((0.13, 0.13, 0.02), 0.008), TRIM, Pose.at(-0.36, -0.10, GROUND + 0.23), "statue")
     yield Object(Cone(0.075, 0.05, 0.10, 0.01), BRONZE, Pose.at(-0.36, -0.10, GROUND + 0.35), "statue")
     yield Object(Cylinder(0.065, 0.06, 0.03), BRONZE, Pose.at(-0.36, -0.10, GROUND + 0.47), "statue")
-    yield Object(Sphere(0.045), BRONZE, Pose.at(-0.36, -0.10, GROUND + 0.565), "statue")
+    yield Object(Ball(0.045), BRONZE, Pose.at(-0.36, -0.10, GROUND + 0.565), "statue")
     yield Object(Cylinder(0.018, 0.09, 0.008), BRONZE, Pose.at(-0.28, -0.12, GROUND + 0.51, tilt=35), "statue")
     for x in (-0.85, 0.62, 0.95):
         yield Object(Cone(0.07, 0.09, 0.08), STONE, Pose.at(x, 0.02, GROUND + 0.08), "trees")
         yield Object(Torus(0.09, 0.012), TRIM, Pose.at(x, 0.02, GROUND + 0.16), "trees")
-        yield Object(Sphere(0.15), LEAVES, Pose.at(x, 0.02, GROUND + 0.30, turn=70 * x), "trees")
+        yield Object(Ball(0.15), LEAVES, Pose.at(x, 0.02, GROUND + 0.30, turn=70 * x), "trees")
     for x, height in ((-2.4, 0.75), (2.3, 0.9), (-4.3, 1.0), (4.4, 0.8)):
         house = STONE if height < 0.85 else PLASTER
-        yield Object(Box((0.80, 0.5, height)), house, Pose.at(x, 1.4, GROUND + height), "houses")
-        yield Object(Box((0.86, 0.55, 0.04)), ROOF, Pose.at(x, 1.4, GROUND + 2 * height + 0.03), "houses")
+        yield Object(Cuboid((0.80, 0.5, height)), house, Pose.at(x, 1.4, GROUND + height), "houses")
+        yield Object(Cuboid((0.86, 0.55, 0.04)), ROOF, Pose.at(x, 1.4, GROUND + 2 * height + 0.03), "houses")
 
 
 def person(place: Pose, shirt: Colour, trousers: Colour) -> Iterator[Object]:
@@ -163,15 +163,15 @@ def person(place: Pose, shirt: Colour, trousers: Colour) -> Iterator[Object]:
         yield Object(legs, Material(Plain(trousers)), place @ Pose.at(side, 0, 0.065), "passers-by")
         yield Object(Cylinder(0.014, 0.055, 0.008), SKIN, place @ Pose.at(2.6 * side, 0, 0.175), "passers-by")
     yield Object(Cone(0.036, 0.052, 0.055, 0.015), Material(Plain(shirt)), place @ Pose.at(0, 0, 0.18), "passers-by")
-    yield Object(Sphere(0.027), SKIN, place @ Pose.at(0, 0, 0.262), "passers-by")
+    yield Object(Ball(0.027), SKIN, place @ Pose.at(0, 0, 0.262), "passers-by")
 
 
 def car(place: Pose, paint: Colour) -> Iterator[Object]:
     """A car along x, 0.7 units long."""
     body = Material(Plain(paint), gloss=1.0, roughness=0.2)
-    yield Object(Box((0.35, 0.14, 0.055), 0.03), body, place @ Pose.at(0, 0, 0.10), "passers-by")
-    yield Object(Box((0.18, 0.12, 0.05), 0.03), GLASS, place @ Pose.at(-0.02, 0, 0.185), "passers-by")
-    yield Object(Box((0.16, 0.115, 0.01), 0.008), body, place @ Pose.at(-0.02, 0, 0.235), "passers-by")
+    yield Object(Cuboid((0.35, 0.14, 0.055), 0.03), body, place @ Pose.at(0, 0, 0.10), "passers-by")
+    yield Object(Cuboid((0.18, 0.12, 0.05), 0.03), GLASS, place @ Pose.at(-0.02, 0, 0.185), "passers-by")
+    yield Object(Cuboid((0.16, 0.115, 0.01), 0.008), body, place @ Pose.at(-0.02, 0, 0.235), "passers-by")
     for x in (-0.21, 0.21):
         wheel = Pose.at(x, 0, 0.05, tilt=90)
         yield Object(Cylinder(0.05, 0.145, 0.01), TYRE, place @ wheel, "passers-by")
@@ -217,14 +217,14 @@ def photographed(seed: int, cameras: Camera, lasting: bool, index: int) -> World
     return world(day, () if lasting else tuple(passing(cameras[index], random)))
 
 
-def stage(size: int = 200, views: int = 100, seed: int = 0) -> Stage:
+def stage(size: int = 200, views: int = 100, seed: int = 0) -> SyntheticStage:
     """The façade by so many visitors; a quarter as many photographs, without anybody before it, are held out."""
     held_out = max(views // 4, 1)
     cameras = visits(views + held_out, np.random.default_rng(seed), size)
     cameras = replace(cameras, image_index=torch.arange(len(cameras)))
     empty = partial(photographed, seed, cameras, True)
     crowded = partial(photographed, seed, cameras, False)
-    return Stage(
+    return SyntheticStage(
         world(Day((30.0, 45.0), 0.0, (1.0, 1.0, 1.0), 1.0)),
         {"train": cameras[:views], "test": cameras[views:]},
         ((-1.0, -0.6, GROUND), (1.0, 1.0, 1.2)),

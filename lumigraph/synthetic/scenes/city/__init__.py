@@ -21,7 +21,7 @@ import torch
 from ....files.ranges import between
 from ...cameras import look_at, pinhole
 from ...options import Pictures
-from ...stage import Stage
+from ...stage import SyntheticStage
 from ...world import World, joined
 from . import light, plan, streets, traffic
 
@@ -36,7 +36,7 @@ ERROR = 10.0  # metres of which errors of poses are so many percent: a street's 
 
 
 @dataclass(frozen=True)
-class Options(Pictures):
+class CityOptions(Pictures):
     """Options of every scene, but for these.
 
     size:      width of the pictures, which are three quarters as high
@@ -115,7 +115,7 @@ def route(crossings: int, stops: int) -> tuple[np.ndarray, np.ndarray, float]:
     return plan.stops(plan.crossings(crossings), stops)
 
 
-def stage(size: int = 320, views: int = 400, seed: int = 0, crossings: int = 6) -> Stage:
+def stage(size: int = 320, views: int = 400, seed: int = 0, crossings: int = 6) -> SyntheticStage:
     """The city, seen along one drive: so many photographs to learn from, and after every seventh one that is not."""
     count = views + max(views // (HOLD_OUT - 1), 1)
     drive = Drive(crossings, count, seed)
@@ -137,7 +137,7 @@ def stage(size: int = 320, views: int = 400, seed: int = 0, crossings: int = 6) 
         return f"city {CITY} {drive} {numbers[image]} {image >= views}"
 
     low, high = plan.extent(crossings)
-    return Stage(
+    return SyntheticStage(
         drive.world(0, lasting=False),
         {"train": cameras[:views], "test": cameras[views:]},
         (low, high),

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ...shapes import Box
+from ...shapes import Cuboid
 from ...textures import Bricks, Checker, Colour, Mottle, Plain, Stripes
 from ...world import Material, Object, Pose
 
@@ -95,7 +95,7 @@ def house(
     def box(
         size: tuple[float, float, float], material: Material, z: float, aside: float = 0.0, back: float = 0.0
     ) -> Object:
-        return Object(Box(size), material, place @ Pose.at(aside, back, z), "houses")
+        return Object(Cuboid(size), material, place @ Pose.at(aside, back, z), "houses")
 
     yield box((x, y, 0.5 * height), style.wall, 0.5 * height)
     yield box((x + 0.05, y + 0.05, 0.35), style.socle, 0.35)
@@ -115,8 +115,8 @@ def front(place: Pose, half: float, style: Style, random: np.random.Generator) -
     door = random.integers(bays)
     for bay, x in enumerate(middles.tolist()):
         if bay == door:
-            yield Object(Box((0.7, 0.06, 1.35)), style.door, place @ Pose.at(x, 0, 1.35), "doors")
-            yield Object(Box((0.85, 0.12, 0.12)), TRIM, place @ Pose.at(x, 0, 2.85), "doors")
+            yield Object(Cuboid((0.7, 0.06, 1.35)), style.door, place @ Pose.at(x, 0, 1.35), "doors")
+            yield Object(Cuboid((0.85, 0.12, 0.12)), TRIM, place @ Pose.at(x, 0, 2.85), "doors")
         elif style.shops:
             yield from shop(place @ Pose.at(x, 0, 0), random)
         else:
@@ -130,25 +130,25 @@ def window(place: Pose, style: Style, random: np.random.Generator) -> Iterator[O
     """A frame with two panes, a sill, maybe shutters."""
     wide, high = style.window
     pane = PANES[random.choice(len(PANES), p=(0.45, 0.3, 0.15, 0.1))]
-    yield Object(Box((wide + 0.1, 0.04, high + 0.1)), TRIM, place, "windows")
+    yield Object(Cuboid((wide + 0.1, 0.04, high + 0.1)), TRIM, place, "windows")
     for side in (-1, 1):
-        yield Object(Box((0.5 * wide - 0.04, 0.05, high)), pane, place @ Pose.at(0.5 * side * wide, 0, 0), "windows")
-    yield Object(Box((wide + 0.22, 0.2, 0.06)), TRIM, place @ Pose.at(0, 0, -high - 0.14), "windows")
+        yield Object(Cuboid((0.5 * wide - 0.04, 0.05, high)), pane, place @ Pose.at(0.5 * side * wide, 0, 0), "windows")
+    yield Object(Cuboid((wide + 0.22, 0.2, 0.06)), TRIM, place @ Pose.at(0, 0, -high - 0.14), "windows")
     if style.shutters is not None:
         for side in (-1, 1):
             leaf = place @ Pose.at(side * (1.45 * wide + 0.14), 0, 0)
-            yield Object(Box((0.42 * wide, 0.07, high + 0.05)), style.shutters, leaf, "windows")
+            yield Object(Cuboid((0.42 * wide, 0.07, high + 0.05)), style.shutters, leaf, "windows")
 
 
 def shop(place: Pose, random: np.random.Generator) -> Iterator[Object]:
     """A large pane under an awning or a sign."""
     colour, other = (PAINTS[i] for i in random.integers(len(PAINTS), size=2))
-    yield Object(Box((1.0, 0.05, 1.05)), PANES[0], place @ Pose.at(0, 0, 1.75), "shops")
-    yield Object(Box((1.08, 0.04, 1.13)), TRIM, place @ Pose.at(0, 0, 1.75), "shops")
+    yield Object(Cuboid((1.0, 0.05, 1.05)), PANES[0], place @ Pose.at(0, 0, 1.75), "shops")
+    yield Object(Cuboid((1.08, 0.04, 1.13)), TRIM, place @ Pose.at(0, 0, 1.75), "shops")
     if random.uniform() < 0.5:
         cloth = Material(Stripes(colour, (0.92, 0.90, 0.85), period=0.5, share=0.5))
         slope = place @ Pose.at(0, -0.5, 2.95, tilt=25) @ Pose.about((0, 1, 0), 90)
-        yield Object(Box((0.03, 0.55, 1.1)), cloth, slope, "shops")
+        yield Object(Cuboid((0.03, 0.55, 1.1)), cloth, slope, "shops")
     else:
         sign = Material(Checker(colour, other, size=0.45, shift=random.uniform(0, 0.4)))
-        yield Object(Box((1.05, 0.09, 0.26)), sign, place @ Pose.at(0, 0, 3.2), "shops")
+        yield Object(Cuboid((1.05, 0.09, 0.26)), sign, place @ Pose.at(0, 0, 3.2), "shops")

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from ...categories import cars
-from ...shapes import Box, Cylinder, Plane, Sphere
+from ...shapes import Ball, Cuboid, Cylinder, Plane
 from ...textures import Bricks, Mottle, Plain, Stripes, Wood
 from ...world import Material, Object, Pose, World
 from .houses import house
@@ -59,7 +59,7 @@ def ground(columns: int, rows: int) -> Iterator[Object]:
     middle = 0.5 * PITCH * (columns - 1), 0.5 * PITCH * (rows - 1)
     yield Object(Plane(), GRASS, Pose.at(0, 0, -0.3), "ground")
     half = middle[0] + OUTSKIRTS, middle[1] + OUTSKIRTS, 0.2
-    yield Object(Box(half), ASPHALT, Pose.at(*middle, -0.2), "ground")
+    yield Object(Cuboid(half), ASPHALT, Pose.at(*middle, -0.2), "ground")
 
 
 def between(here: Crossing, there: Crossing) -> tuple[Pose, float]:
@@ -75,17 +75,17 @@ def markings(places: list[Crossing]) -> Iterator[Object]:
     aside = Pose.about((1, 0, 0), 90)
     for here, there in streets(places):
         middle, half = between(here, there)
-        yield Object(Box((0.01, 0.08, half - 4)), DASHES, middle @ upright, "ground")
+        yield Object(Cuboid((0.01, 0.08, half - 4)), DASHES, middle @ upright, "ground")
         for end in (-1, 1):
             zebra = middle @ Pose.at(end * (half - 1.6), 0, 0) @ aside
-            yield Object(Box((1.2, 0.011, ROAD - 0.4)), ZEBRA, zebra, "ground")
+            yield Object(Cuboid((1.2, 0.011, ROAD - 0.4)), ZEBRA, zebra, "ground")
 
 
 def quarter(i: int, j: int, columns: int, rows: int, random: np.random.Generator) -> Iterator[Object]:
     """The houses between four crossings, of which (i, j) is the lowest, in two rows back to back, on their pavement."""
     half = 0.5 * PITCH - ROAD
     middle = Pose.at((i + 0.5) * PITCH, (j + 0.5) * PITCH, 0)
-    yield Object(Box((half, half, KERB), 0.02), FLAGS, middle, "pavement")
+    yield Object(Cuboid((half, half, KERB), 0.02), FLAGS, middle, "pavement")
     built = half - PAVEMENT
     for north in (False, True):
         count = int(random.integers(2, 4))
@@ -124,16 +124,16 @@ def lined(here: Crossing, there: Crossing, random: np.random.Generator) -> Itera
 def tree(place: Pose, random: np.random.Generator) -> Iterator[Object]:
     leaves, height = LEAVES[random.integers(len(LEAVES))], random.uniform(2.3, 3.0)
     yield Object(Cylinder(0.13, 0.5 * height), BARK, place @ Pose.at(0, 0, 0.5 * height), "trees")
-    yield Object(Sphere(1.05), leaves, place @ Pose.at(0, 0, height + 0.7), "trees")
+    yield Object(Ball(1.05), leaves, place @ Pose.at(0, 0, height + 0.7), "trees")
     for turn in (0, 120, 240):
         ball = Pose.at(0, 0, 0, turn=turn + random.uniform(-30, 30)) @ Pose.at(0.65, 0, height + random.uniform(0, 0.9))
-        yield Object(Sphere(random.uniform(0.6, 0.8)), leaves, place @ ball, "trees")
+        yield Object(Ball(random.uniform(0.6, 0.8)), leaves, place @ ball, "trees")
 
 
 def lamp(place: Pose) -> Iterator[Object]:
     yield Object(Cylinder(0.07, 2.3), IRON, place @ Pose.at(0, 0, 2.3), "lamps")
     yield Object(Cylinder(0.14, 0.25), IRON, place @ Pose.at(0, 0, 0.25), "lamps")
-    yield Object(Sphere(0.24), GLOBE, place @ Pose.at(0, 0, 4.8), "lamps")
+    yield Object(Ball(0.24), GLOBE, place @ Pose.at(0, 0, 4.8), "lamps")
 
 
 def car(place: Pose, random: np.random.Generator, name: str) -> Iterator[Object]:
