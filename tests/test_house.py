@@ -324,7 +324,9 @@ def rooms_table() -> str:
         for name in sorted(rooms):
             path = PACKAGE / name / "__init__.py"
             source = (path if path.is_file() else PACKAGE / f"{name}.py").read_text(encoding="utf-8")
-            rows.append(f"| {number} | `{name}` | {(ast.get_docstring(ast.parse(source)) or '').partition(chr(10))[0]} |")
+            rows.append(
+                f"| {number} | `{name}` | {(ast.get_docstring(ast.parse(source)) or '').partition(chr(10))[0]} |"
+            )
     return "\n".join(rows) + "\n"
 
 
