@@ -55,7 +55,7 @@ class Budget:
     def extended(self, to: Budget, step: int, seconds: float) -> Budget:
         """Another total, for a run that has come to a step by this one.
 
-        Schedules follow the new total. They do not go back behind REJOIN_PROGRESS, or the present progress if that is less.
+        Schedules follow the new total. They go back to REJOIN_PROGRESS at most, and never forward.
         """
         if (to.steps, to.seconds) == (self.steps, self.seconds):
             return replace(self, quality=to.quality or self.quality)

@@ -1,4 +1,4 @@
-"""What can go wrong in ways that a user can mend."""
+"""Errors and warnings that a user can act on."""
 
 
 class LumigraphError(Exception):

@@ -1,4 +1,4 @@
-"""Volume rendering: one weight per sample gives colour, depth, opacity and anything else."""
+"""Volume rendering: weights of samples along rays, colour, depth and opacity."""
 
 from __future__ import annotations
 

@@ -1,8 +1,9 @@
-"""The plan of the house: which room may know which. Arrows point one way."""
+"""The rooms and which of them may import which. Run as a script, it writes the table of rooms into the documents."""
 
 from __future__ import annotations
 
 import ast
+import re
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
@@ -13,6 +14,7 @@ from conftest import JIT, PACKAGE, checked_modules, module_name
 
 import lumigraph
 
+ROOT = PACKAGE.parent
 pytestmark = budget("house")
 
 # Each floor may know the floors above it in this list, and a room on it knows no other room of its own floor.
@@ -308,3 +310,39 @@ def test_compiled_functions_stay_outside_the_shape_checks():
         assert not (compiles and module_name(path) in checked), (
             f"{path.name} compiles functions but imports no compiler"
         )
+
+
+# The table of rooms in the documents follows FLOORS and docstrings.
+
+PAGE = ROOT / "docs" / "architecture.md"
+TABLE = re.compile(r"(?<=<!-- rooms -->\n).*?(?=<!-- end of rooms -->)", re.DOTALL)
+
+
+def rooms_table() -> str:
+    """FLOORS as a Markdown table, each room with the first line of its docstring."""
+    rows = ["| floor | room | contents |", "|---|---|---|"]
+    for number, rooms in enumerate(FLOORS, 1):
+        for name in sorted(rooms):
+            path = PACKAGE / name / "__init__.py"
+            source = (path if path.is_file() else PACKAGE / f"{name}.py").read_text(encoding="utf-8")
+            rows.append(
+                f"| {number} | `{name}` | {(ast.get_docstring(ast.parse(source)) or '').partition(chr(10))[0]} |"
+            )
+    return "\n".join(rows) + "\n"
+
+
+def test_the_table_of_rooms_is_up_to_date():
+    written = TABLE.search(PAGE.read_text(encoding="utf-8"))
+    assert written and written[0] == rooms_table(), "docs/architecture.md is stale; run `python tests/test_house.py`"
+    for row in rooms_table().splitlines()[2:]:
+        assert row.endswith(". |"), f"the first line of a room's docstring must be a sentence: {row}"
+
+
+def test_the_tree_of_the_readme_has_every_room():
+    (tree,) = re.findall(r"```\nlumigraph/\n(.*?)```", (ROOT / "README.md").read_text(encoding="utf-8"), re.DOTALL)
+    named = set().union(*(re.findall(r"\w+", line[4:32]) for line in tree.splitlines() if line[:1] in "├└"))
+    assert named == set().union(*FLOORS) - {"__main__"}
+
+
+if __name__ == "__main__":
+    PAGE.write_text(TABLE.sub(lambda _: rooms_table(), PAGE.read_text(encoding="utf-8")), encoding="utf-8")

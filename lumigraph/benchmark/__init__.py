@@ -1,4 +1,4 @@
-"""Methods side by side: what is trained on what, each cell in a process of its own, and what came of it.
+"""Methods side by side: cells that train in processes of their own, tables, charts.
 
 OUTPUT/
 ├── settings.json   what all cells share

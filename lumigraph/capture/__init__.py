@@ -1,5 +1,6 @@
-"""Open files as a dataset: photographs as a Scene (one reader per format, procedural scenes, one place that finds
-bounds and splits), meshes as Shapes, and folders of either as a Collection."""
+"""Open files as a dataset: photographs as a Scene, meshes as Shapes, folders of either as a Collection.
+
+Each format has one reader; bounds and splits are found in one place."""
 
 from __future__ import annotations
 

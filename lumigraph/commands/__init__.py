@@ -1,4 +1,4 @@
-"""The commands, one file each: a dataclass whose fields are the options, and `run`, a thin door onto the library.
+"""The command line: one file per command, a dataclass of options with a thin `run`.
 
 PyTorch is imported inside `run`, so that help comes at once.
 """

@@ -1,1 +1,1 @@
-"""What methods are made of, by theme: fields, sampling along rays, clouds of Gaussians, training."""
+"""Building blocks that several methods share: fields, sampling, clouds of Gaussians, training."""

@@ -1,5 +1,4 @@
-"""Composition: several methods in one picture, each at a place of its own, hiding one another as things do; and parts
-of one method."""
+"""Composition: several methods in one picture with mutual occlusion, and parts of one method."""
 
 from .composed import compose as compose
 from .picked import PickedCloud as PickedCloud

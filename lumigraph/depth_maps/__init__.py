@@ -1,4 +1,4 @@
-"""Depth maps of methods, sensors and plane sweeps: back-projection, visibility, fusion into a signed distance.
+"""Depth maps of methods, sensors and plane sweeps: back-projection, visibility, TSDF fusion.
 
 A `DepthMap` is one camera and, for each pixel, the distance along its ray to the first surface, in scene units:
 infinity where nothing is, NaN where nobody measured. Three ways lead to one:

@@ -1,1 +1,1 @@
-"""A run becomes another run: of another method, smaller, or aligned with others of its category."""
+"""Runs made of runs: converted, compressed, aligned within a category."""

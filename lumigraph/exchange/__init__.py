@@ -1,4 +1,4 @@
-"""Clouds of Gaussians as files that other programs know: one format, one file; the ending says which."""
+"""File formats of other programs: clouds of Gaussians, octrees, atlases; tensors in few bytes."""
 
 from __future__ import annotations
 

@@ -1,1 +1,1 @@
-"""Equations of papers, measured and drawn on your own data: pages with pictures and the figures behind them."""
+"""Equations of papers, measured and drawn on the user's data."""

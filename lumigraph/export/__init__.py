@@ -1,1 +1,1 @@
-"""Exports: films, meshes, points, splats, panoramas, pages. They know Method.render and no particular method."""
+"""Exports: films, meshes, points, splats, panoramas, web pages."""

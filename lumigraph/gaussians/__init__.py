@@ -1,4 +1,4 @@
-"""Gaussians: a cloud in any frame, how a camera sees it, what it is cleaned of, and several as one."""
+"""Clouds of Gaussians: splatting, cleaning, joining, merging."""
 
 from .cloud import Gaussians as Gaussians
 from .cloud import turned as turned

@@ -1,4 +1,4 @@
-"""The hot loops, one folder per operation. Each has a reference in plain PyTorch that defines it."""
+"""Hot loops, one folder per operation: a reference in PyTorch, engines in Numba and Triton."""
 
 from ._dispatch import Engine as Engine
 from ._dispatch import using as using

@@ -1,5 +1,4 @@
-"""Scenes too large for one field (Tancik 2022, Block-NeRF): divided into blocks, each trained as a run of its own, and
-rendered as one.
+"""Scenes too large for one field (Tancik 2022): blocks that train as runs and render as one.
 
 layout, crossings    positions of blocks, and the photographs of each;  drawing  the plan seen from above
 plan, planning       blocks.json and the task of each block, written before anything is trained

@@ -1,4 +1,4 @@
-"""One paper, one file or folder. A method is found by its name, which is also what the user types."""
+"""Methods: one paper, one file or folder, found by its name."""
 
 from __future__ import annotations
 

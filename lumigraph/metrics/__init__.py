@@ -1,4 +1,4 @@
-"""Measures: how near a rendering comes to a photograph, and scores, which are what any measure gives."""
+"""Metrics: PSNR, SSIM, LPIPS, IoU, chamfer distance; scores."""
 
 from .score import Score as Score
 from .score import named as named

@@ -1,4 +1,4 @@
-"""Camera paths: those that follow the photographs by themselves, and those that a person makes of keyframes."""
+"""Camera paths of films: automatic ones, and curves through keyframes."""
 
 from .automatic import PATHS as PATHS
 from .automatic import UP as UP

@@ -1,4 +1,4 @@
-"""Everything that opens: runs, the folders that training fills; splat files; compositions of several."""
+"""Runs and everything else that opens: folders of training, splat files, compositions."""
 
 from .checkpoint import State as State
 from .folder import Run as Run

@@ -1,4 +1,4 @@
-"""Procedural scenes: worlds made of formulas, photographed by our own ray tracer, with everything about them known.
+"""Procedural scenes with full ground truth, rendered by a ray tracer.
 
     stage = scenes.stage("still-life")                    a world and its cameras
     render(stage.world, stage.cameras["test"][0])         picture, exact depth, normals, masks, albedo

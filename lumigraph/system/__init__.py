@@ -1,1 +1,1 @@
-"""The process and its user: memory, threads, signals, child processes, the terminal, progress bars."""
+"""The process: memory, threads, signals, child processes, terminal, progress bars."""

@@ -1,4 +1,4 @@
-"""The viewer: a scene in the browser, while it is learnt and afterwards. It knows Method.render and no method."""
+"""The viewer: a scene in the browser, during training and afterwards."""
 
 from .address import Address as Address
 from .address import choose_address as choose_address
