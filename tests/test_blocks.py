@@ -345,7 +345,15 @@ def test_an_address_that_does_not_answer(run, address, told, tmp_path):
 
 def of_blocks() -> list[Path]:
     package = Path(worker.__file__).parent
-    return [*package.glob("*.py"), package.parent / "train.py", package.parent / "locks.py"]
+    return [*package.glob("*.py"), package.parent / "training/loop.py", package.parent / "files/locks.py"]
+
+
+@pytest.fixture(autouse=True)
+def handlers():
+    """Ray puts a handler of SIGTERM in place of ours and leaves it there."""
+    before = signal.getsignal(signal.SIGTERM)
+    yield
+    signal.signal(signal.SIGTERM, before)
 
 
 RUNS = "big", "undisturbed"

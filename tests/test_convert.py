@@ -239,7 +239,7 @@ def test_schedules_go_on_from_the_middle(made):
     first = made.metrics()[0]
     before = first["step"] - 1
     assert first["learning_rate"][0] == pytest.approx(
-        made.method().learning_rate(before, 0.5 + 0.5 * before / 72)["means"]
+        made.method().learning_rates(before, 0.5 + 0.5 * before / 72)["means"]
     )
 
 

@@ -16,12 +16,13 @@ from budgets import budget
 from listing import names
 from PIL import Image
 
-from lumigraph import files, methods
+from lumigraph import methods
 from lumigraph.capture.motion.folder import WRITTEN_FILES, claim_results, copy_photographs
 from lumigraph.capture.photos import Photo
 from lumigraph.capture.photos.track import untracked
 from lumigraph.commands.cli import COMMANDS, main
 from lumigraph.errors import LumigraphError
+from lumigraph.files import atomic as files
 from lumigraph.files import marks, partials
 from lumigraph.method import Method
 from lumigraph.methods.plenoctrees.baking import fill

@@ -60,7 +60,7 @@ ASKING = {  # what asks for too much, where a process may have a few gigabytes
 CHILD = """
 import resource
 resource.setrlimit(resource.RLIMIT_AS, (8 << 30, 8 << 30))
-from lumigraph import cli
+from lumigraph.commands import cli
 from lumigraph.commands.methods import Methods
 def ask(self):
     {ask}

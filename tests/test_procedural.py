@@ -25,7 +25,7 @@ from lumigraph.synthetic.shapes import (
     Cuboid,
     Cylinder,
     Plane,
-    Primitive,
+    SolidShape,
     Torus,
     Triangle,
     triangle_of,
@@ -76,7 +76,7 @@ def unfiltered(rays: Rays) -> Rays:
     return replace(rays, radius=rays.radius * 1e-3)
 
 
-def alone(shape: Primitive, pose: Pose = LEANING, material: Material = CHALK) -> World:
+def alone(shape: SolidShape, pose: Pose = LEANING, material: Material = CHALK) -> World:
     return World((Object(shape, material, pose),))
 
 

@@ -17,7 +17,7 @@ from lumigraph import methods
 from lumigraph.commands.cli import COMMANDS, main
 from lumigraph.errors import LumigraphError
 from lumigraph.files import write_json
-from lumigraph.files.ranges import Count, Share, between, check, domain, hints, numbers, outside, typed
+from lumigraph.files.ranges import Count, Share, between, changed, check, domain, hints, numbers, outside, typed
 from lumigraph.run import Run, build
 from lumigraph.training import fit
 
@@ -35,6 +35,22 @@ def dataclasses_of(kind: Any) -> set[type]:
             found.add(kind)
             fresh += hints(kind).values()
         fresh += typing.get_args(kind)
+    return found
+
+
+def nested(kind: Any, values: dict[str, Any]) -> dict[str, Any]:
+    """Values by name as config.json holds them: each in the dataclass that has it."""
+    inner = {name: held for name, held in hints(kind).items() if dataclasses.is_dataclass(held)}
+    below = {name: {x: v for x, v in values.items() if x in hints(held)} for name, held in inner.items()}
+    own = {name: value for name, value in values.items() if not any(name in held for held in below.values())}
+    return own | {name: held for name, held in below.items() if held}
+
+
+def flat_hints(kind: Any) -> dict[str, Any]:
+    """The annotations of a Config and of the dataclasses that it holds, by name."""
+    found = {}
+    for name, annotation in hints(kind).items():
+        found |= flat_hints(annotation) if dataclasses.is_dataclass(annotation) else {name: annotation}
     return found
 
 
@@ -63,9 +79,9 @@ def test_the_least_of_each_number_learns(name):
     kind = methods.find(name)
     frame = dataclasses.replace(tiny.scene().frame, reach=2.0)  # beyond an object, so that no hull is carved
     scene = dataclasses.replace(tiny.scene(), frame=frame)
-    for field, annotation in hints(kind.Config).items():
+    for field, annotation in flat_hints(kind.Config).items():
         for number, range in numbers(annotation):
-            config = dataclasses.replace(kind.smallest(), **{field: number(range.ge)})
+            config = changed(kind.smallest(), **{field: number(range.ge)})
             try:
                 method = build(kind, frame, config, torch.device("cpu"), 0)
             except LumigraphError as told:
@@ -106,8 +122,9 @@ def test_an_absurd_number_ends_in_a_sentence(method, field, value, range, ball_f
 @pytest.mark.parametrize(("method", "field", "value", "range"), ABSURD)
 def test_an_absurd_number_in_a_run_ends_in_a_sentence(method, field, value, range, tmp_path):
     run = tiny.new_run(tmp_path / "run")
-    changed = {"method": method, "config": {field: value}}
-    (run.folder / "config.json").write_text(json.dumps(run.settings.to_json() | changed))
+    config = nested(methods.find(method).Config, {field: value})
+    settings = run.settings.to_json() | {"method": method, "config": config}
+    (run.folder / "config.json").write_text(json.dumps(settings))
     with pytest.raises(LumigraphError) as refused:
         Run(run.folder).new_method()
     told = str(refused.value)
@@ -121,8 +138,9 @@ def test_an_absurd_number_in_a_run_ends_in_a_sentence(method, field, value, rang
 @pytest.mark.parametrize("value", ["16", 16.0, True, None, [16], {"n": 16}, 10**400])
 def test_what_is_no_number_is_refused(value, tmp_path):
     run = tiny.new_run(tmp_path / "run")
-    settings = dataclasses.replace(run.settings, method="nerf", config={"depth": value})
-    with pytest.raises(LumigraphError, match=r"config\.json does not hold what it should: depth is "):
+    config = nested(methods.find("nerf").Config, {"depth": value})
+    settings = dataclasses.replace(run.settings, method="nerf", config=config)
+    with pytest.raises(LumigraphError, match=r"config\.json does not hold what it should: \w+\.depth is "):
         settings.method_config(methods.find("nerf"), run.folder / "config.json")
 
 
@@ -176,7 +194,7 @@ def test_numbers_that_disagree_are_told(words, ball_folder, tmp_path, capsys):
     assert flags[0] in told and told.count("\n") == 1 and list(tmp_path.iterdir()) == []
     values = {flag[2:].replace("-", "_"): int(value) for flag, value in zip(flags[::2], flags[1::2], strict=True)}
     with pytest.raises(LumigraphError, match=flags[0]):
-        typed(methods.find(method).Config, values, "config.json")
+        typed(methods.find(method).Config, nested(methods.find(method).Config, values), "config.json")
 
 
 def test_help_shows_ranges(capsys):

@@ -3,6 +3,7 @@
 from .atomic import Kind as Kind
 from .atomic import claim as claim
 from .atomic import claim_folder as claim_folder
+from .atomic import exchange as exchange
 from .atomic import exists as exists
 from .atomic import expanded as expanded
 from .atomic import explained as explained
