@@ -16,7 +16,7 @@ from lumigraph import methods
 from lumigraph.camera import ring
 from lumigraph.camera.rays import Look, Samples
 from lumigraph.commands.cli import main
-from lumigraph.components.fields.taken_over import OfDepthMaps, OfField, logit, taken_over
+from lumigraph.components.fields.teacher import DepthTeacher, FieldTeacher, logit, teacher_of
 from lumigraph.components.sampling.spaces import space_of
 from lumigraph.datasets.scene import Frame
 from lumigraph.derive.conversion import ConversionTarget, convert, ways
@@ -87,8 +87,8 @@ def ball() -> Ball:
 
 
 @pytest.fixture(scope="module")
-def known(ball) -> OfField:
-    return taken_over(ball, tiny.scene().cameras)
+def known(ball) -> FieldTeacher:
+    return teacher_of(ball, tiny.scene().cameras)
 
 
 def student_of(name: str):
@@ -115,7 +115,7 @@ def test_a_method_begins_as_what_another_holds(name, ball):
 def test_nothing_is_taken_where_cameras_see_past(ball, generator):
     full = Ball(ball.frame, rubbish=50.0).eval()
     points = 2 * torch.rand(4000, 3, generator=generator) - 1
-    away, density = points.norm(dim=-1), taken_over(full, tiny.scene().cameras).density(points)
+    away, density = points.norm(dim=-1), teacher_of(full, tiny.scene().cameras).density(points)
     assert (full.density(points) > 0).all() and (density[away < RADIUS - 0.05] == DENSITY).all()
     assert (density[away > RADIUS + 0.25] == 0).float().mean() > 0.99
 
@@ -130,7 +130,7 @@ def test_surfaces_are_where_cameras_see_them(known):
 
 
 def test_pictures_with_depth_become_a_shell(ball, known, generator):
-    shell = OfDepthMaps(known.depth_maps)
+    shell = DepthTeacher(known.depth_maps)
     ways = unit(torch.randn(500, 3, generator=generator))
     ways = ways[(ways[:, 2].abs() < 0.6)]  # where the ring of cameras looks squarely
     thickness = sum(shell.density(r * ways) * 0.01 for r in torch.linspace(1.2, 0.4, 81).tolist())
@@ -149,7 +149,7 @@ def test_harmonics_are_found_again(known, generator):
     wanted = 0.3 * torch.randn(9, 3, generator=generator)
     points = 0.1 * torch.randn(50, 3, generator=generator)
     depth_maps = [replace(seen, depth=torch.full_like(seen.depth, torch.inf)) for seen in known.depth_maps]
-    found = OfField(depth_maps, Painted(wanted)).harmonics(points, 3, logit)
+    found = FieldTeacher(depth_maps, Painted(wanted)).harmonics(points, 3, logit)
     directions = unit(points - known.depth_maps[3].camera.position)
     seen = (spherical_harmonics(directions, 3)[:, None] @ found)[:, 0]
     torch.testing.assert_close(seen, spherical_harmonics(directions, 3) @ wanted, atol=0.05, rtol=0)

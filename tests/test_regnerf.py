@@ -11,7 +11,7 @@ import tiny
 import torch
 from budgets import budget
 
-from lumigraph.components.training.fog import thickness_before
+from lumigraph.components.training.regularizers import near_thickness
 from lumigraph.components.training.unseen_views import patches, roughness, unseen_cameras
 from lumigraph.files.ranges import changed
 from lumigraph.geometry import nearest_to_lines, unit
@@ -237,7 +237,7 @@ def test_thickness_before_cameras():
     """Samples up to a distance count, the one that it cuts by its share."""
     samples = Samples.rows(torch.tensor([[0.0, 1.0, 3.0], [2.0, 3.0, 4.0]]), torch.tensor([4.0, 5.0]))
     density = torch.tensor([2.0, 3.0, 5.0, 1.0, 1.0, 1.0])
-    assert thickness_before(samples, density, torch.tensor([2.0, 1.0])).tolist() == [2.0 * 1 + 3.0 * 1, 0.0]
+    assert near_thickness(samples, density, torch.tensor([2.0, 1.0])).tolist() == [2.0 * 1 + 3.0 * 1, 0.0]
 
 
 def test_what_stands_before_cameras_costs():

@@ -8,10 +8,10 @@ import torch
 from numba import njit
 
 from lumigraph.camera.rays import Rays, Samples
-from lumigraph.components.sampling.proposal import Proposal, edges_of, overlooked
+from lumigraph.components.sampling.proposal import Proposal, edges_of, proposal_loss
 from lumigraph.components.sampling.proposal_sampler import MIN_WEIGHT, ProposalNumbers, ProposalSampler
 from lumigraph.components.sampling.spaces import NDC, Contraction
-from lumigraph.components.training.fog import elsewhere, scaled_by_distance, spread
+from lumigraph.components.training.regularizers import depth_loss, distortion_loss, scale_gradients
 from lumigraph.datasets.scene import Forward
 from lumigraph.kernels.sample_proposals.cpu import cube_root, exponential
 from lumigraph.method import Field
@@ -71,7 +71,7 @@ def test_the_grid_learns_what_it_overlooked(proposal):
     for _ in range(60):
         found = proposal.sample(rays(), torch.rand(5, 2, generator=generator))
         there = (found.samples.t_start <= 2.5) & (found.samples.t_end > 2.5)
-        loss = overlooked(found, there.float())
+        loss = proposal_loss(found, there.float())
         adam.zero_grad()
         loss.backward()
         adam.step()
@@ -84,8 +84,8 @@ def test_nothing_is_overlooked_within_a_bound():
     proposal = Proposal(SPACES["contracted"], 16, 32, 8)
     found = proposal.sample(rays())
     whole = found.weights.sum(-1, keepdim=True).expand(5, 8).flatten()
-    assert float(overlooked(found, 0 * whole)) == 0
-    assert float(overlooked(found, 2 * whole)) > 0
+    assert float(proposal_loss(found, 0 * whole)) == 0
+    assert float(proposal_loss(found, 2 * whole)) > 0
 
 
 def test_weight_in_one_place_is_not_spread():
@@ -93,21 +93,21 @@ def test_weight_in_one_place_is_not_spread():
     one, two = torch.zeros(2, 8), torch.zeros(2, 8)
     one[:, 3] = 1
     two[:, 0] = two[:, 7] = 0.5
-    assert spread(samples, one.flatten()) < 0.3 * spread(samples, two.flatten())
+    assert distortion_loss(samples, one.flatten()) < 0.3 * distortion_loss(samples, two.flatten())
 
 
 def test_rays_should_end_where_something_is_known_to_be():
     samples = Samples.rows(torch.linspace(1, 3, 9)[:-1].expand(3, 8), torch.full((3,), 3.0))
     weights = torch.zeros(3, 8)
     weights[0, 3], weights[1, 7] = 1, 1  # at 1.75 to 2, behind that, and nowhere
-    found = elsewhere(samples, weights.flatten(), torch.full((3,), 1.8), 1e-3)
+    found = depth_loss(samples, weights.flatten(), torch.full((3,), 1.8), 1e-3)
     torch.testing.assert_close(found, torch.tensor(2 / 3))
 
 
 def test_what_is_near_is_learnt_slowly():
     samples = Samples(torch.tensor([0.0, 1.0, 4.0]), torch.tensor([1.0, 1.5, 5.0]), torch.tensor([0, 3]))
     density, rgb = torch.ones(3, requires_grad=True), torch.ones(3, 3, requires_grad=True)
-    sum(x.sum() for x in scaled_by_distance(samples.t, density, rgb)).backward()
+    sum(x.sum() for x in scale_gradients(samples.t, density, rgb)).backward()
     torch.testing.assert_close(density.grad, torch.tensor([0.25, 1.0, 1.0]))
     torch.testing.assert_close(rgb.grad, torch.tensor([0.25, 1.0, 1.0])[:, None].expand(3, 3))
 

@@ -126,7 +126,7 @@ def carve(
     cell = (high - low) / grid
     axes = [torch.from_numpy(low[k] + cell[k] * (np.arange(grid) + 0.5)).float() for k in range(3)]
     points = torch.stack(torch.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
-    radius = 0.5 * float(np.linalg.norm(cell))  # so that no part of a cell is overlooked
+    radius = 0.5 * float(np.linalg.norm(cell))  # so that no part of a cell is proposal_loss
     seen, missed = torch.zeros(len(points)), torch.zeros(len(points))
     for outline in outlines:
         places, inside_picture = outline.camera.locate(points)

@@ -109,7 +109,7 @@ class Sampler(Part):
         return {}
 
     def begin_from(self, teacher: Any, chance: torch.Generator) -> None:
-        """Initialise from what a teacher holds (`components.fields.taken_over`), in place of `begin`."""
+        """Initialise from what a teacher holds (`components.fields.teacher`), in place of `begin`."""
 
     def settle(self, density: Density, chance: torch.Generator) -> None:
         """Follow a field that was taught by a teacher. density: per scene unit"""

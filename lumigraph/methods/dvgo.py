@@ -14,7 +14,7 @@ from .. import kernels
 from ..camera import Camera
 from ..camera.rays import Look
 from ..components.fields.mlp import MLP
-from ..components.fields.taken_over import cells_of, logit, taken_over
+from ..components.fields.teacher import cells_of, logit, teacher_of
 from ..components.fields.voxels import VoxelGrid, corners, tight_box
 from ..components.sampling.importance import importance
 from ..components.sampling.occupancy_sampler import GridSchedule, OccupancyNumbers, OccupancySampler
@@ -342,7 +342,7 @@ class DVGO(FieldMethod):
     def from_field(self, teacher: Any, cameras: Camera) -> None:
         """Density and colour of the teacher at the fine grid's corners, where it holds something; its first three
         features are colour, and the network adds nothing at first."""
-        known, c, chance, network = taken_over(teacher, cameras), self.config, self.random(3), self.network
+        known, c, chance, network = teacher_of(teacher, cameras), self.config, self.random(3), self.network
         space, n = network.space, c.occupancy
         occupied = known.occupied(space, n.occupancy_resolution, n.occupancy_threshold, chance)
         network.stage.fill_(1 + c.doublings)

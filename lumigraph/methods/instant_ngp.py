@@ -11,7 +11,7 @@ from torch import Tensor
 
 from ..camera import Camera
 from ..components.fields.hash_field import CPU_TABLE, TINY_TABLE, HashField, HashNumbers
-from ..components.fields.taken_over import taken_over
+from ..components.fields.teacher import teacher_of
 from ..components.sampling.importance import importance
 from ..components.sampling.occupancy_sampler import (
     CPU_OCCUPANCY,
@@ -124,7 +124,7 @@ class InstantNGP(FieldMethod):
 
     def from_field(self, teacher: Any, cameras: Camera) -> None:
         """Table and networks, taught at points by the teacher."""
-        known, c, chance = taken_over(teacher, cameras), self.config, self.random(3)
+        known, c, chance = teacher_of(teacher, cameras), self.config, self.random(3)
         optimizers = self.network.optimizers_at(c.learning_rate)
         points = c.occupancy.samples_per_step
         distil(self.field, known, self.network.space, optimizers, points, chance, self.device)

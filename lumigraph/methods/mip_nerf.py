@@ -10,7 +10,7 @@ import torch
 from ..camera import Camera
 from ..components.fields.coordinate_field import NetworkNumbers
 from ..components.fields.frustum_field import FrustumField
-from ..components.fields.taken_over import taken_over
+from ..components.fields.teacher import teacher_of
 from ..components.sampling.cone_sampler import ConeSampler
 from ..components.sampling.hierarchical_sampler import RayNumbers
 from ..components.sampling.occupancy_mask import MaskNumbers
@@ -95,7 +95,7 @@ class MipNeRF(FieldMethod):
 
     def from_field(self, teacher: Any, cameras: Camera) -> None:
         """The network, taught at points by the teacher."""
-        known, c, chance = taken_over(teacher, cameras), self.config, self.random(3)
+        known, c, chance = teacher_of(teacher, cameras), self.config, self.random(3)
         if self.bands:
             self.bands.joined.fill_(1.0)  # the teacher's field has its details
         self.sampler.begin_from(known, chance)

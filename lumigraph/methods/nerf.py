@@ -10,7 +10,7 @@ from torch.nn.functional import softplus
 
 from ..camera import Camera
 from ..components.fields.coordinate_field import CoordinateField, NetworkNumbers
-from ..components.fields.taken_over import taken_over
+from ..components.fields.teacher import teacher_of
 from ..components.sampling.hierarchical_sampler import HierarchicalSampler, RayNumbers
 from ..components.sampling.occupancy_mask import MaskNumbers
 from ..components.sampling.spaces import space_of
@@ -110,7 +110,7 @@ class NeRF(FieldMethod):
 
     def from_field(self, teacher: Any, cameras: Camera) -> None:
         """Both networks alike, taught at points by the teacher."""
-        known, c, chance, network = taken_over(teacher, cameras), self.config, self.random(3), self.network
+        known, c, chance, network = teacher_of(teacher, cameras), self.config, self.random(3), self.network
         self.sampler.begin_from(known, chance)
         optimizer = torch.optim.Adam(network.network.parameters(), c.learning_rate, eps=1e-7)
         usual, network.activation = network.activation, softplus  # negative outputs must learn as well

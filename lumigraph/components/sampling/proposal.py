@@ -127,7 +127,7 @@ def edges_of(count: int, jitter: Float[Tensor, " ray"]) -> Float[Tensor, "ray ed
     return nn.functional.pad(nn.functional.pad(inner / count, (1, 0)), (0, 1), value=1.0)
 
 
-def overlooked(proposed: Proposed, weights: Float[Tensor, " sample"]) -> Float[Tensor, ""]:
+def proposal_loss(proposed: Proposed, weights: Float[Tensor, " sample"]) -> Float[Tensor, ""]:
     """By how much a field's weights exceed what the grid finds in all its intervals that they overlap, mean of all rays
     (Barron 2022, eqs. 12 and 13). Gradients reach the grid alone.
     """

@@ -24,11 +24,11 @@ from ...method import Field, Pass, Sampler
 from ...method.sampler import Density, codes_at
 from ...volume import weights_of
 from ..clouds.dense_points import Points, compile_sweep, seen_points
-from ..training.fog import elsewhere, scaled_by_distance, spread
 from ..training.lazy_adam import LazyAdam
+from ..training.regularizers import depth_loss, distortion_loss, scale_gradients
 from ..training.schedules import falling
 from .occupancy_sampler import rows_of
-from .proposal import Proposal, overlooked
+from .proposal import Proposal, proposal_loss
 from .spaces import Space
 
 CELLS = 96  # of the proposal grid, along each axis
@@ -110,7 +110,7 @@ class ProposalSampler(Sampler):
             density, features = field.geometry(points, own)
         scale = None
         if generator is not None:
-            (density,) = scaled_by_distance(samples.t, density)
+            (density,) = scale_gradients(samples.t, density)
             scale = partial(_scaled, samples.t)
         count = len(samples)
         found = Pass("samples", samples, density, features, directions, None, rgb, count, scale, proposals)
@@ -132,9 +132,9 @@ class ProposalSampler(Sampler):
     def terms(self, density: Density, last: Pass, generator: torch.Generator) -> dict[str, Tensor]:
         """The proposal loss, the distortion loss, and the depth loss of some more rays whose depth is known."""
         weights = weights_of(last.samples, last.density)
-        terms = {"proposal": overlooked(last.proposals, weights)}
+        terms = {"proposal": proposal_loss(last.proposals, weights)}
         if self.numbers.distortion_weight:
-            terms["distortion"] = self.numbers.distortion_weight * spread(last.samples, weights)
+            terms["distortion"] = self.numbers.distortion_weight * distortion_loss(last.samples, weights)
         weight = self.numbers.depth_weight * (1 - self.progress / DEPTH_UNTIL)
         if weight > 0 and len(self.surface):
             error, missed = self._depth_error(density, generator)
@@ -150,9 +150,9 @@ class ProposalSampler(Sampler):
         rays = Rays(origins, ways / distance[:, None], torch.zeros_like(distance))
         proposals = self.proposal.sample(rays, torch.rand(DEPTH_RAYS, 2, generator=generator).to(distance))
         samples = proposals.samples
-        (density,) = scaled_by_distance(samples.t, density_at(samples.along(rays)[0]))
+        (density,) = scale_gradients(samples.t, density_at(samples.along(rays)[0]))
         weights = weights_of(samples, density)
-        return elsewhere(samples, weights, distance, DEPTH_MARGIN), overlooked(proposals, weights)
+        return depth_loss(samples, weights, distance, DEPTH_MARGIN), proposal_loss(proposals, weights)
 
     # Training
 
@@ -196,7 +196,7 @@ class ProposalSampler(Sampler):
 
 
 def _scaled(t: Float[Tensor, " sample"], values: Float[Tensor, "sample _"]) -> Float[Tensor, "sample _"]:
-    return scaled_by_distance(t, values)[0]
+    return scale_gradients(t, values)[0]
 
 
 def some(points: Points, generator: torch.Generator) -> Points:

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from ...geometry import unit
 from ...system.progress import track
-from ..fields.taken_over import TakenOver
+from ..fields.teacher import Teacher
 from ..sampling.spaces import Space
 from .schedules import held
 
@@ -32,7 +32,7 @@ Field = Callable[
 
 def distil(
     field: Field,
-    held_by: TakenOver,
+    held_by: Teacher,
     space: Space,
     optimizers: Sequence[torch.optim.Optimizer],
     points: int,
@@ -77,7 +77,7 @@ def distil(
 
 @torch.no_grad()
 def glances(
-    held_by: TakenOver, places: Float[Tensor, "point 3"], chance: torch.Generator
+    held_by: Teacher, places: Float[Tensor, "point 3"], chance: torch.Generator
 ) -> tuple[Float[Tensor, "point 3"], Float[Tensor, "point 3"], Float[Tensor, " point"]]:
     """For each place the direction from a random camera, the colour from there, and whether (0 or 1) it is seen."""
     directions, rgb, seen = torch.zeros_like(places), torch.full_like(places, 0.5), torch.zeros(len(places))

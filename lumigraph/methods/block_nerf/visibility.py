@@ -12,13 +12,13 @@ from ...components.fields.encodings import FrequencyEncoding
 from ...components.fields.hash_field import side_by_side
 from ...components.fields.mlp import MLP
 from ...components.sampling.spaces import Space
-from ...components.training.fog import evened
+from ...components.training.regularizers import normalized_distance
 from ...components.training.schedules import falling
 from ...method import Part
 
 BANDS = 3  # of spherical harmonics: from which side, and no more than that
 LEARNING_RATES = 5e-3, 5e-4  # at first and in the end
-HORIZON = 0.99  # of evened distances, where rays that do not end are asked about last
+HORIZON = 0.99  # of normalized_distance distances, where rays that do not end are asked about last
 
 
 class Visibility(Part):
@@ -47,7 +47,7 @@ class Visibility(Part):
     ) -> Float[Tensor, ""]:
         """The mean squared error at one random place of each ray, near ones and far ones alike."""
         with torch.no_grad():
-            first, last = (evened(t).clamp(max=HORIZON) for t in self.space.interval(rays))
+            first, last = (normalized_distance(t).clamp(max=HORIZON) for t in self.space.interval(rays))
             s = torch.lerp(first, last, torch.rand(len(rays), generator=generator).to(first))
             t = s / (1 - s)
             light = transmittance(samples, density, t)

@@ -15,7 +15,7 @@ from ...camera import Camera
 from ...camera.rays import Rendering
 from ...color.blending import over
 from ...components.clouds.dense_points import compile_sweep
-from ...components.fields.taken_over import taken_over
+from ...components.fields.teacher import teacher_of
 from ...components.training.pose_refinement import PoseNumbers, poses_for
 from ...datasets.scene import Frame, Photograph, Scene
 from ...files.ranges import CloudSize, PositiveShare, Seed, Share, Steps, between
@@ -163,7 +163,7 @@ class GaussianSplatting(Method):
         found = cloud_of(teacher, cap, degree)
         if found is None:
             count = max(2, math.ceil(MAX_TEACHER_SHARE * cap))
-            found = surface_cloud(taken_over(teacher, cameras), count, degree, self.random(3))
+            found = surface_cloud(teacher_of(teacher, cameras), count, degree, self.random(3))
         self.begin_with(found, cameras)
 
     def begin_with(self, gaussians: Gaussians, cameras: Camera) -> None:

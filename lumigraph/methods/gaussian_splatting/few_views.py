@@ -14,7 +14,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ...camera import Camera
-from ...components.training.fog import evened
+from ...components.training.regularizers import normalized_distance
 from ...components.training.unseen_views import roughness, unseen_cameras
 from ...files.ranges import NonNegative
 from ...gaussians import Gaussians
@@ -69,5 +69,5 @@ def depth_roughness(cloud: Gaussians, cameras: Camera, near: float, generator: t
     camera = unseen_cameras(cameras, 1, generator)
     camera = camera.resized(min(UNOBSERVED_PIXELS / float(camera.size.min()), 1.0))
     seen = splat(cloud, view_of(camera, near), bands=1)
-    place = evened(seen.depth / seen.opacity.clamp_min(1e-3))
+    place = normalized_distance(seen.depth / seen.opacity.clamp_min(1e-3))
     return roughness(place[None], seen.opacity[None])

@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from ...components.fields.taken_over import TakenOver
+from ...components.fields.teacher import Teacher
 from ...errors import LumigraphError
 from ...gaussians import Gaussians
 from ...method.capabilities import HasGaussians, can
@@ -18,7 +18,7 @@ DISC_WIDTH = 0.6  # deviation, in distances to the nearest neighbours
 DISC_THICKNESS = 0.2  # of the width
 
 
-def surface_cloud(teacher: TakenOver, max_count: int, degree: int, generator: torch.Generator) -> Gaussians:
+def surface_cloud(teacher: Teacher, max_count: int, degree: int, generator: torch.Generator) -> Gaussians:
     """Discs on the surfaces that cameras see, across their normals, which reach one another, in the colours that
     cameras see. Raises LumigraphError where there is no surface."""
     seen = teacher.surface

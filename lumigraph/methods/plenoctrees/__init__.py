@@ -13,7 +13,7 @@ from torch import Tensor
 from ...camera import Camera
 from ...camera.rays import Rays, Rendering
 from ...components.fields.hash_field import CPU_LEVELS, TINY_LEVELS, TableNumbers
-from ...components.fields.taken_over import logit, taken_over
+from ...components.fields.teacher import logit, teacher_of
 from ...components.sampling.occupancy_sampler import NGP_SCHEDULE, OccupancyNumbers, OccupancySampler, StepNumbers
 from ...components.sampling.spaces import Box
 from ...components.training.lazy_rmsprop import LazyRMSprop
@@ -248,7 +248,7 @@ class PlenOctrees(FieldMethod):
 
     def from_field(self, teacher: Any, cameras: Camera) -> None:
         """Bake a teacher's density and colour as far as cameras see them; what is learnt from then on are leaves."""
-        known, chance, numbers = taken_over(teacher, cameras), self.random(-1), self._baking
+        known, chance, numbers = teacher_of(teacher, cameras), self.random(-1), self._baking
         mask = met(teacher, cameras, numbers, chance) if can(teacher, HasLooks) else None
         density = density_of(teacher) if can(teacher, HasField) else known.density
         bake(self.leaves, density, mask, cameras, numbers, chance)

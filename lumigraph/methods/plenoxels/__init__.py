@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from ...camera import Camera
-from ...components.fields.taken_over import logit, taken_over
+from ...components.fields.teacher import logit, teacher_of
 from ...components.sampling.importance import importance
 from ...components.sampling.occupancy_sampler import GridSchedule, OccupancyNumbers, OccupancySampler
 from ...components.sampling.proposal_sampler import ProposalNumbers
@@ -262,7 +262,7 @@ class Plenoxels(FieldMethod):
     @torch.no_grad()
     def from_field(self, teacher: Any, cameras: Camera) -> None:
         """Density and harmonics of the teacher at the finest grid's nodes, where it holds something."""
-        known, c, chance, space = taken_over(teacher, cameras), self.config, self.random(3), self.network.space
+        known, c, chance, space = teacher_of(teacher, cameras), self.config, self.random(3), self.network.space
         n = c.occupancy
         occupied = known.occupied(space, n.occupancy_resolution, n.occupancy_threshold, chance)
         cells = cells_of(space, c.resolutions(space.is_open)[1])

@@ -30,8 +30,8 @@ from ...components.sampling.occupancy_sampler import (
 from ...components.sampling.proposal_sampler import ProposalNumbers
 from ...components.sampling.samplers import sampler_for
 from ...components.sampling.spaces import space_of
-from ...components.training.fog import evened
 from ...components.training.pose_refinement import PoseNumbers, poses_for
+from ...components.training.regularizers import normalized_distance
 from ...components.training.schedules import held
 from ...datasets.scene import Batch, Frame, Scene
 from ...errors import LumigraphWarning
@@ -220,7 +220,7 @@ class RawNeRF(FieldMethod):
         measured, known = self.measured(batch)
         (samples,), terms = self.learn(batch.rays, self.random(step))
         look = samples.look(self.network)
-        s = evened(look.samples.t)
+        s = normalized_distance(look.samples.t)
         seen = composite(look.samples, look.density, look.rgb, moments=torch.stack([s, s * s], -1))
         shown = seen.rgb * self.scale(batch.rays) + (1 - seen.opacity)[:, None] * decoded(self.background)
         shown = torch.where(measured >= 1, shown.clamp(max=1), shown)  # a full sensor says: at least so much

@@ -25,9 +25,9 @@ from ...components.sampling.proposal_sampler import ProposalNumbers
 from ...components.sampling.samplers import sampler_for
 from ...components.sampling.spaces import space_of
 from ...components.training.coarse_to_fine import BandSchedule, joining_of
-from ...components.training.fog import evened, thickness_before
 from ...components.training.photometric import backdrop, huber, residuals
 from ...components.training.pose_refinement import PoseNumbers, poses_for
+from ...components.training.regularizers import near_thickness, normalized_distance
 from ...components.training.schedules import falling, held
 from ...components.training.unseen_views import patches, roughness, unseen_cameras
 from ...datasets.scene import Batch, Frame, Scene
@@ -229,7 +229,7 @@ class RegNeRF(FieldMethod):
             if not (weight := self.pass_weights.get(each.name, 1.0)):
                 continue
             look = each.look(self.network)
-            places = evened(look.samples.t)[:, None]
+            places = normalized_distance(look.samples.t)[:, None]
             whole = composite(look.samples, look.density, look.rgb, behind, places=places)
             seen, rest = (part(whole, x) for x in (slice(len(batch)), slice(len(batch), None)))
             residual, self.figures["mse"] = residuals(seen, batch, background)
@@ -262,7 +262,7 @@ class RegNeRF(FieldMethod):
         space = self.network.space
         share = torch.full((len(rays), 1), self.config.occlusion_range, device=rays.origins.device)
         until = space.distance(share, rays, *space.interval(rays))[:, 0]
-        return thickness_before(look.samples, look.density, until).mean()
+        return near_thickness(look.samples, look.density, until).mean()
 
     def optimizers(self) -> list[torch.optim.Optimizer]:
         c = self.config

@@ -16,7 +16,7 @@ from ...camera import Camera
 from ...camera.rays import Look, Rays, Rendering
 from ...color.blending import over
 from ...components.fields.hash_field import CPU_LEVELS, TINY_LEVELS, TableNumbers
-from ...components.fields.taken_over import taken_over
+from ...components.fields.teacher import teacher_of
 from ...components.sampling.occupancy_sampler import (
     CPU_OCCUPANCY,
     CPU_STEPS,
@@ -488,7 +488,7 @@ class SNeRG(FieldMethod):
 
         Raises LumigraphError where cameras see nothing solid.
         """
-        known, grid = taken_over(teacher, cameras), self.visibility
+        known, grid = teacher_of(teacher, cameras), self.visibility
         points, origins = (x.to(self.device) for x in (known.surface.points, known.surface.origins))
         seen = self.voxel_space.warp(points)
         grid.record(seen, seen.new_ones(len(seen)))

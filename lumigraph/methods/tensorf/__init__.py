@@ -13,7 +13,7 @@ from torch import Tensor, nn
 
 from ...camera import Camera
 from ...components.fields.mlp import MLP
-from ...components.fields.taken_over import taken_over
+from ...components.fields.teacher import teacher_of
 from ...components.sampling.importance import importance
 from ...components.sampling.occupancy_sampler import GridSchedule, OccupancyNumbers, OccupancySampler, Stage
 from ...components.sampling.proposal_sampler import ProposalNumbers
@@ -310,7 +310,7 @@ class TensoRF(FieldMethod):
 
     def from_field(self, teacher: Any, cameras: Camera) -> None:
         """The finest grid, in a box around what the teacher holds, taught by it at points."""
-        known, c, chance, network = taken_over(teacher, cameras), self.config, self.random(3), self.network
+        known, c, chance, network = teacher_of(teacher, cameras), self.config, self.random(3), self.network
         self.sampler.begin_from(known, chance)
         self._shrink()
         self._resample(c.finest(self.sampler.is_open), network.box, fresh=self.random(0))

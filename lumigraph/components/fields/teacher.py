@@ -37,14 +37,14 @@ SPREAD = 0.01  # of its distance, by which places near a surface are scattered
 EDGE = 2e-3  # coordinates by which a place may miss its own and still be one
 
 
-def taken_over(teacher: Any, cameras: Camera) -> TakenOver:
+def teacher_of(teacher: Any, cameras: Camera) -> Teacher:
     """A teacher, looked at by cameras around it, ready to be taken over. Raises LumigraphError where they see nothing
     solid."""
     depth_maps = render_depth_maps(teacher.render, cameras, teacher.frame.background, VIEWS, SIZE)
-    return OfField(depth_maps, teacher) if can(teacher, HasField) else OfDepthMaps(depth_maps)
+    return FieldTeacher(depth_maps, teacher) if can(teacher, HasField) else DepthTeacher(depth_maps)
 
 
-class TakenOver(ABC):
+class Teacher(ABC):
     """Density and colour of a teacher at points of the scene, on the CPU.
 
     depth_maps: of cameras around it
@@ -156,7 +156,7 @@ class TakenOver(ABC):
         return torch.cat([known.origins[chosen] + shares[:, None] * ways, space.unwarp(anywhere)])
 
 
-class OfField(TakenOver):
+class FieldTeacher(Teacher):
     """Of a teacher with a field."""
 
     def __init__(self, depth_maps: Sequence[DepthMap], teacher: Any):
@@ -177,7 +177,7 @@ class OfField(TakenOver):
         return torch.cat(found) if found else points
 
 
-class OfDepthMaps(TakenOver):
+class DepthTeacher(Teacher):
     """Of depth maps: a shell around the surfaces that they show, solid from half its thickness on.
 
     It has a `field` itself, so it can stand for its teacher wherever one is needed that has.

@@ -10,18 +10,18 @@ from ...camera.rays import Samples
 from ...kernels import distortion
 
 
-def evened(t: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
+def normalized_distance(t: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
     """Distances t as t / (1 + t): what is near counts for more than what is far, and the horizon is at 1."""
     return t / (1 + t)
 
 
-def spread(samples: Samples, weights: Float[Tensor, " sample"]) -> Float[Tensor, ""]:
+def distortion_loss(samples: Samples, weights: Float[Tensor, " sample"]) -> Float[Tensor, ""]:
     """How far apart along its ray the weight of what a ray sees lies, mean of all rays (Barron 2022, eq. 15)."""
-    start, end = evened(samples.t_start), evened(samples.t_end)
+    start, end = normalized_distance(samples.t_start), normalized_distance(samples.t_end)
     return distortion(weights, 0.5 * (start + end), end - start, samples.ray_starts).mean()
 
 
-def elsewhere(
+def depth_loss(
     samples: Samples,
     weights: Float[Tensor, " sample"],
     distance: Float[Tensor, " ray"],
@@ -31,14 +31,15 @@ def elsewhere(
     early or too late, or not at all (as Deng 2022 supervises depth; linear, for what is known may be wrong).
 
     distance: along each ray to what is known to be there
-    margin:   how far off counts as there, in evened distances, beside half a sample's own length
+    margin:   how far off counts as there, in normalized_distance distances, beside half a sample's own length
     """
-    start, end, known = evened(samples.t_start), evened(samples.t_end), evened(distance)[samples.ray_index]
+    start, end = normalized_distance(samples.t_start), normalized_distance(samples.t_end)
+    known = normalized_distance(distance)[samples.ray_index]
     there = (start - margin < known) & (known < end + margin)
     return 1 - (weights * there).sum() / len(distance)
 
 
-def thickness_before(
+def near_thickness(
     samples: Samples, density: Float[Tensor, " sample"], until: Float[Tensor, " ray"]
 ) -> Float[Tensor, " ray"]:
     """Optical thickness of what lies on each ray before a distance. Yang 2023, eq. 5, has the mean density of a ray's
@@ -60,7 +61,7 @@ class _Scaled(torch.autograd.Function):
         return None, *(g * scale.view(-1, *[1] * (g.ndim - 1)) for g in grads)
 
 
-def scaled_by_distance(t: Float[Tensor, " sample"], *values: Float[Tensor, sample * _]) -> tuple[Tensor, ...]:
+def scale_gradients(t: Float[Tensor, " sample"], *values: Float[Tensor, sample * _]) -> tuple[Tensor, ...]:
     """The same values of samples at distances t, whose gradients count min(1, t^2) (Philip 2023, eq. 7).
 
     As many rays pass a place near a camera as the inverse square of its distance says, and all of one photograph:
