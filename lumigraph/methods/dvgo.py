@@ -41,32 +41,32 @@ class Config:
 
     occupancy: OccupancyNumbers = OccupancyNumbers(samples_per_step=1 << 20)  # 8192 rays, section 6.1
     proposals: ProposalNumbers = ProposalNumbers()
-    coarse_voxels: Voxels = 100**3  # of the coarse stage, section 6.1
-    voxels: Voxels = 160**3  # of the fine stage in the end, section 6.1
-    feature_channels: Annotated[int, between(3, 64)] = 12  # section 6.1; the first three are colour by themselves
-    hidden_width: Width = 128  # section 6.1
-    hidden_layers: Layers = 2  # section 6.1
-    sh_bands: Annotated[int, between(1, 4)] = 4  # of spherical harmonics of the direction
-    coarse_alpha: PositiveShare = 1e-6  # alpha_init of the coarse stage, section 4.1
-    fine_alpha: PositiveShare = 1e-2  # alpha_init of the fine stage
-    open_alpha: PositiveShare = 1e-4  # of both stages where there is no bound, the code's: long rays would see fog
-    coarse_share: Share = 0.2  # of the budget: 5 of 25 thousand steps
-    doublings: Annotated[int, between(0, 12)] = 4  # of the number of voxels in the fine stage, section 5.2
-    growing_share: Share = 0.2  # of the fine stage, in which that happens: 4 of 20 thousand steps
-    box_alpha: PositiveShare = 1e-3  # of a voxel, above which it is inside the tight box
-    step_size: PositiveShare = 0.5  # of a voxel's edge, section 6.1
-    weight_threshold: Share = 1e-4  # of a sample, below which it is asked for no colour in the fine stage
+    coarse_voxels: Voxels = 100**3  # voxels of the coarse stage, section 6.1; more cost memory and time
+    voxels: Voxels = 160**3  # voxels of the fine stage at its end, section 6.1; more give detail, cost memory
+    feature_channels: Annotated[int, between(3, 64)] = 12  # channels of a corner, 6.1; the first 3 are a colour
+    hidden_width: Width = 128  # channels of the colour network, section 6.1; wider costs time
+    hidden_layers: Layers = 2  # hidden layers of the colour network, section 6.1; more cost time
+    sh_bands: Annotated[int, between(1, 4)] = 4  # spherical-harmonics bands of the direction; 1: no view dependence
+    coarse_alpha: PositiveShare = 1e-6  # initial alpha of the coarse stage, eq. 9; higher begins denser
+    fine_alpha: PositiveShare = 1e-2  # initial alpha of the fine stage, eq. 9; higher begins denser
+    open_alpha: PositiveShare = 1e-4  # initial alpha of both stages in the open; higher begins as haze
+    coarse_share: Share = 0.2  # share of the budget of the coarse stage: 5 of the paper's 25 thousand steps
+    doublings: Annotated[int, between(0, 12)] = 4  # doublings of the voxels in the fine stage, section 5.2; 0: none
+    growing_share: Share = 0.2  # share of the fine stage with these doublings: 4 of 20 thousand steps
+    box_alpha: PositiveShare = 1e-3  # alpha of a voxel above which the tight box holds it; higher gives a smaller box
+    step_size: PositiveShare = 0.5  # distance of samples in voxels, section 6.1; larger is faster, less exact
+    weight_threshold: Share = 1e-4  # weight of a sample below which it gets no colour in the fine stage; higher: faster
     open_samples_per_step: Annotated[int, between(64, 1 << 24)] = 1 << 20  # the same where there is no bound
-    density_learning_rate: LearningRate = 0.1  # section 6.1
-    feature_learning_rate: LearningRate = 0.1  # section 6.1
-    network_learning_rate: LearningRate = 1e-3  # section 6.1
-    final_learning_rate: PositiveShare = 0.1  # share of them at the end of the budget, section 6.1
-    point_weight: NonNegative = 0.01  # of each sample's own colour in the loss, eq. 12
-    entropy_weight: NonNegative = 0.001  # of opacities that are neither 0 nor 1, eq. 13
-    tv_density_weight: NonNegative = 1e-3  # of total variation where there is no bound, as the code has it there
-    tv_feature_weight: NonNegative = 1e-4  # the same, of features
-    tv_interval: Steps = 8  # steps between looks at it, each as much stronger
-    seed: Seed = 0
+    density_learning_rate: LearningRate = 0.1  # rate of the density grid at first, section 6.1
+    feature_learning_rate: LearningRate = 0.1  # rate of the feature grid at first, section 6.1
+    network_learning_rate: LearningRate = 1e-3  # rate of the colour network at first, section 6.1
+    final_learning_rate: PositiveShare = 0.1  # share of these rates at the end of the budget, section 6.1
+    point_weight: NonNegative = 0.01  # weight of each sample's own colour in the loss, eq. 12; 0: off
+    entropy_weight: NonNegative = 0.001  # weight of the entropy of opacity, eq. 13; higher gives harder edges
+    tv_density_weight: NonNegative = 1e-3  # weight of density's total variation, in the open; higher smooths
+    tv_feature_weight: NonNegative = 1e-4  # weight of features' total variation, in the open; higher smooths
+    tv_interval: Steps = 8  # steps between these two terms, whose weight is multiplied by it; more are faster
+    seed: Seed = 0  # seed of all random numbers; another seed gives another run
 
 
 EMPTY = -5.0  # of density, where compression has taken a corner out: a softplus of less than 0.0001

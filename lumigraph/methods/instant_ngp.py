@@ -38,22 +38,23 @@ from ..volume import composite
 
 @dataclass(frozen=True)
 class Config:
-    """The paper's numbers, with where it gives them; `InstantNGP.preset` says what a plain CPU does otherwise."""
+    """The paper's numbers, with where it gives them, but for huber_delta and scenes without bounds; `InstantNGP.preset`
+    has those of a plain CPU."""
 
     table: HashNumbers = HashNumbers()
     occupancy: OccupancyNumbers = OccupancyNumbers()
     steps: StepNumbers = StepNumbers()
     proposals: ProposalNumbers = ProposalNumbers()
     poses: PoseNumbers = PoseNumbers()
-    hidden_width: Width = 64  # neurons per hidden layer, section 5.4
-    learning_rate: LearningRate = 1e-2  # section 4
-    final_learning_rate: LearningRate = 1e-3  # at the end of the budget
+    hidden_width: Width = 64  # neurons of a hidden layer, section 5.4; wider costs time
+    learning_rate: LearningRate = 1e-2  # Adam's learning rate at first, section 4; higher: faster, may diverge
+    final_learning_rate: LearningRate = 1e-3  # learning rate at the end of the budget, reached exponentially
     decay_start: Annotated[float, between(0, 0.99)] = 0.3  # share of the budget before the learning rate falls
-    hash_weight_decay: NonNegative = 0.0  # decoupled decay of the table, of objects only: it pulls density towards 1
-    huber_delta: PositiveShare = 0.1  # residual at which the loss turns from square to linear
-    contraction: bool = True  # contract scenes without bounds (Barron 2022); no: section 5.4's cascades around them
-    exposure_correction: Setting = "auto"  # learn a gain per photograph; auto: where they are found to differ
-    seed: Seed = 0
+    hash_weight_decay: NonNegative = 0.0  # decoupled weight decay of an object's table, towards a density of 1
+    huber_delta: PositiveShare = 0.1  # residual at which the loss turns from squared to linear; 1: always squared
+    contraction: bool = True  # contract open captures and sample by proposals (Barron 2022); off: cascades, 5.4
+    exposure_correction: Setting = "auto"  # learn a gain per photograph; auto: where exposures are found to differ
+    seed: Seed = 0  # seed of all random numbers; another seed gives another run
 
 
 class InstantNGP(FieldMethod):

@@ -32,14 +32,14 @@ class Config:
     rays: RayNumbers = RayNumbers(128, 128)  # section 3.2
     mask: MaskNumbers = MaskNumbers()
     poses: PoseNumbers = PoseNumbers()
-    hidden_width: Width = 256  # channels of a layer, as NeRF's
-    coarse_to_fine: Share = 0.0  # share of the budget in which octaves join the coarsest (Yang 2023, eq. 2); 0: at once
-    resample_padding: NonNegative = 0.01  # alpha, weight that every frustum has at least, eq. 17
-    coarse_loss_weight: NonNegative = 0.1  # lambda, section 3.2; 0: the coarse pass only guides the fine one
-    learning_rate: LearningRate = 5e-4  # section 4
-    final_learning_rate: LearningRate = 5e-6  # at the end of the budget, section 4
-    warmup: Share = 0.0025  # share of the budget in which the learning rate grows, section 4
-    seed: Seed = 0
+    hidden_width: Width = 256  # channels of a layer, as NeRF's; wider holds more detail, and costs time
+    coarse_to_fine: Share = 0.0  # share of the budget in which octaves are added (Yang 2023, eq. 2); 0: at once
+    resample_padding: NonNegative = 0.01  # alpha, least weight of a frustum, eq. 17; higher samples more evenly
+    coarse_loss_weight: NonNegative = 0.1  # lambda, weight of the coarse colours, section 3.2; 0: it only guides
+    learning_rate: LearningRate = 5e-4  # Adam's learning rate at first, section 4; higher: faster, may diverge
+    final_learning_rate: LearningRate = 5e-6  # learning rate at the end of the budget, section 4
+    warmup: Share = 0.0025  # share of the budget in which the learning rate rises, section 4; 0: none
+    seed: Seed = 0  # seed of all random numbers; another seed gives another run
 
 
 class MipNeRF(FieldMethod):

@@ -31,15 +31,15 @@ class Config:
     rays: RayNumbers = RayNumbers()
     mask: MaskNumbers = MaskNumbers()
     poses: PoseNumbers = PoseNumbers()
-    hidden_width: Width = 256  # channels of a layer, appendix A
-    learning_rate: LearningRate = 5e-4  # section 5.3
-    final_learning_rate: LearningRate = 5e-5  # at the end of the budget, section 5.3
-    density_noise: NonNegative = 1.0  # deviation of noise on captures' raw density in training, appendix A
-    networks: Annotated[int, between(1, 2)] = 2  # one for each pass; 1: the same for both
-    coarse_loss_weight: NonNegative = 1.0  # weight of the coarse pass's error, eq. 6; 0: it only guides
-    transmittance_threshold: Share = 0.0  # transmittance at which a ray terminates
-    warmup: Share = 0.0  # share of the budget in which the learning rate grows
-    seed: Seed = 0
+    hidden_width: Width = 256  # channels of a layer, appendix A; wider holds more detail, and costs time
+    learning_rate: LearningRate = 5e-4  # Adam's learning rate at first, section 5.3; higher: faster, may diverge
+    final_learning_rate: LearningRate = 5e-5  # learning rate at the end of the budget, section 5.3
+    density_noise: NonNegative = 1.0  # deviation of noise on captures' raw density in training, appendix A; 0: none
+    networks: Annotated[int, between(1, 2)] = 2  # networks: 2, one for each pass, or 1 for both, which is faster
+    coarse_loss_weight: NonNegative = 1.0  # weight of the coarse colours, eq. 6; 0, with one network: it only guides
+    transmittance_threshold: Share = 0.0  # transmittance at which a ray terminates; higher is faster, less exact
+    warmup: Share = 0.0  # share of the budget in which the learning rate rises; 0: none
+    seed: Seed = 0  # seed of all random numbers; another seed gives another run
 
     def check(self) -> None:
         """Raises LumigraphError for numbers that contradict each other."""

@@ -25,11 +25,11 @@ Activation = Callable[[Tensor], Tensor]
 class NetworkNumbers:
     """A Config's numbers of a coordinate network; the paper's (Mildenhall 2020)."""
 
-    depth: Depth = 8  # hidden layers before density, appendix A
-    skip_layer: Layers = 5  # the layer whose activation the input joins again, figure 7
-    position_frequencies: Octaves = 10  # L, octaves of positions, section 5.1
-    direction_frequencies: Octaves = 4  # L, octaves of directions, section 5.1
-    bfloat16: bool = True  # multiply in bfloat16 where the machine is fast at it
+    depth: Depth = 8  # hidden layers before density, appendix A; more hold more detail, and cost time
+    skip_layer: Layers = 5  # layer whose activation the input is concatenated to again, figure 7
+    position_frequencies: Octaves = 10  # L for positions, section 5.1; more give finer detail, and noise
+    direction_frequencies: Octaves = 4  # L for directions, section 5.1; more give sharper highlights
+    bfloat16: bool = True  # multiply in bfloat16 where the processor is fast at it; off: float32, slower
 
     def activation_bytes(self, samples: int, hidden_width: int) -> int:
         """Lower bound of the bytes of activations that a step of so many samples keeps for its gradients."""

@@ -33,11 +33,11 @@ Joining = Callable[[int], Tensor | None]  # weights of so many levels or octaves
 class TableNumbers:
     """A Config's numbers of the hash table (Müller 2022, table 1)."""
 
-    levels: Annotated[int, between(1, 32)] = 16  # L, number of levels
-    features_per_level: Annotated[int, between(1, 16)] = 2  # F, features of an entry
-    log2_hashmap_size: Annotated[int, between(1, 28)] = 19  # log2 T, entries of a level: 14 to 24
-    base_resolution: Annotated[int, between(1, 4096)] = 16  # N_min, resolution of the coarsest level
-    max_resolution: Annotated[int, between(1, 1 << 20)] = 2048  # N_max of the finest, times the reach, section 5.4
+    levels: Annotated[int, between(1, 32)] = 16  # levels L of the hash table; more give more detail, and cost time
+    features_per_level: Annotated[int, between(1, 16)] = 2  # features F of an entry; more cost memory and time
+    log2_hashmap_size: Annotated[int, between(1, 28)] = 19  # log2 of entries T of a level; one more doubles the table
+    base_resolution: Annotated[int, between(1, 4096)] = 16  # cells per axis of the coarsest level, N_min
+    max_resolution: Annotated[int, between(1, 1 << 20)] = 2048  # cells per axis of the finest level, N_max; times reach
 
     def check(self) -> None:
         """Raises LumigraphError for numbers of levels that contradict each other."""
@@ -67,10 +67,10 @@ class TableNumbers:
 class HashNumbers(TableNumbers):
     """The same with numbers of the networks behind the table (section 5.4)."""
 
-    density_layers: Layers = 1  # hidden layers of the density network, section 5.4
-    colour_layers: Layers = 2  # hidden layers of the colour network, section 5.4
+    density_layers: Layers = 1  # hidden layers of the density network, section 5.4; more cost time
+    colour_layers: Layers = 2  # hidden layers of the colour network, section 5.4; more cost time
     geometry_features: Annotated[int, between(1, 256)] = 16  # features from density to colour network, section 5.4
-    sh_bands: Annotated[int, between(1, 4)] = 4  # bands of spherical harmonics of the direction, section 5.4
+    sh_bands: Annotated[int, between(1, 4)] = 4  # spherical-harmonics bands, section 5.4; 1: no view dependence
 
     def activation_bytes(self, samples: int, hidden_width: int) -> int:
         """Lower bound of the bytes of activations that a step of so many samples keeps for its gradients."""

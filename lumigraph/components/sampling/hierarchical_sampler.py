@@ -25,9 +25,9 @@ RAYS_WITH_FEATURES = 1024  # rays that are rendered at once where the features o
 class RayNumbers:
     """A Config's numbers of rays and of the samples of their two passes; the paper's (Mildenhall 2020)."""
 
-    coarse_samples: RaySamples = 64  # samples of a ray in the first pass, appendix A
-    fine_samples: RaySamples = 128  # further samples, drawn where the first pass found density, appendix A
-    rays_per_step: BatchSize = 4096  # section 5.3
+    coarse_samples: RaySamples = 64  # coarse samples of a ray, appendix A; more find thinner things, slower
+    fine_samples: RaySamples = 128  # fine samples of a ray, by the coarse weights, appendix A; more are sharper
+    rays_per_step: BatchSize = 4096  # rays in a step, section 5.3; more reduce noise, and cost memory and time
 
     @property
     def samples_per_step(self) -> int:

@@ -27,8 +27,8 @@ PROBES = 0.02  # share of all cells looked at again at random, in case something
 class MaskNumbers:
     """A Config's numbers of the mask of empty space."""
 
-    occupancy_resolution: Cells = 0  # cells per axis of a grid of where to sample; 0 samples everywhere
-    occupancy_threshold: NonNegative = 0.01  # optical thickness across a cell below which it is empty
+    occupancy_resolution: Cells = 0  # cells per axis of the occupancy grid; 0: no grid, samples everywhere
+    occupancy_threshold: NonNegative = 0.01  # optical thickness of a cell below which it is empty; higher skips more
 
 
 class OccupancyMask(Part):

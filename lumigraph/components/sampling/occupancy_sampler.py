@@ -33,12 +33,12 @@ MIN_RESOLUTION = 4  # cells per axis
 class OccupancyNumbers:
     """A Config's numbers of the occupancy grid and of the samples in its cells; the paper's (Müller 2022)."""
 
-    samples_per_step: Annotated[int, between(64, 1 << 24)] = 1 << 18  # samples of a step, not rays, section 5.4
-    transmittance_threshold: Share = 1e-4  # transmittance at which a ray terminates, appendix E.1
-    occupancy_resolution: Annotated[int, between(4, 512)] = 128  # cells per axis and cascade, appendix E.2
-    occupancy_threshold: NonNegative = 0.05  # optical thickness across a cell below which it is empty, E.2 at n = 128
-    occupancy_interval: Steps = 16  # steps between updates of the occupancy grid, appendix E.2
-    occupancy_decay: Share = 0.95  # decay of the remembered densities at each update, appendix E.2
+    samples_per_step: Annotated[int, between(64, 1 << 24)] = 1 << 18  # samples in a step; more cost memory and time
+    transmittance_threshold: Share = 1e-4  # transmittance at which a ray terminates, E.1; higher is faster, less exact
+    occupancy_resolution: Annotated[int, between(4, 512)] = 128  # cells per axis and cascade, E.2; more skip more
+    occupancy_threshold: NonNegative = 0.05  # optical thickness of a cell below which it is empty, E.2; higher: faster
+    occupancy_interval: Steps = 16  # steps between updates of the occupancy grid, E.2; more are faster
+    occupancy_decay: Share = 0.95  # share of a cell's density kept at each update, E.2; higher forgets more slowly
 
     def further_bytes(self, frame: Frame, learning: bool) -> int:
         """Bytes of the refined grid, of a bounded scene."""
@@ -49,8 +49,8 @@ class OccupancyNumbers:
 class StepNumbers:
     """A Config's numbers of the steps along a ray, where no grid of a field sets them (Müller 2022, appendix E.1)."""
 
-    steps_per_diagonal: Annotated[int, between(4, 16_384)] = 1024  # steps across the diagonal of the unit cascade
-    cone_angle: Share = 1 / 256  # growth of steps with distance, in scenes without bounds
+    steps_per_diagonal: Annotated[int, between(4, 16_384)] = 1024  # samples across the diagonal, E.1; fewer are faster
+    cone_angle: Share = 1 / 256  # growth of the step with distance, appendix E.1; higher: fewer samples far away
 
 
 # Numbers for a plain CPU, which learn most in a minute (docs/methods/instant_ngp.md), and for tests.

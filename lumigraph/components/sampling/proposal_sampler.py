@@ -46,10 +46,10 @@ MIN_WEIGHT = 5e-4  # weight in a ray's colour up to which a rendering omits a sa
 class ProposalNumbers:
     """A Config's numbers of the proposal sampler, for scenes without bounds."""
 
-    proposal_samples: Annotated[int, between(4, 1024)] = 64  # samples of a ray in the proposal grid
-    samples_per_ray: Annotated[int, between(2, 1024)] = 24  # samples of a ray at which the field is evaluated
-    distortion_weight: NonNegative = 0.01  # weight of the distortion loss, Barron 2022, eq. 15, which has the same
-    depth_weight: NonNegative = 0.03  # initial weight of depth from plane sweeps; it falls to zero
+    proposal_samples: Annotated[int, between(4, 1024)] = 64  # samples of a ray in the proposal grid; more cost time
+    samples_per_ray: Annotated[int, between(2, 1024)] = 24  # samples of a ray in the field; more are sharper, slower
+    distortion_weight: NonNegative = 0.01  # distortion loss's weight (Barron 2022, eq. 15); higher: fewer floaters
+    depth_weight: NonNegative = 0.03  # weight of plane-sweep depth at first, falling to 0; 0: off
 
     def further_bytes(self, frame: Frame, learning: bool) -> int:
         """Bytes of the proposal grid, with its gradient and moments while it learns."""

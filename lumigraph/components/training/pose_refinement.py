@@ -34,9 +34,9 @@ FALL = 0.02  # of the rate, that is left of it at the end of the budget
 class PoseNumbers:
     """A Config's numbers of pose refinement."""
 
-    refine_cameras: bool = False  # learn the pose of each photograph, coarse to fine (Lin 2021, BARF)
-    pose_learning_rate: LearningRate = 5e-4  # radians by which a step moves a picture, with refine_cameras
-    match_photographs: bool = True  # with refine_cameras, initialise poses from features that photographs share
+    refine_cameras: bool = False  # learn a correction of each photograph's pose, coarse to fine (Lin 2021, BARF)
+    pose_learning_rate: LearningRate = 5e-4  # pose rate with refine_cameras, in radians a step moves a picture
+    match_photographs: bool = True  # with refine_cameras, begin with poses from matched features; slower to begin
 
 
 def poses_for(frame: Frame, numbers: PoseNumbers) -> PoseRefinement | None:

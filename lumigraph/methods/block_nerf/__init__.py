@@ -45,7 +45,7 @@ from .visibility import Visibility
 
 @dataclass(frozen=True)
 class Config:
-    """The paper's numbers, with where it gives them; `BlockNeRF.preset` gives those of a plain CPU."""
+    """The paper's numbers with a section; others are Mip-NeRF's or ours. `BlockNeRF.preset` has those of a plain CPU."""
 
     network: NetworkNumbers = NetworkNumbers(position_frequencies=16)  # mip-NeRF's
     rays: RayNumbers = RayNumbers(128, 128)  # mip-NeRF's
@@ -54,25 +54,25 @@ class Config:
     steps: StepNumbers = StepNumbers()
     proposals: ProposalNumbers = ProposalNumbers()
     poses: PoseNumbers = PoseNumbers(match_photographs=False)  # section 4.2.2
-    field: Literal["hash", "network"] = "network"  # what holds the block: a hash table, or the paper's Mip-NeRF
-    appearance: bool = True  # a code for each photograph, section 4.2.1
-    appearance_code: CodeWidth = 32  # its numbers
-    exposure: bool = True  # log exposure as input, where photographs say theirs, section 4.2.3
-    exposure_frequencies: Octaves = 4  # its octaves, section 4.2.3
-    visibility: bool = True  # learn which places were seen, section 4.2.5
-    visibility_frequencies: Octaves = 6  # octaves of places
-    visibility_layers: Layers = 4  # hidden layers: a network much smaller than the field
-    visibility_width: Width = 128  # their channels
-    residual_masks: bool = False  # leave out parts of photographs that no other agrees with, beside the masks given
-    huber_delta: PositiveShare = 1.0  # residual at which the loss turns from square to linear; 1: never
-    own_skies: bool = True  # of the hash table in the open: behind everything a sky that depends on the codes
-    hidden_width: Width = 512  # channels of a layer
-    learning_rate: LearningRate = 1e-3
-    final_learning_rate: LearningRate = 1e-5  # at the end of the budget
+    field: Literal["hash", "network"] = "network"  # field of the block: Mip-NeRF's network, or a faster hash table
+    appearance: bool = True  # learn an appearance code for each photograph, section 4.2.1; off: one light
+    appearance_code: CodeWidth = 32  # numbers of an appearance code, section 4.2.1; more fit its light more closely
+    exposure: bool = True  # log exposure as an input, where photographs state it, section 4.2.3; off: ignored
+    exposure_frequencies: Octaves = 4  # octaves of the exposure's encoding, section 4.2.3
+    visibility: bool = True  # learn which places were seen, section 4.2.5; off: all blocks count as seeing
+    visibility_frequencies: Octaves = 6  # octaves of positions in the visibility network, section 4.2.5
+    visibility_layers: Layers = 4  # hidden layers of the visibility network; more cost time
+    visibility_width: Width = 128  # channels of the visibility network; wider costs time
+    residual_masks: bool = False  # exclude parts of photographs with large errors, in addition to given masks
+    huber_delta: PositiveShare = 1.0  # residual at which the loss turns from squared to linear; 1: always squared
+    own_skies: bool = True  # a sky for each photograph behind open captures, by hash table; off: one background
+    hidden_width: Width = 512  # channels of a layer; wider holds more detail, and costs time
+    learning_rate: LearningRate = 1e-3  # Adam's learning rate at first; higher learns faster, and may diverge
+    final_learning_rate: LearningRate = 1e-5  # learning rate at the end of the budget, reached exponentially
     decay_start: Annotated[float, between(0, 0.99)] = 0.0  # share of the budget before the learning rate falls
-    resample_padding: NonNegative = 0.01  # of the network: weight that every frustum has at least
-    coarse_loss_weight: NonNegative = 0.1  # of the network; 0: the coarse pass only guides the fine one
-    seed: Seed = 0
+    resample_padding: NonNegative = 0.01  # of the network: least weight of a frustum; higher samples more evenly
+    coarse_loss_weight: NonNegative = 0.1  # of the network: weight of the coarse colours; 0: it only guides
+    seed: Seed = 0  # seed of all random numbers; another seed gives another run
 
 
 FIT_PIXELS = 2048  # pixels of a photograph that its appearance is found from

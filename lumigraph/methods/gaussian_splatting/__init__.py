@@ -43,15 +43,15 @@ from .tidying import Tidying
 class Config:
     """The paper's numbers, with where it gives them; those without a section are the authors' release's."""
 
-    sh_degree: Annotated[int, between(0, 3)] = 3  # degree of the spherical harmonics, section 5.1
-    sh_degree_interval: Steps = 1000  # steps, section 7.1; or the share below of the budget, if that is sooner
-    sh_degree_interval_share: PositiveShare = 1 / 8  # share of the budget
-    ssim_weight: Share = 0.2  # share of D-SSIM in the loss, eq. 7
-    initialization: Initialization = "sparse"  # points of structure from motion, "dense" with plane sweeps' beside them
-    initial_gaussians: CloudSize = 100_000  # at random places, where nothing else is known, section 7.1
-    half_resolution_until: Share = 0.0  # share of the budget at half size; the first quarter of it at a quarter
-    transmittance_threshold: Share = 1e-4  # transmittance at which a pixel is finished, appendix C
-    strategy: Literal["adaptive", "mcmc"] = "adaptive"  # density control: section 5, or Kheradmand 2024
+    sh_degree: Annotated[int, between(0, 3)] = 3  # degree of spherical harmonics, section 5.1; 0: no view dependence
+    sh_degree_interval: Steps = 1000  # steps for each further degree, section 7.1; or the share below, if sooner
+    sh_degree_interval_share: PositiveShare = 1 / 8  # share of the budget for each further degree, if that is sooner
+    ssim_weight: Share = 0.2  # share of D-SSIM in the loss, eq. 7; higher gives structure more weight
+    initialization: Initialization = "sparse"  # first Gaussians: sparse points, plane sweeps' points too, or random
+    initial_gaussians: CloudSize = 100_000  # random Gaussians, where there are no points, section 7.1
+    half_resolution_until: Share = 0.0  # share of the budget at half size, its first quarter at a quarter; faster
+    transmittance_threshold: Share = 1e-4  # transmittance at which a pixel is finished, appendix C; higher is faster
+    strategy: Literal["adaptive", "mcmc"] = "adaptive"  # density control: section 5, or MCMC (Kheradmand 2024)
     rates: RateNumbers = RateNumbers()
     refine: RefineNumbers = RefineNumbers()
     adaptive: AdaptiveNumbers = AdaptiveNumbers()
@@ -61,7 +61,7 @@ class Config:
     photographs: AppearanceNumbers = AppearanceNumbers()
     distractors: RobustNumbers = RobustNumbers()
     sparse: FewViewNumbers = FewViewNumbers()
-    seed: Seed = 0
+    seed: Seed = 0  # seed of all random numbers; another seed gives another run
 
 
 BLACK = 0.0, 0.0, 0.0

@@ -25,8 +25,8 @@ NEARLY_FULL = 0.99  # of the cap
 class AdaptiveNumbers:
     """A Config's numbers of the strategy adaptive."""
 
-    densify_grad_threshold: NonNegative = 2e-4  # gradient of a centre that asks for more Gaussians, section 5.2
-    opacity_reset_interval: Steps = 3000  # steps, section 5.2
+    densify_grad_threshold: NonNegative = 2e-4  # positional gradient above which Gaussians are added, 5.2; lower: more
+    opacity_reset_interval: Steps = 3000  # steps between opacity resets, section 5.2
 
 
 class AdaptiveDensity(DensityControl):

@@ -36,11 +36,11 @@ MAX_LR_SCALE = 6.0  # of the learning rate, in short runs
 class AppearanceNumbers:
     """A Config's numbers of the appearance of photographs."""
 
-    appearance: Literal["auto", "yes", "no"] = "auto"  # learn how each photograph's colours differ; auto: where they do
-    own_skies: bool = True  # with appearance, in scenes without bounds, learn a sky for each photograph
-    appearance_lr: LearningRate = 5e-3  # learning rate of those changes of colour
-    final_appearance_lr: LearningRate = 5e-4  # at the end of the budget
-    appearance_regularization: NonNegative = 1e-3  # weight of a change's squared numbers in the loss
+    appearance: Literal["auto", "yes", "no"] = "auto"  # colours for each photograph; auto: where photographs differ
+    own_skies: bool = True  # with appearance, learn a sky for each photograph of an open capture
+    appearance_lr: LearningRate = 5e-3  # learning rate of these colours and skies at first
+    final_appearance_lr: LearningRate = 5e-4  # learning rate of these at the end of the budget
+    appearance_regularization: NonNegative = 1e-3  # weight of their squares in the loss; higher: closer to one light
 
 
 class SplatAppearance(Addition):

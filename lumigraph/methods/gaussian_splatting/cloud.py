@@ -33,13 +33,13 @@ REST_BANDS_SCALE = 1 / 20  # of the harmonics' learning rate, beyond the first b
 class RateNumbers:
     """A Config's learning rates, those of the authors' release."""
 
-    means_lr: LearningRate = 1.6e-4  # learning rate of centres, times the extent of the cameras
-    final_means_lr: LearningRate = 1.6e-6  # at the end of the budget
-    sh_lr: LearningRate = 2.5e-3  # learning rate of harmonics; a twentieth of it beyond the first band
-    opacities_lr: LearningRate = 0.05  # learning rate of opacities
-    scales_lr: LearningRate = 5e-3  # learning rate of scales
+    means_lr: LearningRate = 1.6e-4  # learning rate of the means at first, times the extent of the cameras
+    final_means_lr: LearningRate = 1.6e-6  # learning rate of the means at the end of the budget, likewise
+    sh_lr: LearningRate = 2.5e-3  # learning rate of colours; a twentieth of it beyond the first band
+    opacities_lr: LearningRate = 0.05  # learning rate of opacity logits
+    scales_lr: LearningRate = 5e-3  # learning rate of log scales
     quaternions_lr: LearningRate = 1e-3  # learning rate of rotations
-    most_haste: Annotated[float, between(1, 1000)] = 1.0  # times the rates of scales and harmonics, in short runs
+    most_haste: Annotated[float, between(1, 1000)] = 1.0  # largest factor on scales' and colours' rates in short runs
 
 
 class Cloud(Part):

@@ -25,12 +25,12 @@ BYTES_PER_GAUSSIAN = 4096  # lower bound while it learns: itself, its gradient a
 class RefineNumbers:
     """A Config's numbers of when a strategy changes the cloud."""
 
-    max_gaussians: CloudSize = 1_000_000  # cap of the cloud's size
-    refine_every: Steps = 100  # steps between changes of the cloud, section 5.2; or the share, if that is sooner
-    refine_every_share: PositiveShare = 0.1  # share of the budget
-    refine_from: Steps = 500  # step; or the share of the budget, if that is sooner
-    refine_from_share: PositiveShare = 0.15  # share of the budget
-    refine_until: Share = 0.5  # share of the budget; section 7.1: 15 000 of 30 000 steps
+    max_gaussians: CloudSize = 1_000_000  # Gaussians at most; more give detail, and cost memory and time
+    refine_every: Steps = 100  # steps between density control, section 5.2; or the share below, if sooner
+    refine_every_share: PositiveShare = 0.1  # share of the budget between density control, if that is sooner
+    refine_from: Steps = 500  # step at which density control starts, section 5.2; or the share below, if sooner
+    refine_from_share: PositiveShare = 0.15  # share of the budget at which density control starts, if sooner
+    refine_until: Share = 0.5  # share of the budget at which it ends, section 7.1: 15 000 of 30 000 steps
 
 
 class DensityControl(Addition, ABC):

@@ -31,8 +31,8 @@ UNOBSERVED_PIXELS = 96  # along the shorter side of an unobserved view
 class FewViewNumbers:
     """A Config's numbers for few photographs."""
 
-    few_views: bool = False  # drop Gaussians at random, smooth depth at unobserved views, plain colours
-    depth_weight: NonNegative = 1.0  # weight of the roughness of depth at unobserved views, with few_views
+    few_views: bool = False  # for few photographs: dropout, smooth depth at unobserved views, plain colours
+    depth_weight: NonNegative = 1.0  # weight of depth's roughness at unobserved views, with few_views; 0: off
 
 
 class FewViews(Addition):

@@ -27,9 +27,9 @@ MAX_COPIES = 51  # of one Gaussian at a change; more are computed as so many
 class McmcNumbers:
     """A Config's numbers of the strategy mcmc."""
 
-    joining_per_step: NonNegative = 0.0  # Gaussians that mcmc has added by each step, if 5 % a change would be fewer
-    opacity_regularization: NonNegative = 0.01  # weight of the mean opacity in the loss, for mcmc, eq. 11
-    scale_regularization: NonNegative = 0.01  # weight of the mean deviation, in extents, for mcmc
+    joining_per_step: NonNegative = 0.0  # Gaussians that mcmc adds for each step, if 5 % a time would be fewer
+    opacity_regularization: NonNegative = 0.01  # weight of the mean opacity, for mcmc (Kheradmand 2024, eq. 11)
+    scale_regularization: NonNegative = 0.01  # weight of the mean scale in extents, for mcmc (eq. 11)
 
 
 class MarkovChain(DensityControl):

@@ -21,8 +21,8 @@ FILTER_VARIANCE = 0.2  # squared sampling intervals (section 6.1)
 class MipNumbers:
     """A Config's switches of Mip-Splatting."""
 
-    antialiased: bool = False  # 2-D filter that keeps a small Gaussian's light (Yu 2024, section 5.2)
-    filter_3d: bool = False  # 3-D filter that keeps Gaussians as wide as the sampling (Yu 2024, section 5.1)
+    antialiased: bool = False  # Mip-Splatting's 2-D filter (Yu 2024, section 5.2), for smaller pictures
+    filter_3d: bool = False  # Mip-Splatting's 3-D filter (Yu 2024, section 5.1), for larger pictures
 
 
 class MipFilter(Addition):

@@ -30,8 +30,8 @@ PATCH_SHARE = 0.6  # share of inliers in a patch's neighbourhood, eq. 8
 class RobustNumbers:
     """A Config's numbers of the robust mask."""
 
-    robust: Literal["auto", "yes", "no"] = "auto"  # leave out what moved; auto: where photographs' colours differ
-    robust_start: Share = 0.1  # share of the budget before which every pixel counts
+    robust: Literal["auto", "yes", "no"] = "auto"  # exclude moving objects (RobustNeRF); auto: where colours differ
+    robust_start: Share = 0.1  # share of the budget before pixels are excluded
 
 
 class RobustMask(Addition):

@@ -39,7 +39,8 @@ from .transient import EncodedHashField, HashTransientHead, Transient, Transient
 
 @dataclass(frozen=True)
 class Config:
-    """The paper's numbers, with where it gives them; `NeRFW.preset` gives those of a plain CPU."""
+    """The paper's numbers, with where it gives them, but for samples and learning rates; `NeRFW.preset` has those of a
+    plain CPU."""
 
     network: NetworkNumbers = NetworkNumbers(position_frequencies=15)  # supplement
     rays: RayNumbers = RayNumbers(64, 64, rays_per_step=2048)  # supplement
@@ -47,20 +48,20 @@ class Config:
     occupancy: OccupancyNumbers = OccupancyNumbers()
     steps: StepNumbers = StepNumbers()
     proposals: ProposalNumbers = ProposalNumbers()
-    field: Literal["hash", "network"] = "network"  # what holds the scene: a hash table, or the paper's networks
-    appearance_code: CodeWidth = 48  # n^(a), numbers to a photograph, section 5
-    transient_code: CodeWidth = 16  # n^(tau), section 5
-    transient_layers: Layers = 4  # hidden layers of the transient head, supplement
-    transient_width: Width = 128  # their channels, supplement
-    beta_min: PositiveShare = 0.03  # least deviation of a colour, section 5
-    transient_weight: NonNegative = 0.01  # lambda_u, of the mean transient density, section 5
-    transient_start: Share = 0.0  # share of the budget before which the static scene learns alone
-    own_skies: bool = True  # of the hash table in the open: behind everything a sky that depends on the appearance
-    hidden_width: Width = 256  # channels of a layer, supplement
-    learning_rate: LearningRate = 5e-4
-    final_learning_rate: LearningRate = 5e-5  # at the end of the budget
+    field: Literal["hash", "network"] = "network"  # field of the scene: the paper's networks, or a faster hash table
+    appearance_code: CodeWidth = 48  # n^(a), numbers of an appearance code, section 5; more fit its light more closely
+    transient_code: CodeWidth = 16  # n^(tau), numbers of a transient code, section 5; more fit more passers-by
+    transient_layers: Layers = 4  # hidden layers of the transient head, supplement; more cost time
+    transient_width: Width = 128  # channels of the transient head, supplement; wider costs time
+    beta_min: PositiveShare = 0.03  # least uncertainty, section 5; higher gives uncertain pixels more weight
+    transient_weight: NonNegative = 0.01  # lambda_u, weight of transient density, section 5; higher: less transient
+    transient_start: Share = 0.0  # share of the budget before the transient part is on; later: more is static
+    own_skies: bool = True  # a sky for each photograph behind open captures, by hash table; off: one background
+    hidden_width: Width = 256  # channels of a layer, supplement; wider holds more detail, and costs time
+    learning_rate: LearningRate = 5e-4  # Adam's learning rate at first; higher learns faster, and may diverge
+    final_learning_rate: LearningRate = 5e-5  # learning rate at the end of the budget, reached exponentially
     decay_start: Annotated[float, between(0, 0.99)] = 0.0  # share of the budget before the learning rate falls
-    seed: Seed = 0
+    seed: Seed = 0  # seed of all random numbers; another seed gives another run
 
 
 HIDDEN, SHOWN = "hidden", "shown"

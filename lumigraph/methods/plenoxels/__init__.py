@@ -49,30 +49,30 @@ class Config:
         occupancy_decay=0.9,
     )
     proposals: ProposalNumbers = ProposalNumbers()
-    base_resolution: Resolution = 256  # voxels per axis at first, section 3.3
-    max_resolution: Resolution = 512  # and in the end, doubled in between
-    open_base_resolution: Resolution = 128  # the same where there is no bound, the release's
-    open_max_resolution: Resolution = 640
-    refine_until: Share = 0.3  # share of the budget at which the grid is as fine as it gets
-    step_size: Annotated[float, between(0.05, 4)] = 0.5  # of samples along a ray, in voxels
-    initial_density: Positive = 0.1  # per unit of coordinates
-    weight_threshold: Share = 5e-3  # of a sample in a picture, below which its voxel is pruned, section 3.3
-    rays_per_step: BatchSize = 5000  # section 4; at most
-    density_learning_rate: DensityRate = 30.0  # per unit of coordinates, of 256 voxels per axis; in proportion to them
-    final_density_learning_rate: DensityRate = 0.05
-    density_delay: Share = 0.12  # share of the budget in which the density's learning rate comes up to that
-    harmonics_learning_rate: LearningRate = 1e-2
-    final_harmonics_learning_rate: LearningRate = 5e-6
-    tv_density: NonNegative = 1e-5  # weight of the density's total variation, eq. 3
-    tv_harmonics: NonNegative = 1e-3
-    open_tv_density: NonNegative = 5e-4  # the same where there is no bound, the release's
-    open_tv_harmonics: NonNegative = 5e-3
-    tv_share: PositiveShare = 0.01  # of the nodes that a step touches: those that total variation looks at
-    tv_interval: Steps = 1  # steps from one look at it to the next
-    sparsity: NonNegative = 1e-11  # weight of the densities' Cauchy loss, eq. 4
-    beta: NonNegative = 0.0  # weight of the loss of opacities between 0 and 1, eq. 5; for captures without alpha
-    exposure_correction: Setting = "auto"  # learn a gain per photograph; auto: where they are found to differ
-    seed: Seed = 0
+    base_resolution: Resolution = 256  # voxels per axis at first, section 3.3; more cost time early
+    max_resolution: Resolution = 512  # voxels per axis in the end, by doublings; more give detail, cost memory
+    open_base_resolution: Resolution = 128  # voxels per axis at first where there is no bound, the release's
+    open_max_resolution: Resolution = 640  # voxels per axis in the end where there is no bound
+    refine_until: Share = 0.3  # share of the budget at which the grid has its final resolution
+    step_size: Annotated[float, between(0.05, 4)] = 0.5  # distance of samples in voxels; larger is faster, less exact
+    initial_density: Positive = 0.1  # density of all nodes at first, per unit of coordinates
+    weight_threshold: Share = 5e-3  # least weight of a voxel in a picture, section 3.3; higher prunes more
+    rays_per_step: BatchSize = 5000  # rays in a step at most, section 4; more reduce noise, and cost time
+    density_learning_rate: DensityRate = 30.0  # density's rate, for 256 voxels per axis; in proportion to these
+    final_density_learning_rate: DensityRate = 0.05  # density's rate at the end of the budget
+    density_delay: Share = 0.12  # share of the budget in which density's rate rises; longer settles colours first
+    harmonics_learning_rate: LearningRate = 1e-2  # rate of the harmonics at first
+    final_harmonics_learning_rate: LearningRate = 5e-6  # rate of the harmonics at the end of the budget
+    tv_density: NonNegative = 1e-5  # weight of density's total variation, eq. 3; higher smooths
+    tv_harmonics: NonNegative = 1e-3  # weight of harmonics' total variation, eq. 3; higher smooths
+    open_tv_density: NonNegative = 5e-4  # the same of density where there is no bound, the release's
+    open_tv_harmonics: NonNegative = 5e-3  # the same of harmonics where there is no bound
+    tv_share: PositiveShare = 0.01  # share of a step's nodes for total variation; more smooth more, and cost time
+    tv_interval: Steps = 1  # steps between total variation terms; more are faster and smooth less
+    sparsity: NonNegative = 1e-11  # weight of the Cauchy loss of density, eq. 4; higher empties more
+    beta: NonNegative = 0.0  # weight of the beta loss of opacity, eq. 5, for captures without alpha; 0: off
+    exposure_correction: Setting = "auto"  # learn a gain per photograph; auto: where exposures are found to differ
+    seed: Seed = 0  # seed of all random numbers; another seed gives another run
 
     def check(self) -> None:
         """Raises LumigraphError for numbers that contradict each other."""

@@ -51,14 +51,14 @@ class Config:
     steps: StepNumbers = StepNumbers()
     proposals: ProposalNumbers = ProposalNumbers()
     poses: PoseNumbers = PoseNumbers()
-    epsilon: Positive = 1e-3  # added to what the error is relative to, eq. 4; 1 is white in the longest exposure
-    variance_weight: NonNegative = 1e-3  # weight of the variance of weights along a ray, supplement
-    exposure_scales: bool = True  # learn a factor per colour of each exposure, section 4.2
-    hidden_width: Width = 64  # neurons per hidden layer
-    learning_rate: LearningRate = 1e-2
-    final_learning_rate: LearningRate = 1e-3  # at the end of the budget
-    hash_weight_decay: NonNegative = 0.0  # decoupled decay of the table, of objects only
-    seed: Seed = 0
+    epsilon: Positive = 1e-3  # epsilon of eq. 4; 1 is white in the longest exposure; higher: less weight in the dark
+    variance_weight: NonNegative = 1e-3  # weight of the variance of weights, supplement; higher: thinner surfaces
+    exposure_scales: bool = True  # learn a factor per colour of each exposure, section 4.2; off: as stated
+    hidden_width: Width = 64  # neurons of a hidden layer; wider costs time
+    learning_rate: LearningRate = 1e-2  # Adam's learning rate at first; higher learns faster, and may diverge
+    final_learning_rate: LearningRate = 1e-3  # learning rate at the end of the budget, reached exponentially
+    hash_weight_decay: NonNegative = 0.0  # decoupled weight decay of an object's table, towards a density of 1
+    seed: Seed = 0  # seed of all random numbers; another seed gives another run
 
 
 LENS_PLACES = 24  # through which a picture with a shallow focus is seen

@@ -39,8 +39,8 @@ from .patch_flow import SIDE, PatchFlow
 
 @dataclass(frozen=True)
 class Config:
-    """The paper's numbers, with where it gives them, beside those of mip-NeRF's network and of a hash table;
-    `RegNeRF.preset` gives those of a plain CPU."""
+    """The paper's numbers with a section, then mip-NeRF's of the network and Instant-NGP's of the hash table;
+    `RegNeRF.preset` has those of a plain CPU."""
 
     network: NetworkNumbers = NetworkNumbers(position_frequencies=16)
     rays: RayNumbers = RayNumbers(128, 128)
@@ -48,17 +48,17 @@ class Config:
     poses: PoseNumbers = PoseNumbers()
     table: HashNumbers = HashNumbers()
     steps: StepNumbers = StepNumbers()
-    field: Literal["network", "hash"] = "network"  # what is learnt: mip-NeRF's network, the paper's, or a hash table
-    unseen_patches: Annotated[int, between(0, 4096)] = 64  # of 8 x 8 rays in a step; the paper has as many rays as seen
-    depth_weight: NonNegative = 0.1  # of the roughness of depth in them, eq. 6
-    depth_weight_start: NonNegative = 10.0  # what that weight falls from at first
+    field: Literal["network", "hash"] = "network"  # field: mip-NeRF's network, as in the paper, or a faster hash table
+    unseen_patches: Annotated[int, between(0, 4096)] = 64  # patches of 8 x 8 unobserved rays in a step; 0: none
+    depth_weight: NonNegative = 0.1  # weight of depth's roughness in these patches, eq. 6; higher smooths depth
+    depth_weight_start: NonNegative = 10.0  # weight of that roughness at first, which falls to depth_weight
     depth_settling: Share = 0.05  # share of the budget in which it falls
-    likelihood_weight: NonNegative = 1e-3  # of how unlikely their colours are, eq. 8, in nats a number
-    flow_steps: Steps = 400  # in which it is learnt, of 512 patches each, what is likely
-    coarse_to_fine: Share = 0.0  # share of the budget in which finer octaves or levels join the coarsest; 0: at once
-    occlusion_weight: NonNegative = 0.0  # of what stands right before cameras (Yang 2023, eq. 5)
-    occlusion_range: Share = 0.1  # share of each ray that is right before its camera
-    random_backdrop: bool = True  # the network learns open captures before random colours, as a table always does
+    likelihood_weight: NonNegative = 1e-3  # weight of the patches' negative log likelihood, eq. 8; 0: no flow
+    flow_steps: Steps = 400  # steps that train the normalising flow of eq. 8, of 512 patches each
+    coarse_to_fine: Share = 0.0  # share of the budget in which finer octaves or levels are added; 0: at once
+    occlusion_weight: NonNegative = 0.0  # weight of density right before cameras (Yang 2023, eq. 5); 0: off
+    occlusion_range: Share = 0.1  # share of each ray that counts as right before its camera
+    random_backdrop: bool = True  # random colours behind open captures for the network; off: the scene's own
     annealing: Share = 0.01  # share of the budget in which samples spread from the middle of rays, eq. 10
     annealing_start: PositiveShare = 0.5  # p_s, share of each ray that is sampled at first, eq. 10
     seed: Seed = 0
@@ -66,19 +66,19 @@ class Config:
     hidden_width: Width = 256  # channels of a layer
     resample_padding: NonNegative = 0.01  # weight that every frustum has at least
     coarse_loss_weight: NonNegative = 0.1  # 0: the coarse pass only guides the fine one
-    learning_rate: LearningRate = 2e-3
-    final_learning_rate: LearningRate = 2e-5
+    learning_rate: LearningRate = 2e-3  # learning rate of the network at first; higher: faster, may diverge
+    final_learning_rate: LearningRate = 2e-5  # learning rate of the network at the end of the budget
     warmup: Share = 0.0025  # share of the budget in which the learning rate grows
     # Of the hash table and its networks.
-    table_learning_rate: LearningRate = 1e-2
-    final_table_learning_rate: LearningRate = 1e-3
-    table_width: Width = 64  # neurons per hidden layer
-    samples_per_step: Annotated[int, between(64, 1 << 24)] = 1 << 18
-    transmittance_threshold: Share = 1e-4
-    table_occupancy_threshold: NonNegative = 0.05
-    hash_weight_decay: NonNegative = 0.0
-    huber_delta: PositiveShare = 0.1
-    sweep_weight: NonNegative = 0.03  # of what plane sweeps found in the open, at first; it falls to nothing
+    table_learning_rate: LearningRate = 1e-2  # learning rate of the hash table and its networks at first
+    final_table_learning_rate: LearningRate = 1e-3  # learning rate of the hash table and its networks at the end
+    table_width: Width = 64  # neurons of a hidden layer behind the hash table; wider costs time
+    samples_per_step: Annotated[int, between(64, 1 << 24)] = 1 << 18  # of the hash table: samples in a step
+    transmittance_threshold: Share = 1e-4  # transmittance at which a ray terminates; higher is faster, less exact
+    table_occupancy_threshold: NonNegative = 0.05  # of the table: optical thickness of an empty cell; higher: faster
+    hash_weight_decay: NonNegative = 0.0  # decoupled weight decay of an object's table, towards a density of 1
+    huber_delta: PositiveShare = 0.1  # of the hash table: residual at which the loss turns from squared to linear
+    sweep_weight: NonNegative = 0.03  # of the hash table: weight of plane-sweep depth in the open at first; 0: off
 
     @property
     def occupancy(self) -> OccupancyNumbers:

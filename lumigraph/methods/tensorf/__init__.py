@@ -45,33 +45,33 @@ class Config:
 
     occupancy: OccupancyNumbers = OccupancyNumbers(samples_per_step=1 << 20, occupancy_threshold=0.005)
     proposals: ProposalNumbers = ProposalNumbers()
-    factors: Literal["vm", "cp"] = "vm"  # planes and lines, or lines alone, section 3
-    density_components: Components = 16  # of each factor: 3 x 16 of 192, section 5
-    appearance_components: Components = 48  # of each factor: 3 x 48 of 192, section 5
-    initial_resolution: Resolution = 128  # section 5
-    final_resolution: Resolution = 300  # section 5
-    open_final_resolution: Resolution = 640  # where there is no bound, the code's for forward-facing captures
-    appearance_features: Annotated[int, between(1, 256)] = 27  # P, that the basis matrix B gives, section 5
-    shading: Literal["mlp", "sh"] = "mlp"  # features become colours by a network, or are harmonics, section 4.1
-    sh_bands: Annotated[int, between(1, 4)] = 3  # of harmonics, where they are colours
-    hidden_width: Width = 128  # of the network's two hidden layers, section 5
+    factors: Literal["vm", "cp"] = "vm"  # factorisation, section 3: vm, planes and lines, or cp, lines alone, smaller
+    density_components: Components = 16  # components of each density factor, section 5: 3 x 16 of 192
+    appearance_components: Components = 48  # components of each appearance factor, section 5: 3 x 48 of 192
+    initial_resolution: Resolution = 128  # nodes per axis at first, section 5; more cost time early
+    final_resolution: Resolution = 300  # nodes per axis in the end, section 5; more give detail, cost memory
+    open_final_resolution: Resolution = 640  # the same where there is no bound, the code's for forward-facing
+    appearance_features: Annotated[int, between(1, 256)] = 27  # P, outputs of the basis matrix B, section 5
+    shading: Literal["mlp", "sh"] = "mlp"  # colour from features: a network, or spherical harmonics, section 4.1
+    sh_bands: Annotated[int, between(1, 4)] = 3  # spherical-harmonics bands, with --shading sh; more cost time
+    hidden_width: Width = 128  # channels of the network's two hidden layers, section 5; wider costs time
     feature_frequencies: Annotated[int, between(0, 10)] = 2  # octaves of the features' encoding, the code's
     direction_frequencies: Annotated[int, between(0, 10)] = 2  # octaves of the directions' encoding, the code's
-    density_shift: Annotated[float, between(-30, 30)] = -7.0  # before the softplus; under the code's -10 L1 wins here
-    density_scale: Positive = 25.0  # after it, the code's
-    step_ratio: Annotated[float, between(0.05, 8)] = 0.5  # of a sample to the distance of nodes, the code's
-    rays_per_step: BatchSize = 4096  # section 5; at most
+    density_shift: Annotated[float, between(-30, 30)] = -7.0  # shift ahead of the softplus; higher begins denser
+    density_scale: Positive = 25.0  # factor behind the softplus, the code's; higher learns density faster
+    step_ratio: Annotated[float, between(0.05, 8)] = 0.5  # sample distance over node distance; larger is faster
+    rays_per_step: BatchSize = 4096  # rays in a step at most, section 5; more reduce noise, and cost time
     open_samples_per_step: Annotated[int, between(64, 1 << 24)] = 1 << 17  # the same where there is no bound
-    weight_threshold: Share = 1e-4  # weight of a sample below which it gets no colour, the code's
-    l1_weight: NonNegative = 8e-5  # of objects, of density's factors, the code's
-    final_l1_weight: NonNegative = 4e-5  # once the box has shrunk, the code's
-    tv_density_weight: NonNegative = 0.02  # of captures without bounds, the code's 1.0 for forward-facing ones
-    tv_appearance_weight: NonNegative = 0.02  # the same, of appearance
-    tv_interval: Steps = 1  # steps between looks at the total variation, each as much stronger
-    learning_rate: LearningRate = 0.02  # of planes and lines, section 5
-    network_learning_rate: LearningRate = 1e-3  # of basis matrix and network, section 5
-    final_learning_rate: LearningRate = 2e-3  # of planes and lines at the end of the budget; the others fall alike
-    seed: Seed = 0
+    weight_threshold: Share = 1e-4  # weight of a sample below which it gets no colour, the code's; higher: faster
+    l1_weight: NonNegative = 8e-5  # weight of the L1 norm of an object's density factors, the code's; higher: sparser
+    final_l1_weight: NonNegative = 4e-5  # the same once the box has shrunk, the code's
+    tv_density_weight: NonNegative = 0.02  # weight of density's total variation, in the open; higher smooths
+    tv_appearance_weight: NonNegative = 0.02  # weight of appearance's total variation, in the open; higher smooths
+    tv_interval: Steps = 1  # steps between these terms, whose weight is multiplied by it; more are faster
+    learning_rate: LearningRate = 0.02  # rate of planes and lines until the last upsampling, section 5
+    network_learning_rate: LearningRate = 1e-3  # rate of basis matrix and network at first, section 5
+    final_learning_rate: LearningRate = 2e-3  # rate of planes and lines at the end of the budget; the others fall alike
+    seed: Seed = 0  # seed of all random numbers; another seed gives another run
 
     def check(self) -> None:
         """Raises LumigraphError for numbers that contradict each other."""
