@@ -347,11 +347,11 @@ def test_controls_are_passed_on_and_exposures_are_made_one(exposed):
         torch.testing.assert_close(both.blocks[index].rendering(camera).rgb, expected.rgb)
     assert all(x.render(camera).rgb.isfinite().all() for x in near)
     more, most = (both.given(exposure=x) for x in (0.5, 1.5))
-    assert more.blocks[0].method.told["exposure"] == pytest.approx(1)
-    assert most.blocks[0].method.told["exposure"] == pytest.approx(1)  # no more than it learnt from
+    assert more.blocks[0].method.settings["exposure"] == pytest.approx(1)
+    assert most.blocks[0].method.settings["exposure"] == pytest.approx(1)  # no more than it learnt from
     shot = scene.photograph(0)
     taken = both.given(shot)
-    assert taken.blocks[0].method.told["exposure"] == pytest.approx(1 - stops(0), abs=1e-4)
+    assert taken.blocks[0].method.settings["exposure"] == pytest.approx(1 - stops(0), abs=1e-4)
     with pytest.raises(LumigraphError, match="does not learn"):
         both.batch(scene, torch.Generator())
     with pytest.raises(LumigraphError, match="as many centres"):

@@ -81,8 +81,8 @@ def test_what_is_told_shares_all_weights_and_leaves_the_first_alone():
     before, state = method.render(camera).rgb, {name: x.clone() for name, x in method.state_dict().items()}
     told = method.given(brightness=0.5)
     again = told.given(ink="grey", brightness=0.25)
-    assert told.told == {"brightness": 0.5} and again.told == {"brightness": 0.25, "ink": "grey"}
-    assert method.told == {} and told.grids is method.grids is again.grids
+    assert told.settings == {"brightness": 0.5} and again.settings == {"brightness": 0.25, "ink": "grey"}
+    assert method.settings == {} and told.grids is method.grids is again.grids
     assert method.state_dict().keys() == again.state_dict().keys() == state.keys()
     seen = again.render(camera)
     assert (seen.rgb.amax(-1) - seen.rgb.amin(-1)).max() < 1e-5 and not torch.equal(seen.rgb, before)
@@ -363,8 +363,8 @@ def test_a_missing_index_moves_nothing():
 def test_a_film_turns_controls_from_frame_to_frame():
     method = two_moments()
     made = animated(method, {"brightness": [0, 2], "ink": ["colour", "grey"]}, 4)
-    assert [m.told["brightness"] for m in made] == pytest.approx([0, 2 / 3, 4 / 3, 2])
-    assert [m.told["ink"] for m in made] == ["colour", "colour", "grey", "grey"]
+    assert [m.settings["brightness"] for m in made] == pytest.approx([0, 2 / 3, 4 / 3, 2])
+    assert [m.settings["ink"] for m in made] == ["colour", "colour", "grey", "grey"]
     assert all(m.grids is method.grids for m in made)
 
 
@@ -442,7 +442,7 @@ def test_photographs_are_named(tmp_path):
     run = Run.create(tmp_path / "run", made, scene)
     fit(run.new_method(), scene, run, steps=1, show=False)
     with_name, with_number = (open_method(run.folder, "cpu", [f"exposed-as={which}"])[1] for which in ("ball_5", "5"))
-    assert with_name.told == with_number.told == {"exposed_as": "5"}
+    assert with_name.settings == with_number.settings == {"exposed_as": "5"}
     _, method, cameras = open_method(run.folder, "cpu")
     assert torch.equal(cameras["train"].pose, method.refined(scene.cameras[scene.splits["train"]]).pose)
     assert not torch.equal(cameras["train"].pose, run.cameras()["train"].pose)

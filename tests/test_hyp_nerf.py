@@ -113,12 +113,12 @@ def test_the_gaussian_fits_the_codes():
     with torch.no_grad():
         codes.rows[:30] = codes.rows[:30] * torch.tensor([3.0, 1.0, 0.1]) + torch.tensor([5.0, 0.0, -2.0])
     known = codes.rows.detach()[:30]
-    assert codes.names == tuple(map(str, range(30))) and torch.equal(codes.told(AVERAGE), known.mean(0))
+    assert codes.names == tuple(map(str, range(30))) and torch.equal(codes.code_of(AVERAGE), known.mean(0))
     torch.testing.assert_close(codes.axes.T @ codes.axes, known.T.cov())
     torch.testing.assert_close(codes.average + codes.along(known[4]) @ codes.axes, known[4])
     drawn = torch.stack([codes.drawn(torch.Generator().manual_seed(seed)) for seed in range(400)])
     torch.testing.assert_close(drawn.std(0), known.std(0), rtol=0.15, atol=0.01)
-    torch.testing.assert_close(codes.told("3:7:0.25"), torch.lerp(known[3], known[7], 0.25))
+    torch.testing.assert_close(codes.code_of("3:7:0.25"), torch.lerp(known[3], known[7], 0.25))
 
 
 def test_a_code_is_found_again_from_one_picture(learnt):
@@ -138,7 +138,7 @@ def test_tuning_goes_with_what_was_found(learnt):
     whole, half, none = (told.given(instance=x)._told() for x in (FOUND, f"{FOUND}:1:0.5", "1"))
     change = whole.tensors[0] - made.tensors[0]
     assert change.abs().max() > 1e-3
-    (between,) = told._made(told.codes.told(f"{FOUND}:1:0.5", found=told.found.rows[0])[None])
+    (between,) = told._made(told.codes.code_of(f"{FOUND}:1:0.5", found=told.found.rows[0])[None])
     torch.testing.assert_close(half.tensors[0] - between.tensors[0], change / 2, atol=1e-5, rtol=1e-4)
     assert torch.equal(none.tensors[0], learnt.given(instance="1")._told().tensors[0])
     assert told.control("instance") == FOUND and learnt.control("instance") == AVERAGE

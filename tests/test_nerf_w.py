@@ -178,8 +178,8 @@ def test_codes_blend():
     with torch.no_grad():
         codes.codes[0], codes.codes[2] = torch.tensor([1.0, 0.0]), torch.tensor([3.0, 2.0])
     assert codes.average.tolist() == [2.0, 1.0]  # of those that were learnt
-    assert codes.told("average").tolist() == [2.0, 1.0] and codes.told("2").tolist() == [3.0, 2.0]
-    assert codes.told("0:2:0.25").tolist() == [1.5, 0.5] and codes.told("1").tolist() == [2.0, 1.0]  # unknown
+    assert codes.code_of("average").tolist() == [2.0, 1.0] and codes.code_of("2").tolist() == [3.0, 2.0]
+    assert codes.code_of("0:2:0.25").tolist() == [1.5, 0.5] and codes.code_of("1").tolist() == [2.0, 1.0]  # unknown
     assert control.over(["0", "2"], 3) == ["0", "0:2:0.5", "2"]
     assert control.over(["average", "1", "1"], 5) == ["average", "average:1:0.5", "1", "1", "1"]
     assert all(control.checked(value) == value for value in control.over(["0", "1", "2"], 10))

@@ -106,9 +106,9 @@ def test_a_busy_machine_is_told(monkeypatch):
     monkeypatch.setattr(torch, "get_num_threads", lambda: 2)
     monkeypatch.setattr(threads, "processors", lambda: 2)
     monkeypatch.setattr(os, "getloadavg", lambda: (1.5, 0.0, 0.0))
-    assert threads.told() == "2 threads"
+    assert threads.description() == "2 threads"
     monkeypatch.setattr(os, "getloadavg", lambda: (3.25, 0.0, 0.0))
-    assert threads.told() == "2 threads, on a machine that is busy (load 3.2)"
+    assert threads.description() == "2 threads, on a machine that is busy (load 3.2)"
 
 
 def test_threads_sleep_for_a_while_when_others_hold_them_up(monkeypatch):

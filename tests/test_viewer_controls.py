@@ -74,19 +74,19 @@ def test_a_client_sees_what_it_turns_and_nobody_else_does(tmp_path):
             "ink": "colour",
             "time": 2.0,
         }
-        assert one.request().told == other.request().told == ()
+        assert one.request().settings == other.request().settings == ()
         before = method.render(one.request().camera((120, 90))).rgb
         clients[0].turn(handles["ink"], "grey")
         clients[0].turn(handles["time"], 5.0)
         clients[0].turn(handles["brightness"], 2.0000000001)  # a browser's rounding beyond the end
         told = (("brightness", 2.0), ("ink", "grey"), ("time", 5.0))
-        until(lambda: one.request().told == told)
+        until(lambda: one.request().settings == told)
         expected = method.given(**dict(told)).render(one.request().camera((120, 90))).rgb
         until(lambda: np.abs(clients[0].picture(width=120) / 255 - expected.clamp(0, 1).numpy()).mean() < 0.02)
         assert (expected - before).abs().mean() > 0.05
-        assert other.request().told == () and method.told == {"brightness": 0.8}
+        assert other.request().settings == () and method.settings == {"brightness": 0.8}
         clients[0].turn(handles["ink"], "colour")  # back where it began
-        until(lambda: one.request().told == (told[0], told[2]))
+        until(lambda: one.request().settings == (told[0], told[2]))
         assert one.path._here().time == 5.0 and other.path._here().time == 2.0  # a keyframe keeps the moment
         for client in clients:
             client.close()
@@ -113,6 +113,6 @@ def test_a_method_without_controls_has_no_folder(tmp_path):
         client = Client(viewer.address.url)
         client.picture(width=120)
         (visitor,) = viewer._everyone()
-        assert visitor.method_controls._handles == {} and visitor.request().told == ()
+        assert visitor.method_controls._handles == {} and visitor.request().settings == ()
         assert visitor.path._here().time is None
         client.close()

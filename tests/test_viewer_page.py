@@ -237,7 +237,7 @@ def test_appearances_are_a_list_whose_choice_is_seen(page, faults, tmp_path):
         pictures = {}
         for photograph in ("1", "2"):
             choose(page, "Appearance", photograph)
-            wait(lambda n=photograph: visitor.request().told == (("appearance", n),))
+            wait(lambda n=photograph: visitor.request().settings == (("appearance", n),))
             settle(visitor)
             told = method.given(appearance=photograph).render(visitor.request().camera(SIZE)).rgb
             pictures[photograph] = told.clamp(0, 1).numpy()[ROWS, COLUMNS]
@@ -258,7 +258,7 @@ def test_a_slider_changes_the_picture(page, tmp_path):
         slider = page.locator("[role=slider][aria-valuemax='2']").first
         slider.focus()
         slider.press("End")
-        wait(lambda: dict(visitor.request().told).get("brightness") == 2.0)
+        wait(lambda: dict(visitor.request().settings).get("brightness") == 2.0)
         settle(visitor)
         bright = method.given(brightness=2.0).render(visitor.request().camera(SIZE)).rgb.clamp(0, 1)
         assert psnr(bright.numpy()[ROWS, COLUMNS], expected(viewer, visitor)) < 24

@@ -72,7 +72,7 @@ def assemble(
         if (fault := shot.lens.fault()) is not None:
             raise LumigraphError(f"{capture.source}: the lens of {shot.name} has a fault: its {fault}; correct it")
     capture, lost = without_stray_points(capture)
-    told += capture.told + lost + oddities(capture, shots, poses)
+    told += capture.notes + lost + oddities(capture, shots, poses)
     with counting("Looking at photographs", len(shots)) as done:
         chosen = in_parallel(lambda i: choose(shots[i], downscale), range(len(shots)), done)
     told += about_small(capture.source, chosen) if downscale else []

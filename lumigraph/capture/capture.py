@@ -93,7 +93,7 @@ class Capture:
     background: colour behind everything
     up:       which way is up, source's frame, any length
     around:   of a part of a larger capture, centre and half-size of its box of interest, source's frame and units
-    told:     what its user should know, one sentence each
+    notes:     what its user should know, one sentence each
     kept:     whether pictures go to the user's cache even where they fit into memory, for they took long to make
     """
 
@@ -109,5 +109,5 @@ class Capture:
     background: tuple[float, float, float] | None = None
     up: tuple[float, float, float] | None = None
     around: tuple[tuple[float, float, float], float] | None = None
-    told: list[str] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
     kept: bool = False

@@ -29,7 +29,7 @@ def oddities(capture: Capture, shots: list[Shot], poses: Float[np.ndarray, "came
     if capture.bounds is not None:
         return []
     found = [about_double(shots), about_places(poses), about_gaze(capture, poses), about_angles(shots)]
-    if not any("folded" in sentence for sentence in capture.told):  # the reader may know more
+    if not any("folded" in sentence for sentence in capture.notes):  # the reader may know more
         found.append(about_fold(shots, poses))
     return [f"{capture.source} {sentence}" for sentence in found if sentence]
 

@@ -135,7 +135,7 @@ def read(folder: Path) -> Capture:
         missing,
         reach=reach,
         up=whole.up,
-        told=folded(folder),
+        notes=folded(folder),
     )
 
 

@@ -56,7 +56,7 @@ def animate(opened: Any, method: Any, told: Iterable[str], frames: int) -> Any:
 
     stations = {}
     for name, text in (parted("--animate", "NAME=A:B", text) for text in told):
-        if name in method.told:
+        if name in method.settings:
             raise LumigraphError(f"{name} is both set and animated; leave out --set {name} or --animate {name}")
         if ":" not in text:
             raise LumigraphError(f"--animate {name}={text} goes nowhere; write where it goes, as in {name}=A:B")

@@ -44,7 +44,7 @@ class Eval:
     overwrite: Overwrite = False
     scene: Annotated[str | None, option("SCENE", "the path used in training")] = None
     """Path of the training data, if it was moved since training."""
-    told: Set = ()
+    settings: Set = ()
     device: Annotated[str, option("NAME")] = "auto"
     """Device to compute on: auto (a GPU if there is one), cpu, cuda, cuda:1."""
 
@@ -62,9 +62,9 @@ class Eval:
         device = choose_device(self.device)
         if isinstance(run, BlockRun):  # by the exposures of the photographs that it will be given
             data: Any = run.dataset(self.scene, self.split)
-            method = tell(run, run.method(device, data.about.get("exposure")), self.told)
+            method = tell(run, run.method(device, data.about.get("exposure")), self.settings)
         else:
-            method = tell(run, run.method(device), self.told)
+            method = tell(run, run.method(device), self.settings)
             data = run.dataset(self.scene)
         result = evaluate_run(run, method, data, self.split, self.save_images, self.views, lpips, self.right_halves)
         rows: dict[str, Any] = {score.name: bold(score) for score in scores_of(result)}

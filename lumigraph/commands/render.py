@@ -47,7 +47,7 @@ class Render:
     format: Annotated[Literal["png", "exr"], option("{png,exr}")] = "png"
     """Format of the pictures beside the film. exr adds linear light with its full range, FILE/0000.exr."""
     overwrite: Overwrite = False
-    told: Set = ()
+    settings: Set = ()
     animated: Animate = ()
     device: Annotated[str, option("NAME")] = "auto"
     """Device to compute on: auto (a GPU if there is one), cpu, cuda, cuda:1."""
@@ -63,7 +63,7 @@ class Render:
         if self.output is not None:
             kind_of(self.output, fps)
             claim_film(self.output, self.overwrite, reads)
-        opened, method, views = open_method(self.source, self.device, self.told)
+        opened, method, views = open_method(self.source, self.device, self.settings)
         path = fitting(views["train"], opened.frame) if self.path == AUTO else self.path
         output = self.output or opened.renders / f"{Path(path).stem}.mp4"
         kind_of(output, fps)

@@ -32,14 +32,14 @@ class ViewCommand:
     """Address to listen at; 0.0.0.0 gives access to other machines."""
     port: Annotated[Port | None, option("N", "8080, or the next free port")] = None
     """Port to listen at."""
-    told: Set = ()
+    settings: Set = ()
     device: Annotated[str, option("NAME")] = "auto"
     """Device to compute on: auto (a GPU if there is one), cpu, cuda, cuda:1."""
 
     def run(self) -> int:
         from ..viewer import Viewer, choose_address
 
-        opened, method, cameras = open_method(self.source, self.device, self.told)
+        opened, method, cameras = open_method(self.source, self.device, self.settings)
         subject = subject_of(opened, cameras, page=page_of(opened, method, cameras))
         address = choose_address(self.host, self.port)
         with until_interrupted(), Viewer(method, subject, address) as viewer:

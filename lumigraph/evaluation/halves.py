@@ -21,7 +21,7 @@ def judged_by_halves(method: Method) -> bool:
     """True if a method of Scenes accepts single photographs as evidence, and no control already selects a photograph's
     appearance."""
     takes = issubclass(method.learns_from, Scene) and Photograph in method.takes
-    return takes and not any(control.of_photographs and control.name in method.told for control in method.controls)
+    return takes and not any(control.of_photographs and control.name in method.settings for control in method.controls)
 
 
 def definition(method: Method, right_halves: bool) -> str | None:

@@ -238,7 +238,7 @@ def protocol(
         "resolution": sizes[0] if len(sizes) == 1 else sizes,
         "background": list(scene.frame.background) if scene.frame.has_alpha else None,
         "poses": "as the method refined them" if refined else "as captured",
-        "controls": dict(method.told),
+        "controls": dict(method.settings),
         "halves": halves.definition(method, right_halves),
         "masked": any(scene.images.mask(i) is not None for i in compared),
         "colours": LIGHT_PROTOCOL if LIGHT_LAYER in scene.layers else "sRGB in [0, 1]; renderings clipped, not rounded",

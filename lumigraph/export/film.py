@@ -102,7 +102,7 @@ def animated(method: Method, stations: Mapping[str, Sequence[Value]], frames: in
 
 def what_was_told(methods: Sequence[Method]) -> dict[str, Value | list[Value]]:
     """The values of controls that were told: one for all frames, or one for each where they differ."""
-    told = {name: [method.control(name) for method in methods] for name in methods[0].told}
+    told = {name: [method.control(name) for method in methods] for name in methods[0].settings}
     return {name: values[0] if len(set(values)) == 1 else values for name, values in told.items()}
 
 

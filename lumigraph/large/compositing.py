@@ -160,10 +160,10 @@ class InBlocks(Method):
         mine: list[Any] = [piece for piece in evidence if isinstance(piece, self.accepts)]
         told = super().given(*(piece for piece in evidence if not isinstance(piece, self.accepts)), **controls)
         assert isinstance(told, InBlocks)
-        passed = {name: value for name, value in told.told.items() if name != EXPOSURE and name in controls}
+        passed = {name: value for name, value in told.settings.items() if name != EXPOSURE and name in controls}
         parts = self.blocks.each(lambda part: part.given(passed))
         if EXPOSURE in controls and self.usual is not None:
-            parts = parts.each(partial(exposed, exposure=self.usual + float(told.told[EXPOSURE])))
+            parts = parts.each(partial(exposed, exposure=self.usual + float(told.settings[EXPOSURE])))
         for photograph in mine:
             parts = self._seen_in(photograph, parts)
         told.blocks = parts

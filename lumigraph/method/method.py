@@ -50,7 +50,7 @@ class Method(nn.Module, ABC):
     config:  the paper's numbers, a frozen dataclass named Config in the method's file
     figures: of the last step, by name, worth a line in metrics.jsonl; "mse", the squared error of colours, becomes
              the PSNR that training shows
-    told:    what `given` told this one, by the names of its controls
+    settings: values that `given` set, by the names of the controls
     All that must survive a resume lives in parameters, buffers and optimizers.
     """
 
@@ -66,7 +66,7 @@ class Method(nn.Module, ABC):
         super().__init__()
         self.frame, self.config = frame, config
         self.figures: dict[str, float] = {}
-        self.told: dict[str, Value] = {}
+        self.settings: dict[str, Value] = {}
         self.register_buffer("_place", torch.empty(0), persistent=False)  # knows the device, also without parameters
 
     @classmethod
@@ -230,7 +230,7 @@ class Method(nn.Module, ABC):
         for held in ("_parameters", "_buffers", "_modules"):  # the same tensors, in dictionaries of its own
             told.__dict__[held] = dict(self.__dict__[held])
         told.figures = {}
-        told.told = self.told | {name: known[name].checked(value) for name, value in controls.items()}
+        told.settings = self.settings | {name: known[name].checked(value) for name, value in controls.items()}
         for piece, names in zip(evidence, chosen, strict=True):
             for name in names:
                 told._modules[name] = told._modules[name].adapted(told, piece)  # type: ignore[union-attr, operator]
@@ -238,17 +238,17 @@ class Method(nn.Module, ABC):
 
     def control(self, name: str) -> Value:
         """The value of a control: as told, or its default."""
-        if name in self.told:
-            return self.told[name]
+        if name in self.settings:
+            return self.settings[name]
         return next(x.default for x in self.controls if x.name == name)
 
     def moments(self, rays: Rays) -> Float[Tensor, " ray"]:
         """When each ray looks, for methods that follow a moving scene and offer `controls.moment`: as told by the
         control `time`, else as its camera says, else at the first moment of the capture."""
-        if "time" not in self.told and rays.time is not None:
+        if "time" not in self.settings and rays.time is not None:
             return rays.time
         first, _ = self.frame.times or (0.0, 0.0)
-        return torch.full_like(rays.radius, float(self.told.get("time", first)))
+        return torch.full_like(rays.radius, float(self.settings.get("time", first)))
 
     def refined(self, cameras: Camera) -> Camera:
         """The cameras of photographs as this method has come to see them, by their `image_index`; as they are where it

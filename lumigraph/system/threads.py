@@ -128,7 +128,7 @@ def crowd(leave: threading.Event) -> None:
     leave.wait()
 
 
-def told() -> str:
+def description() -> str:
     """Describe the number of threads, and the load of the last minute if it exceeds the processors."""
     import torch
 

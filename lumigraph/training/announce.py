@@ -45,7 +45,7 @@ def machine(device: torch.device) -> str:
     """A device; on a CPU how many threads compute."""
     if device.type == "cuda":
         return f"on {torch.cuda.get_device_name(device)} ({device})"
-    return f"on the CPU with {threads.told()}"
+    return f"on the CPU with {threads.description()}"
 
 
 def how_long(budget: Budget, step: int, seconds: float) -> str:

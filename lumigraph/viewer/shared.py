@@ -45,7 +45,7 @@ class Shared:
         LumigraphError if it has none. Call it inside `turns.turn`."""
         if not request.part:
             return needs(self._given(request), HasGaussians).gaussians()
-        wanted = self.step, request.told, request.crop, request.floaters
+        wanted = self.step, request.settings, request.crop, request.floaters
         if self._picked is None or self._picked[0] != wanted:
             cloud = needs(self._given(request), HasGaussians).gaussians()
             self._picked = wanted, cleaned(cloud, request.crop, **dict(request.floaters))
@@ -62,7 +62,7 @@ class Shared:
         return splatting.render(cloud, camera.to(method.device), frame.background, frame.near).cpu()
 
     def _given(self, request: ViewRequest) -> Method:
-        return self.method.given(**dict(request.told)) if request.told else self.method
+        return self.method.given(**dict(request.settings)) if request.settings else self.method
 
     def knows(self, client: Any) -> bool:
         """True if a client is still connected."""

@@ -27,7 +27,7 @@ class ViewRequest:
     exact:      whether Gaussians are rendered here rather than by the browser
     crop:       what is shown of the scene; None for all of it
     depth:      whether the browser needs depth, because it draws something beside the scene
-    told:       names and values of the method's controls that the client has turned
+    settings:       names and values of the method's controls that the client has turned
     floaters:   names and numbers of what `cleaned` is told of them; nothing if they stay
     """
 
@@ -40,7 +40,7 @@ class ViewRequest:
     exact: bool = False
     crop: Crop | None = None
     depth: bool = False
-    told: tuple[tuple[str, Value], ...] = ()
+    settings: tuple[tuple[str, Value], ...] = ()
     floaters: tuple[tuple[str, float], ...] = ()
 
     @property

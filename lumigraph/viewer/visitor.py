@@ -203,7 +203,8 @@ class Visitor:
             self._flat = request.background
         if self._splats is not None:
             self._splats.visible = True
-        now, eye = (self._shared.step, request.crop, request.told, request.floaters), torch.tensor(request.pose)[:, 3]
+        now = self._shared.step, request.crop, request.settings, request.floaters
+        eye = torch.tensor(request.pose)[:, 3]
         if self._splats is None or (seconds > MOVING_SECONDS and self._sent != now):
             self._send_splats(request, eye, wanted)
             self._sent, self._eye = now, eye

@@ -57,13 +57,13 @@ def with_raw(capture: Capture, folder: Path) -> Capture:
     if not known:
         return capture
     shots = [with_its_raw(shot, known[shot.name]) if shot.name in known else shot for shot in capture.shots]
-    told = list(capture.told)
+    told = list(capture.notes)
     if lacking := [shot.name for shot in shots if shot.name in known and "exposure" not in shot.about]:
         told.append(
             f"{len(lacking)} of {len(known)} raw files do not say how long they were exposed, such as that of "
             f"{lacking[0]}; a method of raw photographs learns their brightness instead"
         )
-    return replace(capture, shots=shots, told=told)
+    return replace(capture, shots=shots, notes=told)
 
 
 def raw_files(capture: Capture, folder: Path) -> dict[str, Developed]:

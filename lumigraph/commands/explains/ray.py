@@ -37,7 +37,7 @@ class ExplainRay:
     overwrite: Overwrite = False
     scene: Annotated[str | None, option("SCENE", "the path used in training")] = None
     """Path of the photographs, if they were moved since training."""
-    told: Set = ()
+    settings: Set = ()
     device: Annotated[str, option("NAME")] = "auto"
     """Device to compute on: auto (a GPU if there is one), cpu, cuda, cuda:1."""
 
@@ -58,7 +58,7 @@ class ExplainRay:
         output = self.output or run.folder / "rays" / f"{file_name(name)}-{x}-{y}.svg"
         for file in (output, output.with_suffix(".json")):
             claim(file, "figure", self.overwrite)
-        method = tell(run, run.method(choose_device(self.device)), self.told)
+        method = tell(run, run.method(choose_device(self.device)), self.settings)
         camera = method.refined(camera)
         with counting("Looking along the ray"):
             sight = along_ray(method, camera, pixel)
@@ -66,7 +66,7 @@ class ExplainRay:
         title = f"{run.method_name}: pixel ({x}, {y}) of {name}"
         write_bytes(output, standalone(ray_figure(sight, title)), "figure")
         about = {"run": str(run.folder), "method": run.method_name, "view": name, "split": self.split}
-        about |= {"controls": method.told} if method.told else {}
+        about |= {"controls": method.settings} if method.settings else {}
         write_json(output.with_suffix(".json"), about | sight.to_json(), "figure")
         show(sight.rows() | {"files": f"{output}, {output.with_suffix('.json')}"})
         return 0

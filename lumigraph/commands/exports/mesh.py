@@ -61,7 +61,7 @@ class ExportMesh:
     """Largest number of these pictures."""
     overwrite: Overwrite = False
     part: OmitArgPrefixes[Keeping] = Keeping()
-    told: Set = ()
+    settings: Set = ()
     device: Annotated[str, option("NAME")] = "auto"
     """Device to compute on: auto (a GPU if there is one), cpu, cuda, cuda:1."""
 
@@ -71,7 +71,7 @@ class ExportMesh:
 
         for_phones = ending(self.output) == ".usdz"
         claim(self.output, "mesh", self.overwrite, [self.source])
-        opened, method, cameras = open_method(self.source, self.device, self.told)
+        opened, method, cameras = open_method(self.source, self.device, self.settings)
         mesh = extract_mesh(
             self.part.without_floaters(method),
             opened.survey(cameras["train"]),

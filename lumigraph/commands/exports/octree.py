@@ -30,7 +30,7 @@ class ExportOctree:
     depth: Annotated[Annotated[int, between(1, 10)] | None, option("N", "all there are")] = None
     """Largest depth of the octree; deeper levels are averaged, for a smaller file."""
     overwrite: Overwrite = False
-    told: Set = ()
+    settings: Set = ()
 
     def run(self) -> int:
         if self.output.suffix.lower() != ".npz":
@@ -41,7 +41,7 @@ class ExportOctree:
         from ...run import open_any
 
         opened = open_any(self.source)
-        octree = needs(tell(opened, opened.method(), self.told), HasOctree).octree(self.depth)
+        octree = needs(tell(opened, opened.method(), self.settings), HasOctree).octree(self.depth)
         in_source = write_octree(self.output, octree, opened.frame)
         show(
             {

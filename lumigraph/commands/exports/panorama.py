@@ -38,7 +38,7 @@ class SphereExport:
     """Width in pixels; the height of each sphere is half of it."""
     overwrite: Overwrite = False
     part: OmitArgPrefixes[Keeping] = Keeping()
-    told: Set = ()
+    settings: Set = ()
     device: Annotated[str, option("NAME")] = "auto"
     """Device to compute on: auto (a GPU if there is one), cpu, cuda, cuda:1."""
 
@@ -50,7 +50,7 @@ class SphereExport:
         picture_format(self.output)
         sphere_size(self.size)
         claim(self.output, "panorama", self.overwrite, [self.source])
-        opened, method, cameras = open_method(self.source, self.device, self.told)
+        opened, method, cameras = open_method(self.source, self.device, self.settings)
         return opened, self.part.of_method(method), *standpoint(cameras["train"], opened.frame, self.place)
 
 

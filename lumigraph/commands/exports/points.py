@@ -35,7 +35,7 @@ class ExportPoints:
     """Largest number of these pictures."""
     overwrite: Overwrite = False
     part: OmitArgPrefixes[Keeping] = Keeping()
-    told: Set = ()
+    settings: Set = ()
     device: Annotated[str, option("NAME")] = "auto"
     """Device to compute on: auto (a GPU if there is one), cpu, cuda, cuda:1."""
 
@@ -45,7 +45,7 @@ class ExportPoints:
         claim(self.output, "points", self.overwrite, [self.source])
         from ...export.points import extract_points, write_points
 
-        opened, method, cameras = open_method(self.source, self.device, self.told)
+        opened, method, cameras = open_method(self.source, self.device, self.settings)
         seers = opened.survey(cameras["train"])
         method, crop = self.part.without_floaters(method), self.part.crop(opened.frame)
         points = extract_points(method, seers, self.count, self.size, self.views, crop).in_source(opened.frame)

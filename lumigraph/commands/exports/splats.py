@@ -60,7 +60,7 @@ class ExportSplats:
     detail: OmitArgPrefixes[Levels] = Levels()
     overwrite: Overwrite = False
     part: OmitArgPrefixes[Keeping] = Keeping()
-    told: Set = ()
+    settings: Set = ()
 
     def run(self) -> int:
         from ...exchange import check_ending, claim_splats, is_splat_file, read_gaussians, size_of, write_gaussians
@@ -75,7 +75,7 @@ class ExportSplats:
         claim_splats(output, self.overwrite, [self.source])
         detail = Detail(**self.detail.given)
         if is_splat_file(self.source):
-            if self.told:
+            if self.settings:
                 raise LumigraphError(f"{self.source} is a file of Gaussians, which has no controls; leave out --set")
             written = read_gaussians(self.source)
             if self.part.crops or self.part.floaters:
@@ -85,7 +85,7 @@ class ExportSplats:
             write_gaussians(output, written, detail)
         else:
             opened = open_any(self.source)
-            method = tell(opened, opened.method(), self.told)
+            method = tell(opened, opened.method(), self.settings)
             gaussians = needs(method, HasGaussians).gaussians()
             gaussians = self.part.of_gaussians(gaussians, self.part.crop(method.frame))
             written = export_splats(gaussians, method.frame, output, detail)

@@ -58,7 +58,7 @@ class ExportWeb:
     """Training time of the octree that a field is converted to, in seconds."""
     overwrite: Overwrite = False
     part: OmitArgPrefixes[Keeping] = Keeping()
-    told: Set = ()
+    settings: Set = ()
     device: Annotated[str, option("NAME")] = "auto"
     """Device to compute on: auto (a GPU if there is one), cpu, cuda, cuda:1."""
 
@@ -70,7 +70,7 @@ class ExportWeb:
             raise LumigraphError(f"{self.output} should end in .html, as pages do; rename it")
         background = self._background()
         claim(self.output, "page", self.overwrite, [self.source])
-        opened, method, cameras = open_method(self.source, self.device, self.told)
+        opened, method, cameras = open_method(self.source, self.device, self.settings)
         kind = self._kind(opened, method)
         told: dict[str, str] = {}
         if kind == "volume":
@@ -113,7 +113,7 @@ class ExportWeb:
             return "splats"
         if self.part.crops:
             return "views"
-        return "volume" if is_baked(method) or (not self.told and can_be_baked(opened, method)) else "views"
+        return "volume" if is_baked(method) or (not self.settings and can_be_baked(opened, method)) else "views"
 
     def _baked(self, opened: Any, method: Any) -> tuple[Any, dict[str, str]]:
         """A volume for the page, and the cost of its conversion."""
@@ -121,7 +121,7 @@ class ExportWeb:
             raise LumigraphError("A volume is shown as a whole; leave out --box and --sphere, or give --as views")
         if is_baked(method):
             return method, {}
-        if self.told:
+        if self.settings:
             raise LumigraphError("What is converted is told nothing; leave out --set, or give --as views")
         about = f"to an octree, which then learns on for {self.seconds:.0f} s; --as views is quicker"
         show({"converts": about})

@@ -97,7 +97,7 @@ class PhotographCodes(Part):
         there = (start - average) @ axes.T / axes.square().sum(-1)
         return average + fitted(there, likely, FIT_STEPS, FIT_RATE) @ axes
 
-    def told(self, value: str) -> Float[Tensor, " width"]:
+    def code_of(self, value: str) -> Float[Tensor, " width"]:
         """The code that a value of `control` stands for: a photograph's, the average, or one between two. A photograph
         that nobody learnt from has the average."""
         first, second, share = blend(value)
@@ -138,16 +138,16 @@ class AppearanceCodes(PhotographCodes):
 
     def shown(self, method: Any) -> Float[Tensor, " width"]:
         """The code of the settings, else of the evidence, else the average."""
-        if self.found is not None and "appearance" not in method.told:
+        if self.found is not None and "appearance" not in method.settings:
             return self.found
-        return self.told(str(method.control("appearance")))
+        return self.code_of(str(method.control("appearance")))
 
     def adapted(self, method: Any, evidence: Photograph | Patches | Appearance) -> AppearanceCodes:
         """The part with the appearance in which the scene looks most like a photograph, by the pixels that are to be
         trusted (Martin-Brualla 2021, section 5), or like patches of pictures; or with a given one."""
         adapted = copy.copy(self)
         adapted.found = self._matched(method, evidence)
-        method.told.pop("appearance", None)
+        method.settings.pop("appearance", None)
         return adapted
 
     @torch.no_grad()

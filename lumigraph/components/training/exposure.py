@@ -90,9 +90,9 @@ class Exposure(Part):
 
     def recoloured(self, method: Any, rgb: Float[Tensor, "point 3"]) -> Float[Tensor, "point 3"]:
         """Colours with the gain of the settings, or of a photograph given as evidence."""
-        if self.found is not None and "exposed_as" not in method.told:
+        if self.found is not None and "exposed_as" not in method.settings:
             rgb = rgb * self.found
-        return rgb * self.gain(method.told) if method.told and bool(self.differ) else rgb
+        return rgb * self.gain(method.settings) if method.settings and bool(self.differ) else rgb
 
     def gain(self, told: dict[str, Value]) -> Float[Tensor, " 3"]:
         """The factor on colours that settings ask for: 1 without any."""
@@ -110,12 +110,12 @@ class Exposure(Part):
     def adapted(self, method: Any, evidence: Photograph) -> Exposure:
         """The part with the gain of a photograph, found from its trusted pixels."""
         batch = drawn(evidence, GAIN_PIXELS, method.random(0)).to(self.log_gain.device)
-        method.told.pop("exposed_as", None)
+        method.settings.pop("exposed_as", None)
         adapted = copy.copy(self)
         if not len(batch):
             return adapted
         plain = copy.copy(method)
-        plain.told = {}
+        plain.settings = {}
         parts = [
             plain.render_rays(batch.rays[part], plain.background).rgb
             for part in torch.arange(len(batch), device=self.log_gain.device).split(plain.rays_per_chunk)

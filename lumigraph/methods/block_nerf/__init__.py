@@ -45,7 +45,7 @@ from .visibility import Visibility
 
 @dataclass(frozen=True)
 class Config:
-    """The paper's numbers with a section; others are Mip-NeRF's or ours. `BlockNeRF.preset` has those of a plain CPU."""
+    """The paper's numbers with a section; others are Mip-NeRF's or ours. `BlockNeRF.preset` has a CPU's."""
 
     network: NetworkNumbers = NetworkNumbers(position_frequencies=16)  # mip-NeRF's
     rays: RayNumbers = RayNumbers(128, 128)  # mip-NeRF's

@@ -84,7 +84,7 @@ class Exposures(Part):
 
     def shown(self, method: Any) -> Float[Tensor, " width"]:
         """The code of the settings, else of the evidence, else of the usual exposure."""
-        stops = method.told.get("exposure", 0.0 if self.taken is None else self.taken)
+        stops = method.settings.get("exposure", 0.0 if self.taken is None else self.taken)
         return self.encoded(self.usual.new_tensor([float(stops)]))[0]
 
     @property

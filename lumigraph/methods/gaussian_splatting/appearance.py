@@ -122,9 +122,9 @@ class SplatAppearance(Addition):
         not differ."""
         if not self.is_active:
             return None
-        if self.found is not None and "appearance" not in method.told:
+        if self.found is not None and "appearance" not in method.settings:
             return self.found
-        return self.codes.told(str(method.control("appearance"))).detach()
+        return self.codes.code_of(str(method.control("appearance"))).detach()
 
     # Settings
 
@@ -154,5 +154,5 @@ class SplatAppearance(Addition):
             target = target - (1 - seen.opacity[..., None]) * background
         adapted, start = copy.copy(self), self.codes.average
         adapted.found = fit_colours(start, seen.rgb[trusted], seen.opacity[trusted], target[trusted], behind)
-        method.told.pop("appearance", None)
+        method.settings.pop("appearance", None)
         return adapted

@@ -373,7 +373,7 @@ class HypNeRF(RayMethod):
     def _told(self) -> HashInstance:
         """The field of the code that was told; of the one that was found, as it was tuned."""
         value = str(self.control("instance"))
-        (instance,) = self._made(self.codes.told(value, **self._others)[None])
+        (instance,) = self._made(self.codes.code_of(value, **self._others)[None])
         first, second, share = blend(value)
         weight = (1 - share) * (first == FOUND) + share * (second == FOUND)
         if not weight or not self.tuned:
@@ -412,7 +412,7 @@ class HypNeRF(RayMethod):
         told._shown = None
         for scene in scenes[-1:]:
             told.frame = scene.frame
-            told.told.pop("instance", None)
+            told.settings.pop("instance", None)
             told._find(scene)
         return told
 
@@ -422,7 +422,7 @@ class HypNeRF(RayMethod):
         assert isinstance(told, HypNeRF)
         told.found, told._shown = Kept(self.codes.drawn(torch.Generator().manual_seed(seed))[None]), None
         told.tuned = untuned(self.shape)
-        told.told.pop("instance", None)
+        told.settings.pop("instance", None)
         return told
 
     def _find(self, scene: Scene) -> None:

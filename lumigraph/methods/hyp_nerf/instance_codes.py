@@ -64,7 +64,7 @@ class InstanceCodes(nn.Module):
         axes = self.axes
         return self.average + torch.randn(len(axes), generator=generator).to(axes) @ axes
 
-    def told(self, value: str, **others: Float[Tensor, " code"]) -> Float[Tensor, " code"]:
+    def code_of(self, value: str, **others: Float[Tensor, " code"]) -> Float[Tensor, " code"]:
         """The code that a control's value stands for: a member's, the average, one of the others by its name, or one
         between two, as `controls.blend` takes values apart."""
         known = {AVERAGE: self.average} | others

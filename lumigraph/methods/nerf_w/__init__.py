@@ -210,7 +210,7 @@ class NeRFW(FieldMethod):
         if self.control("transient") == HIDDEN:
             return super().render_rays(rays, background)
         code, last = self.shown_code, self.sampler.sample(rays, self.network)[-1]
-        transient = self.transient.told(str(self.told.get("appearance", AVERAGE)))
+        transient = self.transient.code_of(str(self.settings.get("appearance", AVERAGE)))
         passing, background = self.transients(rays, last, transient[None]), self.behind(rays, code, background)
         seen = with_transient(last.look(self.network, code), passing, background)
         return replace(seen, rgb=seen.rgb.clamp(0, 1))

@@ -274,7 +274,7 @@ class PixelNeRF(RayMethod):
         told._sources = None
         for scene in scenes[-1:]:
             told.frame = scene.frame
-            told.told.pop("views", None)
+            told.settings.pop("views", None)
             told.kept = told._keeping(scene, len(scene.splits["train"])).to(self.device)
             with torch.no_grad():
                 told.kept.found.rows = told._features(told.kept.pictures()).flatten(0, 2)
@@ -306,7 +306,7 @@ class PixelNeRF(RayMethod):
                     features = rows.view(len(cameras), height, width, -1)
                 else:
                     features = self._features(self.kept.pictures())
-                count = int(float(self.told.get("views", len(cameras))))
+                count = int(float(self.settings.get("views", len(cameras))))
                 self._sources = self._prepared(features[:count], cameras[slice(count)].to(self.device), self.frame)
         return self._sources
 
