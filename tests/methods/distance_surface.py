@@ -23,9 +23,8 @@ class DistanceGrid(Field):
     def __init__(self, cells):
         super().__init__()
         corners = torch.stack(torch.meshgrid(*[torch.linspace(-1, 1, cells)] * 3, indexing="ij"))
-        self.values = nn.Parameter(
-            torch.cat([corners.norm(dim=0, keepdim=True) - 0.6, 0.1 * torch.randn(3, *[cells] * 3)])[None]
-        )
+        distance, colours = corners.norm(dim=0, keepdim=True) - 0.6, 0.1 * torch.randn(3, cells, cells, cells)
+        self.values = nn.Parameter(torch.cat([distance, colours])[None])
 
     def geometry(self, points, code=None):
         places = points.flip(-1)[None, None, None]
@@ -37,16 +36,13 @@ class DistanceGrid(Field):
 
 
 class SurfaceSampler(Sampler):
-    """Samples of a search along each ray, as far as a little behind the first surface."""
-
     batch_size = expected_rays = 128
 
     def sample(self, rays, field, code=None, generator=None):
-        edges = torch.linspace(1.0, 5.0, 49).expand(len(rays), -1)
-        samples = Samples.rows(edges[:, :-1], edges[:, -1])
+        samples = Samples.rows(torch.linspace(1, 4.9, 48).expand(len(rays), -1), torch.full((len(rays),), 5.0))
         with torch.no_grad():
             inside = field.geometry(samples.along(rays)[0])[1][:, 0].view(len(rays), -1) < 0
-            samples = samples.keep((inside.cumsum(-1) < 4).flatten())
+            samples = samples.keep((inside.cumsum(-1) < 4).flatten())  # as far as a little behind the first surface
         points, directions = samples.along(rays)
         return [Pass("surface", samples, *field.geometry(points), directions, evaluated=len(samples))]
 
