@@ -1,4 +1,4 @@
-"""Distance surface: a grid of signed distances, sampled around the first surface of each ray. For tests of samplers."""
+"""Distance surface: a grid of signed distances (density after Yariv 2021), sampled up to each ray's first surface."""
 
 from dataclasses import dataclass
 
@@ -6,20 +6,17 @@ import torch
 from torch import nn
 
 from lumigraph.camera.rays import Samples
-from lumigraph.files.ranges import Cells, LearningRate, Seed
+from lumigraph.files.ranges import Cells, Seed
 from lumigraph.method import Field, FieldMethod, Pass, Sampler
 
 
 @dataclass(frozen=True)
 class Config:
     cells: Cells = 16
-    learning_rate: LearningRate = 0.02
     seed: Seed = 0
 
 
 class DistanceGrid(Field):
-    """Signed distance and colour at corners of a cube, a sphere at first; density after Yariv 2021 (VolSDF)."""
-
     def __init__(self, cells):
         super().__init__()
         corners = torch.stack(torch.meshgrid(*[torch.linspace(-1, 1, cells)] * 3, indexing="ij"))
