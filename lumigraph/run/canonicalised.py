@@ -87,7 +87,7 @@ def canonical_frame(frame: Frame, scale: float, bounds: tuple[Vector, Vector]) -
     scale: canonical units to one of the run's scene
     """
     farthest = max(abs(x) for corner in bounds for x in corner)
-    if frame.reach > 1:
+    if frame.is_open:
         farthest = max(farthest, frame.reach * scale)
     reach = 2.0 ** math.ceil(math.log2(max(farthest, 1.0)))
     rows = Similarity.make(1.0).rows

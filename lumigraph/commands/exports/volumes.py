@@ -39,7 +39,7 @@ def can_be_baked(opened: Any, method: Any) -> bool:
         check(opened, find(INTO))
     except LumigraphError:
         return False
-    return opened.frame.reach == 1 and way(type(method), find(INTO)) == "field"
+    return not opened.frame.is_open and way(type(method), find(INTO)) == "field"
 
 
 def converted(opened: Any, seconds: float, device: Any) -> tuple[Any, str]:
