@@ -18,6 +18,7 @@ from lumigraph.evaluation import evaluate
 from lumigraph.evaluation.light import in_light
 from lumigraph.export.exr import exr
 from lumigraph.export.film import film
+from lumigraph.files.ranges import changed
 from lumigraph.methods.rawnerf import RawNeRF, layers_of
 from lumigraph.methods.rawnerf.thin_lens import through_lens
 from lumigraph.training import fit
@@ -88,7 +89,7 @@ def test_unknown_exposures_become_gains(night):
 def test_it_begins_at_the_light_there_is_and_develops_as_the_camera_did(night, begun):
     assert layers_of(night) == ("mosaic", "filter")
     assert float(begun.brightness) == pytest.approx(50)  # of the longest exposure
-    assert float(begun.marcher.network.level.exp()) == pytest.approx(0.002, rel=0.9)
+    assert float(begun.network.level.exp()) == pytest.approx(0.002, rel=0.9)
     shot = night.photograph(int(night.splits["train"][0]), layers=("radiance",))
     truth = shot.extra["radiance"]
     camera = torch.linalg.solve(begun.srgb_from_camera, truth.reshape(-1, 3).T).T / begun.gains / begun.brightness
@@ -96,7 +97,7 @@ def test_it_begins_at_the_light_there_is_and_develops_as_the_camera_did(night, b
 
 
 def test_it_learns_night_from_noise(night):
-    method = RawNeRF(night.frame, replace(RawNeRF.smallest(), refine_cameras=False, epsilon=1e-3))
+    method = RawNeRF(night.frame, changed(RawNeRF.smallest(), refine_cameras=False, epsilon=1e-3))
     fresh = evaluate(method, night).psnr
     fit(method, night, steps=60, show=False, rehearsal=False)
     found = evaluate(method, night)

@@ -11,6 +11,7 @@ import tiny
 import torch
 from budgets import budget
 
+from lumigraph.camera.rays import Samples
 from lumigraph.components.training.regularizers import near_thickness
 from lumigraph.components.training.unseen_views import patches, roughness, unseen_cameras
 from lumigraph.files.ranges import changed

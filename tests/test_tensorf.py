@@ -14,7 +14,7 @@ from lumigraph import kernels
 from lumigraph.datasets.scene import Forward, Frame
 from lumigraph.kernels.factor_grid import Factors
 from lumigraph.methods.tensorf import UPSAMPLINGS, TensoRF
-from lumigraph.methods.tensorf.factor_grid import FactorGrid, nodes_in
+from lumigraph.methods.tensorf.factorised import FactorGrid, nodes_in
 
 pytestmark = budget("methods")
 

@@ -25,7 +25,7 @@ print(torch.ones(1 << 18).exp().sum())
 
 ARENAS = """
 import ctypes, threading
-from lumigraph import cli
+from lumigraph.commands import cli
 cli.main(["methods"])
 libc = ctypes.CDLL(None)
 libc.malloc.restype = ctypes.c_void_p
@@ -46,7 +46,7 @@ libc.fflush(None)
 
 STEPS = """
 import ctypes, resource
-from lumigraph import cli
+from lumigraph.commands import cli
 cli.main(["methods"])
 libc = ctypes.CDLL(None)
 libc.malloc.restype = ctypes.c_void_p

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from lumigraph.methods.tensorf.factor_grid import FactorGrid
+from lumigraph.methods.tensorf.factorised import FactorGrid
 from lumigraph.methods.tensorf.truncation import decomposed, truncate
 
 

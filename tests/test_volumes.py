@@ -139,7 +139,7 @@ def test_a_baked_run_is_seen_as_it_renders(grid, tmp_path, window, capsys, name,
 
 
 def test_a_field_becomes_an_octree_on_the_way(grid, tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(lumigraph.derive.conversion, "Aim", lambda seconds: small("plenoctrees", 4))
+    monkeypatch.setattr(lumigraph.derive.conversion, "ConversionTarget", lambda seconds: small("plenoctrees", 4))
     assert main(["export", "web", str(grid), str(tmp_path / "page.html")]) == 0
     told = capsys.readouterr().out
     assert "leaves of an octree" in told and "--as views is quicker" in told and "dB to plenoxels" in told

@@ -197,9 +197,19 @@ class DepthMap:
         return Comparison(ahead, smooth, pixels, away)
 
     def sees(
-        self, points: Float[Tensor, "point 3"], tolerance: Tolerance = VISIBLE_TOLERANCE, edge: Tolerance = DEPTH_EDGE
+        self,
+        points: Float[Tensor, "point 3"],
+        tolerance: Tolerance = VISIBLE_TOLERANCE,
+        edge: Tolerance | None = DEPTH_EDGE,
     ) -> Bool[Tensor, " point"]:
-        """Mask of visible points: inside the picture, and no farther than the tolerance behind its surface."""
+        """Mask of visible points: inside the picture, and no farther than the tolerance behind its surface.
+
+        edge: as for `compare`; None takes the depth of the nearest pixel whatever its opacity, for translucent fields
+        """
+        if edge is None:
+            pixels, valid, away = self.project(points)
+            depth = self.at_pixels(self.depth, pixels)
+            return self.inside(pixels, valid) & (away < depth + tolerance(depth))
         compared = self.compare(points, edge)
         return compared.ahead >= -tolerance(compared.distance)
 

@@ -99,7 +99,7 @@ class Teacher(ABC):
         parts = points.split(AT_ONCE)
         for part in track(parts, "Taking over colour", len(parts)):
             squares, products = held.repeat(len(part), 1, 1), part.new_zeros(len(part), width, 3)
-            seen = torch.stack([depth_map.sees(part) for depth_map in chosen])
+            seen = torch.stack([depth_map.sees(part, edge=None) for depth_map in chosen])
             for i, depth_map in enumerate(chosen):
                 asked = (seen[i] | ~seen.any(0)).nonzero()[:, 0]  # what nobody sees is asked for all the same
                 basis = spherical_harmonics(unit(part[asked] - depth_map.camera.position), bands)
@@ -197,7 +197,7 @@ class DepthTeacher(Teacher):
         best, rgb = torch.full((len(points),), -2.0), torch.full_like(points, 0.5)
         for depth_map in self.depth_maps:
             along = (unit(points - depth_map.camera.position) * directions).sum(-1)
-            nearer = ((along > best) & depth_map.sees(points)).nonzero()[:, 0]
+            nearer = ((along > best) & depth_map.sees(points, edge=None)).nonzero()[:, 0]
             best[nearer], rgb[nearer] = along[nearer], self.glance(points[nearer], depth_map)
         return self.density(points), rgb
 

@@ -85,6 +85,6 @@ def glances(
     for i, depth_map in enumerate(track(held_by.depth_maps, "Asking the teacher", len(held_by.depth_maps))):
         own = (camera == i).nonzero()[:, 0]
         directions[own] = unit(places[own] - depth_map.camera.position)
-        own = own[depth_map.sees(places[own])]
+        own = own[depth_map.sees(places[own], edge=None)]
         seen[own], rgb[own] = 1.0, held_by.glance(places[own], depth_map)
     return directions, rgb, seen

@@ -2,7 +2,7 @@
 
 FAULTS = {
     "a neighbour's slope forgotten": ("gpu", "_vary", "dy / length", "0 * dy"),
-    "an axis forgotten": ("gpu", "_vary", "dz * dz + FLAT_", "FLAT_"),
+    "an axis forgotten": ("gpu", "_vary", "dz * dz + EPSILON_", "EPSILON_"),
     "slope's sign": ("cpu", "_vary", "out[down, c] += per * dy", "out[down, c] -= per * dy"),
     "a node's own slope forgotten": ("cpu", "_vary", "per * (dx + dy + dz)", "per * (dx + dy)"),
 }

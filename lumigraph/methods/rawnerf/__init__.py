@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from ...camera import Camera
-from ...camera.rays import Rays, Rendering
+from ...camera.rays import Look, Rays, Rendering
 from ...components.fields.activations import truncated_exp
 from ...components.fields.development import CONTROLS, decoded, exposed, toned
 from ...components.fields.hash_field import CPU_TABLE, TINY_TABLE, HashField, HashNumbers
@@ -208,6 +208,11 @@ class RawNeRF(FieldMethod):
         look = samples.look(self.network)
         return composite(look.samples, look.density, look.rgb)
 
+    def light_and_spread(self, look: Look) -> Rendering:
+        """Light of a look; the extra `moments` is the mean and the mean square of its samples' normalized distances."""
+        s = normalized_distance(look.samples.t)
+        return composite(look.samples, look.density, look.rgb, moments=torch.stack([s, s * s], -1))
+
     def scale(self, rays: Rays) -> Float[Tensor, "ray 3"]:
         """What light is multiplied by in each ray's photograph: its exposure, times alpha, which is learnt for each
         exposure and colour (section 4.2)."""
@@ -219,9 +224,7 @@ class RawNeRF(FieldMethod):
         """The squared error relative to what is shown (eq. 4): that of a tone curve with slope 1 / (y + epsilon)."""
         measured, known = self.measured(batch)
         (samples,), terms = self.learn(batch.rays, self.random(step))
-        look = samples.look(self.network)
-        s = normalized_distance(look.samples.t)
-        seen = composite(look.samples, look.density, look.rgb, moments=torch.stack([s, s * s], -1))
+        seen = self.light_and_spread(samples.look(self.network))
         shown = seen.rgb * self.scale(batch.rays) + (1 - seen.opacity)[:, None] * decoded(self.background)
         shown = torch.where(measured >= 1, shown.clamp(max=1), shown)  # a full sensor says: at least so much
         error = (shown - measured) / (shown.detach() + self.config.epsilon)

@@ -32,7 +32,7 @@ from ...kernels import factor_grid, spherical_harmonics
 from ...kernels.factor_grid import Factors
 from ...method import Field, FieldMethod
 from ...volume import composite
-from .factor_grid import FactorGrid, nodes_in
+from .factorised import FactorGrid, nodes_in
 from .truncation import truncate
 
 Resolution = Annotated[int, between(4, 2048)]  # nodes per axis of a cube with as many nodes

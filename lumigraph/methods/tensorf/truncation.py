@@ -7,7 +7,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ...exchange.packing import most_important
-from .factor_grid import FactorGrid
+from .factorised import FactorGrid
 
 
 @torch.no_grad()

@@ -36,7 +36,7 @@ ERROR = 10.0  # metres of which errors of poses are so many percent: a street's 
 
 
 @dataclass(frozen=True)
-class CityOptions(Pictures):
+class Options(Pictures):
     """Options of every scene, but for these.
 
     size:      width of the pictures, which are three quarters as high
