@@ -8,8 +8,8 @@ from .composite import composite as composite
 from .contract import contract as contract
 from .dense_grid import dense_grid as dense_grid
 from .distortion import distortion as distortion
-from .factorised import Factors as Factors
-from .factorised import factor_grid as factor_grid
+from .factor_grid import Factors as Factors
+from .factor_grid import factor_grid as factor_grid
 from .harmonic_grid import harmonic_grid as harmonic_grid
 from .hash_encode import HashLevels as HashLevels
 from .hash_encode import hash_encode as hash_encode
