@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from typing import ClassVar
+from typing import Any, ClassVar
 
 from jaxtyping import Float
 from torch import Tensor
@@ -37,9 +37,9 @@ class Field(Part):
 
     @abstractmethod
     def colour(
-        self, features: Features, directions: Float[Tensor, "point 3"], code: Float[Tensor, "point code"] | None = None
+        self, features: Any, directions: Float[Tensor, "point 3"], code: Float[Tensor, "point code"] | None = None
     ) -> Float[Tensor, "point 3"]:
-        """sRGB-encoded colour seen along unit directions."""
+        """sRGB-encoded colour seen along unit directions. features: as `geometry` gives them"""
 
     def density(
         self, points: Float[Tensor, "point 3"], code: Float[Tensor, "point code"] | None = None

@@ -58,8 +58,8 @@ class Pass:
     def keep(self, mask: Bool[Tensor, " sample"]) -> Pass:
         """The samples that a mask picks, of a pass all of whose samples get a colour later."""
         features = tuple(x[mask] for x in self.features) if isinstance(self.features, tuple) else self.features[mask]
-        kept = {"density": self.density[mask], "features": features, "directions": self.directions[mask]}
-        return replace(self, samples=self.samples.keep(mask), **kept)
+        samples, density, directions = self.samples.keep(mask), self.density[mask], self.directions[mask]
+        return replace(self, samples=samples, density=density, features=features, directions=directions)
 
     def code_of_samples(self, code: Float[Tensor, "ray code"] | None) -> Float[Tensor, "coloured code"] | None:
         """The codes of rays, one for each sample that gets a colour."""

@@ -239,6 +239,7 @@ class DVGO(FieldMethod):
             a = rendering.opacity.clamp(1e-6, 1 - 1e-6)
             terms["entropy"] = weight * -(a * a.log() + (1 - a) * (1 - a).log()).mean()
         if self.sampler.is_open and step % c.tv_interval == 0 and len(look.samples):
+            assert isinstance(samples.features, Tensor)
             weights = {"tv_density": c.tv_density_weight, "tv_feature": c.tv_feature_weight}
             for grid, (name, weight) in zip(self.network.grids, weights.items(), strict=True):
                 if weight:

@@ -82,9 +82,8 @@ class InstantNGP(FieldMethod):
         features, smaller tables and networks, a wider step and a smaller batch."""
         if device.type == "cuda":
             return Config()
-        sampling = {"occupancy": CPU_OCCUPANCY, "steps": CPU_STEPS}
-        own = {"hidden_width": 32, "learning_rate": 2e-2, "hash_weight_decay": 0.3, "huber_delta": 0.3}
-        return Config(table=CPU_TABLE, **sampling, **own)
+        sampling = CPU_TABLE, CPU_OCCUPANCY, CPU_STEPS
+        return Config(*sampling, hidden_width=32, learning_rate=2e-2, hash_weight_decay=0.3, huber_delta=0.3)
 
     @classmethod
     def smallest(cls) -> Any:

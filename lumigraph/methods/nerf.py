@@ -63,10 +63,10 @@ class NeRF(FieldMethod):
         space = space_of(frame)
         self.poses = poses_for(frame, c.poses)
         noise = c.density_noise if space.is_open else 0.0
-        options = {"joining": self.poses.weights if self.poses else None, "noise": noise}
-        self.network = CoordinateField(c.network, c.hidden_width, space, **options)
+        joining = self.poses.weights if self.poses else None
+        self.network = CoordinateField(c.network, c.hidden_width, space, joining=joining, noise=noise)
         if c.networks == 2:
-            self.network.coarse = CoordinateField(c.network, c.hidden_width, space, **options)
+            self.network.coarse = CoordinateField(c.network, c.hidden_width, space, joining=joining, noise=noise)
         passes = c.coarse_loss_weight > 0, c.transmittance_threshold
         self.sampler = HierarchicalSampler(space, c.rays, c.mask, *passes)
 

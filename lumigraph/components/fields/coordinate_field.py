@@ -157,6 +157,7 @@ class CoordinateField(Field):
         if self.joint:
             assert isinstance(features, tuple)
             return self.colours_at(features, torch.arange(len(directions), device=directions.device), directions)[1]
+        assert code is not None
         if isinstance(features, tuple):  # of a pass: with the encoding of each ray's direction
             return in_chunks(lambda *x: (self._coloured(*x),), *features, code)[0]
         return in_chunks(lambda *x: (self._seen(*x),), features, directions, code)[0]

@@ -28,8 +28,8 @@ class FrustumField(CoordinateField):
     """
 
     def __init__(self, *arguments: Any, padding: float = COLOUR_PADDING, **named: Any):
-        super().__init__(*arguments, activation=shifted_softplus, **named)
-        self.padding = padding
+        super().__init__(*arguments, **named)
+        self.activation, self.padding = shifted_softplus, padding
 
     def encodings(self, keep_input: bool) -> tuple[IntegratedEncoding, FrequencyEncoding]:
         n = self.numbers

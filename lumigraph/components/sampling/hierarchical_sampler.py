@@ -54,15 +54,8 @@ class HierarchicalSampler(Sampler):
         super().__init__()
         self.space, self.numbers, self.learns_coarse = space, numbers, learns_coarse
         self.transmittance_threshold = transmittance_threshold
+        self.batch_size = self.expected_rays = numbers.rays_per_step
         self.empty = OccupancyMask(mask.occupancy_resolution, mask.occupancy_threshold)
-
-    @property
-    def batch_size(self) -> int:
-        return self.numbers.rays_per_step
-
-    @property
-    def expected_rays(self) -> float:
-        return self.numbers.rays_per_step
 
     def sample(
         self, rays: Rays, field: Any, code: Tensor | None = None, generator: torch.Generator | None = None

@@ -73,18 +73,10 @@ class ProposalSampler(Sampler):
         super().__init__()
         self.numbers, self.progress = numbers, 1.0
         rays = max(1, math.ceil(samples_per_step / numbers.samples_per_ray))
-        self.rays = min(rays, max_rays or rays)
+        self.batch_size = self.expected_rays = min(rays, max_rays or rays)
         self.proposal = Proposal(space, CELLS, numbers.proposal_samples, numbers.samples_per_ray)
         for name in self.grows:
             self.register_buffer(name, torch.zeros(0, 3))
-
-    @property
-    def batch_size(self) -> int:  # type: ignore[override]
-        return self.rays
-
-    @property
-    def expected_rays(self) -> float:  # type: ignore[override]
-        return self.rays
 
     def sample(
         self,

@@ -82,6 +82,7 @@ class BlockNeRF(FieldMethod):
     """Colours that depend on a photograph's appearance and exposure, and a network that knows what was seen."""
 
     Config = Config
+    network: HashField | FrustumField
     in_blocks = True
 
     def __init__(self, frame: Frame, config: Any = None):
@@ -201,7 +202,7 @@ class BlockNeRF(FieldMethod):
 
     def optimizers(self) -> list[torch.optim.Optimizer]:
         rate, codes = self.config.learning_rate, [self.appearance.codes] if self.appearance else []
-        if self.config.field == "hash":
+        if isinstance(self.network, HashField):
             groups = [{"params": codes, "scale": CODES_RATE}]
             groups += [{"params": [*self.sky.parameters()], "scale": OPEN_RATE}] if self.sky else []
             own = self.network.optimizers_at(rate, scale=OPEN_RATE, groups=groups)

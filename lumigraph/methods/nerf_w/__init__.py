@@ -71,6 +71,8 @@ class NeRFW(FieldMethod):
     """A static scene whose colours depend on the appearance of a photograph, and a transient of each photograph."""
 
     Config = Config
+    network: EncodedHashField | CoordinateField
+    transient_head: TransientHead | HashTransientHead
     appearance: AppearanceCodes
 
     def __init__(self, frame: Frame, config: Any = None):
@@ -87,9 +89,9 @@ class NeRFW(FieldMethod):
                 self.transient_head = HashTransientHead(encoded + c.transient_code, *hidden)
                 self.sampler = sampler_for(frame, space, c.occupancy, c.proposals, steps=c.steps)
             else:
-                shape, options = (c.network, c.hidden_width, space, code), {"keep_input": True, "activation": softplus}
-                coarse = CoordinateField(*shape, **options)
-                self.network = CoordinateField(*shape, **options, coarse=coarse)
+                shape = c.network, c.hidden_width, space, code
+                coarse = CoordinateField(*shape, keep_input=True, activation=softplus)
+                self.network = CoordinateField(*shape, keep_input=True, activation=softplus, coarse=coarse)
                 exact = not c.network.bfloat16
                 self.transient_head = TransientHead(c.hidden_width + c.transient_code, *hidden, exact=exact)
                 self.sampler = HierarchicalSampler(space, c.rays)
@@ -185,7 +187,7 @@ class NeRFW(FieldMethod):
     def optimizers(self) -> list[torch.optim.Optimizer]:
         rate, codes = self.config.learning_rate, [self.appearance.codes, self.transient.codes]
         others = [*self.transient_head.parameters(), *(self.sky.parameters() if self.sky else [])]
-        if self.config.field == "hash":
+        if isinstance(self.network, EncodedHashField):
             groups = [{"params": others, "scale": OPEN_RATE}, {"params": codes, "scale": CODES_RATE}]
             own = self.network.optimizers_at(rate, scale=OPEN_RATE, groups=groups)
         else:

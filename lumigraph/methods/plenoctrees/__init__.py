@@ -269,7 +269,7 @@ class PlenOctrees(FieldMethod):
         chance, numbers = self.random(-1), self._baking
         mask = met(self, cameras, numbers, chance)
         bake(self.leaves, self.density, mask, cameras, numbers, chance)
-        averaged_harmonics(self.leaves, self.teacher.geometry, numbers.points, chance)
+        averaged_harmonics(self.leaves, self.teacher.geometry, numbers.points, chance)  # type: ignore[arg-type]  # one tensor
         self._leave_field()
 
     @property
@@ -286,7 +286,7 @@ class PlenOctrees(FieldMethod):
     def loss(self, batch: Batch, step: int) -> dict[str, Tensor]:
         generator = self.random(step)
         background = backdrop(batch, self.background, generator)
-        terms = {}
+        terms: dict[str, Tensor] = {}
         if self.baked:
             rows = self.leaves.touched(batch.rays, *self._ends)
             rendering = self.leaves.seen(batch.rays, *self._ends, background, self.leaves.part(rows))

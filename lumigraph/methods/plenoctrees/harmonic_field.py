@@ -56,9 +56,8 @@ class HarmonicHash(Teacher):
         return truncated_exp(raw[:, 0]), raw[:, 1:]
 
     def optimizers_at(self, learning_rate: float) -> list[torch.optim.Optimizer]:
-        common = {"lr": learning_rate, "betas": (0.9, 0.99), "eps": 1e-15}
-        networks = torch.optim.Adam(self.network.parameters(), foreach=True, **common)
-        return [LazyAdam([self.table], **common), networks]
+        networks = torch.optim.Adam(self.network.parameters(), learning_rate, (0.9, 0.99), 1e-15, foreach=True)
+        return [LazyAdam([self.table], learning_rate), networks]
 
 
 class HarmonicNetwork(Teacher):

@@ -23,15 +23,8 @@ class LeafSampler(Sampler):
 
     def __init__(self, near: float, stop: float, rays_per_step: int):
         super().__init__()
-        self.near, self.stop, self.rays_per_step = near, stop, rays_per_step
-
-    @property
-    def batch_size(self) -> int:
-        return self.rays_per_step
-
-    @property
-    def expected_rays(self) -> float:
-        return self.rays_per_step
+        self.near, self.stop = near, stop
+        self.batch_size = self.expected_rays = rays_per_step
 
     def sample(  # type: ignore[override]
         self,

@@ -125,15 +125,14 @@ class RawNeRF(FieldMethod):
         """On a CPU, the table and samples that learn most in a minute."""
         if device.type == "cuda":
             return Config()
-        sampling = {"occupancy": CPU_OCCUPANCY, "steps": CPU_STEPS}
-        return Config(table=CPU_TABLE, **sampling, hidden_width=32, learning_rate=2e-2, hash_weight_decay=0.3)
+        sampling = CPU_TABLE, CPU_OCCUPANCY, CPU_STEPS
+        return Config(*sampling, hidden_width=32, learning_rate=2e-2, hash_weight_decay=0.3)
 
     @classmethod
     def smallest(cls) -> Any:
         """A tiny table with an error that is less relative: in a few steps its gross beginnings fall, and no more."""
-        sampling = {"occupancy": TINY_OCCUPANCY, "steps": TINY_STEPS}
-        poses = PoseNumbers(refine_cameras=True)
-        return Config(table=TINY_TABLE, **sampling, poses=poses, hidden_width=16, learning_rate=2e-2, epsilon=1.0)
+        sampling, poses = (TINY_TABLE, TINY_OCCUPANCY, TINY_STEPS), PoseNumbers(refine_cameras=True)
+        return Config(*sampling, poses=poses, hidden_width=16, learning_rate=2e-2, epsilon=1.0)
 
     @classmethod
     def further_bytes(cls, frame: Frame, config: Any, learning: bool) -> int:

@@ -118,6 +118,7 @@ class RegNeRF(FieldMethod):
     """Mip-NeRF's network or a hash table, with regularisation of patches at unobserved views."""
 
     Config = Config
+    network: HashField | FrustumField
 
     def __init__(self, frame: Frame, config: Any = None):
         c = config or Config()
@@ -266,7 +267,7 @@ class RegNeRF(FieldMethod):
 
     def optimizers(self) -> list[torch.optim.Optimizer]:
         c = self.config
-        if c.field == "hash":
+        if isinstance(self.network, HashField):
             own = self.network.optimizers_at(c.table_learning_rate, c.hash_weight_decay)
         else:
             own = [torch.optim.Adam(self.network.parameters(), c.learning_rate)]

@@ -198,9 +198,9 @@ class TensoRF(FieldMethod):
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(c.seed)
             self.network = TensorField(c, frame, space)
-        bounds = {"max_rays": c.rays_per_step, "open_samples": c.open_samples_per_step}
-        numbers = c.occupancy, c.proposals, SCHEDULE
-        self.sampler = sampler_for(frame, space, *numbers, **bounds, samples_per_ray=SAMPLES_PER_RAY)
+        numbers, rays = (frame, space, c.occupancy, c.proposals, SCHEDULE), c.rays_per_step
+        open_samples = c.open_samples_per_step
+        self.sampler = sampler_for(*numbers, open_samples=open_samples, max_rays=rays, samples_per_ray=SAMPLES_PER_RAY)
         self._optimizer: torch.optim.Optimizer | None = None
 
     @classmethod
