@@ -56,4 +56,4 @@ class DistanceSurface(FieldMethod):
         return Config(cells=8)
 
     def optimizers(self):
-        return [torch.optim.Adam([self.network.values], self.config.learning_rate)]
+        return [torch.optim.Adam([self.network.values], 0.02)]
