@@ -32,7 +32,7 @@ def at_most(ceiling: int, found: list[str]) -> None:
     assert len(found) <= ceiling, "\n".join([f"{len(found)}, and at most {ceiling} may be:", *found])
 
 
-# Docstrings name the thing (STYLE.md, rule 1)
+# Docstrings name the thing
 
 
 def public(tree: ast.Module) -> Iterator[tuple[str, ast.Module | ast.ClassDef | ast.FunctionDef]]:
@@ -58,7 +58,7 @@ def riddles(sources: Sources) -> list[str]:
 
 
 def test_docstrings_name_the_thing(house):
-    at_most(175, riddles(house))
+    at_most(94, riddles(house))
 
 
 @pytest.mark.parametrize(
@@ -91,7 +91,7 @@ def namesakes(sources: Sources) -> list[str]:
 
 
 def test_a_class_name_stands_once(house):
-    at_most(20, namesakes(house))
+    at_most(16, namesakes(house))
 
 
 def test_a_namesake_is_noticed():
@@ -130,7 +130,7 @@ def users(sources: Sources) -> dict[str, set[str]]:
 
 def test_a_component_serves_two(house):
     lonely = {name: found for name, found in users(house).items() if len(found) < 2}
-    at_most(39, [f"{name}: {', '.join(found) or 'nobody'}" for name, found in sorted(lonely.items())])
+    at_most(0, [f"{name}: {', '.join(found) or 'nobody'}" for name, found in sorted(lonely.items())])
 
 
 def test_a_component_of_one_method_is_noticed():
@@ -171,7 +171,7 @@ def heirs(sources: Sources) -> list[str]:
 
 
 def test_no_config_inherits(house):
-    at_most(11, heirs(house))
+    at_most(1, heirs(house))
 
 
 def test_a_config_that_inherits_is_noticed():
