@@ -58,7 +58,7 @@ class Detail:
 
 
 @dataclass(frozen=True)
-class Row:
+class LodRow:
     """Location of a leaf at a level: file number, its first Gaussian, and its number of Gaussians."""
 
     file: Annotated[int, between(0, 10**6)]
@@ -67,25 +67,25 @@ class Row:
 
 
 @dataclass(frozen=True)
-class Box:
+class LodBox:
     min: Point
     max: Point
 
 
 @dataclass(frozen=True)
-class Node:
-    bound: Box | None = None
-    children: list[Node] = field(default_factory=list)
-    lods: dict[str, Row] = field(default_factory=dict)
+class LodNode:
+    bound: LodBox | None = None
+    children: list[LodNode] = field(default_factory=list)
+    lods: dict[str, LodRow] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
-class Meta:
+class LodMeta:
     """Content of lod-meta.json."""
 
     lodLevels: Annotated[int, between(1, MAX_LEVELS)]  # noqa: N815
     filenames: Annotated[list[Name], msgspec.Meta(min_length=1, max_length=10**6)]
-    tree: Node
+    tree: LodNode
     version: int = VERSION
     counts: list[Tally] | None = None
     environment: Name | None = None
@@ -103,7 +103,7 @@ def read(folder: Path, level: int = 0) -> Gaussians:
     """A level, 0 the finest, and the environment where there is one. Raises LumigraphError where a file is missing, or
     holds less than lod-meta.json says."""
     path = folder / META
-    meta: Meta = typed(Meta, read_json(path), path)
+    meta: LodMeta = typed(LodMeta, read_json(path), path)
     if meta.version != VERSION:
         raise LumigraphError(f"{path} is of version {meta.version}, of which {VERSION} is read; export it again")
     rows = sorted(rows_of(meta, level, path), key=lambda row: (row.file, row.offset))
@@ -126,7 +126,7 @@ def read(folder: Path, level: int = 0) -> Gaussians:
     return joined(clouds)
 
 
-def rows_of(meta: Meta, level: int, path: Path) -> Iterator[Row]:
+def rows_of(meta: LodMeta, level: int, path: Path) -> Iterator[LodRow]:
     """The rows of all leaves at a level. Raises LumigraphError for one in no file that is named."""
     nodes = [meta.tree]
     while nodes:
@@ -205,12 +205,12 @@ def coarser(gaussians: Gaussians, detail: Detail) -> list[Gaussians]:
     return levels
 
 
-def packed(counts: list[list[int]], most: int) -> tuple[list[dict[str, Row]], list[tuple[str, int, list[int]]]]:
+def packed(counts: list[list[int]], most: int) -> tuple[list[dict[str, LodRow]], list[tuple[str, int, list[int]]]]:
     """The rows of each leaf by level, and files as (name, level, leaves in it).
 
     counts: Gaussians of each leaf at each level. most: of a file; neighbours share one as long as there is room
     """
-    rows: list[dict[str, Row]] = [{} for _ in counts]
+    rows: list[dict[str, LodRow]] = [{} for _ in counts]
     files: list[tuple[str, int, list[int]]] = []
     for level in range(len(counts[0])):
         held, number = most, 0
@@ -218,13 +218,13 @@ def packed(counts: list[list[int]], most: int) -> tuple[list[dict[str, Row]], li
             if held + count > most:
                 files.append((f"{level}_{number}/{sog.META}", level, []))
                 held, number = 0, number + 1
-            rows[leaf][str(level)] = Row(len(files) - 1, held, count)
+            rows[leaf][str(level)] = LodRow(len(files) - 1, held, count)
             files[-1][2].append(leaf)
             held += count
     return rows, files
 
 
-def tree(bounds: list[Bounds], rows: list[dict[str, Row]]) -> dict[str, Any]:
+def tree(bounds: list[Bounds], rows: list[dict[str, LodRow]]) -> dict[str, Any]:
     """The tree above leaves, whose boxes hold those below."""
     low, high = np.min([low for low, _ in bounds], 0), np.max([high for _, high in bounds], 0)
     node: dict[str, Any] = {"bound": {"min": [plain(x) for x in low], "max": [plain(x) for x in high]}}
