@@ -100,7 +100,7 @@ MEANS: Mapping[Quality, str] = {
 
 @dataclass(frozen=True)
 class Effort:
-    """What a quality asks of a method.
+    """Training effort of a quality.
 
     passes:   how often everything is learnt from, on average: each photograph, or each of their pixels
     at_least: steps, however small the capture

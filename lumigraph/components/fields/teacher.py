@@ -157,7 +157,7 @@ class Teacher(ABC):
 
 
 class FieldTeacher(Teacher):
-    """Of a teacher with a field."""
+    """Teacher with a field."""
 
     def __init__(self, depth_maps: Sequence[DepthMap], teacher: Any):
         super().__init__(depth_maps)
@@ -178,7 +178,7 @@ class FieldTeacher(Teacher):
 
 
 class DepthTeacher(Teacher):
-    """Of depth maps: a shell around the surfaces that they show, solid from half its thickness on.
+    """Teacher of depth maps: a shell around the surfaces that they show, solid from half its thickness on.
 
     It has a `field` itself, so it can stand for its teacher wherever one is needed that has.
     """

@@ -267,7 +267,7 @@ class Contraction(Space):
 
 
 def fits_kernels(points: Tensor) -> bool:
-    """Whether kernels that are not differentiable take these points: float32, and no gradient is asked for."""
+    """True for points that kernels without gradients take: float32, and no gradient is asked for."""
     return points.dtype == torch.float32 and not (torch.is_grad_enabled() and points.requires_grad)
 
 

@@ -127,7 +127,7 @@ class Exposure(Part):
 
 @torch.no_grad()
 def gain_between(rgb: Float[Tensor, "pixel 3"], target: Float[Tensor, "pixel 3"]) -> Float[Tensor, " 3"]:
-    """What colours are to be multiplied with to be a photograph's: the median ratio of each channel, over pixels that
-    are neither too dark nor too bright to tell; 1 where there are none."""
+    """Gain that turns colours into a photograph's: the median ratio of each channel, over pixels that are neither too
+    dark nor too bright; 1 where there are none."""
     inside = ((rgb > DARKEST) & (target > DARKEST) & (target < BRIGHTEST)).all(-1)
     return (target[inside] / rgb[inside]).median(0).values if inside.any() else torch.ones_like(target[:1].sum(0))

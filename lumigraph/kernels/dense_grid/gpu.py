@@ -25,7 +25,7 @@ def _along(x, box, axis: tl.constexpr, size):
 
 @triton.jit
 def _cell_of(points, box, i, here, X, Y, Z):
-    """As `cell_of` of sparse grids, of a grid of X Y Z corners in a box."""
+    """Cell of a grid of X Y Z corners in a box, like `cell_of` of sparse grids."""
     x, y, z = load_row(points, i, here)
     cx, fx, inside_x = _along(x, box, 0, X)
     cy, fy, inside_y = _along(y, box, 1, Y)
