@@ -1,57 +1,149 @@
-"""How well a capture agrees with a reference: camera positions after the best similarity between the two.
+"""Lumigraph's captures beside COLMAP's own defaults: photographs placed, reprojection error, points, seconds.
 
-    python benchmarks/capture.py SCENE REFERENCE
+    python benchmarks/capture.py FOLDER [FOLDER ...] [--count 12 25] [--no-exif] [--half] [--output F.json]
 
-Both are folders that Lumigraph opens. Photographs are matched by file name without suffix. Written: how many both have,
-and the median and largest distance as a share of the reference's extent, which is the diagonal of the box around its
-cameras; the same for directions, in degrees.
+Each folder of photographs (or its `images`) is given to `lumigraph capture` and to pycolmap's feature extraction,
+exhaustive matching and incremental mapping, all with their defaults and each in its own process, one after the other.
+A video becomes ten frames, chosen evenly. With --count, also so many photographs of each folder, chosen evenly.
+--no-exif: photographs without their EXIF data. --half: photographs at half their size.
 """
 
 from __future__ import annotations
 
-import argparse
-from pathlib import Path, PurePosixPath
+import subprocess
+import sys
+import tempfile
+import time
+from dataclasses import asdict, dataclass
+from pathlib import Path
 
-import numpy as np
+import av
 import pycolmap
-from jaxtyping import Float
+import tyro
+from PIL import Image, ImageOps
+from rich.table import Table
 
-from lumigraph.capture import choose_reader
+from lumigraph import files
+from lumigraph.capture.pictures import list_images
+from lumigraph.geometry.choice import evenly
+from lumigraph.system.console import console
+
+VIDEO_FRAMES = 10
+DEFAULTS = """
+import sys, pycolmap
+database, images, models = sys.argv[1:]
+pycolmap.extract_features(database, images, device=pycolmap.Device.cpu)
+pycolmap.match_exhaustive(database, device=pycolmap.Device.cpu)
+pycolmap.incremental_mapping(database, images, models)
+"""
 
 
-def poses(folder: Path) -> dict[str, Float[np.ndarray, "3 4"]]:
-    """Camera-to-world by name."""
-    return {PurePosixPath(shot.name).stem: shot.pose for shot in choose_reader(folder).read(folder).shots}
+@dataclass(frozen=True)
+class Options:
+    folders: tyro.conf.Positional[tuple[Path, ...]]
+    count: tuple[int, ...] = ()
+    no_exif: bool = False
+    half: bool = False
+    output: Path | None = None
 
 
-def compare(
-    found: dict[str, Float[np.ndarray, "3 4"]], reference: dict[str, Float[np.ndarray, "3 4"]]
-) -> dict[str, float]:
-    names = sorted(found.keys() & reference.keys())
-    a, b = (np.stack([poses[name] for name in names]) for poses in (found, reference))
-    extent = float(np.linalg.norm(np.ptp(b[:, :, 3], axis=0)))
-    options = pycolmap.RANSACOptions()
-    options.max_error, options.random_seed = 0.05 * extent, 0
-    fitted = pycolmap.estimate_sim3d_robust(a[:, :, 3], b[:, :, 3], options)
-    assert fitted, "the two share no similarity"
-    similarity = fitted["tgt_from_src"]
-    rotation = similarity.rotation.matrix()
-    away = np.linalg.norm(a[:, :, 3] @ (similarity.scale * rotation).T + similarity.translation - b[:, :, 3], axis=-1)
-    between = np.einsum("nij,nik->njk", rotation @ a[:, :, :3], b[:, :, :3])
-    turned = np.degrees(np.arccos(np.clip((np.trace(between, axis1=1, axis2=2) - 1) / 2, -1, 1)))
-    return {
-        "photographs in both": len(names),
-        "median distance, % of extent": 100 * float(np.median(away)) / extent,
-        "largest distance, % of extent": 100 * float(away.max()) / extent,
-        "median turn, degrees": float(np.median(turned)),
-        "largest turn, degrees": float(turned.max()),
-    }
+@dataclass(frozen=True)
+class Placed:
+    """Result of one reconstruction. photographs: in the largest model; error: mean reprojection error in pixels."""
+
+    photographs: int
+    apart: list[int]
+    error: float
+    points: int
+    seconds: float
+
+
+def frames_of(video: Path, folder: Path) -> list[Path]:
+    with av.open(str(video)) as container:
+        pictures = [frame.to_image() for frame in container.decode(video=0)]
+    paths = []
+    for i, picture in enumerate(evenly(pictures, VIDEO_FRAMES)):
+        paths.append(folder / f"{i:03d}.png")
+        picture.save(paths[-1])
+    return paths
+
+
+def prepare(photographs: list[Path], folder: Path, options: Options) -> None:
+    """Copy photographs to a folder, changed as the options ask. Pixels are recompressed where they change."""
+    for path in photographs:
+        target = folder / path.name
+        if not (options.no_exif or options.half):
+            target.write_bytes(path.read_bytes())
+            continue
+        with Image.open(path) as picture:
+            exif = b"" if options.no_exif else picture.getexif().tobytes()
+            if options.no_exif:
+                picture = ImageOps.exif_transpose(picture)
+            if options.half:
+                picture = picture.reduce(2)
+            picture.convert("RGB").save(target, **({"exif": exif} if exif else {}), quality=95)
+
+
+def measured(models: Path, seconds: float) -> Placed:
+    found = [pycolmap.Reconstruction(place) for place in models.iterdir() if (place / "images.bin").is_file()]
+    found.sort(key=lambda model: -model.num_reg_images())
+    if not found:
+        return Placed(0, [], 0.0, 0, seconds)
+    best = found[0]
+    apart = [model.num_reg_images() for model in found[1:]]
+    return Placed(best.num_reg_images(), apart, best.compute_mean_reprojection_error(), best.num_points3D(), seconds)
+
+
+def compare(photographs: Path, work: Path) -> tuple[Placed, Placed]:
+    """Results of Lumigraph and of COLMAP's defaults."""
+    started = time.perf_counter()
+    ours = work / "ours"
+    command = [sys.executable, "-m", "lumigraph", "capture", str(photographs), "--output", str(ours)]
+    log = subprocess.run(command, capture_output=True, text=True)
+    if log.returncode:
+        console().print(log.stdout[-300:] + log.stderr[-300:])
+    (ours / "sparse").mkdir(parents=True, exist_ok=True)
+    first = measured(ours / "sparse", time.perf_counter() - started)
+    started = time.perf_counter()
+    models = work / "models"
+    models.mkdir()
+    command = [sys.executable, "-c", DEFAULTS, str(work / "database.db"), str(photographs), str(models)]
+    subprocess.run(command, capture_output=True)
+    return first, measured(models, time.perf_counter() - started)
+
+
+def main(options: Options) -> None:
+    table = Table("capture", "photographs", *(f"{who}: {what}" for who in ("ours", "COLMAP") for what in
+                  ("placed", "apart", "error, px", "points", "seconds")))  # fmt: skip
+    rows = []
+    for source in options.folders:
+        for count in (None, *options.count):
+            with tempfile.TemporaryDirectory() as place:
+                work, photographs = Path(place), Path(place) / "photographs"
+                photographs.mkdir()
+                if source.is_file():
+                    paths = frames_of(source, work)
+                else:
+                    folder = source / "images" if (source / "images").is_dir() else source
+                    paths = [folder / name for name in list_images(folder)]
+                if count is not None and count >= len(paths):
+                    continue
+                chosen = paths if count is None else evenly(paths, count)
+                prepare(chosen, photographs, options)
+                results = compare(photographs, work)
+            name = source.stem if source.name[:6] not in ("images", "video.") else f"{source.parent.name}/{source.name}"
+            rows.append([name, len(chosen), *map(asdict, results)])
+            cells = [
+                cell
+                for r in results
+                for cell in (r.photographs, " ".join(map(str, r.apart)), f"{r.error:.2f}", r.points, f"{r.seconds:.0f}")
+            ]
+            table.add_row(name, str(len(chosen)), *map(str, cells))
+            print(name, len(chosen), *cells, flush=True)
+            if options.output:
+                files.write_json(options.output, rows)
+    console().print(table)
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("scene", type=Path)
-    parser.add_argument("reference", type=Path)
-    arguments = parser.parse_args()
-    for name, value in compare(poses(arguments.scene), poses(arguments.reference)).items():
-        print(f"{name:<30} {value:.3f}")
+    main(tyro.cli(Options, description=__doc__))

@@ -6,6 +6,7 @@ import json
 import shutil
 import subprocess
 import sys
+from contextlib import closing
 from dataclasses import replace
 from hashlib import sha256
 from pathlib import Path
@@ -22,7 +23,7 @@ from views import draw, look_at, pattern, spoil, write_views
 from lumigraph.capture import open_scene
 from lumigraph.capture.colmap import read as read_colmap
 from lumigraph.capture.folds import jumps
-from lumigraph.capture.motion import MotionOptions, diagnosis, reconstruct, reconstruction
+from lumigraph.capture.motion import MotionOptions, diagnosis, reconstruct, reconstruction, worker
 from lumigraph.capture.motion.diagnosis import Matches, coverage, folds, read_matches, why_not
 from lumigraph.capture.motion.georeference import georeference, upright
 from lumigraph.capture.motion.lenses import group_by_lens, prior
@@ -502,3 +503,61 @@ def test_where_one_mapper_finds_nothing_the_other_is_tried(tmp_path, monkeypatch
     for _ in range(2):  # once it is there it stays
         work.place("key")
         assert tried == [asked, other] and (work.models / reconstruction.FALLBACK_MARK).exists()
+
+
+def synthetic_model(place, frames, model="SIMPLE_RADIAL", params=(1280.0, 512.0, 384.0, 0.05)):
+    """A model of random points with its database, both as COLMAP makes them."""
+    pycolmap.set_random_seed(1)
+    options = pycolmap.SyntheticDatasetOptions()
+    options.num_rigs, options.num_frames_per_rig, options.num_points3D = 1, frames, 300
+    options.camera_model_id, options.camera_params = getattr(pycolmap.CameraModelId, model), list(params)
+    with closing(pycolmap.Database.open(place / "database.db")) as database:
+        return pycolmap.synthesize_dataset(options, database)
+
+
+@pytest.mark.parametrize("shared", [0, 3])
+def test_models_that_stand_apart_are_joined(tmp_path, shared):
+    whole = synthetic_model(tmp_path, 16)
+    frames = sorted(whole.reg_frame_ids())
+    turn = pycolmap.Rotation3d(np.array([1, 2, 3, 9]) / 95**0.5)
+    for name, kept in (("a", frames[:10]), ("b", frames[10 - shared :])):
+        part = pycolmap.Reconstruction(whole)
+        for frame in set(frames) - set(kept):
+            part.deregister_frame(frame)
+        if name == "b":
+            part.transform(pycolmap.Sim3d(2.5, turn, np.array([1.0, 2.0, 3.0])))
+        (tmp_path / name).mkdir()
+        part.write(tmp_path / name)
+    apart = [str(tmp_path / name) for name in "ab"]
+    job = {"apart": apart, "database": tmp_path / "database.db", "images": tmp_path, "models": tmp_path / "joined"}
+    worker.join(job | {"threads": 1, "seed": 0})
+    joined = pycolmap.Reconstruction(tmp_path / "joined")
+    similarity = pycolmap.align_reconstructions_via_proj_centers(joined, whole, 0.01)
+    joined.transform(similarity)
+    assert joined.num_reg_images() == 16
+    for number in frames:
+        ours, true = joined.frame(number).rig_from_world, whole.frame(number).rig_from_world
+        assert np.allclose(ours.matrix(), true.matrix(), atol=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("model", "params"),
+    [
+        ("SIMPLE_RADIAL", (1280.0, 512.0, 384.0, 0.05)),
+        ("OPENCV", (1280.0, 1240.0, 512.0, 384.0, 0.05, 0.1, 0.01, 0.01)),
+    ],
+)
+def test_a_lens_gets_the_parameters_that_held_out_tracks_confirm(tmp_path, model, params):
+    made = synthetic_model(tmp_path, 30, model, params)
+    noise = pycolmap.SyntheticNoiseOptions()
+    noise.point2D_stddev = 0.5
+    pycolmap.synthesize_noise(noise, made)
+    for camera in made.cameras.values():
+        camera.model, camera.params = pycolmap.CameraModelId.SIMPLE_RADIAL, [1270.0, 512.0, 384.0, 0.04]
+    (tmp_path / "model").mkdir()
+    made.write(tmp_path / "model")
+    worker.refine_lenses({"model": tmp_path / "model", "models": tmp_path / "refined", "views": 30})
+    [camera] = pycolmap.Reconstruction(tmp_path / "refined").cameras.values()
+    assert camera.model.name == model
+    if model == "OPENCV":
+        assert camera.params[:2] == pytest.approx(params[:2], rel=2e-3)

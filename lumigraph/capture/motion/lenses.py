@@ -14,6 +14,7 @@ from ..photos import Photo
 Sharing = Literal["auto", "single", "per-device", "per-image"]
 
 DEFAULT_FOCAL = 1.2  # longer sides of the picture: 43 mm on full frame
+MODEL = "SIMPLE_RADIAL"  # COLMAP's name of the lens that mapping begins with: a focal length and a coefficient
 MIN_FULL_MODEL_VIEWS = 30  # photographs of one lens that determine two focal lengths and four distortion coefficients
 MIN_SAME_SIZE_SHARE = 0.5  # of the photographs of unknown device; from it on one size means one lens
 
@@ -55,18 +56,13 @@ def prior(group: Sequence[Photo]) -> tuple[float, bool]:
     return (known[len(known) // 2], True) if known else (DEFAULT_FOCAL * max(group[0].size), False)
 
 
-def model_for(group: Sequence[Photo]) -> str:
-    """COLMAP's name of a lens with as many unknowns as so many photographs can tell."""
-    return "OPENCV" if len(group) >= MIN_FULL_MODEL_VIEWS else "SIMPLE_RADIAL"
-
-
 def write_database(path: Path, groups: Sequence[Sequence[Photo]]) -> None:
     """A new database with a camera for each group and an image for each photograph."""
     database = pycolmap.Database.open(path)
     try:
         for group in groups:
             focal, known = prior(group)
-            camera = pycolmap.Camera.create_from_model_name(1, model_for(group), focal, *group[0].size)
+            camera = pycolmap.Camera.create_from_model_name(1, MODEL, focal, *group[0].size)
             camera.has_prior_focal_length = known
             camera_id = database.write_camera(camera)
             rig = pycolmap.Rig()

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 import shutil
 import sqlite3
-from collections.abc import Sequence
+from collections.abc import Container, Sequence
 from contextlib import closing
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -39,17 +39,20 @@ from .folder import (
     write_model,
 )
 from .georeference import Georeference, georeference, gps_positions, upright
-from .lenses import Sharing, group_by_lens, model_for, prior, write_database
+from .lenses import MIN_FULL_MODEL_VIEWS, MODEL, Sharing, group_by_lens, prior, write_database
 from .pairs import SEQUENTIAL_NEIGHBOURS, Matching, choose_matching, choose_pairs
 from .stages import Stages, key_of
 
 MIN_VIEWS = 3  # photographs of a model
 MAX_SIDE = 1600  # pixels of the longer side for feature detection
+MAX_FEATURES = 8192
 FEATURE_BUDGETS = (
-    (20, 8192),
-    (60, 4096),
+    (80, MAX_FEATURES),
+    (200, 4096),
 )  # (photographs, features each): up to so many photographs; matching costs the square of features
 MIN_FEATURE_BUDGET = 2048
+MAX_SECOND_SIDE = 3200  # pixels of the longer side, for photographs that found no place
+SECOND_CONTRAST = 0.5  # of COLMAP's threshold for features, for the same
 MIN_KEPT_SHARE = 0.8  # share of the photographs that a model without folds must keep to be preferred
 FALLBACK_MARK = "instead"  # an empty file among the models: they come from the other mapper, not the requested one
 OTHER_MAPPER: dict[str, Literal["incremental", "global"]] = {"incremental": "global", "global": "incremental"}
@@ -175,7 +178,8 @@ class Reconstruction:
             self.work / "database.db",
             self.work / "models",
         )
-        self.unfolded = self.work / "unfolded"
+        self.unfolded, self.completed = self.work / "unfolded", self.work / "completed"
+        self.refined, self.second = self.work / "refined", self.work / "second.db"
         self.masks: Path | None = None
         self.names = [photo.name for photo in self.photos]
         self.groups = group_by_lens(self.photos, self.intake.in_order, self.options.camera)
@@ -189,7 +193,7 @@ class Reconstruction:
         features = key_of(
             pycolmap.__version__,
             [[p.name, *stamp(p.path), *(stamp(p.mask) if p.mask else ())] for p in self.photos],
-            [[prior(group), model_for(group), [p.name for p in group]] for group in self.groups],
+            [[prior(group), MODEL, [p.name for p in group]] for group in self.groups],
             self.options.max_size,
             self.count_features(),
         )
@@ -207,6 +211,8 @@ class Reconstruction:
         self.compare(self.keys["matching"])
         self.place(self.keys["mapping"])
         self.unfold(self.keys["mapping"])
+        self.complete(self.keys["mapping"])
+        self.refine(self.keys["mapping"])
         with counting("Writing the scene"):
             return self.write(self.keys["result"])
 
@@ -231,6 +237,7 @@ class Reconstruction:
                 masks=self.masks and str(self.masks),
                 max_size=self.options.max_size,
                 features=self.count_features(),
+                contrast=1.0,
             )
 
     def compare(self, key: str) -> None:
@@ -242,11 +249,20 @@ class Reconstruction:
             opened.clear_two_view_geometries()
             opened.close()
         with self.stages.working("matching", key):
-            with counting("Choosing pairs"):
-                pairs = choose_pairs(self.matching, self.names, self.database, gps_positions(self.photos))
-            listed = self.work / "pairs.txt"
-            write_bytes(listed, "".join(f"{self.names[i]} {self.names[j]}\n" for i, j in pairs).encode(), ours=True)
-            self.colmap("Comparing pairs", len(pairs), self.database, stage="matching", pairs=str(listed))
+            self.match(self.database)
+
+    def match(self, database: Path, among: Container[str] | None = None) -> None:
+        """Match the chosen pairs; with `among`, those that have one of these photographs."""
+        with counting("Choosing pairs"):
+            pairs = choose_pairs(self.matching, self.names, database, gps_positions(self.photos))
+        named = [(self.names[i], self.names[j]) for i, j in pairs]
+        if among is not None:
+            named = [(a, b) for a, b in named if a in among or b in among]
+        listed = self.work / "pairs.txt"
+        write_bytes(listed, "".join(f"{a} {b}\n" for a, b in named).encode(), ours=True)
+        self.colmap(
+            "Comparing again" if among else "Comparing pairs", len(named), database, stage="matching", pairs=str(listed)
+        )
 
     def place(self, key: str) -> None:
         """By the mapper that was asked for; by the other where it finds no model. One by one needs a pair that tells
@@ -280,17 +296,75 @@ class Reconstruction:
                 with replacing_folder(self.unfolded, ours=True) as partial:
                     self.map(near, partial, "incremental")
 
+    def complete(self, key: str) -> None:
+        """Join models that stand apart, then look again at photographs without a place.
+
+        Their features are detected at the size and the contrast that the first pass has left out, they are compared
+        once more, and mapping continues from the largest model.
+        """
+        if self.stages.is_done("completing", key) and self.completed.is_dir():
+            return
+        with self.stages.working("completing", key), replacing_folder(self.completed, ours=True) as partial:
+            found, _ = self.choose(read_matches(self.database))
+            apart = [partial / f"apart{i}" for i in range(len(found))]
+            for place, model in zip(apart, found, strict=True):
+                place.mkdir()
+                model.write(place)
+            best = apart[0] if apart else None
+            if len(apart) > 1:
+                best = partial / "joined"
+                self.colmap(
+                    "Joining models", len(apart), self.database, stage="joining", apart=list(map(str, apart)),
+                    images=str(self.images), models=str(best),
+                )  # fmt: skip
+            left = set(self.names) - (registered(pycolmap.Reconstruction(best)) if best else set())
+            if left:
+                self.look_again(left)
+                again = partial / "again"
+                again.mkdir()
+                self.map(self.second, again, "incremental", best)
+
+    def look_again(self, left: set[str]) -> None:
+        """The database of the second pass: other features of the photographs without a place, and their matches."""
+        copy_database(self.database, self.second)
+        forget(self.second, left)
+        self.colmap(
+            "Finding more details", len(self.names), self.second, stage="features",
+            names=sorted(left), images=str(self.images), masks=self.masks and str(self.masks),
+            max_size=max(MAX_SECOND_SIDE, self.options.max_size), features=MAX_FEATURES, contrast=SECOND_CONTRAST,
+        )  # fmt: skip
+        self.match(self.second, left)
+
+    def refine(self, key: str) -> None:
+        """The lens with all its coefficients, where photographs left out of its adjustment agree better."""
+        if self.stages.is_done("lenses", key) and self.refined.is_dir():
+            return
+        with self.stages.working("lenses", key):
+            remove(self.refined)
+            models = [path.parent for path in sorted(self.completed.rglob("images.bin"))]
+            best = max(models, key=lambda place: pycolmap.Reconstruction(place).num_reg_images(), default=None)
+            if best:
+                self.colmap(
+                    "Refining the lens",
+                    1,
+                    self.database,
+                    stage="lenses",
+                    model=str(best),
+                    models=str(self.refined),
+                    views=MIN_FULL_MODEL_VIEWS,
+                )
+
     def leaps(self, model: pycolmap.Reconstruction, matches: Matches) -> int:
         poses = {i.name: i.cam_from_world().inverse().matrix() for i in model.images.values() if i.has_pose}
         names = [name for name in self.names if name in poses]
         return len(folds(names, np.stack([poses[name] for name in names]), matches, self.intake.in_order))
 
-    def map(self, database: Path, models: Path, mapper: str) -> None:
+    def map(self, database: Path, models: Path, mapper: str, model: Path | None = None) -> None:
         if mapper == "global":  # it changes what it finds in the database
             copy_database(database, database := self.work / "global.db")
         self.colmap(
-            "Placing cameras", len(self.names), database, stage=mapper, images=str(self.images), models=str(models),
-            calibrate=not all(prior(group)[1] for group in self.groups),
+            "Placing the rest" if model else "Placing cameras", len(self.names), database, stage=mapper, images=str(self.images), models=str(models),
+            calibrate=not all(prior(group)[1] for group in self.groups), model=model and str(model),
         )  # fmt: skip
 
     def choose(self, matches: Matches) -> tuple[list[pycolmap.Reconstruction], list[str]]:
@@ -319,8 +393,10 @@ class Reconstruction:
 
     def write(self, key: str) -> dict[str, Any]:
         """The largest model becomes the scene. capture.json comes last: where it is, the rest is whole."""
-        matches = read_matches(self.database)
+        matches = read_matches(self.second if self.second.is_file() else self.database)
         found, told = self.choose(matches)
+        if self.refined.is_dir():
+            found = [pycolmap.Reconstruction(self.refined), *found]
         if not found or found[0].num_reg_images() < MIN_VIEWS:
             raise LumigraphError(nothing_fits(self.intake, self.photos, matches))
         for name in (RESULT_FILE, "transforms.json"):
@@ -401,6 +477,11 @@ def read_models(folder: Path) -> list[pycolmap.Reconstruction]:
     return sorted(found, key=lambda model: (model.num_reg_images(), model.num_points3D()), reverse=True)
 
 
+def registered(model: pycolmap.Reconstruction) -> set[str]:
+    """Names of the photographs whose cameras a model has."""
+    return {image.name for image in model.images.values() if image.has_pose}
+
+
 def largest(folder: Path) -> int:
     """Number of photographs in the largest of COLMAP's models in a folder; 0 if there is none."""
     return max((model.num_reg_images() for model in read_models(folder)), default=0)
@@ -416,6 +497,22 @@ def copy_database(source: Path, target: Path) -> None:
     remove_database(target)
     with closing(sqlite3.connect(source)) as old, closing(sqlite3.connect(target)) as new:
         old.backup(new)
+
+
+def forget(path: Path, names: Container[str]) -> None:
+    """Delete the features of photographs and their matches from a database."""
+    with closing(pycolmap.Database.open(path)) as database:
+        gone = {image.image_id for image in database.read_all_images() if image.name in names}
+        pairs = [pycolmap.pair_id_to_image_pair(number) for number, _ in zip(*database.read_all_matches(), strict=True)]
+        for a, b in pairs:
+            if a in gone or b in gone:
+                database.delete_matches(a, b)
+                if database.exists_two_view_geometry(a, b):
+                    database.delete_two_view_geometry(a, b)
+    with closing(sqlite3.connect(path)) as rows:
+        for table in ("keypoints", "descriptors"):
+            rows.executemany(f"DELETE FROM {table} WHERE image_id = ?", [(number,) for number in gone])
+        rows.commit()
 
 
 def keep_near(path: Path, names: Sequence[str], reach: int) -> None:

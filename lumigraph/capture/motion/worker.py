@@ -1,8 +1,8 @@
-"""One stage of COLMAP in a process of its own, so that Ctrl-C ends it at once and its memory and chatter stay outside.
+"""One stage of COLMAP in a process of its own: Ctrl-C ends it at once, and its memory and messages stay outside.
 
-Run as a script, with what to do as JSON in its only argument. It knows nothing of the house, so it starts in half a
-second. It writes how much is done to standard output, a number to a line; whatever COLMAP says goes to standard error.
-It ends when its standard input does: nobody is left to hear of the result.
+Run as a script with a job as JSON in its only argument. It imports nothing of the package, so it starts in half a
+second. Progress goes to standard output, a number to a line; COLMAP's messages go to standard error. The process ends
+when its standard input does.
 """
 
 from __future__ import annotations
@@ -12,18 +12,27 @@ import os
 import signal
 import subprocess
 import sys
+import tempfile
 import threading
+from collections import Counter
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pycolmap
 
 COUNTER = Path(__file__).with_name("counter.py")
 BLOCK_PAIRS = 64  # pairs that COLMAP compares between two writes to the database
 MIN_MODEL_VIEWS = 3  # photographs of a model
 MAX_THREADS = 16  # more threads need more memory than they save time
+MAX_ADJUSTMENT_STEPS = 30
+MIN_HELD_POINTS = 30  # points whose error decides on a lens
+MIN_GAIN = 0.99  # error of held-out tracks with the full lens, of that with the simple one, below which it is kept
+MIN_SHARED_POINTS = 15  # points of two models that one similarity maps onto each other
+MIN_SHARED_RATIO = 0.3  # share of those points among all that matches connect
+JOIN_TOLERANCE = 0.05  # distance of two points that count as one, of the median distance from the model's centre
 
 
 def find_features(job: dict[str, Any]) -> None:
@@ -32,6 +41,7 @@ def find_features(job: dict[str, Any]) -> None:
     options = pycolmap.FeatureExtractionOptions()
     options.max_image_size, options.num_threads = job["max_size"], job["threads"]
     options.sift.max_num_features = job["features"]
+    options.sift.peak_threshold *= job["contrast"]
     reading = pycolmap.ImageReaderOptions()
     if job["masks"]:
         reading.mask_path = job["masks"]
@@ -55,11 +65,15 @@ def match(job: dict[str, Any]) -> None:
     pycolmap.match_image_pairs(job["database"], options, pairing, verification, device=pycolmap.Device.cpu)
 
 
-def place_one_by_one(job: dict[str, Any]) -> None:
-    """Incremental structure from motion (Schönberger and Frahm 2016)."""
+def incremental_options(job: dict[str, Any]) -> pycolmap.IncrementalPipelineOptions:
     options = pycolmap.IncrementalPipelineOptions()
     options.num_threads, options.random_seed = job["threads"], job["seed"]
     options.min_model_size = MIN_MODEL_VIEWS
+    return options
+
+
+def place_one_by_one(job: dict[str, Any]) -> None:
+    """Incremental structure from motion (Schönberger and Frahm 2016), from the start or from a model."""
     placed = 2
 
     def another() -> None:
@@ -76,7 +90,8 @@ def place_one_by_one(job: dict[str, Any]) -> None:
         job["database"],
         job["images"],
         job["models"],
-        options,
+        incremental_options(job),
+        input_path=job.get("model") or "",
         initial_image_pair_callback=begun,
         next_image_callback=another,
     )
@@ -92,11 +107,148 @@ def place_all_at_once(job: dict[str, Any]) -> None:
     pycolmap.global_mapping(job["database"], job["images"], job["models"], options)
 
 
+def refine_lenses(job: dict[str, Any]) -> None:
+    """Four distortion coefficients and two focal lengths instead of one of each, where held-out tracks agree better.
+
+    Every tenth point is left out of two bundle adjustments, one with each lens. Then it is triangulated with the
+    cameras found; the lens with the smaller reprojection error stays.
+    """
+    model = pycolmap.Reconstruction(job["model"])
+    views = Counter(image.camera_id for image in model.images.values() if image.has_pose)
+    lenses = [number for number, count in views.items() if count >= job["views"] and is_simple(model.cameras[number])]
+    held = [number for number in sorted(model.point3D_ids()) if model.point3D(number).track.length() >= 3][::10]
+    if lenses and len(held) >= MIN_HELD_POINTS:
+        before, _ = held_out_error(model, [], held)
+        after, sane = held_out_error(model, lenses, held)
+        print(f"held-out tracks: {before:.4f} pixels, with the full lens {after:.4f}")
+        if sane and after < MIN_GAIN * before:
+            set_full(model, lenses)
+            adjust(model)
+    os.makedirs(job["models"])
+    model.write(job["models"])
+
+
+def is_simple(camera: pycolmap.Camera) -> bool:
+    return camera.model == pycolmap.CameraModelId.SIMPLE_RADIAL
+
+
+def set_full(model: pycolmap.Reconstruction, lenses: list[int]) -> None:
+    for number in lenses:
+        camera = model.cameras[number]
+        focal, cx, cy, k1 = camera.params
+        camera.model = pycolmap.CameraModelId.OPENCV
+        camera.params = [focal, focal, cx, cy, k1, 0.0, 0.0, 0.0]
+
+
+def held_out_error(model: pycolmap.Reconstruction, lenses: list[int], held: list[int]) -> tuple[float, bool]:
+    """Mean reprojection error in pixels of points that did not take part in the adjustment, and whether the lenses are
+    plausible: focal lengths that agree to 5 percent, and no coefficient above 1."""
+    model = pycolmap.Reconstruction(model)
+    tracks = [(model.point3D(number).xyz.copy(), model.point3D(number).track.elements) for number in held]
+    tracks = [(xyz, [(e.image_id, e.point2D_idx) for e in elements]) for xyz, elements in tracks]
+    for number in held:
+        model.delete_point3D(number)
+    set_full(model, lenses)
+    adjust(model)
+    added = []
+    for xyz, elements in tracks:
+        track = pycolmap.Track()
+        for image, feature in elements:
+            track.add_element(image, feature)
+        added.append(model.add_point3D(xyz, track))
+    adjust(model, points_alone=True)
+    model.update_point_3d_errors()
+    parameters = [model.cameras[number].params for number in lenses]
+    sane = all(abs(p[0] / p[1] - 1) < 0.05 and max(abs(p[4:])) < 1 for p in parameters)
+    return sum(model.point3D(number).error for number in added) / len(added), sane
+
+
+def adjust(model: pycolmap.Reconstruction, points_alone: bool = False) -> None:
+    options = pycolmap.BundleAdjustmentOptions()
+    options.print_summary = False
+    options.ceres.solver_options.max_num_iterations = MAX_ADJUSTMENT_STEPS
+    if points_alone:
+        options.refine_focal_length = options.refine_extra_params = options.refine_rig_from_world = False
+    pycolmap.bundle_adjustment(model, options)
+
+
+def join(job: dict[str, Any]) -> None:
+    """One model of several, where a similarity maps the points that two of them share onto each other.
+
+    Two points are shared if a feature of a photograph in both models sees them, or if two matched features do.
+    """
+    found = [pycolmap.Reconstruction(place) for place in job["apart"]]
+    with closing(pycolmap.Database.open(job["database"])) as database:
+        pairs = list(zip(*database.read_two_view_geometries(), strict=True))
+        cache = pycolmap.DatabaseCache.create(database, pycolmap.DatabaseCacheOptions())
+    joined, attempts = found[0], found[1:]
+    for other in attempts:
+        similarity = similarity_of(other, joined, pairs)
+        if similarity is None:
+            continue
+        other.transform(similarity)
+        joined = triangulated(cache, joined, other, job)
+    os.makedirs(job["models"])
+    joined.write(job["models"])
+
+
+def similarity_of(source: pycolmap.Reconstruction, target: pycolmap.Reconstruction, pairs: list) -> Any:
+    """The similarity that maps points of one model onto those of another; None unless enough of the shared agree."""
+    shared = set()
+    for number, pair in pairs:
+        a, b = pycolmap.pair_id_to_image_pair(number)
+        for i, j, columns in ((a, b, (0, 1)), (b, a, (1, 0))):
+            if i in source.images and j in target.images:
+                first, second = source.images[i].points2D, target.images[j].points2D
+                for k, m in pair.inlier_matches[:, columns]:
+                    if first[k].has_point3D() and second[m].has_point3D():
+                        shared.add((first[k].point3D_id, second[m].point3D_id))
+    for number in set(source.images) & set(target.images):
+        for first, second in zip(source.images[number].points2D, target.images[number].points2D, strict=True):
+            if first.has_point3D() and second.has_point3D():
+                shared.add((first.point3D_id, second.point3D_id))
+    if len(shared) < MIN_SHARED_POINTS:
+        return None
+    ordered = sorted(shared)
+    from_points = np.array([source.point3D(i).xyz for i, _ in ordered])
+    to_points = np.array([target.point3D(j).xyz for _, j in ordered])
+    options = pycolmap.RANSACOptions()
+    spread = np.linalg.norm(to_points - np.median(to_points, axis=0), axis=1)
+    options.max_error, options.random_seed = JOIN_TOLERANCE * float(np.median(spread)), 0
+    found = pycolmap.estimate_sim3d_robust(from_points, to_points, options)
+    if not found or found["num_inliers"] < max(MIN_SHARED_POINTS, MIN_SHARED_RATIO * len(ordered)):
+        return None
+    return found["tgt_from_src"]
+
+
+def triangulated(
+    cache: pycolmap.DatabaseCache, joined: pycolmap.Reconstruction, other: pycolmap.Reconstruction, job: dict[str, Any]
+) -> pycolmap.Reconstruction:
+    """A model with the photographs of two, its points triangulated anew; the first if the second adds none."""
+    model = pycolmap.Reconstruction()
+    model.load(cache)
+    for part in (other, joined):
+        for number, camera in part.cameras.items():
+            model.cameras[number].params = camera.params
+        for number in part.reg_frame_ids():
+            model.frame(number).rig_from_world = part.frame(number).rig_from_world
+    for number in {*joined.reg_frame_ids(), *other.reg_frame_ids()}:
+        model.register_frame(number)
+    with tempfile.TemporaryDirectory() as place:
+        model = pycolmap.triangulate_points(
+            model, job["database"], job["images"], place, options=incremental_options(job), refine_intrinsics=True
+        )
+    kept = sum(image.has_pose and image.num_points3D >= MIN_SHARED_POINTS for image in model.images.values())
+    return model if kept > joined.num_reg_images() else joined
+
+
 STAGES: dict[str, tuple[Callable[[dict[str, Any]], None], str | None]] = {
     "features": (find_features, "keypoints"),
     "matching": (match, "two_view_geometries"),
     "incremental": (place_one_by_one, None),
     "global": (place_all_at_once, None),
+    "joining": (join, None),
+    "lenses": (refine_lenses, None),
 }
 
 
