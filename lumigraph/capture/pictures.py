@@ -20,6 +20,7 @@ from .capture import PixelPlane, Shot
 from .numbers import TIFF_SUFFIXES, Kind, as_bytes, check_pixels, colours, kind_of, read_numbers, tiff_tags, turned
 
 DEFAULT_MAX_SIDE = 1100  # pixels of the longer side of a photograph
+MAX_KEPT = 1.2  # times as long a side stays as it is, rather than losing sharpness for few pixels
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".JPG", ".JPEG", ".PNG", ".webp", ".tif", ".tiff", ".bmp", ".exr")
 DEEP_SUFFIXES = (".png", ".tif", ".tiff", ".exr")  # of files that may hold more than eight bits
 EXIF_ORIENTATION = 0x0112
@@ -131,7 +132,7 @@ def choose_file(shot: Shot, files: dict[int, Path], downscale: int | None) -> Ch
         calibrated = shot.size
     wanted = reduced(calibrated, downscale)
     times = max(1, round(max(calibrated) / max(wanted)))
-    fitting = [k for k in files if times % k == 0]
+    fitting = [k for k in files if times % k == 0 or (downscale is None and k <= times)]
     path = files[max(fitting) if fitting else min(files, key=lambda k: (k > times, abs(k - times)))]
     stored, orientation = measure(path)
     turned = stored[::-1] if orientation in EXIF_SIDEWAYS else stored
@@ -167,7 +168,10 @@ def check_downscale(downscale: int | None) -> None:
 
 
 def reduced(size: Size, downscale: int | None) -> Size:
-    times = math.ceil(max(size) / DEFAULT_MAX_SIDE) if downscale is None else downscale
+    """Width and height of a photograph after `downscale`; None: with the default longer side, if it is longer."""
+    times = float(downscale or max(size) / DEFAULT_MAX_SIDE)
+    if downscale is None and times <= MAX_KEPT:
+        times = 1.0
     return max(round(size[0] / times), 1), max(round(size[1] / times), 1)
 
 
