@@ -179,7 +179,8 @@ class Reconstruction:
             self.work / "models",
         )
         self.unfolded, self.completed = self.work / "unfolded", self.work / "completed"
-        self.refined, self.second = self.work / "refined", self.work / "second.db"
+        self.refined = self.work / "refined"
+        self.near, self.second = self.work / "near.db", self.work / "second.db"
         self.masks: Path | None = None
         self.names = [photo.name for photo in self.photos]
         self.groups = group_by_lens(self.photos, self.intake.in_order, self.options.camera)
@@ -290,11 +291,10 @@ class Reconstruction:
                 found, matches = read_models(self.models), read_matches(self.database)
                 folded = bool(found) and self.leaps(found[0], matches) > 0
             if folded:
-                near = self.work / "near.db"
-                copy_database(self.database, near)
-                keep_near(near, self.names, SEQUENTIAL_NEIGHBOURS)
+                copy_database(self.database, self.near)
+                keep_near(self.near, self.names, SEQUENTIAL_NEIGHBOURS)
                 with replacing_folder(self.unfolded, ours=True) as partial:
-                    self.map(near, partial, "incremental")
+                    self.map(self.near, partial, "incremental")
 
     def complete(self, key: str) -> None:
         """Join models that stand apart, then look again at photographs without a place.
@@ -305,7 +305,7 @@ class Reconstruction:
         if self.stages.is_done("completing", key) and self.completed.is_dir():
             return
         with self.stages.working("completing", key), replacing_folder(self.completed, ours=True) as partial:
-            found, _ = self.choose(read_matches(self.database))
+            found, _, database = self.choose(read_matches(self.database))
             apart = [partial / f"apart{i}" for i in range(len(found))]
             for place, model in zip(apart, found, strict=True):
                 place.mkdir()
@@ -314,19 +314,19 @@ class Reconstruction:
             if len(apart) > 1:
                 best = partial / "joined"
                 self.colmap(
-                    "Joining models", len(apart), self.database, stage="joining", apart=list(map(str, apart)),
+                    "Joining models", len(apart), database, stage="joining", apart=list(map(str, apart)),
                     images=str(self.images), models=str(best),
                 )  # fmt: skip
             left = set(self.names) - (registered(pycolmap.Reconstruction(best)) if best else set())
             if left:
-                self.look_again(left)
+                self.look_again(left, database)
                 again = partial / "again"
                 again.mkdir()
                 self.map(self.second, again, "incremental", best)
 
-    def look_again(self, left: set[str]) -> None:
+    def look_again(self, left: set[str], database: Path) -> None:
         """The database of the second pass: other features of the photographs without a place, and their matches."""
-        copy_database(self.database, self.second)
+        copy_database(database, self.second)
         forget(self.second, left)
         self.colmap(
             "Finding more details", len(self.names), self.second, stage="features",
@@ -363,25 +363,31 @@ class Reconstruction:
         if mapper == "global":  # it changes what it finds in the database
             copy_database(database, database := self.work / "global.db")
         self.colmap(
-            "Placing the rest" if model else "Placing cameras", len(self.names), database, stage=mapper, images=str(self.images), models=str(models),
-            calibrate=not all(prior(group)[1] for group in self.groups), model=model and str(model),
-        )  # fmt: skip
+            "Placing the rest" if model else "Placing cameras",
+            len(self.names),
+            database,
+            stage=mapper,
+            images=str(self.images),
+            models=str(models),
+            model=model and str(model),
+            calibrate=not all(prior(group)[1] for group in self.groups),
+        )
 
-    def choose(self, matches: Matches) -> tuple[list[pycolmap.Reconstruction], list[str]]:
-        """The models, largest first, and what to say of how they came about."""
-        found, told = read_models(self.models), []
+    def choose(self, matches: Matches) -> tuple[list[pycolmap.Reconstruction], list[str], Path]:
+        """The models, largest first, notes on how they were made, and the database of their matches."""
+        found, notes, database = read_models(self.models), [], self.database
         if (self.models / FALLBACK_MARK).exists():
             how = "all at once" if self.options.mapper == "incremental" else "one by one"
-            told.append(f"--mapper {self.options.mapper} found no model, so photographs were placed {how}")
+            notes.append(f"--mapper {self.options.mapper} found no model, so photographs were placed {how}")
         if self.unfolded.is_dir() and (unfolded := read_models(self.unfolded)):
             enough = unfolded[0].num_reg_images() >= MIN_KEPT_SHARE * found[0].num_reg_images()
             if enough and self.leaps(unfolded[0], matches) < self.leaps(found[0], matches):
-                found = unfolded
-                told.append(
+                found, database = unfolded, self.near
+                notes.append(
                     f"parts of the place look alike and the model folded, so it was made again from the nearest "
                     f"{SEQUENTIAL_NEIGHBOURS} neighbours of each photograph alone; look at capture.png"
                 )
-        return found, told
+        return found, notes, database
 
     def colmap(self, description: str, total: int, database: Path, **job: Any) -> None:
         done = self.stages.colmap(total, database=str(database), **job)
@@ -394,7 +400,7 @@ class Reconstruction:
     def write(self, key: str) -> dict[str, Any]:
         """The largest model becomes the scene. capture.json comes last: where it is, the rest is whole."""
         matches = read_matches(self.second if self.second.is_file() else self.database)
-        found, told = self.choose(matches)
+        found, told, _ = self.choose(matches)
         if self.refined.is_dir():
             found = [pycolmap.Reconstruction(self.refined), *found]
         if not found or found[0].num_reg_images() < MIN_VIEWS:

@@ -27,6 +27,7 @@ COUNTER = Path(__file__).with_name("counter.py")
 BLOCK_PAIRS = 64  # pairs that COLMAP compares between two writes to the database
 MIN_MODEL_VIEWS = 3  # photographs of a model
 MAX_THREADS = 16  # more threads need more memory than they save time
+MIN_ADDED_INLIERS = 18  # inliers that place a photograph in a finished model; COLMAP's 30 hold while it grows
 MAX_ADJUSTMENT_STEPS = 30
 MIN_HELD_POINTS = 30  # points whose error decides on a lens
 MIN_GAIN = 0.99  # error of held-out tracks with the full lens, of that with the simple one, below which it is kept
@@ -73,8 +74,11 @@ def incremental_options(job: dict[str, Any]) -> pycolmap.IncrementalPipelineOpti
 
 
 def place_one_by_one(job: dict[str, Any]) -> None:
-    """Incremental structure from motion (Schönberger and Frahm 2016), from the start or from a model."""
-    placed = 2
+    """Incremental structure from motion (Schönberger and Frahm 2016), from the start or from a model, to which
+    photographs are added with fewer inliers: the model is there to contradict them."""
+    options, placed = incremental_options(job), 2
+    if job["model"]:
+        options.mapper.abs_pose_min_num_inliers = MIN_ADDED_INLIERS
 
     def another() -> None:
         nonlocal placed
@@ -90,8 +94,8 @@ def place_one_by_one(job: dict[str, Any]) -> None:
         job["database"],
         job["images"],
         job["models"],
-        incremental_options(job),
-        input_path=job.get("model") or "",
+        options,
+        input_path=job["model"] or "",
         initial_image_pair_callback=begun,
         next_image_callback=another,
     )
