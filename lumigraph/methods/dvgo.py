@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated, Any, ClassVar
 
 import torch
@@ -175,46 +175,20 @@ class DVGO(FieldMethod):
         self._adam: LazyAdam | None = None
 
     @classmethod
-    def preset(cls, device: torch.device) -> Any:
-        """On a GPU the paper's numbers. On a CPU, what learns most in a minute."""
-        if device.type == "cuda":
-            return Config()
-        return Config(
-            coarse_voxels=64**3,
-            voxels=128**3,
-            hidden_width=32,
-            coarse_share=0.1,
-            doublings=3,
-            growing_share=0.4,
-            step_size=0.8,
-            occupancy=OccupancyNumbers(1 << 17, transmittance_threshold=1e-3, occupancy_threshold=0.1),
-            open_samples_per_step=1 << 16,
-            density_learning_rate=0.6,
-            feature_learning_rate=0.2,
-            network_learning_rate=5e-3,
-            point_weight=0.0,
-            entropy_weight=0.0,
-        )
+    def cpu_preset(cls) -> Any:
+        occupancy = OccupancyNumbers(1 << 17, transmittance_threshold=1e-3, occupancy_threshold=0.1)
+        c = Config(occupancy, coarse_voxels=64**3, voxels=128**3, hidden_width=32, step_size=0.8)
+        c = replace(c, coarse_share=0.1, doublings=3, growing_share=0.4, open_samples_per_step=1 << 16)
+        c = replace(c, density_learning_rate=0.6, feature_learning_rate=0.2, network_learning_rate=5e-3)
+        return replace(c, point_weight=0.0, entropy_weight=0.0)
 
     @classmethod
     def smallest(cls) -> Any:
         """Grids of a few thousand voxels that reach the fine stage and double twice within some twenty quick steps."""
-        return Config(
-            coarse_voxels=16**3,
-            voxels=24**3,
-            feature_channels=4,
-            hidden_width=16,
-            hidden_layers=1,
-            sh_bands=2,
-            coarse_share=0.2,
-            doublings=2,
-            growing_share=0.5,
-            occupancy=OccupancyNumbers(4096, occupancy_resolution=16),
-            open_samples_per_step=4096,
-            density_learning_rate=0.5,
-            feature_learning_rate=0.2,
-            network_learning_rate=1e-2,
-        )
+        c = Config(OccupancyNumbers(4096, occupancy_resolution=16), coarse_voxels=16**3, voxels=24**3)
+        c = replace(c, feature_channels=4, hidden_width=16, hidden_layers=1, sh_bands=2, open_samples_per_step=4096)
+        c = replace(c, density_learning_rate=0.5, feature_learning_rate=0.2, network_learning_rate=1e-2)
+        return replace(c, coarse_share=0.2, doublings=2, growing_share=0.5)
 
     @classmethod
     def further_bytes(cls, frame: Frame, config: Any, learning: bool) -> int:

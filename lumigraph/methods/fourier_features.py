@@ -48,15 +48,15 @@ class FourierFeatures(RayMethod):
     Config = Config
 
     def __init__(self, frame: Frame, config: Any = None):
-        config = config or Config()
-        super().__init__(frame, config)
-        rows = frequencies(config)
+        c = config or Config()
+        super().__init__(frame, c)
+        rows = frequencies(c)
         self.encoding = nn.Identity() if rows is None else Waves(rows)
-        widths = [2 if rows is None else 2 * len(rows), *[config.hidden_width] * (config.layers - 1)]
+        widths = [2 if rows is None else 2 * len(rows), *[c.hidden_width] * (c.layers - 1)]
         with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(config.seed)
-            hidden = [Dense(a, b, relu=True, exact=config.exact or a < FEW) for a, b in pairwise(widths)]
-            self.layers = nn.Sequential(*hidden, Dense(config.hidden_width, 3, exact=True))
+            torch.manual_seed(c.seed)
+            hidden = [Dense(a, b, relu=True, exact=c.exact or a < FEW) for a, b in pairwise(widths)]
+            self.layers = nn.Sequential(*hidden, Dense(c.hidden_width, 3, exact=True))
 
     @classmethod
     def smallest(cls) -> Any:

@@ -35,6 +35,14 @@ class RayNumbers:
         return self.rays_per_step * (self.coarse_samples + self.fine_samples)
 
 
+# A Config's numbers for a plain CPU, and for tests.
+CPU_NETWORK: dict[str, Any] = {"rays": RayNumbers(32, 16, rays_per_step=1024), "mask": MaskNumbers(128)}
+CPU_NETWORK |= {"hidden_width": 128, "learning_rate": 4e-3, "final_learning_rate": 2e-4, "warmup": 0.02}
+CPU_NETWORK |= {"coarse_loss_weight": 0.0}
+TINY_NETWORK: dict[str, Any] = {"rays": RayNumbers(16, 12, rays_per_step=192), "mask": MaskNumbers(16)}
+TINY_NETWORK |= {"hidden_width": 32, "learning_rate": 5e-3, "final_learning_rate": 5e-4, "warmup": 0.1}
+
+
 class HierarchicalSampler(Sampler):
     """Two passes of a `CoordinateField`: a coarse one, and a fine one of the coarse samples and more.
 

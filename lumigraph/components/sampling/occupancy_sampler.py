@@ -53,13 +53,6 @@ class StepNumbers:
     cone_angle: Share = 1 / 256  # growth of the step with distance, appendix E.1; higher: fewer samples far away
 
 
-# Numbers for a plain CPU, which learn most in a minute (docs/methods/instant_ngp.md), and for tests.
-CPU_OCCUPANCY = OccupancyNumbers(samples_per_step=1 << 15, transmittance_threshold=1e-3, occupancy_threshold=0.15)
-CPU_STEPS = StepNumbers(steps_per_diagonal=384, cone_angle=1 / 96)
-TINY_OCCUPANCY = OccupancyNumbers(samples_per_step=2048, occupancy_resolution=16)
-TINY_STEPS = StepNumbers(steps_per_diagonal=128)
-
-
 class Stage(NamedTuple):
     """From a share of the budget on: shares of `occupancy_resolution` and of `steps_per_diagonal`."""
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 FIRST_SHARE = 0.01  # of the learning rate, at the very beginning of a warm-up
 RISE = 20  # steps in which a rate that is held rises
 
@@ -23,3 +25,15 @@ def held(first: float, last: float, step: int, progress: float, start: float) ->
     """
     fall = max(0.0, progress - start) / (1 - start)
     return falling(first, last, fall) * min(1.0, (step + 1) / RISE)
+
+
+def exponential_decay(method: Any, step: int, progress: float) -> float:
+    """`Method.learning_rate` that is `falling`, by the numbers of the Config."""
+    c = method.config
+    return falling(c.learning_rate, c.final_learning_rate, progress, getattr(c, "warmup", 0.0))
+
+
+def held_decay(method: Any, step: int, progress: float) -> float:
+    """`Method.learning_rate` that is `held`, by the numbers of the Config."""
+    c = method.config
+    return held(c.learning_rate, c.final_learning_rate, step, progress, c.decay_start)

@@ -23,7 +23,7 @@ from ...components.sampling.occupancy_sampler import reached
 from ...components.training.lazy_adam import LazyAdam
 from ...components.training.members import chance, photographed, rays_through
 from ...components.training.photometric import backdrop, residuals
-from ...components.training.schedules import falling
+from ...components.training.schedules import exponential_decay
 from ...datasets.collection import Collection
 from ...datasets.scene import Batch, Frame, Photograph, Scene
 from ...errors import LumigraphError
@@ -89,12 +89,6 @@ class Config:
     seed: Seed = 0  # seed of all random numbers; another seed gives another run
 
 
-CPU_TABLE = HashNumbers(5, 4, log2_hashmap_size=12, base_resolution=8, max_resolution=64, sh_bands=2)
-TINY_TABLE = HashNumbers(
-    levels=3, log2_hashmap_size=9, base_resolution=4, max_resolution=16, geometry_features=8, sh_bands=1
-)
-
-
 @dataclass(frozen=True)
 class Evidence:
     """What is known of one scene: some rays, cells that may hold something, and the colour behind it."""
@@ -150,12 +144,12 @@ class HypNeRF(RayMethod):
     field looks like its photographs and tunes that field to them."""
 
     Config, learns_from, accepts = Config, Collection, (Scene,)
+    learning_rate = exponential_decay
     efforts: ClassVar[Efforts] = {"draft": Effort(50, 2000), "good": Effort(300, 10_000), "best": Effort(1500, 50_000)}
 
     def __init__(self, frame: Frame, config: Any = None):
-        config = config or Config()
-        super().__init__(frame, config)
-        c = config
+        c = config or Config()
+        super().__init__(frame, c)
         self.shape = HashShape.of(c.table, c.hidden_width)
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(c.seed)
@@ -171,56 +165,23 @@ class HypNeRF(RayMethod):
         self._denoising = False
 
     @classmethod
-    def preset(cls, device: torch.device) -> Any:
-        """On a GPU the paper's numbers. On a CPU smaller codes, tables and networks of the same design."""
-        if device.type == "cuda":
-            return Config()
-        return Config(
-            shape_code=64,
-            colour_code=32,
-            code_deviation=0.1,
-            hyper_width=96,
-            hyper_layers=2,
-            members=1024,
-            table=CPU_TABLE,
-            hidden_width=32,
-            steps_per_diagonal=112,
-            transmittance_threshold=1e-3,
-            occupancy_resolution=32,
-            members_per_step=4,
-            rays_per_member=192,
-            targets=2,
-            empty_points=256,
-            learning_rate=4e-3,
-            final_learning_rate=4e-4,
-            denoiser_start=0.8,
-        )
+    def cpu_preset(cls) -> Any:
+        """Smaller codes, tables and networks of the same design."""
+        table = HashNumbers(5, 4, log2_hashmap_size=12, base_resolution=8, max_resolution=64, sh_bands=2)
+        c = Config(table, shape_code=64, colour_code=32, code_deviation=0.1, hyper_width=96, hidden_width=32)
+        c = replace(c, steps_per_diagonal=112, transmittance_threshold=1e-3, occupancy_resolution=32, members=1024)
+        c = replace(c, members_per_step=4, rays_per_member=192, targets=2, empty_points=256)
+        return replace(c, learning_rate=4e-3, final_learning_rate=4e-4, denoiser_start=0.8)
 
     @classmethod
     def smallest(cls) -> Any:
-        return Config(
-            shape_code=4,
-            colour_code=4,
-            code_deviation=0.1,
-            hyper_width=16,
-            hyper_layers=1,
-            members=16,
-            table=TINY_TABLE,
-            hidden_width=16,
-            steps_per_diagonal=64,
-            occupancy_resolution=16,
-            members_per_step=2,
-            rays_per_member=128,
-            empty_points=64,
-            learning_rate=1e-2,
-            final_learning_rate=5e-3,
-            denoiser_width=4,
-            denoiser_start=0.0,
-            code_steps=8,
-            tune_steps=4,
-            denoise_views=2,
-            denoise_steps=4,
-        )
+        table = HashNumbers(3, 2, log2_hashmap_size=9, base_resolution=4, max_resolution=16)
+        table = replace(table, geometry_features=8, sh_bands=1)
+        c = Config(table, shape_code=4, colour_code=4, code_deviation=0.1, hyper_width=16, hyper_layers=1)
+        c = replace(c, hidden_width=16, members=16, steps_per_diagonal=64, occupancy_resolution=16, empty_points=64)
+        c = replace(c, members_per_step=2, rays_per_member=128, learning_rate=1e-2, final_learning_rate=5e-3)
+        c = replace(c, denoiser_width=4, denoiser_start=0.0, denoise_views=2, denoise_steps=4)
+        return replace(c, code_steps=8, tune_steps=4)
 
     @classmethod
     def further_bytes(cls, frame: Frame, config: Any, learning: bool) -> int:
@@ -334,9 +295,6 @@ class HypNeRF(RayMethod):
         common = {"lr": self.config.learning_rate, "betas": (0.9, 0.99), "eps": 1e-15}
         networks = [*self.hyper.parameters(), *self.denoiser.parameters()]
         return [torch.optim.Adam(networks, fused=True, **common), LazyAdam([self.codes.rows], **common)]
-
-    def learning_rate(self, step: int, progress: float) -> float:
-        return falling(self.config.learning_rate, self.config.final_learning_rate, progress)
 
     def before_step(self, step: int, progress: float) -> None:
         self._shown, self._denoising = None, progress >= self.config.denoiser_start

@@ -13,22 +13,15 @@ from torch.nn.functional import softplus
 from ...camera.rays import Rays, Rendering, Samples
 from ...components.fields.appearance import AVERAGE, AppearanceCodes, CodeWidth, PhotographCodes
 from ...components.fields.coordinate_field import CoordinateField, NetworkNumbers
-from ...components.fields.hash_field import CODES_RATE, CPU_TABLE, OPEN_RATE, TINY_TABLE, HashNumbers
+from ...components.fields.hash_field import CODES_RATE, OPEN_RATE, HashNumbers
 from ...components.fields.sky import sky_for
 from ...components.sampling.hierarchical_sampler import RAYS_WITH_FEATURES, HierarchicalSampler, RayNumbers
-from ...components.sampling.occupancy_sampler import (
-    CPU_OCCUPANCY,
-    CPU_STEPS,
-    TINY_OCCUPANCY,
-    TINY_STEPS,
-    OccupancyNumbers,
-    StepNumbers,
-)
+from ...components.sampling.occupancy_sampler import OccupancyNumbers, StepNumbers
 from ...components.sampling.proposal_sampler import ProposalNumbers
-from ...components.sampling.samplers import sampler_for
+from ...components.sampling.samplers import CPU_HASH, TINY_HASH, sampler_for, sampling_bytes
 from ...components.sampling.spaces import space_of
 from ...components.training.photometric import backdrop
-from ...components.training.schedules import held
+from ...components.training.schedules import held_decay
 from ...datasets.scene import Batch, Frame
 from ...files.ranges import Layers, LearningRate, NonNegative, PositiveShare, Seed, Share, Width, between
 from ...method import FieldMethod, Pass
@@ -70,7 +63,7 @@ HIDDEN, SHOWN = "hidden", "shown"
 class NeRFW(FieldMethod):
     """A static scene whose colours depend on the appearance of a photograph, and a transient of each photograph."""
 
-    Config = Config
+    Config, further_bytes, learning_rate = Config, staticmethod(sampling_bytes), held_decay
     network: EncodedHashField | CoordinateField
     transient_head: TransientHead | HashTransientHead
     appearance: AppearanceCodes
@@ -101,49 +94,16 @@ class NeRFW(FieldMethod):
         self.settling = False  # whether the static scene learns alone
 
     @classmethod
-    def preset(cls, device: torch.device) -> Any:
-        """On a GPU the paper's networks and numbers. On a CPU a hash table with Instant-NGP's numbers there."""
-        if device.type == "cuda":
-            return Config()
-        return Config(
-            field="hash",
-            table=CPU_TABLE,
-            occupancy=CPU_OCCUPANCY,
-            steps=CPU_STEPS,
-            transient_layers=2,
-            transient_width=32,
-            beta_min=0.1,
-            transient_start=0.1,
-            hidden_width=32,
-            learning_rate=2e-2,
-            final_learning_rate=1e-3,
-            decay_start=0.3,
-        )
+    def cpu_preset(cls) -> Any:
+        """A hash table with Instant-NGP's numbers."""
+        c = Config(**CPU_HASH, field="hash", hidden_width=32, transient_layers=2, transient_width=32, beta_min=0.1)
+        return replace(c, transient_start=0.1, learning_rate=2e-2, final_learning_rate=1e-3, decay_start=0.3)
 
     @classmethod
     def smallest(cls) -> Any:
         """A tiny table with tiny networks and a grid of three sizes, within some twenty quick steps."""
-        return Config(
-            field="hash",
-            table=TINY_TABLE,
-            occupancy=TINY_OCCUPANCY,
-            steps=TINY_STEPS,
-            appearance_code=4,
-            transient_code=4,
-            transient_layers=1,
-            transient_width=16,
-            hidden_width=16,
-            learning_rate=2e-2,
-            final_learning_rate=1e-3,
-        )
-
-    @classmethod
-    def further_bytes(cls, frame: Frame, config: Any, learning: bool) -> int:
-        c = config
-        if c.field == "network":
-            return c.network.activation_bytes(c.rays.samples_per_step, c.hidden_width) * learning
-        activations = c.table.activation_bytes(c.occupancy.samples_per_step, c.hidden_width)
-        return super().further_bytes(frame, config, learning) + activations * learning
+        c = Config(**TINY_HASH, field="hash", hidden_width=16, learning_rate=2e-2, final_learning_rate=1e-3)
+        return replace(c, appearance_code=4, transient_code=4, transient_layers=1, transient_width=16)
 
     # Learning
 
@@ -193,10 +153,6 @@ class NeRFW(FieldMethod):
         else:
             own = [torch.optim.Adam([*self.network.parameters(), *others, *codes], rate, eps=1e-7)]
         return [*own, *super().optimizers()]
-
-    def learning_rate(self, step: int, progress: float) -> float:
-        c = self.config
-        return held(c.learning_rate, c.final_learning_rate, step, progress, c.decay_start)
 
     def before_step(self, step: int, progress: float) -> None:
         self.settling = progress < self.config.transient_start

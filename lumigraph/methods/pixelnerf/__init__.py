@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
 
@@ -22,7 +22,7 @@ from ...components.fields.kept_photographs import KeptPhotographs, padded
 from ...components.sampling.sampling import inverse_transform, midpoints, stratified
 from ...components.sampling.spaces import space_of
 from ...components.training.members import chance, photographed, rays_through
-from ...components.training.schedules import falling
+from ...components.training.schedules import exponential_decay
 from ...datasets.collection import Collection
 from ...datasets.scene import Batch, Frame, Photograph, Scene
 from ...errors import LumigraphError
@@ -129,12 +129,12 @@ class PixelNeRF(RayMethod):
     """
 
     Config, learns_from, accepts = Config, Collection, (Scene,)
+    learning_rate = exponential_decay
     efforts: ClassVar[Efforts] = {"draft": Effort(10, 1000), "good": Effort(200, 20_000), "best": Effort(2000, 200_000)}
 
     def __init__(self, frame: Frame, config: Any = None):
-        config = config or Config()
-        super().__init__(frame, config)
-        c = config
+        c = config or Config()
+        super().__init__(frame, c)
         self.encode = FrequencyEncoding(3, c.position_frequencies, base=1.5)
         self.encoder = PictureEncoder(c.encoder_widths, c.encoder_blocks, c.encoder_pool, bool(c.encoder_weights))
         shape = (self.encode.width + 3, self.encoder.width, c.hidden_width, c.blocks, c.view_blocks, not c.bfloat16)
@@ -144,52 +144,19 @@ class PixelNeRF(RayMethod):
         self._boxed = True
 
     @classmethod
-    def preset(cls, device: torch.device) -> Any:
-        """On a GPU the paper's numbers. On a CPU a smaller encoder and network of the same design."""
-        if device.type == "cuda":
-            return Config()
-        return Config(
-            hidden_width=64,
-            encoder_widths=(32, 32, 64, 128),
-            encoder_blocks=(2, 2, 2),
-            encoder_pool=False,
-            coarse_samples=20,
-            fine_samples=12,
-            depth_samples=0,
-            networks=1,
-            coarse_loss_weight=0.1,
-            density="softplus",
-            density_scale=10.0,
-            members_per_step=3,
-            rays_per_member=128,
-            boxed=0.5,
-            learning_rate=1e-3,
-            final_learning_rate=1e-4,
-            warmup=0.02,
-            empty_threshold=1e-2,
-        )
+    def cpu_preset(cls) -> Any:
+        """A smaller encoder and network of the same design."""
+        c = Config(hidden_width=64, encoder_widths=(32, 32, 64, 128), encoder_blocks=(2, 2, 2), encoder_pool=False)
+        c = replace(c, coarse_samples=20, fine_samples=12, depth_samples=0, networks=1, empty_threshold=1e-2)
+        c = replace(c, density="softplus", density_scale=10.0, members_per_step=3, rays_per_member=128, boxed=0.5)
+        return replace(c, coarse_loss_weight=0.1, learning_rate=1e-3, final_learning_rate=1e-4, warmup=0.02)
 
     @classmethod
     def smallest(cls) -> Any:
-        return Config(
-            hidden_width=16,
-            blocks=2,
-            view_blocks=1,
-            encoder_widths=(8, 8, 8, 8),
-            encoder_blocks=(1, 1, 1),
-            encoder_pool=False,
-            coarse_samples=12,
-            fine_samples=4,
-            depth_samples=4,
-            density="softplus",
-            density_scale=5.0,
-            source_views=2,
-            members_per_step=1,
-            rays_per_member=96,
-            targets=2,
-            learning_rate=1e-2,
-            final_learning_rate=3e-3,
-        )
+        c = Config(encoder_widths=(8, 8, 8, 8), encoder_blocks=(1, 1, 1), encoder_pool=False, hidden_width=16)
+        c = replace(c, blocks=2, view_blocks=1, density="softplus", density_scale=5.0, source_views=2, targets=2)
+        c = replace(c, coarse_samples=12, fine_samples=4, depth_samples=4, members_per_step=1, rays_per_member=96)
+        return replace(c, learning_rate=1e-2, final_learning_rate=3e-3)
 
     @classmethod
     def further_bytes(cls, frame: Frame, config: Any, learning: bool) -> int:
@@ -241,15 +208,8 @@ class PixelNeRF(RayMethod):
         self.figures |= {"mse": float(terms["fine"].detach()), "views": len(batch.sources[0])}
         return terms
 
-    @property
-    def pass_weights(self) -> dict[str, float]:
-        return {"coarse": self.config.coarse_loss_weight}
-
     def optimizers(self) -> list[torch.optim.Optimizer]:
         return [torch.optim.Adam(self.parameters(), self.config.learning_rate)]
-
-    def learning_rate(self, step: int, progress: float) -> float:
-        return falling(self.config.learning_rate, self.config.final_learning_rate, progress, self.config.warmup)
 
     def before_step(self, step: int, progress: float) -> None:
         self._sources, self._boxed = None, progress < self.config.boxed

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated, Any, Literal
 
 import torch
@@ -120,45 +120,20 @@ class PlenOctrees(FieldMethod):
         self._progress, self._optimizers = 0.0, list[torch.optim.Optimizer]()
 
     @classmethod
-    def preset(cls, device: torch.device) -> Any:
-        """On a GPU the paper's numbers. On a CPU a hash table, three bands, and what learns most in a minute."""
-        if device.type == "cuda":
-            return Config()
-        return Config(
-            table=CPU_LEVELS,
-            occupancy=OccupancyNumbers(1 << 15, transmittance_threshold=0.01, occupancy_threshold=0.15),
-            field="hash",
-            hidden_width=32,
-            sh_bands=3,
-            sparsity_points=1024,
-            steps_per_diagonal=384,
-            learning_rate=2e-2,
-            final_learning_rate=1e-3,
-            decay_start=0.3,
-            teacher_share=0.5,
-            octree_depth=8,
-            leaf_points=8,
-        )
+    def cpu_preset(cls) -> Any:
+        """A hash table, three bands, and a shallower octree."""
+        occupancy = OccupancyNumbers(1 << 15, transmittance_threshold=0.01, occupancy_threshold=0.15)
+        c = Config(CPU_LEVELS, occupancy, field="hash", hidden_width=32, sh_bands=3, steps_per_diagonal=384)
+        c = replace(c, learning_rate=2e-2, final_learning_rate=1e-3, decay_start=0.3, sparsity_points=1024)
+        return replace(c, teacher_share=0.5, octree_depth=8, leaf_points=8)
 
     @classmethod
     def smallest(cls) -> Any:
         """Tiny tables that are baked half way through some twenty quick steps."""
-        return Config(
-            table=TINY_LEVELS,
-            occupancy=OccupancyNumbers(2048, transmittance_threshold=0.01, occupancy_resolution=16),
-            field="hash",
-            hidden_width=16,
-            hidden_layers=1,
-            sh_bands=2,
-            sparsity_points=64,
-            steps_per_diagonal=128,
-            learning_rate=2e-2,
-            final_learning_rate=1e-2,
-            teacher_share=0.5,
-            octree_depth=4,
-            leaf_points=2,
-            rays_per_step=128,
-        )
+        occupancy = OccupancyNumbers(2048, transmittance_threshold=0.01, occupancy_resolution=16)
+        c = Config(TINY_LEVELS, occupancy, field="hash", hidden_width=16, hidden_layers=1, sh_bands=2)
+        c = replace(c, steps_per_diagonal=128, learning_rate=2e-2, final_learning_rate=1e-2, sparsity_points=64)
+        return replace(c, teacher_share=0.5, octree_depth=4, leaf_points=2, rays_per_step=128)
 
     @classmethod
     def further_bytes(cls, frame: Frame, config: Any, learning: bool) -> int:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated, Any, ClassVar
 
 import torch
@@ -172,60 +172,22 @@ class Plenoxels(FieldMethod):
         return self.network.voxels
 
     @classmethod
-    def preset(cls, device: torch.device) -> Any:
-        """On a GPU the paper's numbers. On a CPU, what learns most in a minute."""
-        if device.type == "cuda":
-            return Config()
-        return Config(
-            base_resolution=128,
-            max_resolution=192,
-            open_base_resolution=64,
-            open_max_resolution=192,
-            rays_per_step=4096,
-            occupancy=OccupancyNumbers(
-                samples_per_step=1 << 16, transmittance_threshold=1e-3, occupancy_threshold=0.02, occupancy_decay=0.9
-            ),
-            refine_until=0.4,
-            step_size=1.0,
-            density_learning_rate=40.0,
-            final_density_learning_rate=4.0,
-            density_delay=0.2,
-            harmonics_learning_rate=0.15,
-            final_harmonics_learning_rate=0.02,
-            tv_share=0.1,
-            tv_interval=8,
-            sparsity=0.0,
-        )
+    def cpu_preset(cls) -> Any:
+        occupancy = OccupancyNumbers(1 << 16, 1e-3, occupancy_threshold=0.02, occupancy_decay=0.9)
+        c = Config(occupancy, base_resolution=128, max_resolution=192, open_base_resolution=64, open_max_resolution=192)
+        c = replace(c, refine_until=0.4, step_size=1.0, rays_per_step=4096, tv_share=0.1, tv_interval=8, sparsity=0.0)
+        c = replace(c, density_learning_rate=40.0, final_density_learning_rate=4.0, density_delay=0.2)
+        return replace(c, harmonics_learning_rate=0.15, final_harmonics_learning_rate=0.02)
 
     @classmethod
     def smallest(cls) -> Any:
         """A grid of three sizes with every loss, within some twenty quick steps."""
-        return Config(
-            base_resolution=8,
-            max_resolution=32,
-            open_base_resolution=8,
-            open_max_resolution=32,
-            refine_until=0.5,
-            step_size=1.0,
-            occupancy=OccupancyNumbers(
-                samples_per_step=1 << 20,
-                occupancy_resolution=16,
-                occupancy_threshold=1e-2,
-                occupancy_interval=4,
-                occupancy_decay=0.9,
-            ),
-            rays_per_step=128,
-            density_delay=0.1,
-            density_learning_rate=60.0,
-            final_density_learning_rate=10.0,
-            harmonics_learning_rate=0.2,
-            final_harmonics_learning_rate=0.05,
-            tv_share=0.5,
-            tv_interval=2,
-            sparsity=1e-5,
-            beta=1e-4,
-            exposure_correction="yes",
-        )
+        occupancy = replace(Config().occupancy, occupancy_resolution=16, occupancy_interval=4)
+        c = Config(occupancy, base_resolution=8, max_resolution=32, open_base_resolution=8, open_max_resolution=32)
+        c = replace(c, refine_until=0.5, step_size=1.0, rays_per_step=128, tv_share=0.5, tv_interval=2)
+        c = replace(c, density_learning_rate=60.0, final_density_learning_rate=10.0, density_delay=0.1)
+        c = replace(c, harmonics_learning_rate=0.2, final_harmonics_learning_rate=0.05)
+        return replace(c, sparsity=1e-5, beta=1e-4, exposure_correction="yes")
 
     @classmethod
     def further_bytes(cls, frame: Frame, config: Any, learning: bool) -> int:

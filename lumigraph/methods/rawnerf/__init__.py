@@ -18,17 +18,10 @@ from ...camera import Camera
 from ...camera.rays import Look, Rays, Rendering
 from ...components.fields.activations import truncated_exp
 from ...components.fields.development import CONTROLS, decoded, exposed, toned
-from ...components.fields.hash_field import CPU_TABLE, TINY_TABLE, HashField, HashNumbers
-from ...components.sampling.occupancy_sampler import (
-    CPU_OCCUPANCY,
-    CPU_STEPS,
-    TINY_OCCUPANCY,
-    TINY_STEPS,
-    OccupancyNumbers,
-    StepNumbers,
-)
+from ...components.fields.hash_field import HashField, HashNumbers
+from ...components.sampling.occupancy_sampler import OccupancyNumbers, StepNumbers
 from ...components.sampling.proposal_sampler import ProposalNumbers
-from ...components.sampling.samplers import sampler_for
+from ...components.sampling.samplers import CPU_HASH, TINY_HASH, sampler_for, sampling_bytes
 from ...components.sampling.spaces import space_of
 from ...components.training.pose_refinement import PoseNumbers, poses_for
 from ...components.training.regularizers import normalized_distance
@@ -91,7 +84,7 @@ class RawNeRF(FieldMethod):
     """Each pixel of a mosaic is compared in the one colour that it measured, noise and all, so that noise averages out
     over all photographs; the picture is developed afterwards."""
 
-    Config = Config
+    Config, further_bytes = Config, staticmethod(sampling_bytes)
     looks = None  # type: ignore[assignment]  # samples hold light, and a picture is developed from its sum
     network: LightField
     exposure: Tensor
@@ -121,23 +114,14 @@ class RawNeRF(FieldMethod):
         self.register_buffer("brightness", torch.tensor(1.0))
 
     @classmethod
-    def preset(cls, device: torch.device) -> Any:
-        """On a CPU, the table and samples that learn most in a minute."""
-        if device.type == "cuda":
-            return Config()
-        sampling = CPU_TABLE, CPU_OCCUPANCY, CPU_STEPS
-        return Config(*sampling, hidden_width=32, learning_rate=2e-2, hash_weight_decay=0.3)
+    def cpu_preset(cls) -> Any:
+        return Config(**CPU_HASH, hidden_width=32, learning_rate=2e-2, hash_weight_decay=0.3)
 
     @classmethod
     def smallest(cls) -> Any:
         """A tiny table with an error that is less relative: in a few steps its gross beginnings fall, and no more."""
-        sampling, poses = (TINY_TABLE, TINY_OCCUPANCY, TINY_STEPS), PoseNumbers(refine_cameras=True)
-        return Config(*sampling, poses=poses, hidden_width=16, learning_rate=2e-2, epsilon=1.0)
-
-    @classmethod
-    def further_bytes(cls, frame: Frame, config: Any, learning: bool) -> int:
-        activations = config.table.activation_bytes(config.occupancy.samples_per_step, config.hidden_width)
-        return super().further_bytes(frame, config, learning) + activations * learning
+        poses = PoseNumbers(refine_cameras=True)
+        return Config(**TINY_HASH, poses=poses, hidden_width=16, learning_rate=2e-2, epsilon=1.0)
 
     # What there is to learn from
 

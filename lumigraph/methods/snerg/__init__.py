@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated, Any, Literal, NamedTuple
 
 import torch
@@ -17,15 +17,9 @@ from ...camera.rays import Look, Rays, Rendering
 from ...color.blending import over
 from ...components.fields.hash_field import CPU_LEVELS, TINY_LEVELS, TableNumbers
 from ...components.fields.teacher import teacher_of
-from ...components.sampling.occupancy_sampler import (
-    CPU_OCCUPANCY,
-    CPU_STEPS,
-    TINY_STEPS,
-    OccupancyNumbers,
-    StepNumbers,
-)
+from ...components.sampling.occupancy_sampler import OccupancyNumbers, StepNumbers
 from ...components.sampling.proposal_sampler import ProposalNumbers
-from ...components.sampling.samplers import sampler_for
+from ...components.sampling.samplers import CPU_HASH, TINY_HASH, sampler_for
 from ...components.sampling.spaces import Box, contraction_of, space_of
 from ...components.training.exchange import exchange
 from ...components.training.lazy_adam import LazyAdam
@@ -157,51 +151,22 @@ class SNeRG(FieldMethod):
         self._adam: torch.optim.Adam | None = None
 
     @classmethod
-    def preset(cls, device: torch.device) -> Any:
-        """On a GPU the paper's numbers. On a CPU a hash table with Instant-NGP's numbers there, fewer voxels in smaller
-        blocks, and voxels that learn on after baking."""
-        if device.type == "cuda":
-            return Config()
-        return Config(
-            table=CPU_LEVELS,
-            occupancy=CPU_OCCUPANCY,
-            steps=CPU_STEPS,
-            field="hash",
-            deferred_share=0.6,
-            voxel_share=0.8,
-            resolution=400,
-            visibility_resolution=128,
-            rays_per_step=4096,
-            learning_rate=2e-2,
-            final_learning_rate=1e-3,
-            decay_start=0.3,
-            view_learning_rate=5e-3,
-            hidden_layers=2,
-            hidden_width=32,
-            hash_weight_decay=0.3,
-            huber_delta=0.3,
-        )
+    def cpu_preset(cls) -> Any:
+        """A hash table with Instant-NGP's numbers, fewer voxels in smaller blocks, and voxels that learn on after
+        baking."""
+        c = Config(**CPU_HASH | {"table": CPU_LEVELS}, field="hash", hidden_layers=2, hidden_width=32)
+        c = replace(c, learning_rate=2e-2, final_learning_rate=1e-3, decay_start=0.3, view_learning_rate=5e-3)
+        c = replace(c, deferred_share=0.6, voxel_share=0.8, resolution=400, visibility_resolution=128)
+        return replace(c, rays_per_step=4096, hash_weight_decay=0.3, huber_delta=0.3)
 
     @classmethod
     def smallest(cls) -> Any:
         """A tiny table, a grid of three sizes and a few thousand voxels, in all stages within some twenty steps."""
-        return Config(
-            table=TINY_LEVELS,
-            occupancy=OccupancyNumbers(2048, transmittance_threshold=1e-3, occupancy_resolution=16),
-            steps=TINY_STEPS,
-            field="hash",
-            deferred_share=0.6,
-            voxel_share=0.6,
-            resolution=32,
-            block_size=8,
-            visibility_resolution=16,
-            rays_per_step=512,
-            learning_rate=2e-2,
-            final_learning_rate=2e-3,
-            view_learning_rate=5e-3,
-            hidden_layers=1,
-            hidden_width=16,
-        )
+        occupancy = OccupancyNumbers(2048, transmittance_threshold=1e-3, occupancy_resolution=16)
+        table = TINY_HASH | {"table": TINY_LEVELS, "occupancy": occupancy}
+        c = Config(**table, field="hash", hidden_layers=1, hidden_width=16, rays_per_step=512)
+        c = replace(c, learning_rate=2e-2, final_learning_rate=2e-3, view_learning_rate=5e-3, visibility_resolution=16)
+        return replace(c, deferred_share=0.6, voxel_share=0.6, resolution=32, block_size=8)
 
     @classmethod
     def further_bytes(cls, frame: Frame, config: Any, learning: bool) -> int:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from bisect import bisect_right
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated, Any, Literal
 
 import torch
@@ -204,50 +204,21 @@ class TensoRF(FieldMethod):
         self._optimizer: torch.optim.Optimizer | None = None
 
     @classmethod
-    def preset(cls, device: torch.device) -> Any:
-        """On a GPU the paper's numbers. On a CPU, what learns most in a minute."""
-        if device.type == "cuda":
-            return Config()
-        return Config(
-            density_components=16,
-            appearance_components=16,
-            initial_resolution=96,
-            final_resolution=200,
-            open_final_resolution=320,
-            hidden_width=64,
-            feature_frequencies=0,
-            rays_per_step=4096,
-            occupancy=OccupancyNumbers(1 << 17, transmittance_threshold=1e-3, occupancy_threshold=0.05),
-            open_samples_per_step=1 << 15,
-            step_ratio=1.0,
-            density_shift=-8.0,
-            l1_weight=0.0,
-            final_l1_weight=0.0,
-            tv_interval=8,
-            weight_threshold=1e-3,
-        )
+    def cpu_preset(cls) -> Any:
+        occupancy = OccupancyNumbers(1 << 17, transmittance_threshold=1e-3, occupancy_threshold=0.05)
+        c = Config(occupancy, initial_resolution=96, final_resolution=200, open_final_resolution=320)
+        c = replace(c, appearance_components=16, hidden_width=64, feature_frequencies=0, density_shift=-8.0)
+        c = replace(c, open_samples_per_step=1 << 15, step_ratio=1.0, weight_threshold=1e-3)
+        return replace(c, l1_weight=0.0, final_l1_weight=0.0, tv_interval=8)
 
     @classmethod
     def smallest(cls) -> Any:
         """Few components and nodes, all upsamplings, a grid of three sizes, within some twenty quick steps."""
-        return Config(
-            density_components=4,
-            appearance_components=6,
-            initial_resolution=8,
-            final_resolution=16,
-            open_final_resolution=16,
-            appearance_features=8,
-            hidden_width=16,
-            feature_frequencies=1,
-            direction_frequencies=1,
-            density_shift=-3.0,
-            step_ratio=1.0,
-            rays_per_step=256,
-            occupancy=OccupancyNumbers(4096, occupancy_resolution=16, occupancy_threshold=0.005),
-            learning_rate=0.05,
-            network_learning_rate=1e-2,
-            final_learning_rate=5e-3,
-        )
+        occupancy = OccupancyNumbers(4096, occupancy_resolution=16, occupancy_threshold=0.005)
+        c = Config(occupancy, initial_resolution=8, final_resolution=16, open_final_resolution=16)
+        c = replace(c, density_components=4, appearance_components=6, appearance_features=8, hidden_width=16)
+        c = replace(c, feature_frequencies=1, direction_frequencies=1, density_shift=-3.0, step_ratio=1.0)
+        return replace(c, rays_per_step=256, learning_rate=0.05, network_learning_rate=1e-2, final_learning_rate=5e-3)
 
     @classmethod
     def further_bytes(cls, frame: Frame, config: Any, learning: bool) -> int:
