@@ -27,8 +27,7 @@ from lumigraph.geometry import Similarity
 from lumigraph.large import InBlocks, Mixing, Nearby, align_appearance
 from lumigraph.large.weights import inverse_distance, seeing, shares
 from lumigraph.methods.block_nerf import BlockNeRF
-from lumigraph.methods.block_nerf.moving import CELLS, Moving
-from lumigraph.methods.block_nerf.visibility import Visibility, transmittance
+from lumigraph.methods.block_nerf.parts import CELLS, Moving, Visibility, transmittance
 from lumigraph.run import build
 from lumigraph.training import fit
 

@@ -27,7 +27,7 @@ from lumigraph.geometry import to_matrix, unit
 from lumigraph.kernels import spherical_harmonics
 from lumigraph.method import RayMethod
 from lumigraph.method.capabilities import FromField, HasField, can
-from lumigraph.methods.gaussian_splatting.surfaces import rotation_to_normal
+from lumigraph.methods.gaussian_splatting.initialization import rotation_to_normal
 from lumigraph.metrics import psnr
 from lumigraph.run import Run, build, open_any
 from lumigraph.run.converted import Converted

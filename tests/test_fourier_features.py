@@ -17,7 +17,7 @@ from PIL import Image
 from lumigraph.camera.rays import Rays
 from lumigraph.capture import open_scene
 from lumigraph.commands.cli import main
-from lumigraph.components.fields.dense import Dense
+from lumigraph.components.fields.layers import Dense
 from lumigraph.datasets.scene import Frame
 from lumigraph.explain.encodings import GRID_POINTS, compare, kernel_at_start, learn
 from lumigraph.explain.encodings_page import write_page

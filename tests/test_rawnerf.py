@@ -19,8 +19,7 @@ from lumigraph.evaluation.light import in_light
 from lumigraph.export.exr import exr
 from lumigraph.export.film import film
 from lumigraph.files.ranges import changed
-from lumigraph.methods.rawnerf import RawNeRF, layers_of
-from lumigraph.methods.rawnerf.thin_lens import through_lens
+from lumigraph.methods.rawnerf import RawNeRF, layers_of, through_lens
 from lumigraph.training import fit
 
 

@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from ..components.fields.dense import Dense
+from ..components.fields.layers import Dense
 
 
 @torch.no_grad()

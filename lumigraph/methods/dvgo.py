@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from .. import kernels
 from ..camera import Camera
 from ..camera.rays import Look
-from ..components.fields.mlp import MLP
+from ..components.fields.layers import MLP
 from ..components.fields.teacher import cells_of, logit, teacher_of
 from ..components.fields.voxels import VoxelGrid, corners, tight_box
 from ..components.sampling.importance import importance
@@ -21,8 +21,8 @@ from ..components.sampling.occupancy_sampler import GridSchedule, OccupancyNumbe
 from ..components.sampling.proposal_sampler import ProposalNumbers
 from ..components.sampling.samplers import sampler_for
 from ..components.sampling.spaces import NDC, Space, space_of
-from ..components.training.lazy_adam import LazyAdam
 from ..components.training.photometric import backdrop, residuals
+from ..components.training.row_optimizers import LazyAdam
 from ..components.training.schedules import falling
 from ..datasets.scene import Batch, Frame, Scene
 from ..exchange.packing import Stored, most_important

@@ -12,8 +12,8 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from ..camera.rays import Rays, Rendering
-from ..components.fields.dense import Dense
 from ..components.fields.encodings import FourierFeatures as Waves
+from ..components.fields.layers import Dense
 from ..datasets.scene import Batch, Frame, Scene
 from ..files.ranges import BatchSize, Depth, LearningRate, NonNegative, Seed, Width, between
 from ..method import RayMethod

@@ -13,9 +13,9 @@ from ...files.ranges import Depth, Layers, Octaves
 from ...method import Field
 from ..sampling.spaces import Space
 from .coordinate_network import CoordinateNetwork
-from .dense import in_chunks
 from .encodings import FrequencyEncoding
 from .hash_field import Joining
+from .layers import in_chunks
 
 Places = tuple[Tensor, ...]  # what is encoded: coordinates of points, or means and variances of frustums
 Activation = Callable[[Tensor], Tensor]

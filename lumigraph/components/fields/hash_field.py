@@ -16,9 +16,8 @@ from ...exchange.packing import Stored
 from ...files.ranges import Layers, between
 from ...method import Field
 from ..sampling.spaces import Space
-from ..training.lazy_adam import LazyAdam
-from .activations import truncated_exp
-from .mlp import MLP
+from ..training.row_optimizers import LazyAdam
+from .layers import MLP, truncated_exp
 
 OPEN_RATE = (
     0.5  # of the table's learning rate, that of networks in the open: at all of it one seed in three never learns a hue

@@ -10,7 +10,7 @@ from ...camera.rays import Rays
 from ...datasets.scene import Frame
 from ...method import Part
 from .hash_field import side_by_side
-from .mlp import MLP
+from .layers import MLP
 
 
 class SkyField(Part):

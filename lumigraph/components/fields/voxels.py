@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from ... import kernels
-from ..training.exchange import exchange
+from ..training.row_optimizers import exchange
 
 LARGEST = 1 << 20  # corners that are looked up at a time where a grid is made anew
 

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from ... import kernels
 from ...camera.rays import Rays, Samples
 from ...volume import weights_of
-from ..fields.activations import LIMIT, truncated_exp
+from ..fields.layers import LIMIT, truncated_exp
 from ..fields.voxels import VoxelGrid
 from .sampling import FAINT, inverse_transform
 from .spaces import NDC, Contraction, Space, fits_kernels

@@ -24,8 +24,8 @@ from ...method import Field, Pass, Sampler
 from ...method.sampler import Density, codes_at
 from ...volume import weights_of
 from ..clouds.dense_points import Points, compile_sweep, seen_points
-from ..training.lazy_adam import LazyAdam
 from ..training.regularizers import depth_loss, distortion_loss, scale_gradients
+from ..training.row_optimizers import LazyAdam
 from ..training.schedules import falling
 from .occupancy_sampler import rows_of
 from .proposal import Proposal, proposal_loss

@@ -68,3 +68,9 @@ def scale_gradients(t: Float[Tensor, " sample"], *values: Float[Tensor, sample *
     without this, learning would be fastest where least is known.
     """
     return _Scaled.apply(t.square().clamp(max=1), *values)
+
+
+def cauchy(density: Float[Tensor, " sample"], rays: int) -> Tensor:
+    """Mean over rays of the sum of log(1 + 2 sigma^2) along each (Hedman 2021, section 4.2; Fridovich-Keil and Yu 2022,
+    eq. 4)."""
+    return torch.log1p(2 * density.square()).sum() / max(rays, 1)

@@ -31,9 +31,7 @@ from ...datasets.scene import Batch, Frame, Photograph, Scene
 from ...files.ranges import Layers, LearningRate, NonNegative, Octaves, PositiveShare, Seed, Width, between
 from ...method import FieldMethod
 from ...volume import composite
-from .exposures import Exposures
-from .moving import Moving
-from .visibility import Visibility
+from .parts import Exposures, Moving, Visibility
 
 
 @dataclass(frozen=True)

@@ -29,13 +29,12 @@ from .cloud import Cloud, RateNumbers
 from .compression import picture_share, thinned
 from .density_control import DensityControl, RefineNumbers
 from .few_views import FewViewNumbers, FewViews
-from .initialization import Initialization, initial_cloud, random_cloud
+from .initialization import Initialization, cloud_of, initial_cloud, random_cloud, surface_cloud
 from .interval_schedule import intervals
 from .mcmc import MarkovChain, McmcNumbers
 from .mip_filter import MipFilter, MipNumbers
 from .poses import seen_from
 from .robust_mask import RobustMask, RobustNumbers
-from .surfaces import cloud_of, surface_cloud
 from .tidying import Tidying
 
 

@@ -14,15 +14,15 @@ from torch import Tensor
 from ...budget import Effort, Efforts
 from ...camera import Camera
 from ...camera.rays import Look, Rays, Rendering
-from ...components.fields.code_space import fitted
+from ...components.fields.appearance import fitted
 from ...components.fields.hash_field import HashNumbers
 from ...components.fields.kept_photographs import Kept
 from ...components.sampling.carving import visual_hull
 from ...components.sampling.occupancy import OccupancyGrid
 from ...components.sampling.occupancy_sampler import reached
-from ...components.training.lazy_adam import LazyAdam
 from ...components.training.members import chance, photographed, rays_through
 from ...components.training.photometric import backdrop, residuals
+from ...components.training.row_optimizers import LazyAdam
 from ...components.training.schedules import exponential_decay
 from ...datasets.collection import Collection
 from ...datasets.scene import Batch, Frame, Photograph, Scene
@@ -43,10 +43,8 @@ from ...geometry import look_at
 from ...method import Method, RayMethod
 from ...method.controls import Control, Value, blend
 from ...volume import composite
-from .hash_instance import HashInstance, HashShape
-from .hypernetwork import HyperNetwork
 from .instance_codes import AVERAGE, InstanceCodes
-from .picture_denoiser import PictureDenoiser
+from .networks import HashInstance, HashShape, HyperNetwork, PictureDenoiser
 
 Tally = Annotated[int, between(0, 100_000)]
 

@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
-from ...components.fields.code_space import axes_of
+from ...components.fields.appearance import axes_of
 from ...method.controls import blend
 
 AVERAGE = "average"

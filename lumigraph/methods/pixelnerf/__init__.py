@@ -16,9 +16,9 @@ from ...budget import Effort, Efforts
 from ...camera import Camera
 from ...camera.rays import Look, Rays, Samples
 from ...capture.fewer import spread_out
-from ...components.fields.dense import in_chunks
 from ...components.fields.encodings import FrequencyEncoding
 from ...components.fields.kept_photographs import KeptPhotographs, padded
+from ...components.fields.layers import in_chunks
 from ...components.sampling.sampling import inverse_transform, midpoints, stratified
 from ...components.sampling.spaces import space_of
 from ...components.training.members import chance, photographed, rays_through
@@ -42,9 +42,7 @@ from ...files.ranges import (
 from ...method import Method, RayMethod
 from ...method.controls import Control, Value
 from ...volume import composite, weights_of
-from .picture_encoder import STRIDE, PictureEncoder
-from .picture_lookup import look_up
-from .residual_network import ResidualNetwork
+from .networks import STRIDE, PictureEncoder, ResidualNetwork, look_up
 
 Views = Annotated[int, between(1, 64)]
 

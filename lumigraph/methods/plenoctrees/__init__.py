@@ -16,8 +16,8 @@ from ...components.fields.hash_field import CPU_LEVELS, TINY_LEVELS, TableNumber
 from ...components.fields.teacher import logit, teacher_of
 from ...components.sampling.occupancy_sampler import NGP_SCHEDULE, OccupancyNumbers, OccupancySampler, StepNumbers
 from ...components.sampling.spaces import Box
-from ...components.training.lazy_rmsprop import LazyRMSprop
 from ...components.training.photometric import backdrop, residuals
+from ...components.training.row_optimizers import LazyRMSprop
 from ...components.training.schedules import falling, held
 from ...datasets.scene import Batch, Frame, Scene
 from ...errors import LumigraphError
@@ -42,8 +42,7 @@ from ...method.capabilities import HasField, HasLooks, can
 from ...volume import composite, weights_of
 from .baking import Baking, averaged_harmonics, bake, density_of, fill, met
 from .harmonic_field import HarmonicHash, HarmonicNetwork, Teacher
-from .leaf_sampler import LeafSampler
-from .leaves import Leaves, ask_for_octree
+from .leaves import LeafSampler, Leaves, ask_for_octree
 
 DensityRate = Annotated[float, between(1e-6, 1e4)]
 

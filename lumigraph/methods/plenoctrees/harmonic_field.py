@@ -9,11 +9,10 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from ... import kernels
-from ...components.fields.activations import truncated_exp
+from ...components.fields.coordinate_network import PositionNetwork
 from ...components.fields.hash_field import TableNumbers, new_table
-from ...components.fields.mlp import MLP
-from ...components.fields.position_network import PositionNetwork
-from ...components.training.lazy_adam import LazyAdam
+from ...components.fields.layers import MLP, truncated_exp
+from ...components.training.row_optimizers import LazyAdam
 from ...method import Field
 
 

@@ -16,6 +16,7 @@ from ...exchange.baked import Octree
 from ...exchange.packing import Stored
 from ...kernels.octree_cells import Crossed, Tree, code_of, levels_of
 from ...kernels.octree_cells.reference import leaves
+from ...method import Pass, Sampler
 from ...system.memory import free_on, gigabytes
 from .harmonic_field import SphericalHarmonicsField
 
@@ -229,3 +230,31 @@ def codes_of(place: Int[Tensor, "row 3"], depth: int) -> Int[Tensor, " row"]:
     """Codes of cells of one level, from their whole numbers along each axis."""
     x, y, z = place.unbind(-1)
     return code_of(x, y, z, depth)
+
+
+class LeafSampler(Sampler):
+    """Samples at the leaves of an octree, from near to far until rays terminate.
+
+    near:          distance from a camera at which its rays begin
+    stop:          transmittance at which a ray terminates
+    rays_per_step: rays of a step
+    """
+
+    rays_per_chunk = 1 << 18
+
+    def __init__(self, near: float, stop: float, rays_per_step: int):
+        super().__init__()
+        self.near, self.stop = near, stop
+        self.batch_size = self.expected_rays = rays_per_step
+
+    def sample(  # type: ignore[override]
+        self,
+        rays: Rays,
+        field: Leaves,
+        code: Float[Tensor, "ray code"] | None = None,
+        generator: torch.Generator | None = None,
+    ) -> list[Pass]:
+        found = field.crossed(rays, self.near, self.stop)
+        density = field.densities[found.rows, 0].relu()
+        directions = rays.directions[found.samples.ray_index]
+        return [Pass("leaves", found.samples, density, field.harmonics[found.rows], directions)]

@@ -18,10 +18,10 @@ from ...components.sampling.proposal_sampler import ProposalNumbers
 from ...components.sampling.samplers import sampler_for
 from ...components.sampling.spaces import NDC, Space, space_of
 from ...components.training.exposure import Exposure, Setting
-from ...components.training.lazy_rmsprop import LazyRMSprop
 from ...components.training.photometric import backdrop, residuals
+from ...components.training.regularizers import cauchy
+from ...components.training.row_optimizers import LazyRMSprop
 from ...components.training.schedules import falling
-from ...components.training.sparsity import cauchy
 from ...datasets.scene import Batch, Frame, Scene
 from ...errors import LumigraphError
 from ...exchange.packing import Stored, most_important

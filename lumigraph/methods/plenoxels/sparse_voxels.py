@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from torch.nn.functional import embedding
 
 from ... import kernels
-from ...components.training.exchange import exchange
+from ...components.training.row_optimizers import exchange
 from ...kernels import Nodes
 from ...kernels.harmonic_grid import COEFFICIENTS
 from ...kernels.sparse_grid.cpu import CHUNK, corners

@@ -21,11 +21,10 @@ from ...components.sampling.occupancy_sampler import OccupancyNumbers, StepNumbe
 from ...components.sampling.proposal_sampler import ProposalNumbers
 from ...components.sampling.samplers import CPU_HASH, TINY_HASH, sampler_for
 from ...components.sampling.spaces import Box, contraction_of, space_of
-from ...components.training.exchange import exchange
-from ...components.training.lazy_adam import LazyAdam
 from ...components.training.photometric import backdrop, residuals
+from ...components.training.regularizers import cauchy
+from ...components.training.row_optimizers import LazyAdam, exchange
 from ...components.training.schedules import falling, held
-from ...components.training.sparsity import cauchy
 from ...datasets.scene import Batch, Frame, Scene
 from ...errors import LumigraphError, LumigraphWarning
 from ...exchange.baked import Atlas
@@ -47,9 +46,8 @@ from ...kernels.spherical_harmonics import K00
 from ...method import FieldMethod, Pass
 from ...method.capabilities import HasField, can
 from ...volume import composite, weights_of
-from .baked_voxels import BakedVoxels, rounded
+from .baked_voxels import BakedVoxels, VisibilityGrid, rounded, smoothed
 from .deferred_field import Deferred, DeferredField, Geometry, HashDeferred, NetworkDeferred, ViewDependence
-from .visibility_grid import VisibilityGrid, smoothed
 
 
 @dataclass(frozen=True)

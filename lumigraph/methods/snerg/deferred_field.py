@@ -13,11 +13,9 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from ... import kernels
-from ...components.fields.activations import truncated_exp
-from ...components.fields.dense import Dense
+from ...components.fields.coordinate_network import PositionNetwork
 from ...components.fields.hash_field import OPEN_RESOLUTION, TableNumbers, new_table
-from ...components.fields.mlp import MLP
-from ...components.fields.position_network import PositionNetwork
+from ...components.fields.layers import MLP, Dense, truncated_exp
 from ...components.sampling.spaces import Space
 from ...exchange.baked import ViewNetwork
 from ...method import Field

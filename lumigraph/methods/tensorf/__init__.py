@@ -12,7 +12,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from ...camera import Camera
-from ...components.fields.mlp import MLP
+from ...components.fields.layers import MLP
 from ...components.fields.teacher import teacher_of
 from ...components.sampling.importance import importance
 from ...components.sampling.occupancy_sampler import GridSchedule, OccupancyNumbers, OccupancySampler, Stage
@@ -20,9 +20,8 @@ from ...components.sampling.proposal_sampler import ProposalNumbers
 from ...components.sampling.samplers import sampler_for
 from ...components.sampling.spaces import Space, space_of
 from ...components.training.distillation import distil
-from ...components.training.exchange import exchange
-from ...components.training.lazy_adam import LazyAdam
 from ...components.training.photometric import backdrop, residuals
+from ...components.training.row_optimizers import LazyAdam, exchange
 from ...components.training.schedules import falling
 from ...datasets.scene import Batch, Frame, Scene
 from ...errors import LumigraphError
@@ -32,8 +31,7 @@ from ...kernels import factor_grid, spherical_harmonics
 from ...kernels.factor_grid import Factors
 from ...method import Field, FieldMethod
 from ...volume import composite
-from .factorised import FactorGrid, nodes_in
-from .truncation import truncate
+from .factorised import FactorGrid, nodes_in, truncate
 
 Resolution = Annotated[int, between(4, 2048)]  # nodes per axis of a cube with as many nodes
 Components = Annotated[int, between(1, 1024)]  # of each factor

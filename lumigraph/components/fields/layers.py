@@ -1,14 +1,17 @@
-"""Wide layers: products in bfloat16 where the machine is fast at them, weights and sums in float32."""
+"""Layers of networks: wide ones in bfloat16 where the machine is fast at it, small perceptrons, activations."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from functools import cache
+from itertools import pairwise
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 from torch.nn import functional as F
+
+from ... import kernels
 
 # Samples that go through a network together. On a CPU a layer's inputs and outputs then stay in its caches: 262 144
 # samples through eight layers of 256 took 2.5 times as long all at once. On a GPU it bounds the memory.
@@ -88,3 +91,36 @@ def in_chunks(
     if where is None:
         return tuple(answers)
     return tuple(x.new_zeros(total, *x.shape[1:]).index_copy(0, asked, x) for x in answers)
+
+
+class MLP(nn.Module):
+    """`kernels.perceptron` with weights of its own: MLP(inputs, hidden, ..., outputs)."""
+
+    def __init__(self, *widths: int):
+        super().__init__()
+        self.weights = nn.ParameterList(nn.Parameter(torch.empty(b, a)) for a, b in pairwise(widths))
+        for weight in self.weights:
+            nn.init.kaiming_uniform_(weight, nonlinearity="relu")
+
+    def forward(self, x: Float[Tensor, "sample input"]) -> Float[Tensor, "sample output"]:
+        return kernels.perceptron(x, *self.weights)
+
+
+LIMIT = 15.0
+
+
+class _TruncatedExp(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, x):
+        ctx.save_for_backward(y := x.clamp(max=2 * LIMIT).exp())
+        return y
+
+    @staticmethod
+    def backward(ctx, grad):
+        (y,) = ctx.saved_tensors
+        return grad * y.clamp(max=2.718281828459045**LIMIT)
+
+
+def truncated_exp(x: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
+    """exp(x), with a gradient no steeper than e^15, so that one dense sample cannot blow up a step (Müller 2022)."""
+    return _TruncatedExp.apply(x)

@@ -7,32 +7,32 @@ from __future__ import annotations
 
 import math
 import warnings
-from dataclasses import dataclass
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
-from ...camera import Camera
-from ...camera.rays import Look, Rays, Rendering
-from ...components.fields.activations import truncated_exp
-from ...components.fields.development import CONTROLS, decoded, exposed, toned
-from ...components.fields.hash_field import HashField, HashNumbers
-from ...components.sampling.occupancy_sampler import OccupancyNumbers, StepNumbers
-from ...components.sampling.proposal_sampler import ProposalNumbers
-from ...components.sampling.samplers import CPU_HASH, TINY_HASH, sampler_for, sampling_bytes
-from ...components.sampling.spaces import space_of
-from ...components.training.pose_refinement import PoseNumbers, poses_for
-from ...components.training.regularizers import normalized_distance
-from ...components.training.schedules import held
-from ...datasets.scene import Batch, Frame, Scene
-from ...errors import LumigraphWarning
-from ...files.ranges import LearningRate, NonNegative, Positive, Seed, Width
-from ...method import FieldMethod
-from ...method.controls import Control
-from ...volume import composite
-from .thin_lens import through_lens
+from ..camera import Camera
+from ..camera.rays import Look, Rays, Rendering
+from ..components.fields.development import CONTROLS, decoded, exposed, toned
+from ..components.fields.hash_field import HashField, HashNumbers
+from ..components.fields.layers import truncated_exp
+from ..components.sampling.occupancy_sampler import OccupancyNumbers, StepNumbers
+from ..components.sampling.proposal_sampler import ProposalNumbers
+from ..components.sampling.samplers import CPU_HASH, TINY_HASH, sampler_for, sampling_bytes
+from ..components.sampling.spaces import space_of
+from ..components.training.pose_refinement import PoseNumbers, poses_for
+from ..components.training.regularizers import normalized_distance
+from ..components.training.schedules import held
+from ..datasets.scene import Batch, Frame, Scene
+from ..errors import LumigraphWarning
+from ..files.ranges import LearningRate, NonNegative, Positive, Seed, Width
+from ..method import FieldMethod
+from ..method.controls import Control
+from ..volume import composite
 
 
 @dataclass(frozen=True)
@@ -303,3 +303,33 @@ def layers_of(scene: Scene) -> tuple[str, ...]:
     if "mosaic" in scene.layers:
         return "mosaic", "filter"
     return ("raw",) if "raw" in scene.layers else ()
+
+
+GOLDEN_ANGLE = math.pi * (3 - math.sqrt(5))
+NARROWEST = 0.2  # cosine with the axis below which a ray is taken to be no flatter
+
+
+def through_lens(camera: Camera, aperture: float, focus: float, count: int) -> Iterator[Rays]:
+    """Rays of all pixels of a camera (a batch of one) through so many places of its lens, one place after the other.
+
+    aperture: diameter of the lens, scene units
+    focus:    distance along the optical axis at which all of a pixel's rays meet, scene units
+    Places lie on a spiral that fills the disc evenly (Vogel 1979), turned for each pixel by a fixed amount of its own,
+    so that few of them make grain rather than rings, and the same grain each time.
+    """
+    pixels = camera.pixels()
+    rays = camera.rays(pixels)
+    right, down, forward = camera.pose[0, :, :3].unbind(-1)
+    meeting = rays.at(focus / (rays.directions @ forward).clamp_min(NARROWEST))
+    turn = 2 * math.pi * grain(pixels)
+    for k in range(count):
+        radius, angle = 0.5 * aperture * math.sqrt((k + 0.5) / count), GOLDEN_ANGLE * k + turn
+        place = radius * (angle.cos()[:, None] * right + angle.sin()[:, None] * down)
+        origins = rays.origins + place
+        yield replace(rays, origins=origins, directions=torch.nn.functional.normalize(meeting - origins, dim=-1))
+
+
+def grain(pixels: Float[Tensor, "pixel 2"]) -> Float[Tensor, " pixel"]:
+    """A number in [0, 1) for each pixel, unlike its neighbours' (interleaved gradient noise, Jimenez 2014)."""
+    weights = torch.tensor([0.06711056, 0.00583715], dtype=torch.float64)
+    return ((52.9829189 * ((pixels.double().cpu() @ weights) % 1)) % 1).to(pixels)
