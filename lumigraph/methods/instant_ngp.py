@@ -31,8 +31,7 @@ from ..volume import composite
 
 @dataclass(frozen=True)
 class Config:
-    """The paper's numbers, with where it gives them, but for huber_delta and scenes without bounds; `InstantNGP.preset`
-    has those of a plain CPU."""
+    """The paper's numbers, but for huber_delta and scenes without bounds; `InstantNGP.preset` has a plain CPU's."""
 
     table: HashNumbers = HashNumbers()
     occupancy: OccupancyNumbers = OccupancyNumbers()

@@ -82,8 +82,7 @@ class HashTransientHead(nn.Module):
 
 
 class EncodedHashField(HashField):
-    """A hash table whose features include the encoding, without gradients: the table holds the static scene, and a
-    transient head does not change what it learns."""
+    """A hash table whose features include the encoding, detached: a transient head does not change the table."""
 
     def geometry(
         self, points: Float[Tensor, "point 3"], code: Tensor | None = None
@@ -122,8 +121,7 @@ def opaque(thickness: Float[Tensor, " sample"]) -> Float[Tensor, " sample"]:
 
 @dataclass(frozen=True)
 class Config:
-    """The paper's numbers, with where it gives them, but for samples and learning rates; `NeRFW.preset` has those of a
-    plain CPU."""
+    """The paper's numbers, but for samples and learning rates; `NeRFW.preset` has those of a plain CPU."""
 
     network: NetworkNumbers = NetworkNumbers(position_frequencies=15)  # supplement
     rays: RayNumbers = RayNumbers(64, 64, rays_per_step=2048)  # supplement

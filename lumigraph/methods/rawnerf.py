@@ -197,8 +197,7 @@ class RawNeRF(FieldMethod):
         return composite(look.samples, look.density, look.rgb, moments=torch.stack([s, s * s], -1))
 
     def scale(self, rays: Rays) -> Float[Tensor, "ray 3"]:
-        """What light is multiplied by in each ray's photograph: its exposure, times alpha, which is learnt for each
-        exposure and colour (section 4.2)."""
+        """Factor on light in each photograph: its exposure times alpha of that exposure and colour (section 4.2)."""
         assert rays.image_index is not None
         alpha = (self.log_scale[self.group] * self.free[:, None]).exp()
         return (self.exposure[:, None] * alpha)[rays.image_index]

@@ -142,8 +142,7 @@ def sweep(view: FlatView, neighbours: Sequence[FlatView], span: tuple[float, flo
 
 
 def disparity(view: FlatView, warps: Float[Tensor, "neighbour 3 4"], near: float, far: float) -> float:
-    """Pixels that the middle of a view travels in its neighbours from the nearest to the farthest hypothesis, at most
-    as far as their pictures are wide."""
+    """Pixels between the nearest and farthest hypothesis of a view's middle in its neighbours, within their width."""
     height, width = view.trust.shape
     middle = torch.tensor([width / 2, height / 2, 1.0])
     places = [warps[:, :, :3] @ middle + h * warps[:, :, 3] for h in torch.linspace(far, near, 64).tolist()]

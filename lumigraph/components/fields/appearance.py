@@ -37,10 +37,7 @@ def axes_of(codes: Float[Tensor, "known code"], least: float = 0.0) -> Float[Ten
 
 
 def fitted(
-    start: Float[Tensor, " width"],
-    error: Callable[[Float[Tensor, " width"]], Tensor],
-    steps: int,
-    learning_rate: float,
+    start: Float[Tensor, " width"], error: Callable[[Float[Tensor, " width"]], Tensor], steps: int, learning_rate: float
 ) -> Float[Tensor, " width"]:
     """The numbers that make an error small, by so many steps of Adam from a start, with all else as it is.
 
@@ -132,8 +129,7 @@ class PhotographCodes(Part):
         return average + fitted(there, likely, FIT_STEPS, FIT_RATE) @ axes
 
     def code_of(self, value: str) -> Float[Tensor, " width"]:
-        """The code that a value of `control` stands for: a photograph's, the average, or one between two. A photograph
-        that nobody learnt from has the average."""
+        """Code of a control's value: a photograph's (the average if not learnt), the average, or one between two."""
         first, second, share = blend(value)
         return torch.lerp(self._of(first), self._of(second), share)
 
@@ -215,8 +211,7 @@ class AppearanceCodes(PhotographCodes):
 
 
 def drawn(photograph: Photograph, count: int, generator: torch.Generator) -> Batch:
-    """Random pixels of a photograph that are to be trusted, no two the same; all of them where there are fewer. None
-    where there is none."""
+    """Random trusted pixels of a photograph, without repetition; all where there are fewer; maybe none."""
     trusted = torch.ones(len(photograph), dtype=torch.bool) if photograph.mask is None else photograph.mask.flatten()
     there = trusted.nonzero()[:, 0]
     chosen = there[torch.randperm(len(there), generator=generator)[:count]]

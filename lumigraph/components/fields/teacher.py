@@ -38,8 +38,7 @@ EDGE = 2e-3  # coordinates by which a place may miss its own and still be one
 
 
 def teacher_of(teacher: Any, cameras: Camera) -> Teacher:
-    """A teacher, looked at by cameras around it, ready to be taken over. Raises LumigraphError where they see nothing
-    solid."""
+    """A teacher with depth maps of cameras around it. Raises LumigraphError where they see nothing solid."""
     depth_maps = render_depth_maps(teacher.render, cameras, teacher.frame.background, VIEWS, SIZE)
     return FieldTeacher(depth_maps, teacher) if can(teacher, HasField) else DepthTeacher(depth_maps)
 

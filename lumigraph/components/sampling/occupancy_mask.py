@@ -70,8 +70,7 @@ class OccupancyMask(Part):
     def may_hold(
         self, coordinates: Float[Tensor, "sample 3"], radius: Float[Tensor, " sample"] | None = None
     ) -> Bool[Tensor, " sample"] | None:
-        """Whether something may be at or within a radius of coordinates; None without a grid. Beyond it the nearest
-        cell tells."""
+        """Mask of places with something within a radius; None without a grid. The nearest cell counts beyond it."""
         if not self.cells:
             return None
         if radius is None:

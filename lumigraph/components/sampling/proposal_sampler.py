@@ -109,8 +109,7 @@ class ProposalSampler(Sampler):
         return [found]
 
     def _visible(self, rays: Rays, field: Field, code: Float[Tensor, "ray code"] | None) -> Pass:
-        """A pass for pictures, without gradients: samples with at most MIN_WEIGHT of their ray's colour are left out,
-        and those behind them get that weight."""
+        """A pass for pictures: samples of at most MIN_WEIGHT are left out, so those behind them get that weight."""
         samples = self.proposal.places(rays)
         points, directions = samples.along(rays)
         own = codes_at(samples.ray_index, code) if code is not None and field.deforms else None
@@ -180,11 +179,7 @@ class ProposalSampler(Sampler):
 
     def storage(self) -> dict[str, Stored]:
         """Rendering needs the grid of proposals alone."""
-        return {
-            "proposal.grid.values": Stored("half"),
-            "surface": Stored("nothing"),
-            "surface_from": Stored("nothing"),
-        }
+        return {"proposal.grid.values": Stored("half"), "surface": Stored("nothing"), "surface_from": Stored("nothing")}
 
 
 def _scaled(t: Float[Tensor, " sample"], values: Float[Tensor, "sample _"]) -> Float[Tensor, "sample _"]:

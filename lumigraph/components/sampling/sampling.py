@@ -24,9 +24,7 @@ def stratified(
 
 
 def inverse_transform(
-    edges: Float[Tensor, "ray edge"],
-    weights: Float[Tensor, "ray bin"],
-    shares: Float[Tensor, "ray count"],
+    edges: Float[Tensor, "ray edge"], weights: Float[Tensor, "ray bin"], shares: Float[Tensor, "ray count"]
 ) -> Float[Tensor, "ray count"]:
     """Numbers spread like a piecewise constant density: its inverse cumulative distribution (Mildenhall 2020, eq. 5).
 

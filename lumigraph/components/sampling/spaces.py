@@ -63,8 +63,7 @@ class Space(ABC):
 
     @abstractmethod
     def unwarp(self, coordinates: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n 3"]:
-        """The points that have these coordinates: `warp` undone. Coordinates of [-1, 1]^3 that no point has give the
-        farthest one in about that direction."""
+        """Points with these coordinates; the farthest in about that direction for coordinates that no point has."""
 
     @abstractmethod
     def jacobian(self, points: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3 3"]:

@@ -27,10 +27,7 @@ def backdrop(
 
 
 def residuals(
-    rendering: Rendering,
-    batch: Batch,
-    background: Float[Tensor, "#ray 3"],
-    exposure: Exposure | None = None,
+    rendering: Rendering, batch: Batch, background: Float[Tensor, "#ray 3"], exposure: Exposure | None = None
 ) -> tuple[Float[Tensor, "row 3"], float]:
     """What a rendering before a background has too much of each colour, and the mean square of that.
 

@@ -86,8 +86,7 @@ class PoseRefinement(Part):
 
     @torch.no_grad()
     def find(self, scene: Scene, matching: bool = True) -> None:
-        """Begin at the poses as given, or, with matching, at those that points say which photographs share, where these
-        are enough; see `adjusted`."""
+        """Begin at the given poses or, with matching and enough shared points, at adjusted ones; see `adjusted`."""
         self.choose_axes(scene.cameras, scene.frame)
         if not matching:
             return

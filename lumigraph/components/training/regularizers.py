@@ -22,10 +22,7 @@ def distortion_loss(samples: Samples, weights: Float[Tensor, " sample"]) -> Floa
 
 
 def depth_loss(
-    samples: Samples,
-    weights: Float[Tensor, " sample"],
-    distance: Float[Tensor, " ray"],
-    margin: float,
+    samples: Samples, weights: Float[Tensor, " sample"], distance: Float[Tensor, " ray"], margin: float
 ) -> Float[Tensor, ""]:
     """The share of rays that does not end where something is known to be, mean of all rays: light that is stopped too
     early or too late, or not at all (as Deng 2022 supervises depth; linear, for what is known may be wrong).
@@ -71,6 +68,5 @@ def scale_gradients(t: Float[Tensor, " sample"], *values: Float[Tensor, sample *
 
 
 def cauchy(density: Float[Tensor, " sample"], rays: int) -> Tensor:
-    """Mean over rays of the sum of log(1 + 2 sigma^2) along each (Hedman 2021, section 4.2; Fridovich-Keil and Yu 2022,
-    eq. 4)."""
+    """Sum of log(1 + 2 sigma^2) along a ray, mean of all (Hedman 2021, section 4.2; Fridovich-Keil 2022, eq. 4)."""
     return torch.log1p(2 * density.square()).sum() / max(rays, 1)

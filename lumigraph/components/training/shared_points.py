@@ -1,5 +1,4 @@
-"""Points that photographs share: scale-invariant features, compared, and kept where one motion between two views
-explains them."""
+"""Points that photographs share: SIFT features, matched, and kept where one motion of two views explains them."""
 
 from __future__ import annotations
 

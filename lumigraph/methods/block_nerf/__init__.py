@@ -178,8 +178,7 @@ class BlockNeRF(FieldMethod):
 
     @property
     def shown_in(self) -> Appearance:
-        """The appearance of pictures: of the settings, else of the evidence, else the average. Empty where none was
-        learnt."""
+        """Appearance of pictures: of the settings, else of the evidence, else the average; empty without codes."""
         return Appearance(self.appearance.shown(self) if self.appearance else torch.zeros(0, device=self.device))
 
     @property
@@ -191,6 +190,5 @@ class BlockNeRF(FieldMethod):
     def visibility(
         self, points: Float[Tensor, "point 3"], directions: Float[Tensor, "point 3"]
     ) -> Float[Tensor, " point"]:
-        """Share of each place, seen along a unit direction, that the block's photographs saw (section 4.2.5); 1 where
-        that was not learnt."""
+        """Share of each place, along a unit direction, that the photographs saw (section 4.2.5); 1 if not learnt."""
         return self.sight(points, directions) if self.sight else torch.ones_like(points[:, 0])

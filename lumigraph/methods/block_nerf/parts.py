@@ -144,8 +144,7 @@ class Moving(Part):
 
     @torch.no_grad()
     def judge(self) -> None:
-        """Choose the cells to learn from: those that err, with their neighbours, no more than most, or not much more
-        than others of their photograph."""
+        """Choose cells to learn from: their error and their neighbours' is below most, or near their photograph's."""
         known = self.error > 0
         if not known.any():
             return

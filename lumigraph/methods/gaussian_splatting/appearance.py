@@ -118,8 +118,7 @@ class SplatAppearance(Addition):
         return cloud if code is None else replace(cloud, harmonics=recoloured_harmonics(cloud.harmonics, code))
 
     def code(self, method: Any) -> Float[Tensor, " number"] | None:
-        """The code of the control, else of a photograph given as evidence, else the average; None where photographs do
-        not differ."""
+        """Code of the control, else of a given photograph, else the average; None where photographs do not differ."""
         if not self.is_active:
             return None
         if self.found is not None and "appearance" not in method.settings:
@@ -142,8 +141,7 @@ class SplatAppearance(Addition):
 
     @torch.no_grad()
     def adapted(self, method: Any, evidence: Photograph) -> SplatAppearance:
-        """The part with the code in which the cloud looks most like the trusted pixels of a photograph; the average,
-        where there is none."""
+        """The part with the code that fits the trusted pixels of a photograph best; the average without any."""
         photograph, background = evidence.to(method.device), method.background[0]
         seen = method.rasterized(photograph.camera)
         target, trusted = photograph.before(background), photograph.mask

@@ -69,13 +69,7 @@ def sparse_points(scene: Scene, max_count: int, generator: torch.Generator) -> t
 
 
 def with_dense_points(
-    scene: Scene,
-    means: Tensor,
-    colours: Tensor,
-    count: int,
-    max_count: int,
-    generator: torch.Generator,
-    seconds: float,
+    scene: Scene, means: Tensor, colours: Tensor, count: int, max_count: int, generator: torch.Generator, seconds: float
 ) -> tuple[Tensor, Tensor]:
     """Sparse points and dense ones; without sparse ones also some far out, where sweeps find nothing that agrees."""
     found = dense_points(scene, seconds)
@@ -168,8 +162,7 @@ def surface_cloud(teacher: Teacher, max_count: int, degree: int, generator: torc
 
 
 def cloud_of(teacher: object, max_count: int, degree: int) -> Gaussians | None:
-    """The teacher's own Gaussians, the largest and most opaque ones, with harmonics of another degree; None where it
-    has none."""
+    """The teacher's largest, most opaque Gaussians, with harmonics of another degree; None where it has none."""
     if not can(teacher, HasGaussians):
         return None
     cloud: Gaussians = teacher.gaussians()  # type: ignore[attr-defined]

@@ -53,8 +53,7 @@ class Leaves(SphericalHarmonicsField):
 
     @staticmethod
     def bytes_of(rows: int, basis: int, learning: bool) -> int:
-        """What so many leaves take with their tree; where they learn, twice more: their mean squares, and what a
-        step touches."""
+        """Bytes of leaves with their tree; learning takes twice more: mean squares, and the rows of a step."""
         return rows * (4 * (1 + 3 * basis) * (3 if learning else 1) + 64)
 
     @property
@@ -171,8 +170,7 @@ class Leaves(SphericalHarmonicsField):
 
     @torch.no_grad()
     def coarser(self, depth: int) -> Leaves:
-        """The same with so many levels at most: a cell holds the mean density of what lies in it, and the harmonics
-        that it has on average where it is dense."""
+        """The octree with fewer levels: a cell has the mean density, and the harmonics weighted by density."""
         codes, levels = self.codes.long(), levels_of(self.codes.long())
         over = (levels - depth).clamp_min(0)
         merged, which = torch.unique(codes >> 3 * over, return_inverse=True)

@@ -38,8 +38,7 @@ DensityRate = Annotated[float, between(1e-6, 1e4)]
 
 @dataclass(frozen=True)
 class Config:
-    """The paper's numbers for synthetic scenes (section 3, and the authors' release); `Plenoxels.preset` says what a
-    plain CPU does otherwise."""
+    """The paper's numbers for synthetic scenes (section 3, and its release); `Plenoxels.preset` has a CPU's."""
 
     occupancy: OccupancyNumbers = OccupancyNumbers(
         samples_per_step=1 << 20,

@@ -39,8 +39,7 @@ from .patch_flow import SIDE, PatchFlow
 
 @dataclass(frozen=True)
 class Config:
-    """The paper's numbers with a section, then mip-NeRF's of the network and Instant-NGP's of the hash table;
-    `RegNeRF.preset` has those of a plain CPU."""
+    """The paper's numbers, mip-NeRF's of the network, Instant-NGP's of the table; `RegNeRF.preset` has a CPU's."""
 
     network: NetworkNumbers = NetworkNumbers(position_frequencies=16)
     rays: RayNumbers = RayNumbers(128, 128)

@@ -74,8 +74,7 @@ class PatchFlow(nn.Module):
         return nats / x.shape[1]
 
     def learn(self, scene: Scene, steps: int, generator: torch.Generator, seconds: float = math.inf) -> None:
-        """Learn from patches of a scene's training photographs, in several sizes, for so many steps, or seconds if
-        these are over sooner."""
+        """Learn from patches of the training photographs in several sizes, for some steps, or at most some seconds."""
         begin = time.perf_counter()
         known = photographed(scene, generator).to(self.mean)
         centred = known.flatten(1) - known.flatten(1).mean(0)

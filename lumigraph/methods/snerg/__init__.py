@@ -150,8 +150,7 @@ class SNeRG(FieldMethod):
 
     @classmethod
     def cpu_preset(cls) -> Any:
-        """A hash table with Instant-NGP's numbers, fewer voxels in smaller blocks, and voxels that learn on after
-        baking."""
+        """A hash table, fewer voxels in smaller blocks, and voxels that learn on after baking."""
         c = Config(**CPU_HASH | {"table": CPU_LEVELS}, field="hash", hidden_layers=2, hidden_width=32)
         c = replace(c, learning_rate=2e-2, final_learning_rate=1e-3, decay_start=0.3, view_learning_rate=5e-3)
         c = replace(c, deferred_share=0.6, voxel_share=0.8, resolution=400, visibility_resolution=128)
