@@ -14,6 +14,7 @@ from ..errors import LumigraphError
 from ..exchange.baked import Atlas, Octree
 from ..exchange.packing import Stored
 from ..gaussians import Gaussians
+from .field import Colours, Densities, Directions, Points
 
 
 @runtime_checkable
@@ -28,9 +29,7 @@ class HasDensity(Protocol):
 class HasField(Protocol):
     """Knows density and colour at points, as baking, conversion and composition ask for them."""
 
-    def field(
-        self, points: Float[Tensor, "point 3"], directions: Float[Tensor, "point 3"]
-    ) -> tuple[Float[Tensor, " point"], Float[Tensor, "point 3"]]:
+    def field(self, points: Points, directions: Directions) -> tuple[Densities, Colours]:
         """Density per scene unit, and sRGB-encoded colour seen along unit directions."""
 
 
@@ -88,9 +87,7 @@ class RefinesPoses(Protocol):
 class HasVisibility(Protocol):
     """Knows which places its photographs saw."""
 
-    def visibility(
-        self, points: Float[Tensor, "point 3"], directions: Float[Tensor, "point 3"]
-    ) -> Float[Tensor, " point"]:
+    def visibility(self, points: Points, directions: Directions) -> Float[Tensor, " point"]:
         """Share of the photographs' view of each place along a unit direction, in [0, 1]."""
 
 

@@ -30,6 +30,7 @@ from ..files.ranges import Layers, LearningRate, NonNegative, PositiveShare, See
 from ..geometry.choice import evenly
 from ..kernels.spherical_harmonics import K00
 from ..method import Field, FieldMethod
+from ..method.field import Colours, Densities, Directions, Points
 from ..volume import composite
 
 Voxels = Annotated[int, between(64, 1 << 30)]
@@ -116,18 +117,14 @@ class VoxelField(Field):
     def grids(self) -> tuple[VoxelGrid, VoxelGrid]:
         return self.density_grid, self.feature_grid
 
-    def geometry(
-        self, points: Float[Tensor, "point 3"], code: Tensor | None = None
-    ) -> tuple[Float[Tensor, " point"], Float[Tensor, "point 3"]]:
+    def geometry(self, points: Points, code: Tensor | None = None) -> tuple[Densities, Points]:
         """Density: interpolate, then activate (section 4.1, "post-activation"). Features: the points' coordinates."""
         coordinates = self.space.warp(points)
         thickness = nn.functional.softplus(self.density_grid(coordinates)[:, 0] + self.shift(int(self.stage)))
         density = thickness * float(1 / self.edge)  # contracted voxels are larger
         return density * self.space.stretch(points) if self.space.is_open else density, coordinates
 
-    def colour(
-        self, features: Float[Tensor, "point 3"], directions: Float[Tensor, "point 3"], code: Tensor | None = None
-    ) -> Float[Tensor, "point 3"]:
+    def colour(self, features: Float[Tensor, "point 3"], directions: Directions, code: Tensor | None = None) -> Colours:
         found = self.feature_grid(features)
         harmonics = kernels.spherical_harmonics(directions, self.config.sh_bands)
         if self.stage == 0:  # which knows one colour for all directions (section 4.2)

@@ -28,6 +28,7 @@ from ..datasets.scene import Batch, Frame
 from ..files.ranges import Layers, LearningRate, NonNegative, PositiveShare, Seed, Share, Width, between
 from ..method import FieldMethod, Pass
 from ..method.controls import Control
+from ..method.field import Densities, Points
 from ..volume import composite
 
 MIN_OPACITY = 1e-10  # opacity of a sample that is divided by at least
@@ -84,9 +85,7 @@ class HashTransientHead(nn.Module):
 class EncodedHashField(HashField):
     """A hash table whose features include the encoding, detached: a transient head does not change the table."""
 
-    def geometry(
-        self, points: Float[Tensor, "point 3"], code: Tensor | None = None
-    ) -> tuple[Float[Tensor, " point"], Any]:
+    def geometry(self, points: Points, code: Tensor | None = None) -> tuple[Densities, Any]:
         encoded = self.encode(points)
         density, geometry = self.decode(points, encoded)
         return density, (geometry, encoded.detach())

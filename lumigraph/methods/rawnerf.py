@@ -32,6 +32,7 @@ from ..errors import LumigraphWarning
 from ..files.ranges import LearningRate, NonNegative, Positive, Seed, Width
 from ..method import FieldMethod
 from ..method.controls import Control
+from ..method.field import Colours, Densities, Directions, Points
 from ..volume import composite
 
 
@@ -289,9 +290,7 @@ class RawNeRF(FieldMethod):
         balanced = (self.brightness * self.gains * light) @ self.srgb_from_camera.T
         return exposed(balanced, float(self.control("exposure")), float(self.control("white_balance")))
 
-    def field(
-        self, points: Float[Tensor, "point 3"], directions: Float[Tensor, "point 3"]
-    ) -> tuple[Float[Tensor, " point"], Float[Tensor, "point 3"]]:
+    def field(self, points: Points, directions: Directions) -> tuple[Densities, Colours]:
         """Density per scene unit, and sRGB-encoded colour seen along unit directions."""
         density, light = self.network(points, directions)
         return density, toned(self.linear(light), str(self.control("tone")))

@@ -11,6 +11,7 @@ from torch import Tensor, nn
 
 from ...files.ranges import Depth, Layers, Octaves
 from ...method import Field
+from ...method.field import Codes, Colours, Densities, Directions, Points
 from ..sampling.spaces import Space
 from .coordinate_network import CoordinateNetwork
 from .encodings import FrequencyEncoding
@@ -138,9 +139,7 @@ class CoordinateField(Field):
 
     # At points
 
-    def geometry(
-        self, points: Float[Tensor, "point 3"], code: Tensor | None = None
-    ) -> tuple[Float[Tensor, " point"], Tensor | Places]:
+    def geometry(self, points: Points, code: Tensor | None = None) -> tuple[Densities, Tensor | Places]:
         """Density per scene unit; features, without a code the places themselves."""
         coordinates = self.space.warp(points)
         if self.joint:
@@ -148,12 +147,7 @@ class CoordinateField(Field):
         density, features = self.features_at(coordinates)
         return density * self.space.stretch(points), features
 
-    def colour(
-        self,
-        features: Tensor | Places,
-        directions: Float[Tensor, "point 3"],
-        code: Float[Tensor, "point code"] | None = None,
-    ) -> Float[Tensor, "point 3"]:
+    def colour(self, features: Tensor | Places, directions: Directions, code: Codes | None = None) -> Colours:
         if self.joint:
             assert isinstance(features, tuple)
             return self.colours_at(features, torch.arange(len(directions), device=directions.device), directions)[1]
@@ -165,12 +159,7 @@ class CoordinateField(Field):
     def density(self, points: Float[Tensor, "point 3"], code: Tensor | None = None) -> Float[Tensor, " point"]:
         return self.density_at(self.space.warp(points)) * self.space.stretch(points)
 
-    def forward(
-        self,
-        points: Float[Tensor, "point 3"],
-        directions: Float[Tensor, "point 3"],
-        code: Float[Tensor, "point code"] | None = None,
-    ) -> tuple[Float[Tensor, " point"], Float[Tensor, "point 3"]]:
+    def forward(self, points: Points, directions: Directions, code: Codes | None = None) -> tuple[Densities, Colours]:
         def answer(x: Tensor, *seen: Tensor) -> tuple[Tensor, Tensor]:
             raw, feature = self.network.geometry(self.encode(x))
             return self.activation(raw), self._seen(feature, *seen)

@@ -22,6 +22,7 @@ from ...geometry import unit
 from ...geometry.choice import evenly
 from ...kernels import spherical_harmonics
 from ...method.capabilities import HasDensity, HasField, can
+from ...method.field import Colours, Densities, Directions, Points
 from ...system.progress import track
 from ..sampling.spaces import Space
 
@@ -189,9 +190,7 @@ class DepthTeacher(Teacher):
         return ((0.5 - distance).clamp(0, 1) * SPENT / truncation).nan_to_num(0.0)
 
     @torch.no_grad()
-    def field(
-        self, points: Float[Tensor, "point 3"], directions: Float[Tensor, "point 3"]
-    ) -> tuple[Float[Tensor, " point"], Float[Tensor, "point 3"]]:
+    def field(self, points: Points, directions: Directions) -> tuple[Densities, Colours]:
         """Density per scene unit, and the colour in that picture which sees the point most nearly along a direction."""
         best, rgb = torch.full((len(points),), -2.0), torch.full_like(points, 0.5)
         for depth_map in self.depth_maps:

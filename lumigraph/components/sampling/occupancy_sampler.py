@@ -15,7 +15,7 @@ from ...datasets.scene import Frame, Scene
 from ...exchange.packing import Stored
 from ...files.ranges import NonNegative, Share, Steps, between
 from ...method import Features, Field, Pass, Sampler
-from ...method.sampler import Density, codes_at
+from ...method.sampler import Density, RayCodes, codes_at
 from ...volume import visible, weights_of
 from .carving import visual_hull
 from .occupancy import OccupancyGrid
@@ -132,11 +132,7 @@ class OccupancySampler(Sampler):
         )
 
     def sample(
-        self,
-        rays: Rays,
-        field: Field,
-        code: Float[Tensor, "ray code"] | None = None,
-        generator: torch.Generator | None = None,
+        self, rays: Rays, field: Field, code: RayCodes | None = None, generator: torch.Generator | None = None
     ) -> list[Pass]:
         jitter = None if generator is None else torch.rand(len(rays), generator=generator).to(rays.origins.device)
         code_of = code if field.deforms else None

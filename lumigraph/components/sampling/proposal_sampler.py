@@ -21,7 +21,7 @@ from ...datasets.scene import Frame, Scene
 from ...exchange.packing import Stored
 from ...files.ranges import NonNegative, between
 from ...method import Field, Pass, Sampler
-from ...method.sampler import Density, codes_at
+from ...method.sampler import Density, RayCodes, codes_at
 from ...volume import weights_of
 from ..clouds.dense_points import Points, compile_sweep, seen_points
 from ..training.regularizers import depth_loss, distortion_loss, scale_gradients
@@ -79,11 +79,7 @@ class ProposalSampler(Sampler):
             self.register_buffer(name, torch.zeros(0, 3))
 
     def sample(
-        self,
-        rays: Rays,
-        field: Field,
-        code: Float[Tensor, "ray code"] | None = None,
-        generator: torch.Generator | None = None,
+        self, rays: Rays, field: Field, code: RayCodes | None = None, generator: torch.Generator | None = None
     ) -> list[Pass]:
         if generator is None and not torch.is_grad_enabled():
             return [self._visible(rays, field, code)]

@@ -30,6 +30,7 @@ from ...components.training.schedules import held_decay
 from ...datasets.scene import Batch, Frame, Photograph, Scene
 from ...files.ranges import Layers, LearningRate, NonNegative, Octaves, PositiveShare, Seed, Width, between
 from ...method import FieldMethod
+from ...method.field import Directions, Points
 from ...volume import composite
 from .parts import Exposures, Moving, Visibility
 
@@ -187,8 +188,6 @@ class BlockNeRF(FieldMethod):
         return self.exposures.usual_stops if self.exposures else None
 
     @torch.no_grad()
-    def visibility(
-        self, points: Float[Tensor, "point 3"], directions: Float[Tensor, "point 3"]
-    ) -> Float[Tensor, " point"]:
+    def visibility(self, points: Points, directions: Directions) -> Float[Tensor, " point"]:
         """Share of each place, along a unit direction, that the photographs saw (section 4.2.5); 1 if not learnt."""
         return self.sight(points, directions) if self.sight else torch.ones_like(points[:, 0])

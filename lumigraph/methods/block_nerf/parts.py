@@ -21,6 +21,7 @@ from ...components.training.schedules import falling
 from ...datasets.scene import Photograph, Scene
 from ...method import Part
 from ...method.controls import Control
+from ...method.field import Directions, Points
 
 FULL = 8.0  # stops that count as 1, so that the longest wave rises all the way from four below the usual to four above
 SAME = 0.01  # stops within which all photographs count as exposed alike
@@ -184,9 +185,7 @@ class Visibility(Part):
         self.space, self.encode = space, FrequencyEncoding(3, octaves)
         self.network = MLP(self.encode.width + BANDS**2, *[width] * layers, 1)
 
-    def forward(
-        self, points: Float[Tensor, "point 3"], directions: Float[Tensor, "point 3"]
-    ) -> Float[Tensor, " point"]:
+    def forward(self, points: Points, directions: Directions) -> Float[Tensor, " point"]:
         """points: in scene units; directions: unit length, away from the eye"""
         places = self.encode(self.space.warp(points))
         return self.network(side_by_side(places, kernels.spherical_harmonics(directions, BANDS)))[:, 0].sigmoid()

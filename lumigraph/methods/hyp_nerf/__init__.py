@@ -31,6 +31,7 @@ from ...files.ranges import BatchSize, Count, Layers, LearningRate, NonNegative,
 from ...geometry import look_at
 from ...method import Method, RayMethod
 from ...method.controls import Control, Value, blend
+from ...method.field import Colours, Densities, Directions, Points
 from ...volume import composite
 from .instance_codes import AVERAGE, InstanceCodes
 from .networks import HashInstance, HashShape, HyperNetwork, PictureDenoiser
@@ -453,9 +454,7 @@ class HypNeRF(RayMethod):
         samples, _ = reached(rays, samples, instance, None, self.config.transmittance_threshold)
         return [Look("samples", samples, *instance(*samples.along(rays)))]
 
-    def field(
-        self, points: Float[Tensor, "point 3"], directions: Float[Tensor, "point 3"]
-    ) -> tuple[Float[Tensor, " point"], Float[Tensor, "point 3"]]:
+    def field(self, points: Points, directions: Directions) -> tuple[Densities, Colours]:
         """Density per scene unit, nothing beyond the bounds, and sRGB-encoded colour seen along unit directions."""
         density, rgb = self.shown[0](points, directions)
         return density * self._inside(points), rgb

@@ -14,6 +14,7 @@ from ... import kernels
 from ...components.fields.hash_field import HashNumbers, side_by_side
 from ...components.fields.layers import truncated_exp
 from ...method import Field
+from ...method.field import Colours, Densities, Directions, Points
 
 TABLE, CALM = 1e-4, 0.1  # of a table's first entries; of what codes change at first, beside what all have in common
 
@@ -88,20 +89,15 @@ class HashInstance(Field):
         super().__init__()
         self.shape, self.tensors = shape, [*tensors]
 
-    def geometry(
-        self, points: Float[Tensor, "point 3"], code: Tensor | None = None
-    ) -> tuple[Float[Tensor, " point"], Float[Tensor, "point geometry"]]:
+    def geometry(self, points: Points, code: Tensor | None = None) -> tuple[Densities, Float[Tensor, "point geometry"]]:
         table, layers = self.tensors[0], self.tensors[1 : len(self.shape.density)]
         encoded = kernels.hash_encode(points * 0.5 + 0.5, table.contiguous(), self.shape.levels)
         geometry = kernels.perceptron(encoded, *layers)
         return truncated_exp(geometry[:, 0]), geometry
 
     def colour(
-        self,
-        features: Float[Tensor, "point geometry"],
-        directions: Float[Tensor, "point 3"],
-        code: Tensor | None = None,
-    ) -> Float[Tensor, "point 3"]:
+        self, features: Float[Tensor, "point geometry"], directions: Directions, code: Tensor | None = None
+    ) -> Colours:
         harmonics = kernels.spherical_harmonics(directions, self.shape.bands)
         return kernels.perceptron(side_by_side(features, harmonics), *self.tensors[len(self.shape.density) :]).sigmoid()
 

@@ -41,6 +41,7 @@ from ...files.ranges import (
 )
 from ...method import Method, RayMethod
 from ...method.controls import Control, Value
+from ...method.field import Colours, Densities, Directions, Points
 from ...volume import composite, weights_of
 from .networks import STRIDE, PictureEncoder, ResidualNetwork, look_up
 
@@ -336,13 +337,8 @@ class PixelNeRF(RayMethod):
         return torch.cat(places, -1)
 
     def _ask(
-        self,
-        network: int,
-        points: Float[Tensor, "point 3"],
-        directions: Float[Tensor, "point 3"],
-        sources: Sources,
-        where: Tensor | None = None,
-    ) -> tuple[Float[Tensor, " point"], Float[Tensor, "point 3"]]:
+        self, network: int, points: Points, directions: Directions, sources: Sources, where: Tensor | None = None
+    ) -> tuple[Densities, Colours]:
         """Density per scene unit and colour of points seen along directions (section 4.2, eq. 4 to 6)."""
         cameras, c = sources.cameras, self.config
         turned = cameras.pose[:, :, :3].mT  # the world's axes in each camera's
@@ -361,8 +357,6 @@ class PixelNeRF(RayMethod):
         density, rgb = in_chunks(answer, points, directions, where=where)
         return density, rgb
 
-    def field(
-        self, points: Float[Tensor, "point 3"], directions: Float[Tensor, "point 3"]
-    ) -> tuple[Float[Tensor, " point"], Float[Tensor, "point 3"]]:
+    def field(self, points: Points, directions: Directions) -> tuple[Densities, Colours]:
         """Density per scene unit, and sRGB-encoded colour seen along unit directions. Both depend on the direction."""
         return self._ask(len(self.networks) - 1, points, directions, self.sources)

@@ -17,6 +17,7 @@ from ...exchange.packing import Stored
 from ...kernels.octree_cells import Crossed, Tree, code_of, levels_of
 from ...kernels.octree_cells.reference import leaves
 from ...method import Pass, Sampler
+from ...method.field import Densities, Points
 from ...system.memory import free_on, gigabytes
 from .harmonic_field import SphericalHarmonicsField
 
@@ -120,9 +121,7 @@ class Leaves(SphericalHarmonicsField):
         value, _ = leaves(tree, torch.where(inside[:, None], place, 0).long())
         return torch.where(inside & (value < 0), -1 - value, -1)
 
-    def geometry(
-        self, points: Float[Tensor, "point 3"], code: Tensor | None = None
-    ) -> tuple[Float[Tensor, " point"], Float[Tensor, "point harmonic"]]:
+    def geometry(self, points: Points, code: Tensor | None = None) -> tuple[Densities, Float[Tensor, "point harmonic"]]:
         """Density and harmonics of the leaf that each point is in; zeros where there is none."""
         rows = self.rows_at(points)
         return self._rows(self.densities, rows)[:, 0].relu(), self._rows(self.harmonics, rows)

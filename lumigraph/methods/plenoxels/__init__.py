@@ -29,6 +29,7 @@ from ...files.ranges import BatchSize, LearningRate, NonNegative, Positive, Posi
 from ...kernels import total_variation
 from ...kernels.harmonic_grid import BANDS
 from ...method import Field, FieldMethod
+from ...method.field import Colours, Densities, Directions, Points
 from ...volume import composite, weights_of
 from .sparse_voxels import Cells, Part, SparseVoxels
 
@@ -114,21 +115,15 @@ class HarmonicField(Field):
         self.voxels = SparseVoxels(cells_of(space, first), config.initial_density)
         self.touched: tuple[Tensor, Part]
 
-    def geometry(
-        self, points: Float[Tensor, "point 3"], code: Tensor | None = None
-    ) -> tuple[Float[Tensor, " point"], Float[Tensor, "point 3"]]:
+    def geometry(self, points: Points, code: Tensor | None = None) -> tuple[Densities, Points]:
         """Density, and as features the points' coordinates."""
         places = self.space.warp(points)
         return self.voxels.density_at(places).relu() * self.space.stretch(points), places
 
-    def colour(
-        self, features: Float[Tensor, "point 3"], directions: Float[Tensor, "point 3"], code: Tensor | None = None
-    ) -> Float[Tensor, "point 3"]:
+    def colour(self, features: Float[Tensor, "point 3"], directions: Directions, code: Tensor | None = None) -> Colours:
         return self.voxels.at(features, directions)[1].sigmoid()
 
-    def forward(
-        self, points: Float[Tensor, "point 3"], directions: Float[Tensor, "point 3"], code: Tensor | None = None
-    ) -> tuple[Float[Tensor, " point"], Float[Tensor, "point 3"]]:
+    def forward(self, points: Points, directions: Directions, code: Tensor | None = None) -> tuple[Densities, Colours]:
         voxels: SparseVoxels | Part = self.voxels
         if torch.is_grad_enabled():
             rows = self.voxels.touched(self.space.warp(points))

@@ -45,6 +45,7 @@ from ...kernels.block_march import ALPHA, CHANNELS
 from ...kernels.spherical_harmonics import K00
 from ...method import FieldMethod, Pass
 from ...method.capabilities import HasField, can
+from ...method.field import Colours, Densities, Directions, Points
 from ...volume import composite, weights_of
 from .baked_voxels import BakedVoxels, VisibilityGrid, rounded, smoothed
 from .deferred_field import Deferred, DeferredField, Geometry, HashDeferred, NetworkDeferred, ViewDependence
@@ -261,9 +262,7 @@ class SNeRG(FieldMethod):
     def _density_of(self, alpha: Float[Tensor, " point"], points: Float[Tensor, "point 3"]) -> Float[Tensor, " point"]:
         return self.voxels.density(alpha, self.voxels.length(points, self.voxels.edge))
 
-    def field(
-        self, points: Float[Tensor, "point 3"], directions: Float[Tensor, "point 3"]
-    ) -> tuple[Float[Tensor, " point"], Float[Tensor, "point 3"]]:
+    def field(self, points: Points, directions: Directions) -> tuple[Densities, Colours]:
         """Density per scene unit, and sRGB-encoded colour seen along unit directions if nothing is before or behind."""
         if self.stage == FIELD:
             density, (diffuse, features) = self.network.geometry(points)

@@ -30,6 +30,7 @@ from ...files.ranges import BatchSize, LearningRate, NonNegative, Positive, Seed
 from ...kernels import factor_grid, spherical_harmonics
 from ...kernels.factor_grid import Factors
 from ...method import Field, FieldMethod
+from ...method.field import Colours, Densities, Directions, Points
 from ...volume import composite
 from .factorised import FactorGrid, nodes_in, truncate
 
@@ -133,9 +134,7 @@ class TensorField(Field):
         low, high = self.box
         return (self.space.warp(points) - low) / (high - low)
 
-    def geometry(
-        self, points: Float[Tensor, "point 3"], code: Tensor | None = None
-    ) -> tuple[Float[Tensor, " point"], Float[Tensor, "point 3"]]:
+    def geometry(self, points: Points, code: Tensor | None = None) -> tuple[Densities, Points]:
         """Density: softplus of the sum over all components (eq. 5); 0 outside the box. Features: places in the cube."""
         c, places = self.config, self.places(points)
         inside = ((places > 0) & (places < 1)).all(-1)  # points before the plane of a forward capture are on it
@@ -143,9 +142,7 @@ class TensorField(Field):
         density = c.density_scale * nn.functional.softplus(total + c.density_shift) * inside
         return density * self.space.stretch(points) if self.space.is_open else density, places
 
-    def colour(
-        self, features: Float[Tensor, "point 3"], directions: Float[Tensor, "point 3"], code: Tensor | None = None
-    ) -> Float[Tensor, "point 3"]:
+    def colour(self, features: Float[Tensor, "point 3"], directions: Directions, code: Tensor | None = None) -> Colours:
         """S(B [products], d) (eq. 6); in memory one feature of all samples after another, as networks read them."""
         return self.shade((self.basis.weight @ self.appearance_grid(features).t()).t(), directions)
 
