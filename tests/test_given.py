@@ -17,8 +17,7 @@ from lumigraph.camera import Camera
 from lumigraph.camera.rays import Rays
 from lumigraph.capture import open_scene
 from lumigraph.commands.cli import main
-from lumigraph.components.training.exposure import gain_between
-from lumigraph.components.training.lights import spread_of_exposure
+from lumigraph.components.training.photometric import gain_between, spread_of_exposure
 from lumigraph.datasets.images import ImageStore
 from lumigraph.datasets.scene import Frame
 from lumigraph.errors import LumigraphError, LumigraphWarning

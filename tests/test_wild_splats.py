@@ -16,7 +16,7 @@ from test_nerf_w import two_lights
 
 from lumigraph import kernels
 from lumigraph.color.blending import over
-from lumigraph.components.training.lights import spread_of_light
+from lumigraph.components.training.photometric import spread_of_light
 from lumigraph.datasets.images import ImageStore
 from lumigraph.datasets.scene import Photograph
 from lumigraph.errors import LumigraphError, LumigraphWarning

@@ -11,15 +11,12 @@ from torch import Tensor
 
 from ..camera import Camera
 from ..components.fields.hash_field import HashField, HashNumbers
-from ..components.fields.teacher import teacher_of
+from ..components.fields.teacher import distil, teacher_of
 from ..components.sampling.importance import importance
 from ..components.sampling.occupancy_sampler import OccupancyNumbers, StepNumbers
-from ..components.sampling.proposal_sampler import ProposalNumbers
-from ..components.sampling.samplers import CPU_HASH, TINY_HASH, sampler_for, sampling_bytes
+from ..components.sampling.samplers import CPU_HASH, TINY_HASH, ProposalNumbers, sampler_for, sampling_bytes
 from ..components.sampling.spaces import Box, space_of
-from ..components.training.distillation import distil
-from ..components.training.exposure import Exposure, Setting
-from ..components.training.photometric import backdrop, huber, residuals
+from ..components.training.photometric import Exposure, Setting, backdrop, huber, residuals
 from ..components.training.pose_refinement import PoseNumbers, poses_for
 from ..components.training.schedules import held
 from ..datasets.scene import Batch, Frame

@@ -10,16 +10,14 @@ import torch
 from ..camera import Camera
 from ..components.fields.coordinate_field import NetworkNumbers
 from ..components.fields.frustum_field import FrustumField
-from ..components.fields.teacher import teacher_of
+from ..components.fields.teacher import POINTS_PER_RAY, distil, teacher_of
 from ..components.sampling.cone_sampler import ConeSampler
 from ..components.sampling.hierarchical_sampler import CPU_NETWORK, TINY_NETWORK, RayNumbers
 from ..components.sampling.occupancy_mask import MaskNumbers
 from ..components.sampling.samplers import sampling_bytes
 from ..components.sampling.spaces import space_of
-from ..components.training.coarse_to_fine import BandSchedule, joining_of
-from ..components.training.distillation import POINTS_PER_RAY, distil
 from ..components.training.pose_refinement import PoseNumbers, poses_for
-from ..components.training.schedules import exponential_decay
+from ..components.training.schedules import BandSchedule, exponential_decay, joining_of
 from ..datasets.scene import Frame
 from ..files.ranges import LearningRate, NonNegative, Seed, Share, Width
 from ..method import FieldMethod

@@ -12,15 +12,13 @@ from torch.nn.functional import softplus
 
 from .. import kernels
 from ..camera.rays import Look, Rays, Rendering, Samples
-from ..components.fields.appearance import AVERAGE, AppearanceCodes, CodeWidth, PhotographCodes
+from ..components.fields.appearance import AVERAGE, AppearanceCodes, CodeWidth, PhotographCodes, sky_for
 from ..components.fields.coordinate_field import CoordinateField, NetworkNumbers
 from ..components.fields.hash_field import CODES_RATE, OPEN_RATE, HashField, HashNumbers, side_by_side
 from ..components.fields.layers import MLP, Dense, in_chunks, truncated_exp
-from ..components.fields.sky import sky_for
 from ..components.sampling.hierarchical_sampler import RAYS_WITH_FEATURES, HierarchicalSampler, RayNumbers
 from ..components.sampling.occupancy_sampler import OccupancyNumbers, StepNumbers
-from ..components.sampling.proposal_sampler import ProposalNumbers
-from ..components.sampling.samplers import CPU_HASH, TINY_HASH, sampler_for, sampling_bytes
+from ..components.sampling.samplers import CPU_HASH, TINY_HASH, ProposalNumbers, sampler_for, sampling_bytes
 from ..components.sampling.spaces import space_of
 from ..components.training.photometric import backdrop
 from ..components.training.schedules import held_decay

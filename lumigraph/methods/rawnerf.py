@@ -21,8 +21,7 @@ from ..components.fields.development import CONTROLS, decoded, exposed, toned
 from ..components.fields.hash_field import HashField, HashNumbers
 from ..components.fields.layers import truncated_exp
 from ..components.sampling.occupancy_sampler import OccupancyNumbers, StepNumbers
-from ..components.sampling.proposal_sampler import ProposalNumbers
-from ..components.sampling.samplers import CPU_HASH, TINY_HASH, sampler_for, sampling_bytes
+from ..components.sampling.samplers import CPU_HASH, TINY_HASH, ProposalNumbers, sampler_for, sampling_bytes
 from ..components.sampling.spaces import space_of
 from ..components.training.pose_refinement import PoseNumbers, poses_for
 from ..components.training.regularizers import normalized_distance

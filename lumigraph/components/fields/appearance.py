@@ -14,12 +14,16 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
-from ...datasets.scene import Batch, Photograph
+from ... import kernels
+from ...camera.rays import Rays
+from ...datasets.scene import Batch, Frame, Photograph
 from ...errors import LumigraphError
 from ...files.ranges import between
 from ...method import Part
 from ...method.controls import Control, blend
 from ...volume import composite, weights_of
+from .hash_field import side_by_side
+from .layers import MLP
 
 
 def axes_of(codes: Float[Tensor, "known code"], least: float = 0.0) -> Float[Tensor, "axis code"]:
@@ -218,3 +222,27 @@ def drawn(photograph: Photograph, count: int, generator: torch.Generator) -> Bat
     rays = photograph.camera.rays(photograph.camera.pixels()[chosen])
     alpha = None if photograph.alpha is None else photograph.alpha.flatten()[chosen]
     return Batch(rays, photograph.rgb.flatten(0, 1)[chosen], alpha)
+
+
+class SkyField(Part):
+    """Colours behind everything (as in Rematas 2022, beside the code).
+
+    Photographs do not agree on the weather. Without a sky, a transient head would explain all of it, and nothing would
+    be left for the scene.
+    """
+
+    def __init__(self, bands: int, code: int, hidden_width: int):
+        super().__init__()
+        self.bands, self.network = bands, MLP(bands**2 + code, hidden_width, 3)
+
+    def behind(
+        self, rays: Rays, code: Float[Tensor, "#ray code"] | None, background: Float[Tensor, "#ray 3"]
+    ) -> Float[Tensor, "ray 3"]:
+        codes = [] if code is None else [code.expand(len(rays), -1)]
+        harmonics = kernels.spherical_harmonics(rays.directions, self.bands)
+        return self.network(side_by_side(harmonics, *codes)).sigmoid()
+
+
+def sky_for(frame: Frame, wanted: bool, bands: int, code: int, hidden_width: int) -> SkyField | None:
+    """A sky where a scene without bounds shows one, and it is wanted."""
+    return SkyField(bands, code, hidden_width) if wanted and frame.is_open and not frame.has_alpha else None

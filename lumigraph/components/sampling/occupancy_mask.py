@@ -13,8 +13,7 @@ from torch.nn.functional import max_pool3d
 from ...datasets.scene import Scene
 from ...files.ranges import Cells, NonNegative
 from ...method import Part
-from .carving import visual_hull
-from .occupancy import OccupancyGrid
+from .occupancy import OccupancyGrid, visual_hull
 from .spaces import Space
 
 BEGINS = 0.1  # share of the budget before the grid rules anything out: a young network is thin everywhere

@@ -17,8 +17,7 @@ from ...files.ranges import NonNegative, Share, Steps, between
 from ...method import Features, Field, Pass, Sampler
 from ...method.sampler import Density, RayCodes, codes_at
 from ...volume import visible, weights_of
-from .carving import visual_hull
-from .occupancy import OccupancyGrid
+from .occupancy import OccupancyGrid, visual_hull
 from .spaces import Space
 
 FIRST_RAYS = 256  # rays of the first step, before the number of samples per ray is known

@@ -16,9 +16,8 @@ from ...files.ranges import LearningRate
 from ...geometry import rotated
 from ...method import Part
 from .bundle_adjustment import adjusted, pixel_angle, rotation_vector
-from .coarse_to_fine import ENDS, band_weights
 from .row_optimizers import RowOptimizer
-from .schedules import falling
+from .schedules import ENDS, band_weights, falling
 from .shared_points import shared_points
 
 PLACES = 16  # along each side of a picture, and as many depths: where its motion is measured

@@ -13,16 +13,14 @@ from jaxtyping import Float, Int
 from torch import Tensor
 from torch.nn.functional import huber_loss
 
-from ...components.fields.appearance import Appearance, AppearanceCodes, CodeWidth, Patches
+from ...components.fields.appearance import Appearance, AppearanceCodes, CodeWidth, Patches, sky_for
 from ...components.fields.coordinate_field import NetworkNumbers
 from ...components.fields.frustum_field import FrustumField
 from ...components.fields.hash_field import CODES_RATE, OPEN_RATE, HashField, HashNumbers
-from ...components.fields.sky import sky_for
 from ...components.sampling.cone_sampler import ConeSampler
 from ...components.sampling.hierarchical_sampler import RAYS_WITH_FEATURES, RayNumbers
 from ...components.sampling.occupancy_sampler import OccupancyNumbers, StepNumbers
-from ...components.sampling.proposal_sampler import ProposalNumbers
-from ...components.sampling.samplers import CPU_HASH, TINY_HASH, sampler_for, sampling_bytes
+from ...components.sampling.samplers import CPU_HASH, TINY_HASH, ProposalNumbers, sampler_for, sampling_bytes
 from ...components.sampling.spaces import space_of
 from ...components.training.photometric import backdrop
 from ...components.training.pose_refinement import PoseNumbers, poses_for

@@ -15,7 +15,7 @@ from ... import kernels
 from ...camera import Camera
 from ...camera.rays import Rendering
 from ...components.fields.appearance import PhotographCodes
-from ...components.training.lights import spread_of_light
+from ...components.training.photometric import spread_of_light
 from ...components.training.schedules import falling
 from ...datasets.scene import Frame, Photograph, Scene
 from ...errors import LumigraphWarning

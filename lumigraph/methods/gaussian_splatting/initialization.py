@@ -11,7 +11,7 @@ from torch import Tensor
 
 from ...components.clouds.dense_points import dense_points
 from ...components.fields.teacher import Teacher
-from ...components.sampling.carving import visual_hull
+from ...components.sampling.occupancy import visual_hull
 from ...datasets.scene import Frame, Scene
 from ...errors import LumigraphError
 from ...gaussians import Gaussians

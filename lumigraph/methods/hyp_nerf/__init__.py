@@ -16,11 +16,9 @@ from ...camera import Camera
 from ...camera.rays import Look, Rays, Rendering
 from ...components.fields.appearance import fitted
 from ...components.fields.hash_field import HashNumbers
-from ...components.fields.kept_photographs import Kept
-from ...components.sampling.carving import visual_hull
-from ...components.sampling.occupancy import OccupancyGrid
+from ...components.fields.kept_photographs import Kept, chance, photographed, rays_through
+from ...components.sampling.occupancy import OccupancyGrid, visual_hull
 from ...components.sampling.occupancy_sampler import reached
-from ...components.training.members import chance, photographed, rays_through
 from ...components.training.photometric import backdrop, residuals
 from ...components.training.row_optimizers import LazyAdam
 from ...components.training.schedules import exponential_decay

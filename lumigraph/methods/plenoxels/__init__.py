@@ -14,11 +14,9 @@ from ...camera import Camera
 from ...components.fields.teacher import logit, teacher_of
 from ...components.sampling.importance import importance
 from ...components.sampling.occupancy_sampler import GridSchedule, OccupancyNumbers, OccupancySampler
-from ...components.sampling.proposal_sampler import ProposalNumbers
-from ...components.sampling.samplers import sampler_for
+from ...components.sampling.samplers import ProposalNumbers, sampler_for
 from ...components.sampling.spaces import NDC, Space, space_of
-from ...components.training.exposure import Exposure, Setting
-from ...components.training.photometric import backdrop, residuals
+from ...components.training.photometric import Exposure, Setting, backdrop, residuals
 from ...components.training.regularizers import cauchy
 from ...components.training.row_optimizers import LazyRMSprop
 from ...components.training.schedules import falling

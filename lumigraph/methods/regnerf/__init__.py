@@ -21,15 +21,12 @@ from ...components.sampling.cone_sampler import ConeSampler
 from ...components.sampling.hierarchical_sampler import CPU_NETWORK, TINY_NETWORK, RayNumbers
 from ...components.sampling.occupancy_mask import MaskNumbers
 from ...components.sampling.occupancy_sampler import MIN_RESOLUTION, OccupancyNumbers, StepNumbers
-from ...components.sampling.proposal_sampler import ProposalNumbers
-from ...components.sampling.samplers import CPU_HASH, sampler_for, sampling_bytes
+from ...components.sampling.samplers import CPU_HASH, ProposalNumbers, sampler_for, sampling_bytes
 from ...components.sampling.spaces import space_of
-from ...components.training.coarse_to_fine import BandSchedule, joining_of
 from ...components.training.photometric import backdrop, huber, residuals
 from ...components.training.pose_refinement import PoseNumbers, poses_for
-from ...components.training.regularizers import near_thickness, normalized_distance
-from ...components.training.schedules import falling, held
-from ...components.training.unseen_views import patches, roughness, unseen_cameras
+from ...components.training.regularizers import near_thickness, normalized_distance, patches, roughness, unseen_cameras
+from ...components.training.schedules import BandSchedule, falling, held, joining_of
 from ...datasets.scene import Batch, Frame, Scene
 from ...files.ranges import LearningRate, NonNegative, PositiveShare, Seed, Share, Steps, Width, between
 from ...method import FieldMethod

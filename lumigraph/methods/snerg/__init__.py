@@ -18,8 +18,7 @@ from ...color.blending import over
 from ...components.fields.hash_field import CPU_LEVELS, TINY_LEVELS, TableNumbers
 from ...components.fields.teacher import teacher_of
 from ...components.sampling.occupancy_sampler import OccupancyNumbers, StepNumbers
-from ...components.sampling.proposal_sampler import ProposalNumbers
-from ...components.sampling.samplers import CPU_HASH, TINY_HASH, sampler_for
+from ...components.sampling.samplers import CPU_HASH, TINY_HASH, ProposalNumbers, sampler_for
 from ...components.sampling.spaces import Box, contraction_of, space_of
 from ...components.training.photometric import backdrop, residuals
 from ...components.training.regularizers import cauchy

@@ -13,13 +13,11 @@ from torch import Tensor, nn
 
 from ...camera import Camera
 from ...components.fields.layers import MLP
-from ...components.fields.teacher import teacher_of
+from ...components.fields.teacher import distil, teacher_of
 from ...components.sampling.importance import importance
 from ...components.sampling.occupancy_sampler import GridSchedule, OccupancyNumbers, OccupancySampler, Stage
-from ...components.sampling.proposal_sampler import ProposalNumbers
-from ...components.sampling.samplers import sampler_for
+from ...components.sampling.samplers import ProposalNumbers, sampler_for
 from ...components.sampling.spaces import Space, space_of
-from ...components.training.distillation import distil
 from ...components.training.photometric import backdrop, residuals
 from ...components.training.row_optimizers import LazyAdam, exchange
 from ...components.training.schedules import falling
