@@ -24,7 +24,7 @@ from lumigraph.capture import open_scene
 from lumigraph.components.fields import layers
 from lumigraph.components.fields.coordinate_network import CoordinateNetwork
 from lumigraph.components.sampling.hierarchical_sampler import RayNumbers
-from lumigraph.components.sampling.occupancy_mask import MaskNumbers, OccupancyMask
+from lumigraph.components.sampling.occupancy import MaskNumbers, OccupancyMask
 from lumigraph.datasets.scene import Scene
 from lumigraph.errors import LumigraphError
 from lumigraph.files import write_json

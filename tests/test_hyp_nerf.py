@@ -21,8 +21,7 @@ from lumigraph.files.ranges import changed
 from lumigraph.kernels import HashLevels
 from lumigraph.methods import find
 from lumigraph.methods.hyp_nerf import FOUND, HypNeRF, around, held, patch
-from lumigraph.methods.hyp_nerf.instance_codes import AVERAGE, InstanceCodes
-from lumigraph.methods.hyp_nerf.networks import HashInstance, HashShape, HyperNetwork
+from lumigraph.methods.hyp_nerf.networks import AVERAGE, HashInstance, HashShape, HyperNetwork, InstanceCodes
 from lumigraph.metrics import psnr
 from lumigraph.run import Run, State
 

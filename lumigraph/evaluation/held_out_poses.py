@@ -55,7 +55,7 @@ class HeldOutPoses:
         poses = PoseRefinement(self.scene.frame.image_count, LEARNING_RATE).to(self.method.device)
         poses.choose_axes(self.scene.cameras[index], self.scene.frame)
         self.frozen.poses = poses
-        optimizer, generator = poses.optimizer(), torch.Generator().manual_seed(index)
+        (optimizer,), generator = poses.optimizers(), torch.Generator().manual_seed(index)
         with torch.enable_grad():
             for step in range(STEPS):
                 optimizer.param_groups[0]["lr"] = poses.rate(step / STEPS)

@@ -232,23 +232,11 @@ class RawNeRF(FieldMethod):
 
     @property
     def controls(self) -> tuple[Control, ...]:
-        return (
-            *CONTROLS,
-            Control(
-                "aperture",
-                0.0,
-                (0.0, MAX_APERTURE),
-                unit="scene units",
-                about="Diameter of the lens: the wider, the more blurred is what lies before and behind the focus.",
-            ),
-            Control(
-                "focus",
-                0.0,
-                (0.0, MAX_FOCUS * self.frame.reach),
-                unit="scene units",
-                about="Distance that is sharp; 0: that of the picture's middle. Told alone, it opens the lens.",
-            ),
-        )
+        wide = "Diameter of the lens: the wider, the more blurred is what lies before and behind the focus."
+        sharp = "Distance that is sharp; 0: that of the picture's middle. Told alone, it opens the lens."
+        aperture = Control("aperture", 0.0, (0.0, MAX_APERTURE), unit="scene units", about=wide)
+        ends = 0.0, MAX_FOCUS * self.frame.reach
+        return *CONTROLS, aperture, Control("focus", 0.0, ends, unit="scene units", about=sharp)
 
     @torch.no_grad()
     def render(self, camera: Camera) -> Rendering:

@@ -19,21 +19,12 @@ XYZ_TO_SRGB = (
 
 Light = Float[Tensor, "*pixels 3"]
 
+WHITE = "The temperature of the light that is shown as white; 6500 is as shot, less is bluer."
+TONE = "How light becomes brightness: sRGB's curve, one that keeps highlights as film does, or none."
 CONTROLS = (
     Control("exposure", 0.0, (-STOPS, STOPS), unit="stops", about="Each stop doubles the light."),
-    Control(
-        "white_balance",
-        DAYLIGHT,
-        (WARMEST, COLDEST),
-        unit="kelvin",
-        about="The temperature of the light that is shown as white; 6500 is as shot, less is bluer.",
-    ),
-    Control(
-        "tone",
-        "srgb",
-        choices=("srgb", "filmic", "linear"),
-        about="How light becomes brightness: sRGB's curve, one that keeps highlights as film does, or none.",
-    ),
+    Control("white_balance", DAYLIGHT, (WARMEST, COLDEST), unit="kelvin", about=WHITE),
+    Control("tone", "srgb", choices=("srgb", "filmic", "linear"), about=TONE),
 )
 
 

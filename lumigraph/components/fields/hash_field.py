@@ -20,9 +20,7 @@ from ..sampling.spaces import Space
 from ..training.row_optimizers import LazyAdam
 from .layers import MLP, truncated_exp
 
-OPEN_RATE = (
-    0.5  # of the table's learning rate, that of networks in the open: at all of it one seed in three never learns a hue
-)
+OPEN_RATE = 0.5  # of the table's learning rate, for networks in the open: at 1, one seed in three never learns a hue
 CODES_RATE = 0.25  # of the learning rate, that of codes beside a hash table
 OPEN_RESOLUTION = 2  # factor on max_resolution where coordinates are contracted: the box of interest is half as wide
 

@@ -165,10 +165,7 @@ class FieldTeacher(Teacher):
         self.teacher = teacher
 
     def _density(self, points):
-        there = points.to(self.teacher.device)
-        if can(self.teacher, HasDensity):
-            return self.teacher.density(there).cpu().float()
-        return self.teacher.field(there, torch.nn.functional.normalize(there + 1e-6, dim=-1))[0].cpu().float()
+        return density_of(self.teacher)(points.to(self.teacher.device)).cpu().float()
 
     def glance(self, points, depth_map):
         there, directions = points, unit(points - depth_map.camera.position)
@@ -204,6 +201,13 @@ class DepthTeacher(Teacher):
         pixels, valid, _ = depth_map.project(points)
         inside = depth_map.inside(pixels, valid)[:, None]
         return torch.where(inside, depth_map.at_pixels(depth_map.rgb, pixels), 0.5)
+
+
+def density_of(teacher: Any) -> Callable[[Points], Densities]:
+    """Density at points, of a teacher with a `field`."""
+    if can(teacher, HasDensity):
+        return teacher.density
+    return lambda points: teacher.field(points, torch.nn.functional.normalize(points + 1e-6, dim=-1))[0]
 
 
 def logit(rgb: Float[Tensor, "point 3"]) -> Float[Tensor, "point 3"]:

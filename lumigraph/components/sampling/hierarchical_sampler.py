@@ -14,7 +14,7 @@ from ...files.ranges import BatchSize, RaySamples
 from ...method import Pass, Sampler
 from ...volume import weights_of
 from ..fields.coordinate_field import CoordinateField, Places
-from .occupancy_mask import MaskNumbers, OccupancyMask
+from .occupancy import MaskNumbers, OccupancyMask
 from .sampling import inverse_transform, midpoints, stratified
 from .spaces import Space
 

@@ -97,13 +97,11 @@ class ProposalSampler(Sampler):
             features: Any = ()
         else:
             density, features = field.geometry(points, own)
-        scale = None
+        count, scale = len(samples), None
         if generator is not None:
             (density,) = scale_gradients(samples.t, density)
             scale = partial(_scaled, samples.t)
-        count = len(samples)
-        found = Pass("samples", samples, density, features, directions, None, rgb, count, scale, proposals)
-        return [found]
+        return [Pass("samples", samples, density, features, directions, None, rgb, count, scale, proposals)]
 
     def _visible(self, rays: Rays, field: Field, code: Float[Tensor, "ray code"] | None) -> Pass:
         """A pass for pictures: samples of at most MIN_WEIGHT are left out, so those behind them get that weight."""

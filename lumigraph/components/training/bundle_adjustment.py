@@ -95,9 +95,8 @@ def step(
     two = torch.stack([sideways, torch.linalg.cross(bearing, sideways)], 1)  # T
     left = (two @ direction[:, :, None])[..., 0]
     ahead = (direction * bearing).sum(-1) > 0.5
-    weight = (ahead / (1 + left.square().sum(-1) / (2 * scale) ** 2) / scale)[
-        :, None, None
-    ]  # its root, as rows have it
+    weight = ahead / (1 + left.square().sum(-1) / (2 * scale) ** 2) / scale  # its root, as rows have it
+    weight = weight[:, None, None]
 
     eye = torch.eye(3).double()
     of_point = weight * (two @ (eye - direction[:, :, None] * direction[:, None]) / distance @ turns.mT)

@@ -1,4 +1,4 @@
-"""Colours against photographs: backdrops, residuals, the spread of light, a gain for each photograph where they differ."""
+"""Colours against photographs: backdrops, residuals, the spread of light, a gain for each photograph."""
 
 from __future__ import annotations
 

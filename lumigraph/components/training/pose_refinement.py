@@ -131,14 +131,10 @@ class PoseRefinement(Part):
         return None if progress >= ENDS else band_weights(bands, progress).to(self.twist)
 
     def optimizers(self) -> list[torch.optim.Optimizer]:
-        return [self.optimizer()]
+        return [PoseAdam([{"name": "poses", "params": [self.twist]}], self.learning_rate)]
 
     def learning_rates(self, step: int, progress: float) -> dict[str, float]:
         return {"poses": self.rate(progress)}
-
-    def optimizer(self) -> PoseAdam:
-        """Fresh; its group is called "poses", and its rate is that of `rate`."""
-        return PoseAdam([{"name": "poses", "params": [self.twist]}], self.learning_rate)
 
     def rate(self, progress: float) -> float:
         """The learning rate at a share of the budget: it grows, then falls exponentially."""

@@ -14,8 +14,7 @@ from torch import Tensor
 from torch.nn.functional import huber_loss
 
 from ...components.fields.appearance import Appearance, AppearanceCodes, CodeWidth, Patches, sky_for
-from ...components.fields.coordinate_field import NetworkNumbers
-from ...components.fields.frustum_field import FrustumField
+from ...components.fields.coordinate_field import FrustumField, NetworkNumbers
 from ...components.fields.hash_field import CODES_RATE, OPEN_RATE, HashField, HashNumbers
 from ...components.sampling.cone_sampler import ConeSampler
 from ...components.sampling.hierarchical_sampler import RAYS_WITH_FEATURES, RayNumbers

@@ -25,8 +25,7 @@ from ...method import Method
 from .adaptive import AdaptiveDensity, AdaptiveNumbers
 from .addition import Addition, Step
 from .appearance import AppearanceNumbers, SplatAppearance
-from .cloud import Cloud, RateNumbers
-from .compression import picture_share, thinned
+from .cloud import Cloud, RateNumbers, picture_share, thinned
 from .density_control import DensityControl, RefineNumbers
 from .few_views import FewViewNumbers, FewViews
 from .initialization import Initialization, cloud_of, initial_cloud, random_cloud, surface_cloud

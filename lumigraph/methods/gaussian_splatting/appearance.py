@@ -14,7 +14,7 @@ from torch import Tensor
 from ... import kernels
 from ...camera import Camera
 from ...camera.rays import Rendering
-from ...components.fields.appearance import PhotographCodes
+from ...components.fields.appearance import APPEARANCE, PhotographCodes
 from ...components.training.photometric import spread_of_light
 from ...components.training.schedules import falling
 from ...datasets.scene import Frame, Photograph, Scene
@@ -129,10 +129,7 @@ class SplatAppearance(Addition):
 
     @property
     def controls(self) -> tuple[Control, ...]:
-        about = (
-            "The photograph, by number or name, in whose light and colours the scene is shown; or the average of all."
-        )
-        return (self.codes.control("appearance", about),) if self.is_active else ()
+        return (self.codes.control("appearance", APPEARANCE),) if self.is_active else ()
 
     @property
     def accepts(self) -> tuple[type, ...]:

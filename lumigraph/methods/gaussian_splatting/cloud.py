@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Annotated, ClassVar
 
@@ -12,13 +12,16 @@ import torch
 from jaxtyping import Bool, Float, Int
 from numba import njit, prange
 from torch import Tensor, nn
+from torch.nn.functional import normalize
 
 from ...camera import Camera
 from ...components.training.row_optimizers import RowOptimizer, adam_moments, adam_rate, exchange
 from ...components.training.schedules import falling
-from ...exchange.packing import Stored
+from ...exchange.morton import morton_order
+from ...exchange.packing import Stored, most_important
 from ...files.ranges import LearningRate, between
 from ...gaussians import Gaussians
+from ...gaussians.splatting import splat, view_of
 from ...method import Part
 from .interval_schedule import short_schedule_lr_scale
 
@@ -249,3 +252,24 @@ def zero_unobserved_sh(harmonics: Float[Tensor, "gaussian coefficient 3"], count
     for first, fewest in MIN_VIEWS.items():
         few = (count < fewest).nonzero()[:, 0]
         harmonics[few, first:] = 0
+
+
+def picture_share(cloud: Gaussians, camera: Camera, near: float) -> Float[Tensor, " gaussian"]:
+    """Derivative of a picture's brightness in that of each Gaussian."""
+    grey = torch.zeros(len(cloud), 1, 3, device=cloud.means.device, requires_grad=True)
+    with torch.enable_grad():
+        seen = splat(replace(cloud, harmonics=grey), view_of(camera, near), 1)
+        (gain,) = torch.autograd.grad(seen.rgb.sum(), grey)
+    return gain[:, 0].mean(-1)
+
+
+def thinned(
+    cloud: Gaussians, importance: Float[Tensor, " gaussian"], share: float
+) -> tuple[Gaussians, Int[Tensor, " kept"]]:
+    """The cloud without a share of its Gaussians, the least important ones, and indices of the others. They are in
+    Morton order, where neighbours are alike, and each rotation is the quaternion with w >= 0."""
+    kept = most_important(importance, 1 - share).nonzero()[:, 0]
+    kept = kept[torch.from_numpy(morton_order(cloud.means[kept].detach().cpu().numpy()))]
+    upright = normalize(cloud.quaternions, dim=-1)
+    upright = torch.where(upright[:, :1] < 0, -upright, upright)
+    return replace(cloud, quaternions=upright)[kept], kept

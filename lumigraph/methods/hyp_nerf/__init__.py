@@ -31,8 +31,7 @@ from ...method import Method, RayMethod
 from ...method.controls import Control, Value, blend
 from ...method.field import Colours, Densities, Directions, Points
 from ...volume import composite
-from .instance_codes import AVERAGE, InstanceCodes
-from .networks import HashInstance, HashShape, HyperNetwork, PictureDenoiser
+from .networks import AVERAGE, HashInstance, HashShape, HyperNetwork, InstanceCodes, PictureDenoiser
 
 Tally = Annotated[int, between(0, 100_000)]
 
@@ -200,14 +199,11 @@ class HypNeRF(RayMethod):
             members.append(number)
             batch = rays_through(photographs, c.rays_per_member, True, generator).to(self.device)
             background = torch.tensor([scene.frame.background], device=self.device)
-            evidence.append(Evidence(batch, self._cells_of_member(number, scene), background))
+            if number not in self._cells:
+                self._cells[number] = self._cells_of(scene)
+            evidence.append(Evidence(batch, self._cells[number], background))
         rays, picture = patch(photographs[0], scene.frame, generator)  # the last one's
         return InstanceLesson(members, evidence, rays.to(self.device), picture.to(self.device))
-
-    def _cells_of_member(self, number: int, scene: Scene) -> OccupancyGrid:
-        if number not in self._cells:
-            self._cells[number] = self._cells_of(scene)
-        return self._cells[number]
 
     def _cells_of(self, scene: Scene) -> OccupancyGrid:
         """The cells of a scene that no photograph proves empty. Raises LumigraphError for scenes without bounds."""
@@ -304,14 +300,14 @@ class HypNeRF(RayMethod):
 
     def _filled(self, instance: HashInstance) -> OccupancyGrid:
         """The cells where a field holds something."""
-        cells, generator = OccupancyGrid(1.0, self.config.occupancy_resolution).to(self.device), self.random(0)
+        c, generator = self.config, self.random(0)
+        cells = OccupancyGrid(1.0, c.occupancy_resolution).to(self.device)
+
+        def density(points: Points) -> Densities:
+            return instance.density(points) * self._inside(points)
+
         for _ in range(GRID_UPDATES):
-            cells.update(
-                lambda points: instance.density(points) * self._inside(points),
-                self.config.occupancy_threshold,
-                generator,
-                decay=1.0,
-            )
+            cells.update(density, c.occupancy_threshold, generator, decay=1.0)
         return cells
 
     def _told(self) -> HashInstance:

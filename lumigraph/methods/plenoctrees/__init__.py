@@ -13,7 +13,7 @@ from torch import Tensor
 from ...camera import Camera
 from ...camera.rays import Rays, Rendering
 from ...components.fields.hash_field import CPU_LEVELS, TINY_LEVELS, TableNumbers
-from ...components.fields.teacher import logit, teacher_of
+from ...components.fields.teacher import density_of, logit, teacher_of
 from ...components.sampling.occupancy_sampler import NGP_SCHEDULE, OccupancyNumbers, OccupancySampler, StepNumbers
 from ...components.sampling.spaces import Box
 from ...components.training.photometric import backdrop, residuals
@@ -40,7 +40,7 @@ from ...files.ranges import (
 from ...method import Field, FieldMethod, Sampler
 from ...method.capabilities import HasField, HasLooks, can
 from ...volume import composite, weights_of
-from .baking import Baking, averaged_harmonics, bake, density_of, fill, met
+from .baking import Baking, averaged_harmonics, bake, fill, met
 from .harmonic_field import HarmonicHash, HarmonicNetwork, Teacher
 from .leaves import LeafSampler, Leaves, ask_for_octree
 

@@ -19,7 +19,6 @@ from ...camera import Camera
 from ...camera.rays import Rays
 from ...errors import LumigraphError
 from ...kernels import composite
-from ...method.capabilities import HasDensity, can
 from ...system.memory import free_on, gigabytes
 from ...volume import weights_of
 from .leaves import Leaves, codes_of
@@ -74,13 +73,6 @@ def bake(
     leaves.keep(seen(leaves, cameras, numbers, generator))
     if not len(leaves):
         raise LumigraphError("No camera sees anything dense in this field, so no octree can be made; train it longer")
-
-
-def density_of(teacher: Any) -> Density:
-    """Density at points, of whatever has `field`."""
-    if can(teacher, HasDensity):
-        return teacher.density
-    return lambda points: teacher.field(points, torch.nn.functional.normalize(points + 1e-6, dim=-1))[0]
 
 
 def random_rays(cameras: Camera, count: int, generator: torch.Generator) -> Rays:

@@ -18,6 +18,7 @@ from ...kernels.octree_cells import Crossed, Tree, code_of, levels_of
 from ...kernels.octree_cells.reference import leaves
 from ...method import Pass, Sampler
 from ...method.field import Densities, Points
+from ...method.sampler import RayCodes
 from ...system.memory import free_on, gigabytes
 from .harmonic_field import SphericalHarmonicsField
 
@@ -245,11 +246,7 @@ class LeafSampler(Sampler):
         self.batch_size = self.expected_rays = rays_per_step
 
     def sample(  # type: ignore[override]
-        self,
-        rays: Rays,
-        field: Leaves,
-        code: Float[Tensor, "ray code"] | None = None,
-        generator: torch.Generator | None = None,
+        self, rays: Rays, field: Leaves, code: RayCodes | None = None, generator: torch.Generator | None = None
     ) -> list[Pass]:
         found = field.crossed(rays, self.near, self.stop)
         density = field.densities[found.rows, 0].relu()

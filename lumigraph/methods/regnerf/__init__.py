@@ -14,12 +14,11 @@ import torch
 from torch import Tensor
 
 from ...camera.rays import Look, Rays, Rendering
-from ...components.fields.coordinate_field import NetworkNumbers
-from ...components.fields.frustum_field import FrustumField
+from ...components.fields.coordinate_field import FrustumField, NetworkNumbers
 from ...components.fields.hash_field import HashField, HashNumbers
 from ...components.sampling.cone_sampler import ConeSampler
 from ...components.sampling.hierarchical_sampler import CPU_NETWORK, TINY_NETWORK, RayNumbers
-from ...components.sampling.occupancy_mask import MaskNumbers
+from ...components.sampling.occupancy import MaskNumbers
 from ...components.sampling.occupancy_sampler import MIN_RESOLUTION, OccupancyNumbers, StepNumbers
 from ...components.sampling.samplers import CPU_HASH, ProposalNumbers, sampler_for, sampling_bytes
 from ...components.sampling.spaces import space_of

@@ -322,10 +322,9 @@ class SNeRG(FieldMethod):
 
     def learning_rate(self, step: int, progress: float) -> dict[str, float]:
         c, spent = self.config, self._spent(progress)
+        over = min(1.0, progress / c.deferred_share)
         return {
-            "field": held(
-                c.learning_rate, c.final_learning_rate, step, min(1.0, progress / c.deferred_share), c.decay_start
-            ),
+            "field": held(c.learning_rate, c.final_learning_rate, step, over, c.decay_start),
             "view": falling(c.view_learning_rate, 0.1 * c.view_learning_rate, spent),
             "voxels": falling(c.voxel_learning_rate, 0.1 * c.voxel_learning_rate, spent / max(self._voxel_share, 1e-9)),
         }
