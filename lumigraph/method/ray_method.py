@@ -59,7 +59,7 @@ class RayMethod(Method):
         return terms
 
     def render_rays(self, rays: Rays, background: Float[Tensor, "#ray 3"]) -> Rendering:
-        """What each ray sees, in front of a background colour: the last look at it, composited."""
+        """Rendering of each ray before a background colour: the last look, composited."""
         look = needs(self, HasLooks).looks(rays)[-1]
         return composite(look.samples, look.density, look.rgb, background)
 

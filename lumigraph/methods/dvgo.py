@@ -230,7 +230,7 @@ class DVGO(FieldMethod):
         return {name: share * rate for name, rate in {**rates, "network": c.network_learning_rate}.items()}
 
     def begin(self, data: Scene, seconds: float = math.inf) -> None:
-        """What no learning is needed for: the silhouettes' hull, and how many photographs see each voxel."""
+        """Initialise with the silhouettes' hull and the number of photographs that see each voxel."""
         super().begin(data, seconds)
         if self._adam is not None:
             rates = self._view_share(data)
@@ -286,8 +286,8 @@ class DVGO(FieldMethod):
 
     @torch.no_grad()
     def _view_share(self, scene: Scene) -> Float[Tensor, " corner"]:
-        """How many photographs see each corner, as a share of the most: by it the coarse stage learns, so that what one
-        camera alone has before its lens does not grow dense first (section 4.1)."""
+        """Photographs that see each corner, as a share of the most: rates of the coarse stage, so that space before one
+        camera alone does not grow dense first (section 4.1)."""
         n = VIEW_CELLS
         counts = torch.zeros(n**3, device=self.device)
         box = self.network.density_grid.box
@@ -343,7 +343,7 @@ class DVGO(FieldMethod):
         self.sampler.settle(self.density, self.random(~0))
 
     def importance(self, camera: Camera) -> dict[str, Float[Tensor, " row"]]:
-        """How much each corner adds to one picture; see `components.sampling.importance`."""
+        """Share of each corner in one picture; see `components.sampling.importance`."""
 
         def lookup(points: Float[Tensor, "sample 3"]) -> Float[Tensor, "sample 1"]:
             return self.network.density_grid(self.network.space.warp(points))

@@ -74,7 +74,7 @@ class FourierFeatures(RayMethod):
         return Rendering(rgb, t.where(hit, math.inf), hit.float())
 
     def meet(self, rays: Rays) -> tuple[Float[Tensor, " ray"], Float[Tensor, "ray 2"], Bool[Tensor, " ray"]]:
-        """Where rays meet the wall: how far away, at which place, and whether within the scene's bounds at all."""
+        """Intersections of rays with the wall: distance, place, and a mask of those within the scene's bounds."""
         t = -rays.origins[:, 1] / rays.directions[:, 1]
         x, _, z = rays.at(t).unbind(1)
         (left, _, bottom), (right, _, top) = self.frame.bounds

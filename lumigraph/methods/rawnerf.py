@@ -156,8 +156,7 @@ class RawNeRF(FieldMethod):
         self.brightness.copy_(self.brightness_of(scene, light[measured[:, 1] & (taken == 1), 1]))
 
     def brightness_of(self, scene: Scene, green: Float[Tensor, " pixel"]) -> Float[Tensor, ""]:
-        """What linear light is multiplied by when it is developed: as the photographs were, else so that little of it
-        is beyond white.
+        """Factor on linear light in development: that of the photographs, else one that leaves little beyond white.
 
         green: light of some pixels in the longest exposure
         """
@@ -259,7 +258,7 @@ class RawNeRF(FieldMethod):
         return Rendering.cat([self.light(rays[part]) for part in parts])
 
     def distance_ahead(self, camera: Camera) -> float:
-        """How far away along the optical axis that is what the middle of a camera's picture shows."""
+        """Distance along the optical axis of the surface in the middle of a camera's picture."""
         depth = float(self.light(camera.rays(camera.size[:1] / 2).to(self.device)).depth[0])
         return depth if math.isfinite(depth) else self.frame.reach
 
@@ -284,7 +283,7 @@ class RawNeRF(FieldMethod):
 
 
 def layers_of(scene: Scene) -> tuple[str, ...]:
-    """What of a scene tells light best: mosaics, linear photographs, else pictures alone."""
+    """Names of the layers with a scene's light: mosaics, else linear photographs, else none."""
     if "mosaic" in scene.layers:
         return "mosaic", "filter"
     return ("raw",) if "raw" in scene.layers else ()

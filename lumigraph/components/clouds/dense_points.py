@@ -88,7 +88,7 @@ def around(view: FlatView, known: Float[Tensor, "point 3"]) -> tuple[float, floa
 
 
 def swept(views: Sequence[FlatView], ranges: Sequence[tuple[float, float]], what: str, seconds: float) -> Points:
-    """What the views find, where their neighbours agree: all views, or as many as can be swept in so many seconds."""
+    """Points of the views where their neighbours agree; of as many views as can be swept in so many seconds."""
     if seconds < math.inf:
         some = evenly(list(range(len(views))), affordable(views, ranges, seconds))
         views, ranges = [views[i] for i in some], [ranges[i] for i in some]
@@ -114,7 +114,7 @@ def swept(views: Sequence[FlatView], ranges: Sequence[tuple[float, float]], what
 
 
 def affordable(views: Sequence[FlatView], ranges: Sequence[tuple[float, float]], seconds: float) -> int:
-    """How many views can be swept in so many seconds, as one of them tells."""
+    """Number of views that can be swept in so many seconds, by the time of one."""
     begin, middle = time.perf_counter(), len(views) // 2
     positions = torch.stack([view.pose[:, 3] for view in views])
     sweep(views[middle], [views[j] for j in best_neighbours(middle, views, positions, ranges[middle])], ranges[middle])

@@ -52,7 +52,7 @@ class FlatView:
         return homogeneous[:, :2] / depth.clamp_min(1e-9)[:, None], depth
 
     def sees(self, points: Float[Tensor, "point 3"]) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Of points before the picture: whether they are, their row, their column, how far along the axis they lie."""
+        """Mask of points inside the picture, their row, their column, their distance along the axis."""
         pixels, depth = self.project(points)
         column, row = pixels.clamp(-1, 1e6).floor().long().unbind(-1)
         height, width = self.trust.shape

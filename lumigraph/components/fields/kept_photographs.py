@@ -25,7 +25,7 @@ WHERE = "what a checkpoint says of its photographs"
 
 @dataclass(frozen=True)
 class Taken:
-    """Where photographs were taken from, a row for each. lens: see `Lens.to_json`."""
+    """Cameras of photographs, a row for each. lens: see `Lens.to_json`."""
 
     pose: list[tuple[Row, Row, Row]]
     lens: dict[str, Any]
@@ -70,7 +70,7 @@ class KeptPhotographs(nn.Module):
         return kept
 
     def cameras(self) -> Camera:
-        """Where they were taken from, on the CPU. Raises LumigraphError for what are no cameras."""
+        """Cameras of the photographs, on the CPU. Raises LumigraphError for a damaged description."""
         said = typed(Taken, from_json(self.taken.rows.cpu().numpy().tobytes(), WHERE), WHERE)
         lens, pose, size = Lens.from_json(said.lens, WHERE), torch.tensor(said.pose), torch.tensor(said.size)
         if not len(lens) == len(pose) == len(size) or 3 * int(size.prod(-1).sum()) != len(self.pixels.rows):

@@ -1,4 +1,4 @@
-"""What a method takes over from another one: density and colour at points, as far as cameras see them.
+"""Teachers: density and colour of another method at points, as far as cameras see them, and distillation from these.
 
 A teacher that has a `field` is asked for it. One without, such as a cloud of Gaussians, is rendered into depth maps,
 which are fused into a shell of density around its surfaces (Curless and Levoy 1996). Of either nothing is taken where
@@ -115,8 +115,8 @@ class Teacher(ABC):
     def occupied(
         self, space: Space, cells: int, thickness: float, chance: torch.Generator
     ) -> Bool[Tensor, "cell cell cell"]:
-        """Which cells of a space's [-1, 1]^3, so many along each axis, hold something, or are beside one that does:
-        looked at coarsely first, then half as large, and so on.
+        """Mask of the cells of a space's [-1, 1]^3, so many along each axis, that hold something or are beside one
+        that does: from coarse to fine.
 
         thickness: optical thickness across a cell from which on there is something in it
         """
@@ -211,7 +211,7 @@ def density_of(teacher: Any) -> Callable[[Points], Densities]:
 
 
 def logit(rgb: Float[Tensor, "point 3"]) -> Float[Tensor, "point 3"]:
-    """What a sigmoid makes these colours of, kept from black and white, which it never reaches."""
+    """Logit of colours, clamped off black and white."""
     return rgb.clamp(0.01, 0.99).logit()
 
 

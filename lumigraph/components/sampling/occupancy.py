@@ -52,7 +52,7 @@ def visual_hull(scene: Scene, resolution: int, coarsest: int = 32) -> Bool[Tenso
 def _seen_through(
     camera: Camera, alpha: Float[Tensor, "height width"], centres: Float[Tensor, "cell 3"], radius: float
 ) -> Bool[Tensor, " cell"]:
-    """Whether all pixels around each ball's projection are transparent. Balls outside the picture are not known."""
+    """Mask of balls around whose projection all pixels are transparent; False for balls outside the picture."""
     if not len(centres):
         return torch.zeros(0, dtype=torch.bool)
     height, width = alpha.shape
@@ -98,7 +98,7 @@ class OccupancyGrid(nn.Module):
 
     @classmethod
     def bytes_of(cls, reach: float, resolution: int) -> int:
-        """What a grid takes once it is refined to a resolution: a density and two marks for each cell."""
+        """Bytes of a grid refined to a resolution: a density and two marks for each cell."""
         return cls.cascades_of(reach) * resolution**3 * (4 + 1 + 1)
 
     @property

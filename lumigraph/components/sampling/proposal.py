@@ -26,7 +26,7 @@ SPARE = 0.01  # share of samples that lie anywhere, however little was found the
 
 @dataclass(frozen=True)
 class Proposed:
-    """What a grid proposes for a batch of rays.
+    """Proposals for a batch of rays.
 
     samples: intervals to ask a field about, as many on each ray
     edges:   where they begin and end, as shares of the way from near to far

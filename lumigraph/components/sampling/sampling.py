@@ -1,4 +1,4 @@
-"""Where along a ray to sample: evenly at first, then where the first samples found something."""
+"""Places of samples along a ray: stratified, and by inverse transform of the weights of earlier ones."""
 
 from __future__ import annotations
 

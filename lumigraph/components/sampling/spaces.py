@@ -49,7 +49,7 @@ class Space(ABC):
 
     @abstractmethod
     def interval(self, rays: Rays) -> tuple[Float[Tensor, " ray"], Float[Tensor, " ray"]]:
-        """Where each ray's samples begin and end, in scene units: finite, and equal for rays that see nothing."""
+        """Near and far end of each ray's samples, in scene units: finite, and equal for rays that see nothing."""
 
     @abstractmethod
     def distance(
@@ -271,5 +271,5 @@ def fits_kernels(points: Tensor) -> bool:
 
 
 def even_in_inverse(share: Tensor, first: Tensor, last: Tensor) -> Tensor:
-    """How much of the way from first to last lies behind x, once 1 / x has gone a share of its own way."""
+    """Share of the way from first to last at x, where 1 / x has gone a share of its own way."""
     return share * first / (share * first + (1 - share) * last)

@@ -57,7 +57,7 @@ def agreeing(
     m: Int[Tensor, "match 2"],
     gate: float,
 ) -> Tensor:
-    """Which matches of two views lie near their epipolar lines, as poses have these."""
+    """Mask of the matches of two views that lie near their epipolar lines."""
     i, j = pair
     a = seen[i].bearings[m[:, 0]].double() @ pose[i, :, :3].T
     b = seen[j].bearings[m[:, 1]].double() @ pose[j, :, :3].T

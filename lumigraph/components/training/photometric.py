@@ -217,7 +217,7 @@ def backdrop(
 def residuals(
     rendering: Rendering, batch: Batch, background: Float[Tensor, "#ray 3"], exposure: Exposure | None = None
 ) -> tuple[Float[Tensor, "row 3"], float]:
-    """What a rendering before a background has too much of each colour, and the mean square of that.
+    """Differences of a rendering before a background from photographs, and their mean square.
 
     Where photographs have alpha, as many rows again say the same before the opposite colours, 1 - background, where
     only what opacity lacks looks different; they are not in the mean.

@@ -126,7 +126,7 @@ class PoseRefinement(Part):
         return replace(cameras, pose=torch.stack([*axes, cameras.position + shift], -1))
 
     def weights(self, bands: int) -> Float[Tensor, " band"] | None:
-        """Of an encoding's bands at this share of the budget; None once all count fully."""
+        """Weights of an encoding's bands at this share of the budget; None once all count fully."""
         progress = float(self.progress)
         return None if progress >= ENDS else band_weights(bands, progress).to(self.twist)
 

@@ -21,7 +21,7 @@ def normalized_distance(t: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
 
 
 def distortion_loss(samples: Samples, weights: Float[Tensor, " sample"]) -> Float[Tensor, ""]:
-    """How far apart along its ray the weight of what a ray sees lies, mean of all rays (Barron 2022, eq. 15)."""
+    """Spread of weights along each ray, mean of all rays (Barron 2022, eq. 15)."""
     start, end = normalized_distance(samples.t_start), normalized_distance(samples.t_end)
     return distortion(weights, 0.5 * (start + end), end - start, samples.ray_starts).mean()
 

@@ -77,7 +77,7 @@ class Exposures(Part):
         return float(self.usual) if self.known.any() else None
 
     def stops_of(self, image: int) -> float | None:
-        """Of one photograph, from the usual; None where it is not known."""
+        """Stops of one photograph from the usual exposure; None where it is not known."""
         return float(self.stops[image]) if self.known[image] else None
 
     # Settings

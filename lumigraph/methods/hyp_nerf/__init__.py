@@ -76,7 +76,7 @@ class Config:
 
 @dataclass(frozen=True)
 class Evidence:
-    """What is known of one scene: some rays, cells that may hold something, and the colour behind it."""
+    """Observations of one scene: some rays, cells that may hold something, and the colour behind it."""
 
     rays: Batch
     cells: OccupancyGrid
@@ -99,7 +99,7 @@ class InstanceLesson:
 
 
 class TensorChanges(torch.nn.Module):
-    """What was added to the tensors of an instance by tuning: a row of each, or none."""
+    """Changes of an instance's tensors by tuning: a row of each, or none."""
 
     def __init__(self, rows: Iterable[Float[Tensor, "_ _ _"]]):
         super().__init__()
@@ -235,7 +235,7 @@ class HypNeRF(RayMethod):
         return terms
 
     def _errors(self, instance: HashInstance, evidence: Evidence, generator: torch.Generator) -> dict[str, Tensor]:
-        """Of colours, before random backgrounds where photographs have alpha, and of density where nothing is."""
+        """Errors of colours, before random backgrounds where photographs have alpha, and of density in empty space."""
         batch, cells = evidence.rays, evidence.cells
         jitter = torch.rand(len(batch), generator=generator).to(self.device)
         background = backdrop(batch, evidence.background, generator)
@@ -250,7 +250,7 @@ class HypNeRF(RayMethod):
         return terms
 
     def _denoiser_error(self, batch: InstanceLesson, instance: HashInstance) -> Tensor:
-        """Of a denoised rendering, beside the photograph."""
+        """Squared error of a denoised rendering against the photograph."""
         last = batch.evidence[-1]
         with torch.no_grad():
             seen = self._seen(instance, last.cells, batch.rays, last.background).rgb
@@ -264,7 +264,7 @@ class HypNeRF(RayMethod):
         background: Float[Tensor, "#ray 3"],
         jitter: Float[Tensor, " ray"] | None = None,
     ) -> Rendering:
-        """What rays see of an instance, of all samples in cells: few lie far behind what is seen."""
+        """Rendering of an instance from all samples in cells: few lie far behind visible surfaces."""
         samples = cells.sample(rays, self.frame.near, self.step_length, jitter=jitter)
         density, rgb = instance(*samples.along(rays))
         self.figures |= {"rays": len(rays), "samples": len(samples)}
@@ -467,7 +467,7 @@ def untuned(shape: HashShape) -> TensorChanges:
 
 
 def held(cells: OccupancyGrid, points: Float[Tensor, "point 3"]) -> Bool[Tensor, " point"]:
-    """Whether points of [-1, 1]^3 lie in cells that may hold something."""
+    """Mask of the points of [-1, 1]^3 in cells that may hold something."""
     x, y, z = ((points + 1) * (cells.resolution / 2)).long().clamp(0, cells.resolution - 1).unbind(-1)
     return cells.occupied[0, x, y, z]
 

@@ -81,7 +81,7 @@ class HashShape:
 
     @property
     def of_colour(self) -> list[bool]:
-        """Which tensors are the colour network's."""
+        """True for the tensors of the colour network."""
         return [i >= len(self.density) for i in range(len(self.tensors))]
 
 
@@ -106,8 +106,8 @@ class HashInstance(Field):
 
 
 class PictureDenoiser(nn.Module):
-    """What is to be added to a picture, from a neighbourhood of about 30 pixels: convolutions at full resolution around
-    others at half of it, which see farther.
+    """A correction of a picture, from a neighbourhood of about 30 pixels: convolutions at full resolution around others
+    at half of it, with a larger receptive field.
 
     width: channels
     """
@@ -163,7 +163,7 @@ class InstanceCodes(nn.Module):
 
     @property
     def names(self) -> tuple[str, ...]:
-        """What they are called: their numbers."""
+        """Numbers of the members whose codes were learnt, as text."""
         return tuple(str(number) for number in self.learnt.nonzero()[:, 0].tolist())
 
     @property
@@ -179,7 +179,7 @@ class InstanceCodes(nn.Module):
         return axes_of(self.rows.detach()[self.learnt])
 
     def along(self, code: Float[Tensor, " code"]) -> Float[Tensor, " axis"]:
-        """Where a code is along the axes, in deviations from the average."""
+        """Coordinates of a code along the axes, in deviations from the average."""
         axes = self.axes
         return (code - self.average) @ axes.T / axes.square().sum(-1)
 

@@ -108,7 +108,7 @@ class Sources:
 
 @dataclass(frozen=True)
 class SourceLesson:
-    """Of several scenes, in order: the photographs that are looked at, and rays through others."""
+    """Source photographs of several scenes, in order, and rays through others."""
 
     unit: ClassVar[str] = "rays"
 
@@ -239,7 +239,7 @@ class PixelNeRF(RayMethod):
         return told
 
     def evidence_bytes(self, scene: Scene) -> int:
-        """What is kept and found of its photographs."""
+        """Bytes of the photographs and their features."""
         sizes = scene.cameras.size[scene.splits["train"]]
         cells = len(sizes) * int(torch.ceil(sizes.amax(0) / STRIDE).prod())
         numbers = self.encoder.width * 4 + len(self.networks) * self.config.view_blocks * self.config.hidden_width
@@ -253,7 +253,7 @@ class PixelNeRF(RayMethod):
 
     @property
     def sources(self) -> Sources:
-        """What it looks at. Raises LumigraphError where nothing was given."""
+        """Source photographs as features. Raises LumigraphError without any."""
         if self._sources is None:
             if not self.kept:
                 raise LumigraphError("pixelnerf shows what it was given photographs of, and it was given none")
@@ -269,7 +269,7 @@ class PixelNeRF(RayMethod):
         return self._sources
 
     def _seen(self, lesson: SourceLesson) -> list[Sources]:
-        """What the encoder finds in the photographs of each scene, of all at once."""
+        """Features of the photographs of each scene, encoded all at once."""
         both = zip(lesson.sources, lesson.frames, strict=True)
         pictures = [photograph.before(frame.background) for photographs, frame in both for photograph in photographs]
         cameras = [Camera.cat([photograph.camera for photograph in photographs]) for photographs in lesson.sources]
@@ -324,7 +324,7 @@ class PixelNeRF(RayMethod):
     def _again(
         self, shares: Float[Tensor, "ray sample"], weights: Float[Tensor, "ray sample"], generator: Any
     ) -> Float[Tensor, "ray again"]:
-        """Where to look again: by the weights found, and around the depth found."""
+        """Places of the fine samples: by the coarse weights, and around the coarse depth."""
         c, count, device = self.config, len(shares), self.device
         evenly = stratified(count, c.fine_samples, generator, device)
         places = [inverse_transform(midpoints(shares), weights[:, 1:-1], evenly)]

@@ -205,7 +205,7 @@ class ResidualNetwork(nn.Module):
             nn.init.kaiming_normal_(layer.weight)
 
     def prepared(self, features: Float[Tensor, "view row column feature"]) -> Float[Tensor, "view row column joins"]:
-        """What each cell's features add to the inputs of the first blocks, end to end."""
+        """Additions of each cell's features to the inputs of the first blocks, end to end."""
         return self.join(features.flatten(0, 2)).float().unflatten(0, features.shape[:3])
 
     def forward(

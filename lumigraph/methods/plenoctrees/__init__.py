@@ -170,7 +170,7 @@ class PlenOctrees(FieldMethod):
 
     @torch.no_grad()
     def importance(self, camera: Camera) -> dict[str, Float[Tensor, " row"]]:
-        """How much each leaf adds to one picture. Raises LumigraphError while there is no octree."""
+        """Share of each leaf in one picture. Raises LumigraphError while there is no octree."""
         leaves, rays = self._leaves(), camera.rays(camera.pixels()).to(self.device)
         total = torch.zeros(len(leaves), device=self.device)
         for i in range(0, len(rays), self.rays_per_chunk):
@@ -232,13 +232,13 @@ class PlenOctrees(FieldMethod):
         self._leave_field()
 
     def load_state_dict(self, state_dict: Mapping[str, Any], strict: bool = True, assign: bool = False) -> Any:
-        """As of any module; where what was saved is baked, there is no field any more."""
+        """Load as any module does; without a field where a baked octree was saved."""
         if not any(name.startswith("teacher.") for name in state_dict):
             self._leave_field()
         return super().load_state_dict(state_dict, strict, assign)
 
     def _bake(self, cameras: Camera) -> None:
-        """What was learnt becomes leaves, and is dropped."""
+        """Bake the field into leaves, and drop it."""
         assert self.teacher is not None
         chance, numbers = self.random(-1), self._baking
         mask = met(self, cameras, numbers, chance)

@@ -77,7 +77,7 @@ class Leaves(SphericalHarmonicsField):
     def seen(
         self, rays: Rays, near: float, stop: float, background: Float[Tensor, "#ray 3"], part: Subtree | None = None
     ) -> Rendering:
-        """What rays see before a background colour. part: the rows through which gradients go; all by default"""
+        """Rendering of rays before a background colour. part: the rows through which gradients go; all by default"""
         tree, density, harmonics = part or (self.tree, self.densities, self.harmonics)
         thickness = density[:, 0].relu() * float(self.size)
         tables = thickness, harmonics.view(-1, self.basis, 3)

@@ -190,7 +190,7 @@ class Plenoxels(FieldMethod):
     # Compression
 
     def importance(self, camera: Camera) -> dict[str, Float[Tensor, " row"]]:
-        """How much each voxel adds to one picture; see `components.sampling.importance`."""
+        """Share of each voxel in one picture; see `components.sampling.importance`."""
 
         def lookup(points: Float[Tensor, "sample 3"]) -> Float[Tensor, "sample 1"]:
             return self.voxels.density_at(self.network.space.warp(points))[:, None]

@@ -54,14 +54,14 @@ class SparseVoxels(nn.Module):
 
     @staticmethod
     def bytes_of(cells: Cells, learning: bool) -> int:
-        """What a grid takes at least: its index, and the values of as many nodes as are left of most scenes; where it
+        """Bytes of a grid at least: its index, and the values of as many nodes as are left of most scenes; where it
         learns, as much again for their mean squares."""
         nodes = (cells[0] + 1) * (cells[1] + 1) * (cells[2] + 1)
         return 4 * nodes + int(SHARE * nodes) * 4 * (1 + 3 * COEFFICIENTS) * (2 if learning else 1)
 
     @property
     def nodes(self) -> Nodes:
-        """Which row each node has. Made when first asked for, and again where the numbers were loaded or moved."""
+        """Row of each node; made on first use, and again where the numbers were loaded or moved."""
         made = self._made
         if made is None or made[0] is not self.numbers or made[1] != self.numbers._version:
             x, y, z = (self.cells + 1).tolist()

@@ -197,7 +197,7 @@ class RegNeRF(FieldMethod):
         return terms
 
     def _unlike(self, seen: Rendering) -> dict[str, Tensor]:
-        """What patches that nobody photographed cost: how rough their depth is, how unlikely their colours are."""
+        """Loss terms of unobserved patches: roughness of their depth, negative log likelihood of their colours."""
         c, shape, terms = self.config, (-1, SIDE, SIDE), {}
         opacity = seen.opacity.view(shape)
         place = (seen.extra["places"][:, 0] / seen.opacity.clamp_min(1e-3)).view(shape)
@@ -211,7 +211,7 @@ class RegNeRF(FieldMethod):
         return terms
 
     def _before_cameras(self, rays: Rays, look: Look) -> Tensor:
-        """How thick what stands in the first share of each ray is, mean of all rays."""
+        """Optical thickness of the first share of each ray, mean of all rays."""
         space = self.network.space
         share = torch.full((len(rays), 1), self.config.occlusion_range, device=rays.origins.device)
         until = space.distance(share, rays, *space.interval(rays))[:, 0]
@@ -245,6 +245,6 @@ def joined(first: Rays, second: Rays) -> Rays:
 
 
 def part(whole: Rendering, rays: slice) -> Rendering:
-    """What some of the rays saw."""
+    """Rendering of some of the rays."""
     extra = {name: values[rays] for name, values in whole.extra.items()}
     return Rendering(whole.rgb[rays], whole.depth[rays], whole.opacity[rays], extra)

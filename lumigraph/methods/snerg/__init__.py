@@ -186,12 +186,12 @@ class SNeRG(FieldMethod):
 
     @property
     def _bounded(self) -> bool:
-        """Whether voxels hold only a part of what there is."""
+        """True if voxels hold the box of interest of an open capture alone."""
         return self.sampler.is_open and self.voxels.space is None
 
     @property
     def _values(self) -> Float[Tensor, "voxel 8"]:
-        """Of voxels: as they are learnt, or as eight bits tell them."""
+        """Values of voxels: as they are learnt, or of eight bits."""
         return self.tuned.values if self.stage == VOXELS else self.voxels.values
 
     def _marched(self, rays: Rays) -> RaySum:
@@ -331,7 +331,7 @@ class SNeRG(FieldMethod):
 
     @property
     def _voxel_share(self) -> float:
-        """Of the budget after baking, in which voxels learn."""
+        """Share of the budget after baking in which voxels learn."""
         return max(self.config.voxel_share, TAUGHT_VOXEL_SHARE) if self.of_another else self.config.voxel_share
 
     def _spent(self, progress: float) -> float:

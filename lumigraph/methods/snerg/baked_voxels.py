@@ -74,7 +74,7 @@ class BakedVoxels(nn.Module):
 
     @property
     def values(self) -> Float[Tensor, "voxel 8"]:
-        """What eight bits tell."""
+        """Values of eight bits."""
         return self._known[1]
 
     @property
@@ -96,13 +96,13 @@ class BakedVoxels(nn.Module):
     def march(
         self, rays: Rays, values: Float[Tensor, "voxel 8"], near: float, stop: float
     ) -> tuple[Float[Tensor, "ray 8"], Float[Tensor, " ray"]]:
-        """What lies along rays, one voxel a step, accumulated front to back; and opacity times distance, in scene
+        """Values along rays, one voxel a step, accumulated front to back; and opacity times distance, in scene
         units. near, stop: as of `kernels.block_march`, near in scene units"""
         totals, distance = kernels.block_march(*self._along(rays, near), self.blocks, values, stop)
         return totals, distance * self.edge
 
     def at(self, points: Float[Tensor, "point 3"], values: Float[Tensor, "voxel 8"]) -> Float[Tensor, "point 8"]:
-        """What is blended at points of the scene; nothing beyond the grid. A march of one step finds it."""
+        """Interpolated values at points of the scene, by a march of one step; zero beyond the grid."""
         zeros = points.new_zeros(len(points))
         ahead = points.new_tensor([0.0, 0.0, 1.0]).expand(len(points), 3)
         return kernels.block_march(self._in_voxels(points), ahead, zeros, zeros + 0.5, self.blocks, values)[0]
@@ -136,7 +136,7 @@ class BakedVoxels(nn.Module):
         return samples, torch.cat(found) if found else values[:0]
 
     def length(self, points: Float[Tensor, "point 3"], edge: Tensor | float) -> Float[Tensor, " point"]:
-        """Of a voxel with such an edge, where it lies in the scene, in scene units; along the way out."""
+        """Length along the way out of a voxel with such an edge, in scene units."""
         radius = points.norm(dim=-1) if self.space else points.new_zeros(len(points))
         return edge * radius.clamp_min(1).square()
 

@@ -215,7 +215,7 @@ class TensoRF(FieldMethod):
 
     @classmethod
     def further_bytes(cls, frame: Frame, config: Any, learning: bool) -> int:
-        """What the factors grow by, and what a step keeps of its samples."""
+        """Growth of the factors, and the samples that a step keeps."""
         box = torch.tensor(((-1.0,) * 3, (1.0,) * 3) if frame.is_open else frame.bounds, device="cpu")
         resolutions = config.initial_resolution, config.finest(frame.is_open)
         first, last = (Factors(config.factors, nodes_in(box, n)).rows for n in resolutions)
@@ -225,7 +225,7 @@ class TensoRF(FieldMethod):
         return super().further_bytes(frame, config, learning) + grown + step * learning
 
     def begin(self, data: Scene, seconds: float = math.inf) -> None:
-        """Where photographs say what is transparent, the grid's box is that of the visual hull from the beginning."""
+        """Shrink the grid's box to the visual hull of photographs with alpha."""
         super().begin(data, seconds)
         if not self.sampler.is_open and data.images.has_alpha:
             self._shrink()
@@ -289,7 +289,7 @@ class TensoRF(FieldMethod):
         self.sampler.settle(self.density, chance)
 
     def importance(self, camera: Camera) -> dict[str, Float[Tensor, " row"]]:
-        """How much each node of planes and lines adds to one picture, by its share in interpolating there."""
+        """Share of each node of planes and lines in one picture, by its interpolation weights."""
         network, factors = self.network, self.network.density_grid.factors
         ones = torch.ones(factors.rows, 1, device=self.device, requires_grad=True)
 
