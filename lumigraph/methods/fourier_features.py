@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from ..camera.rays import Rays, Rendering
-from ..components.fields.encodings import FourierFeatures as Waves
+from ..components.fields.encodings import FourierEncoding
 from ..components.fields.layers import Dense
 from ..datasets.scene import Batch, Frame, Scene
 from ..files.ranges import BatchSize, Depth, LearningRate, NonNegative, Seed, Width, between
@@ -51,7 +51,7 @@ class FourierFeatures(RayMethod):
         c = config or Config()
         super().__init__(frame, c)
         rows = frequencies(c)
-        self.encoding = nn.Identity() if rows is None else Waves(rows)
+        self.encoding = nn.Identity() if rows is None else FourierEncoding(rows)
         widths = [2 if rows is None else 2 * len(rows), *[c.hidden_width] * (c.layers - 1)]
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(c.seed)

@@ -75,7 +75,7 @@ def weighted(
     return waves if weights is None else waves * weights[:, None, None]
 
 
-class FourierFeatures(nn.Module):
+class FourierEncoding(nn.Module):
     """Waves in the directions and at the frequencies that the rows of B hold (Tancik 2020, section 4).
 
         gamma(p) = (cos(2 pi B p), sin(2 pi B p))

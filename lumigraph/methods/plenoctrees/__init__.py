@@ -41,7 +41,7 @@ from ...method import Field, FieldMethod, Sampler
 from ...method.capabilities import HasField, HasLooks, can
 from ...volume import composite, weights_of
 from .baking import Baking, averaged_harmonics, bake, fill, met
-from .harmonic_field import HarmonicHash, HarmonicNetwork, Teacher
+from .harmonic_field import HarmonicHash, HarmonicNetwork, HarmonicTeacher
 from .leaves import LeafSampler, Leaves, ask_for_octree
 
 DensityRate = Annotated[float, between(1e-6, 1e4)]
@@ -90,7 +90,7 @@ class PlenOctrees(FieldMethod):
     """
 
     Config = Config
-    teacher: Teacher | None
+    teacher: HarmonicTeacher | None
     teacher_sampler: OccupancySampler | None
     begun: Tensor
 

@@ -29,7 +29,7 @@ class SphericalHarmonicsField(Field):
         return (basis[:, :, None] * harmonics).sum(1).sigmoid()
 
 
-class Teacher(SphericalHarmonicsField):
+class HarmonicTeacher(SphericalHarmonicsField):
     """A field that learns from photographs before it is baked. bands: of spherical harmonics"""
 
     @abstractmethod
@@ -37,7 +37,7 @@ class Teacher(SphericalHarmonicsField):
         """Fresh optimizers."""
 
 
-class HarmonicHash(Teacher):
+class HarmonicHash(HarmonicTeacher):
     """A hash table and one tiny network (Müller 2022), over [-1, 1]^3."""
 
     def __init__(self, numbers: TableNumbers, layers: int, width: int, bands: int):
@@ -55,7 +55,7 @@ class HarmonicHash(Teacher):
         return [LazyAdam([self.table], learning_rate), networks]
 
 
-class HarmonicNetwork(Teacher):
+class HarmonicNetwork(HarmonicTeacher):
     """The paper's network: NeRF's layers, which see no direction, then density and harmonics."""
 
     def __init__(self, octaves: int, depth: int, width: int, skip_layer: int, bands: int):

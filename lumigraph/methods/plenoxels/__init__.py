@@ -29,7 +29,7 @@ from ...kernels.harmonic_grid import BANDS
 from ...method import Field, FieldMethod
 from ...method.field import Colours, Densities, Directions, Points
 from ...volume import composite, weights_of
-from .sparse_voxels import Cells, Part, SparseVoxels
+from .sparse_voxels import Cells, SparseVoxels, VoxelRows
 
 Resolution = Annotated[int, between(4, 1024)]
 DensityRate = Annotated[float, between(1e-6, 1e4)]
@@ -111,7 +111,7 @@ class HarmonicField(Field):
         self.config, self.space = config, space
         first, _ = config.resolutions(space.is_open)
         self.voxels = SparseVoxels(cells_of(space, first), config.initial_density)
-        self.touched: tuple[Tensor, Part]
+        self.touched: tuple[Tensor, VoxelRows]
 
     def geometry(self, points: Points, code: Tensor | None = None) -> tuple[Densities, Points]:
         """Density, and as features the points' coordinates."""
@@ -122,7 +122,7 @@ class HarmonicField(Field):
         return self.voxels.at(features, directions)[1].sigmoid()
 
     def forward(self, points: Points, directions: Directions, code: Tensor | None = None) -> tuple[Densities, Colours]:
-        voxels: SparseVoxels | Part = self.voxels
+        voxels: SparseVoxels | VoxelRows = self.voxels
         if torch.is_grad_enabled():
             rows = self.voxels.touched(self.space.warp(points))
             voxels = self.voxels.part(rows)

@@ -82,12 +82,12 @@ class SparseVoxels(nn.Module):
         self, places: Float[Tensor, "sample 3"], directions: Float[Tensor, "sample 3"]
     ) -> tuple[Float[Tensor, " sample"], Float[Tensor, "sample 3"]]:
         """Density and colour at coordinates, before activation."""
-        return Part(self.nodes, self.density, self.harmonics).at(places, directions)
+        return VoxelRows(self.nodes, self.density, self.harmonics).at(places, directions)
 
-    def part(self, rows: Int[Tensor, " some"]) -> Part:
+    def part(self, rows: Int[Tensor, " some"]) -> VoxelRows:
         """A small table of some rows, through which a sparse gradient reaches them: what a step touches."""
         density, harmonics = (embedding(rows, table, sparse=True) for table in (self.density, self.harmonics))
-        return Part(self.nodes.part(rows), density, harmonics)
+        return VoxelRows(self.nodes.part(rows), density, harmonics)
 
     @torch.no_grad()
     def touched(self, places: Float[Tensor, "sample 3"]) -> Int[Tensor, " some"]:
@@ -159,7 +159,7 @@ class SparseVoxels(nn.Module):
         self.weights = torch.zeros(len(numbers), device=numbers.device)
 
 
-class Part:
+class VoxelRows:
     """Some rows of a grid as a table of their own."""
 
     def __init__(self, nodes: Nodes, density: Float[Tensor, "row 1"], harmonics: Float[Tensor, "row 27"]):
