@@ -290,7 +290,7 @@ def layers_of(scene: Scene) -> tuple[str, ...]:
 
 
 GOLDEN_ANGLE = math.pi * (3 - math.sqrt(5))
-NARROWEST = 0.2  # cosine with the axis below which a ray is taken to be no flatter
+MIN_COSINE = 0.2  # cosine with the axis below which a ray is taken to be no flatter
 
 
 def through_lens(camera: Camera, aperture: float, focus: float, count: int) -> Iterator[Rays]:
@@ -304,7 +304,7 @@ def through_lens(camera: Camera, aperture: float, focus: float, count: int) -> I
     pixels = camera.pixels()
     rays = camera.rays(pixels)
     right, down, forward = camera.pose[0, :, :3].unbind(-1)
-    meeting = rays.at(focus / (rays.directions @ forward).clamp_min(NARROWEST))
+    meeting = rays.at(focus / (rays.directions @ forward).clamp_min(MIN_COSINE))
     turn = 2 * math.pi * grain(pixels)
     for k in range(count):
         radius, angle = 0.5 * aperture * math.sqrt((k + 0.5) / count), GOLDEN_ANGLE * k + turn

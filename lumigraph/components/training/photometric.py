@@ -21,11 +21,11 @@ from ...method.controls import Control, Value
 from ..clouds.flat_view import FlatView, flat_view
 from ..fields.appearance import AVERAGE, drawn
 
-LOOKED_AT = 32  # photographs, each beside its neighbour
-LONGEST = 200  # pixels along their longer side
+MAX_PHOTOGRAPHS = 32  # photographs, each beside its neighbour
+MAX_SIDE = 200  # pixels along their longer side
 POINTS = 1 << 14  # places at most
-FEWEST = 30  # places that two photographs must share to be compared
-DARKEST, BRIGHTEST = 0.05, 0.95  # colours between which a ratio says something
+MIN_SHARED = 30  # places that two photographs must share to be compared
+MIN_COLOUR, MAX_COLOUR = 0.05, 0.95  # colours between which a ratio says something
 ENCODED = 2.2  # stops of light to one of sRGB-encoded colours
 
 
@@ -41,8 +41,8 @@ def spread_of_light(scene: Scene) -> float | None:
         return None
     points = scene.points[evenly(range(len(scene.points)), POINTS)]
     beside = neighbours(scene.cameras[train])
-    chosen = evenly(range(len(train)), LOOKED_AT)
-    views = {i: flat_view(scene.photograph(int(train[i])), LONGEST) for i in {*chosen, *beside[chosen].tolist()}}
+    chosen = evenly(range(len(train)), MAX_PHOTOGRAPHS)
+    views = {i: flat_view(scene.photograph(int(train[i])), MAX_SIDE) for i in {*chosen, *beside[chosen].tolist()}}
     ratios = [ratio for i in chosen if (ratio := brighter(points, views[i], views[int(beside[i])])) is not None]
     return float(torch.stack(ratios).square().mean().sqrt()) if ratios else None
 
@@ -78,8 +78,8 @@ def brighter(points: Float[Tensor, "point 3"], one: FlatView, other: FlatView) -
         seen, row, column, _ = view.sees(points)
         rgb = view.rgb[row, column]
         colours.append(rgb)
-        known &= seen & (view.trust[row, column] > 0.5) & (rgb > DARKEST).all(-1) & (rgb < BRIGHTEST).all(-1)
-    if int(known.sum()) < FEWEST:
+        known &= seen & (view.trust[row, column] > 0.5) & (rgb > MIN_COLOUR).all(-1) & (rgb < MAX_COLOUR).all(-1)
+    if int(known.sum()) < MIN_SHARED:
         return None
     return (colours[0][known] / colours[1][known]).log2().median(0).values
 
@@ -196,7 +196,7 @@ class Exposure(Part):
 def gain_between(rgb: Float[Tensor, "pixel 3"], target: Float[Tensor, "pixel 3"]) -> Float[Tensor, " 3"]:
     """Gain that turns colours into a photograph's: the median ratio of each channel, over pixels that are neither too
     dark nor too bright; 1 where there are none."""
-    inside = ((rgb > DARKEST) & (target > DARKEST) & (target < BRIGHTEST)).all(-1)
+    inside = ((rgb > MIN_COLOUR) & (target > MIN_COLOUR) & (target < MAX_COLOUR)).all(-1)
     return (target[inside] / rgb[inside]).median(0).values if inside.any() else torch.ones_like(target[:1].sum(0))
 
 
