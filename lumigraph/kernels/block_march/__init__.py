@@ -8,9 +8,7 @@ import torch
 from jaxtyping import Float, Int, Int32
 from torch import Tensor
 
-from .._dispatch import implementation
-from .._doors import door, require
-from .._facts import Facts
+from .._operation import Facts, door, implementation, require
 
 FACTS = Facts(unit="rays", outputs=2, differentiable=(5,), typical=4, compiled=9, smooth=(2, 3, 7))
 

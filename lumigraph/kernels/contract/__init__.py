@@ -1,14 +1,10 @@
 """Contraction: all of space in a ball of radius 1, as networks and grids of open captures need it."""
 
-from __future__ import annotations
-
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from .._dispatch import implementation
-from .._doors import door
-from .._facts import Facts
+from .._operation import Facts, door, implementation
 
 FACTS = Facts(unit="points", outputs=2, differentiable=(), typical=3, compiled=3)
 

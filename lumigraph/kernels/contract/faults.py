@@ -1,7 +1,4 @@
-"""Faults that the tests write into a copy of an engine, one at a time, to see their comparison turn red.
-
-By name: the engine, the function, what stands there, and what is put in its place.
-"""
+"""Seeded faults by name: engine, function, a piece of it, its replacement. In ASTRAY an index leaves its array."""
 
 FAULTS = {
     "a ball of radius 2": ("cpu", "scale_of", "np.float32(0.5) * (one", "np.float32(1) * (one"),
@@ -12,7 +9,4 @@ FAULTS = {
     "square root for the cube root": ("gpu", "stretch_of", ") / 3)", ") / 2)"),
 }
 
-# These let an index leave its array.
-ASTRAY = {
-    "a fourth axis": ("cpu", "_contract", "range(3)", "range(4)"),
-}
+ASTRAY = {"a fourth axis": ("cpu", "_contract", "range(3)", "range(4)")}

@@ -1,7 +1,5 @@
 """The definition: every lattice interval of every ray, (R, K), then a mask."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

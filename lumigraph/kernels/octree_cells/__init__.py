@@ -9,9 +9,7 @@ from jaxtyping import Float, Int, Int32
 from torch import Tensor
 
 from ...camera.rays import Samples
-from .._dispatch import implementation, using
-from .._doors import door, require
-from .._facts import Facts
+from .._operation import Facts, door, implementation, require, using
 
 FACTS = Facts(unit="rays", outputs=4, differentiable=(), typical=3, compiled=5)
 

@@ -1,7 +1,5 @@
 """The definition: every hypothesis at every pixel, (P, H, W), one neighbour after the other."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, grid_sample

@@ -8,9 +8,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from .._dispatch import implementation
-from .._doors import door, require
-from .._facts import Facts
+from .._operation import Facts, door, implementation, require
 from ..project import MIN_ALPHA
 
 FACTS = Facts(unit="gaussians", outputs=2, differentiable=(), typical=2, compiled=6)

@@ -1,9 +1,18 @@
-"""Rows of three numbers, for the Triton engines."""
-
-from __future__ import annotations
+"""For the Triton engines: launching kernels, and rows of three numbers."""
 
 import triton
 import triton.language as tl
+
+
+def blocks(count: int, block: tl.constexpr) -> int:
+    """Number of blocks that hold `count` things."""
+    return triton.cdiv(count, block.value)
+
+
+def launch(kernel, grid: tuple[int, ...], *arguments, **options) -> None:
+    """Run a kernel on a grid of programs, which may be empty."""
+    if all(grid):
+        kernel[grid](*arguments, **options)
 
 
 @triton.jit
