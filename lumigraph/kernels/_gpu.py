@@ -16,6 +16,13 @@ def launch(kernel, grid: tuple[int, ...], *arguments, **options) -> None:
 
 
 @triton.jit
+def indices(count, BLOCK: tl.constexpr):
+    """Numbers of the things in this program's block, and whether each is below the count."""
+    i = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
+    return i, i < count
+
+
+@triton.jit
 def load_row(array, r, here, first=0.0):
     """Row r of an (_, 3) array; (first, 0, 0) where it is not here."""
     x = tl.load(array + 3 * r, mask=here, other=first)

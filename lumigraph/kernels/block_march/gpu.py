@@ -4,7 +4,7 @@ import torch
 import triton
 import triton.language as tl
 
-from .._gpu import blocks, launch, load_row
+from .._gpu import blocks, indices, launch, load_row
 from .._operation import differentiable, empty
 from ..sparse_grid.gpu import corner_of, weight_of
 from . import ALPHA, CHANNELS
@@ -130,9 +130,8 @@ def _march(
     index, rows = grid
     totals, distance, lengths = out
     starts, steps, lights = noted
-    r = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
+    r, here = indices(R, BLOCK)
     c = tl.arange(0, C)
-    here = r < R
     ox, oy, oz = load_row(origins, r, here)
     dx, dy, dz = load_row(directions, r, here, 1.0)
     t = tl.load(enter + r, mask=here, other=0.0)
@@ -188,9 +187,8 @@ def _backward(grads, rays, grid, values, noted, to_values, R, X, Y, Z, ball, CUR
     origins, directions = rays
     index, rows = grid
     starts, steps, lights = noted
-    r = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
+    r, here = indices(R, BLOCK)
     c = tl.arange(0, C)
-    here = r < R
     ox, oy, oz = load_row(origins, r, here)
     dx, dy, dz = load_row(directions, r, here, 1.0)
     g = tl.load(g_totals + r[:, None] * C + c[None, :], mask=here[:, None], other=0.0)

@@ -5,7 +5,7 @@ FAULTS = {
     "contracted inside the unit ball too": ("cpu", "scale_of", " if radius > one else one", ""),
     "two directions of the Jacobian": ("cpu", "_stretch", "across * across", "across"),
     "radius of a plane": ("gpu", "scale_of", " + z * z", ""),
-    "coordinate of another axis": ("gpu", "_contract", "+ 1, across * y", "+ 1, across * x"),
+    "coordinate of another axis": ("gpu", "_contract", "across * x, across * y", "across * x, across * x"),
     "square root for the cube root": ("gpu", "stretch_of", ") / 3)", ") / 2)"),
 }
 

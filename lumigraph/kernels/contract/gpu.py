@@ -3,7 +3,7 @@
 import triton
 import triton.language as tl
 
-from .._gpu import blocks, launch, load_row, store_row
+from .._gpu import blocks, indices, launch, load_row, store_row
 from .._operation import empty
 
 BLOCK = tl.constexpr(256)
@@ -24,8 +24,7 @@ def stretch_of(inverse, across):
 
 @triton.jit
 def _contract(points, coordinates, stretch, count, STRETCH: tl.constexpr):
-    i = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
-    here = i < count
+    i, here = indices(count, BLOCK)
     x, y, z = load_row(points, i, here)
     inverse, across = scale_of(x, y, z)
     store_row(coordinates, i, (across * x, across * y, across * z), here)

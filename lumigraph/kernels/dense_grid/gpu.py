@@ -4,7 +4,7 @@ import torch
 import triton
 import triton.language as tl
 
-from .._gpu import blocks, launch, load_row, store_row
+from .._gpu import blocks, indices, launch, load_row, store_row
 from .._operation import differentiable, empty
 from ..sparse_grid.gpu import corner_of, slope_of, weight_of
 
@@ -38,9 +38,8 @@ def _entry(corner, Y, Z):
 
 @triton.jit(do_not_specialize=["S", "X", "Y", "Z"])
 def _forward(points, grid, box, out, S, X, Y, Z, C: tl.constexpr, CHANNELS: tl.constexpr):
-    i = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
+    i, here = indices(S, BLOCK)
     c = tl.arange(0, CHANNELS)
-    here = i < S
     there = here[:, None] & (c < C)[None, :]
     cell, f, _ = _cell_of(points, box, i, here, X, Y, Z)
     total = tl.zeros([BLOCK, CHANNELS], tl.float32)
@@ -53,9 +52,8 @@ def _forward(points, grid, box, out, S, X, Y, Z, C: tl.constexpr, CHANNELS: tl.c
 
 @triton.jit(do_not_specialize=["S", "X", "Y", "Z"])
 def _backward_grid(grad, points, box, d_grid, S, X, Y, Z, C: tl.constexpr, CHANNELS: tl.constexpr):
-    i = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
+    i, here = indices(S, BLOCK)
     c = tl.arange(0, CHANNELS)
-    here = i < S
     there = here[:, None] & (c < C)[None, :]
     cell, f, _ = _cell_of(points, box, i, here, X, Y, Z)
     g = tl.load(grad + i[:, None] * C + c[None, :], mask=there, other=0.0)
@@ -67,9 +65,8 @@ def _backward_grid(grad, points, box, d_grid, S, X, Y, Z, C: tl.constexpr, CHANN
 
 @triton.jit(do_not_specialize=["S", "X", "Y", "Z"])
 def _backward_points(grad, points, grid, box, d_points, S, X, Y, Z, C: tl.constexpr, CHANNELS: tl.constexpr):
-    i = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
+    i, here = indices(S, BLOCK)
     c = tl.arange(0, CHANNELS)
-    here = i < S
     there = here[:, None] & (c < C)[None, :]
     cell, f, inside = _cell_of(points, box, i, here, X, Y, Z)
     g = tl.load(grad + i[:, None] * C + c[None, :], mask=there, other=0.0)

@@ -4,7 +4,7 @@ import torch
 import triton
 import triton.language as tl
 
-from .._gpu import blocks, launch
+from .._gpu import blocks, indices, launch
 from .._operation import differentiable, empty
 
 BLOCK = tl.constexpr(64)  # samples
@@ -51,8 +51,7 @@ def _add_plane(table, row, across, f, g, c, there, x, R: tl.constexpr):
 def _forward(
     points, table, out, S, nx, ny, nz, VM: tl.constexpr, SUMMED: tl.constexpr, R: tl.constexpr, C: tl.constexpr
 ):
-    i = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
-    here = i < S
+    i, here = indices(S, BLOCK)
     x, fx = _place(points, i, 0, here, nx)
     y, fy = _place(points, i, 1, here, ny)
     z, fz = _place(points, i, 2, here, nz)
@@ -98,8 +97,7 @@ def _backward(
     R: tl.constexpr,
     C: tl.constexpr,
 ):
-    i = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
-    here = i < S
+    i, here = indices(S, BLOCK)
     x, fx = _place(points, i, 0, here, nx)
     y, fy = _place(points, i, 1, here, ny)
     z, fz = _place(points, i, 2, here, nz)

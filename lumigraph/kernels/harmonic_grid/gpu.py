@@ -4,7 +4,7 @@ import torch
 import triton
 import triton.language as tl
 
-from .._gpu import blocks, launch, load_row
+from .._gpu import blocks, indices, launch, load_row
 from .._operation import differentiable, empty
 from ..sparse_grid.gpu import cell_of, corner_of, row_of, weight_of
 from ..spherical_harmonics.gpu import harmonic
@@ -25,9 +25,8 @@ def _basis(directions, i, here, c):
 
 @triton.jit(do_not_specialize=["S"])
 def _forward(points, directions, index, rows, density, harmonics, to_density, to_rgb, S, X, Y, Z):
-    i = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
+    i, here = indices(S, BLOCK)
     c = tl.arange(0, 32)
-    here = i < S
     cell, f, _ = cell_of(points, i, here, X - 1, Y - 1, Z - 1)
     sigma = tl.zeros([BLOCK], tl.float32)
     total = tl.zeros([BLOCK, 32], tl.float32)
@@ -46,9 +45,8 @@ def _forward(points, directions, index, rows, density, harmonics, to_density, to
 
 @triton.jit(do_not_specialize=["S"])
 def _backward(d_sigma, d_rgb, points, directions, index, rows, d_density, d_harmonics, S, X, Y, Z):
-    i = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
+    i, here = indices(S, BLOCK)
     c = tl.arange(0, 32)
-    here = i < S
     cell, f, _ = cell_of(points, i, here, X - 1, Y - 1, Z - 1)
     g_sigma = tl.load(d_sigma + i, mask=here, other=0.0)
     g = tl.load(d_rgb + 3 * i[:, None] + c[None, :] % 3, mask=here[:, None], other=0.0)

@@ -7,7 +7,7 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from .._gpu import blocks, launch, store_row
+from .._gpu import blocks, indices, launch, store_row
 from .._operation import differentiable, empty
 from ..sparse_grid.gpu import cell_of, corner_of, slope_of, weight_of
 from . import PRIMES, HashLevels
@@ -31,9 +31,8 @@ def _forward(points, table, pyramid, out, S, L: tl.constexpr, F: tl.constexpr, F
     level = tl.program_id(1)
     n = tl.load(pyramid + 3 * level).to(tl.int32)
     offset, mask = tl.load(pyramid + 3 * level + 1), tl.load(pyramid + 3 * level + 2)
-    i = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
+    i, here = indices(S, BLOCK)
     feature = tl.arange(0, FEATURES)
-    here = i < S
     there = here[:, None] & (feature < F)[None, :]
     cell, f, _ = cell_of(points, i, here, n, n, n)
     total = tl.zeros([BLOCK, FEATURES], tl.float32)
@@ -49,9 +48,8 @@ def _backward_table(grad, points, pyramid, d_table, S, L: tl.constexpr, F: tl.co
     level = tl.program_id(1)
     n = tl.load(pyramid + 3 * level).to(tl.int32)
     offset, mask = tl.load(pyramid + 3 * level + 1), tl.load(pyramid + 3 * level + 2)
-    i = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
+    i, here = indices(S, BLOCK)
     feature = tl.arange(0, FEATURES)
-    here = i < S
     there = here[:, None] & (feature < F)[None, :]
     cell, f, _ = cell_of(points, i, here, n, n, n)
     g = tl.load(grad + i[:, None] * (L * F) + level * F + feature[None, :], mask=there, other=0.0)
@@ -66,9 +64,8 @@ def _backward_points(
     grad, points, table, pyramid, d_points, S, L: tl.constexpr, F: tl.constexpr, FEATURES: tl.constexpr
 ):
     """Here one program sees all levels, so that it can sum over them."""
-    i = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
+    i, here = indices(S, BLOCK)
     feature = tl.arange(0, FEATURES)
-    here = i < S
     there = here[:, None] & (feature < F)[None, :]
     dx = tl.zeros([BLOCK], tl.float32)
     dy = tl.zeros([BLOCK], tl.float32)

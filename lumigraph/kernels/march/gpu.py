@@ -6,7 +6,7 @@ import torch
 import triton
 import triton.language as tl
 
-from .._gpu import blocks, launch, load_row
+from .._gpu import blocks, indices, launch, load_row
 from .._operation import empty
 
 BLOCK = tl.constexpr(32)  # rays; they march together, so a program is as slow as its slowest
@@ -80,8 +80,7 @@ def _march(
     STOP: tl.constexpr,
     WRITE: tl.constexpr,
 ):
-    r = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
-    here = r < R
+    r, here = indices(R, BLOCK)
     ox, oy, oz = load_row(origins, r, here)
     dx, dy, dz = load_row(directions, r, here, 1.0)
     t_near = tl.load(t_nears + r, mask=here, other=0.0)

@@ -22,14 +22,20 @@ def _inverse(d, side):
 
 
 @njit(inline="always")
-def enter(o, d, r, side, near):
-    """Ray r in smallest cells (origin, direction, one over it), and where it enters and leaves the cube."""
-    x, y, z = o[r, 0] * side, o[r, 1] * side, o[r, 2] * side
-    ix, iy, iz = _inverse(d[r, 0], side), _inverse(d[r, 1], side), _inverse(d[r, 2], side)
-    a, b, c = -x * ix, -y * iy, -z * iz
-    e, f, g = (side - x) * ix, (side - y) * iy, (side - z) * iz
-    ray = x, y, z, d[r, 0] * side, d[r, 1] * side, d[r, 2] * side, ix, iy, iz
-    return ray, max(min(a, e), min(b, f), min(c, g), near), min(max(a, e), max(b, f), max(c, g))
+def in_cells(o, d, r, side):
+    """Ray r in smallest cells: its origin, its direction, and one over that."""
+    dx, dy, dz = d[r, 0], d[r, 1], d[r, 2]
+    ix, iy, iz = _inverse(dx, side), _inverse(dy, side), _inverse(dz, side)
+    return o[r, 0] * side, o[r, 1] * side, o[r, 2] * side, dx * side, dy * side, dz * side, ix, iy, iz
+
+
+@njit(inline="always")
+def through_cube(ray, side, near):
+    """Where a ray enters the cube and leaves it."""
+    ox, oy, oz, _, _, _, ix, iy, iz = ray
+    a, b, c = -ox * ix, -oy * iy, -oz * iz
+    d, e, f = (side - ox) * ix, (side - oy) * iy, (side - oz) * iz
+    return max(min(a, d), min(b, e), min(c, f), near), min(max(a, d), max(b, e), max(c, f))
 
 
 @njit(inline="always")
@@ -60,9 +66,8 @@ def leaf(cells, path, level, depth, x, y, z):
 
 
 @njit(inline="always")
-def leave(place, shift, ray, t):
+def leave(x, y, z, shift, ray, t):
     """Where a ray leaves the cell of side 2^shift at a place, and the place beyond."""
-    x, y, z = place
     ox, oy, oz, dx, dy, dz, ix, iy, iz = ray
     size = np.int64(1) << shift
     lx, ly, lz = x >> shift << shift, y >> shift << shift, z >> shift << shift
@@ -78,35 +83,32 @@ def leave(place, shift, ray, t):
         v = hy if iy > ZERO else ly - 1
     else:
         w = hz if iz > ZERO else lz - 1
-    return end, (u, v, w)
+    return end, u, v, w
 
 
 @njit(inline="always")
-def cross(cells, rows, path, level, depth, place, ray, t):
+def cross(cells, rows, path, level, depth, x, y, z, ray, t):
     """Cross the undivided cell at a place: its row, -1 for none, its level, and the results of `leave`.
 
     rows: `Tree.rows`; path: the nodes from the cube down to `level`, to which those below are added
     """
-    value, level = leaf(cells, path, level, depth, place[0], place[1], place[2])
+    value, level = leaf(cells, path, level, depth, x, y, z)
     row = np.int64(-1)
     if value < 0:
         row = np.int64(rows[-1 - value]) if len(rows) else -1 - value
-    end, beyond = leave(place, depth - level, ray, t)
-    return row, level, end, beyond
+    end, u, v, w = leave(x, y, z, depth - level, ray, t)
+    return row, level, end, u, v, w
 
 
 @njit(inline="always")
-def outside(place, side):
+def outside(u, v, w, side):
     """Whether a place lies beyond the cube."""
-    u, v, w = place
     return u < 0 or v < 0 or w < 0 or u >= side or v >= side or w >= side
 
 
 @njit(inline="always")
-def shared(level, depth, place, beyond):
-    """The deepest level above a cell's own whose node holds two places."""
-    differing = (place[0] ^ beyond[0]) | (place[1] ^ beyond[1]) | (place[2] ^ beyond[2])
-    level -= 1
+def shared(level, depth, differing):
+    """The deepest level, at most this one, whose node holds two places. differing: the bits in which they do"""
     while differing >> (depth - level):
         level -= 1
     return level
@@ -116,25 +118,27 @@ def shared(level, depth, place, beyond):
 def _walk(o, d, cells, named, density, depth, near, most, write, starts, t_start, t_end, rows):
     """Count the cells of ray r into starts[r + 1], or write them from starts[r] on."""
     n, side = len(o), np.int64(1) << depth
+    across = np.float32(side)
     for chunk in prange((n + CHUNK - 1) // CHUNK):
         path = np.zeros(depth + 1, np.int64)
         for r in range(chunk * CHUNK, min(n, (chunk + 1) * CHUNK)):
-            ray, t, far = enter(o, d, r, np.float32(side), near)
+            ray = in_cells(o, d, r, across)
+            t, far = through_cube(ray, across, near)
             count, thickness, level = np.int64(0), ZERO, np.int64(0)
             if t < far:
-                place = place_at(ray, t, side)
+                x, y, z = place_at(ray, t, side)
                 while True:
-                    row, level, end, beyond = cross(cells, named, path, level, depth, place, ray, t)
+                    row, level, end, u, v, w = cross(cells, named, path, level, depth, x, y, z, ray, t)
                     if row >= 0:
                         if write:
                             i = starts[r] + count
                             t_start[i], t_end[i], rows[i] = t, end, row
                         count += 1
                         thickness += density[row] * (end - t)
-                    if outside(beyond, side) or thickness > most:
+                    if outside(u, v, w, side) or thickness > most:
                         break
-                    level = shared(level, depth, place, beyond)
-                    place, t = beyond, end
+                    level = shared(level - 1, depth, (x ^ u) | (y ^ v) | (z ^ w))
+                    x, y, z, t = u, v, w, end
             if not write:
                 starts[r + 1] = count
 

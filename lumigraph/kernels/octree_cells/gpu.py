@@ -7,7 +7,7 @@ import torch
 import triton
 import triton.language as tl
 
-from .._gpu import blocks, launch, load_row
+from .._gpu import blocks, indices, launch, load_row
 from .._operation import empty
 from . import MIN_SPEED as _MIN_SPEED
 
@@ -102,8 +102,7 @@ def _walk(
 ):
     origins, directions = rays
     t_start, t_end, rows = out
-    r = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
-    here = r < R
+    r, here = indices(R, BLOCK)
     ray, t, going, cell = enter(origins, directions, r, here, near, DEPTH)
     x, y, z = cell
     count = tl.zeros([BLOCK], tl.int32)

@@ -8,7 +8,7 @@ import torch
 from numba import get_num_threads, njit, prange
 
 from .._operation import differentiable, empty
-from ..octree_cells.cpu import CHUNK, FAST, ONE, ZERO, cross, enter, outside, place_at, shared
+from ..octree_cells.cpu import CHUNK, FAST, ONE, ZERO, cross, in_cells, outside, place_at, shared, through_cube
 from ..spherical_harmonics.cpu import basis
 
 HALF = np.float32(0.5)
@@ -52,20 +52,22 @@ def _shown(met, weights, count, harmonics, y, asked):
 @njit(parallel=True, fastmath=True, **FAST)
 def _forward(chunks, o, d, cells, named, density, harmonics, bands, depth, near, stop, rgb, distance, opacity, counts):
     n, side = len(o), np.int64(1) << depth
+    across = np.float32(side)
     for i in prange(len(chunks)):
         chunk = chunks[i]
         path, y = np.zeros(depth + 1, np.int64), np.zeros(16, np.float32)
         met, weights = np.zeros(CELLS_PER_CHUNK, np.int64), np.zeros(CELLS_PER_CHUNK, np.float32)
         asked = np.zeros(1, np.float32)  # a sum that nobody needs, or compilers would leave it out
         for r in range(chunk * CHUNK, min(n, (chunk + 1) * CHUNK)):
-            ray, t, far = enter(o, d, r, np.float32(side), near)
+            ray = in_cells(o, d, r, across)
+            t, far = through_cube(ray, across, near)
             red = green = blue = way = spent = ZERO
             through, count, level, waiting = ONE, np.int64(0), np.int64(0), 0
             if t < far:
                 basis(d[r, 0], d[r, 1], d[r, 2], bands, y)
-                place = place_at(ray, t, side)
+                u, v, w = place_at(ray, t, side)
                 while True:
-                    row, level, end, beyond = cross(cells, named, path, level, depth, place, ray, t)
+                    row, level, end, u2, v2, w2 = cross(cells, named, path, level, depth, u, v, w, ray, t)
                     if row >= 0:
                         count += 1
                         keep = np.exp(-density[row] * (end - t))
@@ -78,10 +80,10 @@ def _forward(chunks, o, d, cells, named, density, harmonics, bands, depth, near,
                         if waiting == CELLS_PER_CHUNK:
                             r_, g_, b_ = _shown(met, weights, waiting, harmonics, y, asked)
                             red, green, blue, waiting = red + r_, green + g_, blue + b_, 0
-                    if outside(beyond, side) or through < stop:
+                    if outside(u2, v2, w2, side) or through < stop:
                         break
-                    level = shared(level, depth, place, beyond)
-                    place, t = beyond, end
+                    level = shared(level - 1, depth, (u ^ u2) | (v ^ v2) | (w ^ w2))
+                    u, v, w, t = u2, v2, w2, end
                 if waiting:
                     r_, g_, b_ = _shown(met, weights, waiting, harmonics, y, asked)
                     red, green, blue = red + r_, green + g_, blue + b_
@@ -100,22 +102,24 @@ def _share(
     over all of a ray is at hand, in its outputs.
     """
     n, side = len(o), np.int64(1) << depth
+    across = np.float32(side)
     for j in prange(len(chunks)):
         chunk = chunks[j]
         path = np.zeros(depth + 1, np.int64)
         for r in range(chunk * CHUNK, min(n, (chunk + 1) * CHUNK)):
             if starts[r] == starts[r + 1]:
                 continue
-            ray, t, _ = enter(o, d, r, np.float32(side), near)
+            ray = in_cells(o, d, r, across)
+            t, _ = through_cube(ray, across, near)
             y = bases[r]
             basis(d[r, 0], d[r, 1], d[r, 2], bands, y)
             behind = g_distance[r] * distance[r] + g_opacity[r] * opacity[r]
             for c in range(3):
                 behind += g_rgb[r, c] * rgb[r, c]
             through, i, level = ONE, starts[r], np.int64(0)
-            place = place_at(ray, t, side)
+            u, v, w = place_at(ray, t, side)
             while True:
-                row, level, end, beyond = cross(cells, named, path, level, depth, place, ray, t)
+                row, level, end, u2, v2, w2 = cross(cells, named, path, level, depth, u, v, w, ray, t)
                 if row >= 0:
                     length = end - t
                     keep = np.exp(-density[row] * length)
@@ -133,8 +137,8 @@ def _share(
                     i += 1
                     if i == starts[r + 1]:
                         break
-                level = shared(level, depth, place, beyond)
-                place, t = beyond, end
+                level = shared(level - 1, depth, (u ^ u2) | (v ^ v2) | (w ^ w2))
+                u, v, w, t = u2, v2, w2, end
 
 
 @njit(cache=True)

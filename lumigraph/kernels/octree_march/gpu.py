@@ -4,7 +4,7 @@ import torch
 import triton
 import triton.language as tl
 
-from .._gpu import blocks, launch, load_row, store_row
+from .._gpu import blocks, indices, launch, load_row, store_row
 from .._operation import differentiable, empty
 from ..octree_cells.gpu import enter, inside, leaf, leave, row_in
 from ..spherical_harmonics.gpu import harmonic
@@ -30,8 +30,7 @@ def _colour(harmonics, row, held, direction, BASIS: tl.constexpr):
 def _forward(rays, cells, named, density, harmonics, outputs, R, near, stop, DEPTH: tl.constexpr, BASIS: tl.constexpr):
     origins, directions = rays
     rgb, distance, opacity = outputs
-    r = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
-    here = r < R
+    r, here = indices(R, BLOCK)
     ray, t, going, cell = enter(origins, directions, r, here, near, DEPTH)
     x, y, z = cell
     red = tl.zeros([BLOCK], tl.float32)
@@ -82,8 +81,7 @@ def _backward(
     d_rgb, d_distance, d_opacity = grads
     rgb, distance, opacity = outputs
     to_density, to_harmonics = found
-    r = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
-    here = r < R
+    r, here = indices(R, BLOCK)
     ray, t, going, cell = enter(origins, directions, r, here, near, DEPTH)
     x, y, z = cell
     dx, dy, dz = ray[1]

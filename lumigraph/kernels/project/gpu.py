@@ -19,7 +19,7 @@ C = T T^T + blur I = (a b; b c), K = C^-1 the conic; T_0 and T_1 are a matrix's 
 import triton
 import triton.language as tl
 
-from .._gpu import blocks, launch, load_row, store_row
+from .._gpu import blocks, indices, launch, load_row, store_row
 from .._operation import differentiable, empty
 from ..spherical_harmonics.gpu import harmonic, harmonic_slope
 from . import MIN_ALPHA as _MIN_ALPHA
@@ -240,8 +240,7 @@ def _reaches(u, extent, size):
 def _forward(inputs, view, outputs, N, blur, K: tl.constexpr, BANDS: tl.constexpr, COMPENSATE: tl.constexpr):
     means, quaternions, scales, opacities, harmonics = inputs
     centres, conics, depths, colours, shown = outputs
-    i = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
-    here = i < N
+    i, here = indices(N, BLOCK)
     R = _rotation(view)
     v = _mix(1.0, load_row(means, i, here), -1.0, load_row(view + EYE, 0, True))
     p = _apply(R, v)
@@ -277,8 +276,7 @@ def _backward(
     d_centres, d_conics, d_depths, d_colours, d_shown = grads
     means, quaternions, scales, opacities, harmonics = inputs
     d_means, d_quaternions, d_scales, d_opacities, d_harmonics = found
-    i = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
-    here = i < N
+    i, here = indices(N, BLOCK)
     seen = tl.load(depths + i, mask=here, other=0.0) > 0  # what is not seen has depth zero, and all gradients zero
     R = _rotation(view)
     v = _mix(1.0, load_row(means, i, seen), -1.0, load_row(view + EYE, 0, True))

@@ -8,7 +8,7 @@ import torch
 import triton
 import triton.language as tl
 
-from .._gpu import load_row, store_row
+from .._gpu import launch, load_row, store_row
 from .._operation import differentiable, empty
 from ..project import MAX_ALPHA as _MAX_ALPHA
 from ..project import MIN_ALPHA as _MIN_ALPHA
@@ -152,7 +152,7 @@ def forward(ctx, centres, conics, opacities, colours, depths, tiles, stop):
     ctx.grid = (tiles.across * tiles.down * (tiles.side // square) ** 2,)
     ctx.rest = width, height, max(float(stop), MIN_TRANSMITTANCE)
     ctx.options = {"SIDE": tiles.side, "SQUARE": square}
-    _forward[ctx.grid](gaussians, tiles.order, tiles.starts, outputs, *ctx.rest, **ctx.options)
+    launch(_forward, ctx.grid, gaussians, tiles.order, tiles.starts, outputs, *ctx.rest, **ctx.options)
     ctx.save_for_backward(*gaussians, tiles.order, tiles.starts, *outputs)
     return outputs
 
@@ -161,7 +161,7 @@ def backward(ctx, *grads):
     *gaussians, order, starts, picture, depth, weight = ctx.saved_tensors
     found = tuple(torch.zeros_like(x) for x in gaussians)
     given = grads, tuple(gaussians), order, starts, (picture, depth, weight), found
-    _backward[ctx.grid](*given, *ctx.rest, **ctx.options)
+    launch(_backward, ctx.grid, *given, *ctx.rest, **ctx.options)
     return *found, None, None
 
 

@@ -4,7 +4,7 @@ import torch
 import triton
 import triton.language as tl
 
-from .._gpu import blocks, launch, load_row, store_row
+from .._gpu import blocks, indices, launch, load_row, store_row
 from .._operation import differentiable, empty
 
 BLOCK = tl.constexpr(64)
@@ -65,9 +65,8 @@ def row_of(index, rows, node, here, Y, Z):
 
 @triton.jit(do_not_specialize=["S"])
 def _forward(points, index, rows, values, out, S, X, Y, Z, C: tl.constexpr, WIDTH: tl.constexpr):
-    i = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
+    i, here = indices(S, BLOCK)
     c = tl.arange(0, WIDTH)
-    here = i < S
     cell, f, _ = cell_of(points, i, here, X - 1, Y - 1, Z - 1)
     total = tl.zeros([BLOCK, WIDTH], tl.float32)
     for k in tl.static_range(8):
@@ -80,9 +79,8 @@ def _forward(points, index, rows, values, out, S, X, Y, Z, C: tl.constexpr, WIDT
 
 @triton.jit(do_not_specialize=["S"])
 def _backward_values(grad, points, index, rows, d_values, S, X, Y, Z, C: tl.constexpr, WIDTH: tl.constexpr):
-    i = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
+    i, here = indices(S, BLOCK)
     c = tl.arange(0, WIDTH)
-    here = i < S
     cell, f, _ = cell_of(points, i, here, X - 1, Y - 1, Z - 1)
     g = tl.load(grad + i[:, None] * C + c[None, :], mask=here[:, None] & (c < C)[None, :], other=0.0)
     for k in tl.static_range(8):
@@ -94,9 +92,8 @@ def _backward_values(grad, points, index, rows, d_values, S, X, Y, Z, C: tl.cons
 
 @triton.jit(do_not_specialize=["S"])
 def _backward_points(grad, points, index, rows, values, d_points, S, X, Y, Z, C: tl.constexpr, WIDTH: tl.constexpr):
-    i = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
+    i, here = indices(S, BLOCK)
     c = tl.arange(0, WIDTH)
-    here = i < S
     cell, f, inside = cell_of(points, i, here, X - 1, Y - 1, Z - 1)
     g = tl.load(grad + i[:, None] * C + c[None, :], mask=here[:, None] & (c < C)[None, :], other=0.0)
     dx = tl.zeros([BLOCK], tl.float32)

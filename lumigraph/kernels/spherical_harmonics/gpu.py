@@ -3,7 +3,7 @@
 import triton
 import triton.language as tl
 
-from .._gpu import blocks, launch, load_row, store_row
+from .._gpu import blocks, indices, launch, load_row, store_row
 from .._operation import differentiable, empty
 from . import K00, K1, K20, K21, K22, K30, K31, K32, K33
 
@@ -91,8 +91,7 @@ def harmonic_slope(k: tl.constexpr, x, y, z):
 
 @triton.jit(do_not_specialize=["R"])
 def _forward(directions, out, R, BANDS: tl.constexpr):
-    r = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
-    here = r < R
+    r, here = indices(R, BLOCK)
     x, y, z = load_row(directions, r, here)
     for k in tl.static_range(BANDS * BANDS):
         tl.store(out + r * (BANDS * BANDS) + k, harmonic(k, x, y, z), mask=here)
@@ -100,8 +99,7 @@ def _forward(directions, out, R, BANDS: tl.constexpr):
 
 @triton.jit(do_not_specialize=["R"])
 def _backward(grad, directions, d_directions, R, BANDS: tl.constexpr):
-    r = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
-    here = r < R
+    r, here = indices(R, BLOCK)
     x, y, z = load_row(directions, r, here)
     dx, dy, dz = tl.zeros_like(x), tl.zeros_like(x), tl.zeros_like(x)
     for k in tl.static_range(1, BANDS * BANDS):

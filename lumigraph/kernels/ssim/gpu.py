@@ -7,7 +7,7 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from .._gpu import blocks
+from .._gpu import blocks, launch
 from .._operation import differentiable, empty
 from . import C1, C2, WINDOW, weights
 
@@ -122,8 +122,8 @@ def forward(ctx, a, b):
     first, second = (b, a) if wanted == (False, True) else (a, b)  # S is symmetric
     count = 3 + all(wanted) if any(wanted) else 0
     rows, out, maps = (empty(n, height, length, device=a.device) for n in (4, 1, count))
-    _moments[ctx.grid](first, second, ctx.window, rows, height, length, C=channels)
-    _likeness[ctx.grid](rows, ctx.window, out, maps, height, length, MAPS=count)
+    launch(_moments, ctx.grid, first, second, ctx.window, rows, height, length, C=channels)
+    launch(_likeness, ctx.grid, rows, ctx.window, out, maps, height, length, MAPS=count)
     ctx.save_for_backward(a, b, maps)
     return out.mean()
 
@@ -132,14 +132,14 @@ def backward(ctx, grad):
     a, b, maps = ctx.saved_tensors
     count, height, length = maps.shape
     rows = empty(*maps.shape, device=a.device)
-    _along[(*ctx.grid, count)](maps, ctx.window, rows, height, length, C=a.shape[2])
+    launch(_along, (*ctx.grid, count), maps, ctx.window, rows, height, length, C=a.shape[2])
     gradients: list[Tensor | None] = [None, None]
     for i, (own, other) in enumerate([(a, b), (b, a)]):
         if ctx.needs_input_grad[i]:
             mean = MEAN_B if i and count > MEAN_B else MEAN_A
             found = gradients[i] = empty(*a.shape, device=a.device)
             given = rows, ctx.window, own, other, grad, found
-            _gradient[ctx.grid](*given, height, length, mean, 1 / a.numel())
+            launch(_gradient, ctx.grid, *given, height, length, mean, 1 / a.numel())
     return (*gradients,)
 
 

@@ -7,7 +7,7 @@ import torch
 import triton
 import triton.language as tl
 
-from .._gpu import blocks, launch
+from .._gpu import blocks, indices, launch
 from ..project import MIN_ALPHA as _MIN_ALPHA
 
 MIN_ALPHA = tl.constexpr(_MIN_ALPHA)
@@ -47,8 +47,7 @@ def _least_on(x, y0, y1, c, tilt, rest):
 def _tile(near_first, gaussians, counts, ends, pairs, N, width, height, SIDE: tl.constexpr, WRITE: tl.constexpr):
     centres, conics, opacities = gaussians
     pair_tiles, pair_numbers = pairs
-    rank = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
-    here = rank < N
+    rank, here = indices(N, BLOCK)
     i = tl.load(near_first + rank, mask=here, other=0)
     cx, cy = tl.load(centres + 2 * i, mask=here, other=0.0), tl.load(centres + 2 * i + 1, mask=here, other=0.0)
     a = tl.load(conics + 3 * i, mask=here, other=1.0)
