@@ -31,7 +31,7 @@ Found = TypeVar("Found")
 
 @dataclass(frozen=True)
 class Facts:
-    """One operation in numbers. Inputs and outputs are meant by their position, cases by theirs in `cases()`.
+    """One operation in numbers. Inputs and outputs are named by their position, cases by theirs in `cases()`.
 
     unit:           what the benchmark counts per second
     unit_axes:      the first input has one unit for each entry along its leading so many axes
@@ -63,26 +63,27 @@ def tensors(found: Any) -> tuple[Tensor, ...]:
     return tuple(x for x in found if isinstance(x, Tensor)) if isinstance(found, tuple) else (found,)
 
 
-class Stated(NamedTuple):
-    """Annotation of a tensor: names or sizes of its axes, and permitted types."""
+class Annotation(NamedTuple):
+    """Names or sizes of a tensor's axes, and its permitted types."""
 
     axes: tuple[str | int, ...]
     types: frozenset[torch.dtype]
 
 
 def door(function: Callable[Given, Found]) -> Callable[Given, Found]:
-    """The function, which raises ValueError for tensors that are not as its annotations say: `Float[Tensor, "ray 3"]`.
+    """Wrap a function to raise ValueError for tensors that differ from their annotations, `Float[Tensor, "ray 3"]`.
 
-    An axis has the same size wherever its name stands. Floating-point tensors are of one type, and all on one device.
+    Axes of one name have one size. Floating-point tensors are of one type, and all tensors on one device.
     """
     names = [*inspect.signature(function).parameters]
 
     @wraps(function)
     def guarded(*args: Given.args, **kwargs: Given.kwargs) -> Found:
-        said, sizes, floats, devices = stated(function), dict[str, int](), set[torch.dtype](), set[torch.device]()
+        expected, sizes = annotations_of(function), dict[str, int]()
+        floats, devices = set[torch.dtype](), set[torch.device]()
         further = ((names[-1], value) for value in args[len(names) :])  # of *weights
         for name, value in (*zip(names, args, strict=False), *further, *kwargs.items()):
-            if about := said.get(name):
+            if about := expected.get(name):
                 assert isinstance(value, Tensor)
                 if not fits(value, about, sizes):
                     raise ValueError(f"{name} is {value.dtype} {tuple(value.shape)}, not {about.axes} of {sizes}")
@@ -97,19 +98,19 @@ def door(function: Callable[Given, Found]) -> Callable[Given, Found]:
 
 
 @cache
-def stated(function: Callable) -> dict[str, Stated]:
+def annotations_of(function: Callable) -> dict[str, Annotation]:
     """Annotations of the tensor parameters of a function, by name."""
     found = {}
     for name, kind in typing.get_type_hints(function).items():
         if name != "return" and hasattr(kind, "dim_str"):
             axes = (int(axis) if axis.isdecimal() else axis for axis in kind.dim_str.split())
             types = (getattr(torch, dtype, None) for dtype in kind.dtypes)
-            found[name] = Stated(tuple(axes), frozenset(dtype for dtype in types if dtype is not None))
+            found[name] = Annotation(tuple(axes), frozenset(dtype for dtype in types if dtype is not None))
     return found
 
 
-def fits(tensor: Tensor, about: Stated, sizes: dict[str, int]) -> bool:
-    """Check a tensor against an annotation. sizes: of the axes that have been seen, to which it adds its own."""
+def fits(tensor: Tensor, about: Annotation, sizes: dict[str, int]) -> bool:
+    """Check a tensor against an annotation. sizes: of the axes of earlier tensors; new ones are added."""
     if tensor.ndim != len(about.axes) or tensor.dtype not in about.types:
         return False
     for axis, size in zip(about.axes, tensor.shape, strict=True):
@@ -125,7 +126,7 @@ def require(holds: bool, fault: str) -> None:
 
 
 def require_starts(name: str, starts: Tensor, count: int) -> None:
-    """Raise ValueError unless int64 starts lead from 0 to the count without going back."""
+    """Raise ValueError unless the starts are int64 and rise from 0 to the count, some of them perhaps equal."""
     holds = len(starts) > 0 and starts.dtype == torch.int64
     if holds and not starts.is_cuda:
         holds = int(starts[0]) == 0 and int(starts[-1]) == count and bool((starts[1:] >= starts[:-1]).all())
@@ -159,7 +160,7 @@ def implementation(operation: str, tensor: Tensor) -> Callable:
 
 
 def empty(*shape: int, dtype: torch.dtype = torch.float32, device: torch.device | str = "cpu") -> Tensor:
-    """Memory for an engine's output. With LUMIGRAPH_DEBUG set it starts as NaN, so that what is never written shows."""
+    """Memory for an engine's output. LUMIGRAPH_DEBUG fills it with NaN, which shows entries never written."""
     out = torch.empty(shape, dtype=dtype, device=device)
     if os.environ.get("LUMIGRAPH_DEBUG") and dtype.is_floating_point:
         out.fill_(torch.nan)
@@ -167,9 +168,9 @@ def empty(*shape: int, dtype: torch.dtype = torch.float32, device: torch.device 
 
 
 def differentiable(forward: Callable, backward: Callable, contiguous: bool = True) -> Callable:
-    """The `run` of an engine from its ways there and back, which are as in `torch.autograd.Function`.
+    """The `run` of an engine made of `forward` and `backward`, which are as in `torch.autograd.Function`.
 
-    contiguous: whether tensors and gradients are made contiguous before; else they come as they are
+    contiguous: make input tensors and gradients contiguous first
     """
 
     def laid_out(inputs: Iterable[Any]) -> Iterator[Any]:

@@ -1,4 +1,4 @@
-"""Distortion: how far apart along its ray the weight of what a ray sees lies."""
+"""Distortion loss: how far apart the weights along a ray lie."""
 
 import torch
 from jaxtyping import Float, Int

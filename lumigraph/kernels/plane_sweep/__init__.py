@@ -52,7 +52,7 @@ def plane_sweep(
 
 
 def centred(pictures: Float[Tensor, "picture rows columns"], trust: Float[Tensor, "picture rows columns"]) -> Tensor:
-    """Pictures without the mean of what they are trusted in, and zero where they are not trusted at all."""
+    """Pictures less their mean weighted by trust, and zero where trust is zero."""
     total = trust.sum((1, 2), keepdim=True).clamp_min(1e-6)
     mean = (pictures * trust).sum((1, 2), keepdim=True) / total
     return torch.where(trust > 0, pictures - mean, 0)

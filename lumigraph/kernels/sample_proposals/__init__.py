@@ -1,4 +1,4 @@
-"""Proposal sampling: from a coarse grid of density to the intervals of each ray at which a field is asked."""
+"""Proposal sampling: from a coarse grid of density to the intervals of each ray at which a field is evaluated."""
 
 from dataclasses import dataclass
 
