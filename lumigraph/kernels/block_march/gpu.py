@@ -123,12 +123,12 @@ def _alpha(seen):
 
 @triton.jit(do_not_specialize=["R"])
 def _march(
-    rays, grid, values, out, noted, R, X, Y, Z, ball, stop, NOTE: tl.constexpr, CURVED: tl.constexpr, B: tl.constexpr
+    rays, grid, values, sums, noted, R, X, Y, Z, ball, stop, NOTE: tl.constexpr, CURVED: tl.constexpr, B: tl.constexpr
 ):
     """Composite along each ray; or NOTE its steps that meet something, and the light that reaches them."""
     origins, directions, enter, leave = rays
     index, rows = grid
-    totals, distance, lengths = out
+    totals, distance, lengths = sums
     starts, steps, lights = noted
     r, here = indices(R, BLOCK)
     c = tl.arange(0, C)
