@@ -21,7 +21,7 @@ from proofs import sources
 from torch import Tensor
 
 from lumigraph import kernels
-from lumigraph.kernels._facts import Facts, operations, tensors
+from lumigraph.kernels._operation import Facts, operations, tensors
 
 OPERATIONS = operations()
 ENGINES = ["cpu", "gpu"]

@@ -121,7 +121,7 @@ def test_an_arrow_the_wrong_way_is_noticed(module, line):
 @pytest.mark.parametrize(
     ("module", "line"),
     [
-        ("lumigraph.kernels.march.cpu", "from .._dispatch import differentiable"),
+        ("lumigraph.kernels.march.cpu", "from .._operation import differentiable"),
         ("lumigraph.kernels.march.cpu", "from ...camera.rays import Samples"),
         ("lumigraph.methods.instant_ngp", "from .. import kernels\nfrom ..components import perceptron"),
         ("lumigraph.commands.cli", "from lumigraph import Scene, __version__, fit"),
