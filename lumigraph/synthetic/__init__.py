@@ -19,11 +19,12 @@ A new scene is a new file in `scenes/`, a new category of objects one in `catego
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from functools import partial
 from typing import Any
 
 import numpy as np
+import torch
 
 from ..camera import Camera
 from ..capture.capture import Capture, PixelPlane, Shot
@@ -31,17 +32,16 @@ from ..capture.raw import RawPhoto, facts, planes
 from . import categories as categories
 from . import scenes as scenes
 from .blender_folder import write_blender as write_blender
-from .jitter import jittered as jittered
 from .members import is_category as is_category
 from .members import is_collection as is_collection
 from .members import member_stage
 from .members import members_of as members_of
-from .options import told
 from .rendering import eight_bits, photograph, radiance
 from .rendering import render as render
 from .rendering import signed_distance as signed_distance
 from .rendering import trace as trace
 from .stage import SyntheticStage as SyntheticStage
+from .stage import told
 from .world import Lamp as Lamp
 from .world import Material as Material
 from .world import Object as Object
@@ -49,6 +49,7 @@ from .world import Pose as Pose
 from .world import Sky as Sky
 from .world import Sun as Sun
 from .world import World as World
+from .world import rotation_about
 
 TRUE_POSE = "true_pose"  # of `Scene.about`: camera-to-world in the source's frame
 TURN = "turn"  # of `Scene.about`: rotation from an object's upright frame to the source's; see `Stage.turn`
@@ -181,3 +182,19 @@ def picture(stage: SyntheticStage, camera: Camera) -> np.ndarray:
     if stage.sensor is not None and camera.image_index is not None:
         return taken_raw(stage, camera).developed(stage.sensor.brightness(int(camera.image_index)))
     return eight_bits(*photograph(stage.world_of(camera), camera), alpha=not stage.world.sky.visible)
+
+
+def jittered(stage: SyntheticStage, amount: float, seed: int) -> dict[str, Camera]:
+    """The stage's cameras, those to learn from each turned by `amount` degrees about an axis of its own and moved by
+    `amount` percent of the longest side of the box of interest, or of `Stage.error`, any way. Held-out ones stay where
+    they are."""
+    random = np.random.default_rng([seed, 0x9E3779B9])
+    low, high = (np.array(corner) for corner in stage.bounds)
+    shift = amount / 100 * (stage.error or float((high - low).max()))
+    cameras = stage.cameras["train"]
+    pose = cameras.pose.double().numpy().copy()
+    for one in pose:
+        axis, way = random.normal(size=(2, 3))
+        one[:, :3] = rotation_about(tuple(axis), amount) @ one[:, :3]
+        one[:, 3] += shift * way / np.linalg.norm(way)
+    return stage.cameras | {"train": replace(cameras, pose=torch.from_numpy(pose).to(cameras.pose))}

@@ -8,8 +8,7 @@ from types import ModuleType
 
 from ...errors import LumigraphError
 from .. import categories
-from ..options import Pictures
-from ..stage import SyntheticStage
+from ..stage import Pictures, SyntheticStage
 
 
 def available() -> list[str]:
