@@ -15,7 +15,7 @@ from typing import Any
 
 import tyro
 
-from lumigraph.capture.fewer import with_fewer_views
+from lumigraph.capture.views import with_fewer_views
 from lumigraph.evaluation import evaluate
 from lumigraph.figures import Row, contact_sheet, save_picture
 from lumigraph.geometry.choice import evenly

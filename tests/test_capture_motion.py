@@ -21,7 +21,6 @@ from views import draw, look_at, pattern, spoil, write_views
 
 from lumigraph.capture import open_scene
 from lumigraph.capture.colmap import read as read_colmap
-from lumigraph.capture.folds import jumps
 from lumigraph.capture.motion import MotionOptions, diagnosis, reconstruct, reconstruction
 from lumigraph.capture.motion.diagnosis import Matches, coverage, folds, read_matches, why_not
 from lumigraph.capture.motion.georeference import georeference, upright
@@ -30,6 +29,7 @@ from lumigraph.capture.motion.pairs import aggregated, alike, choose_matching, e
 from lumigraph.capture.motion.pairs import near as near_by
 from lumigraph.capture.motion.reconstruction import Reconstruction
 from lumigraph.capture.motion.stages import WORKER, Stages, key_of
+from lumigraph.capture.oddities import jumps
 from lumigraph.capture.photos import Intake, Photo
 from lumigraph.capture.transforms import read as read_transforms
 from lumigraph.commands import capture as command

@@ -16,12 +16,11 @@ from test_gaussian_splatting import new
 
 from lumigraph.capture import open_scene
 from lumigraph.capture.motion.folder import copy_masks
-from lumigraph.capture.objects.masking import doubts, mask_object
-from lumigraph.capture.objects.region import find_table
+from lumigraph.capture.objects import doubts, mask_object
 from lumigraph.capture.objects.segment import segment
-from lumigraph.capture.objects.view import ObjectView
+from lumigraph.capture.objects.view import ObjectView, find_table
 from lumigraph.capture.photos import gather
-from lumigraph.capture.photos.track import untracked
+from lumigraph.capture.photos.photo import untracked
 from lumigraph.datasets.scene import Scene
 from lumigraph.errors import LumigraphError, LumigraphWarning
 from lumigraph.evaluation import evaluate

@@ -22,8 +22,7 @@ from ..geometry import RIGID_TOLERANCE
 from ..system.progress import counting
 from .beside import make_about, make_layers
 from .capture import Capture, Shot
-from .forward import find_forward
-from .normalise import ScenePlacement, find_place
+from .normalise import ScenePlacement, find_forward, find_place
 from .oddities import oddities
 from .pictures import Chosen, check_downscale, choose
 

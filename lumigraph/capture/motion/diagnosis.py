@@ -13,8 +13,8 @@ from scipy.spatial import ConvexHull, QhullError
 
 from ...files.names import counted, natural
 from ...system.library import pycolmap
-from ..folds import in_steps, jumps
 from ..normalise import where_axes_meet
+from ..oddities import in_steps, jumps
 from ..photos import Intake, Photo
 
 MIN_FEATURES = 100

@@ -19,7 +19,7 @@ from ...files.marks import is_ours
 from ...system.library import pycolmap
 from ..masks import MASKS as MASKS
 from ..photos import Photo
-from ..photos.track import Track
+from ..photos.photo import Track
 from ..pictures import list_images, read_grey
 from ..raw import RAW_FILE
 from ..transforms import OPENCV_FROM_OPENGL, Made

@@ -22,7 +22,7 @@ from ...files.ranges import typed
 from ...system.library import pycolmap
 from ...system.progress import counting
 from ..photos import Intake, Photo, gather
-from ..photos.track import Track, untracked
+from ..photos.photo import Track, untracked
 from ..raw import RAW_FILE, Remembered
 from ..transforms import Made
 from .diagnosis import MIN_FEATURES, Diagnosis, Matches, diagnose, folds, read_matches

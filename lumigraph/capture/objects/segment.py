@@ -15,13 +15,13 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from scipy import ndimage
+from scipy.cluster.vq import kmeans2
+from scipy.sparse import csr_matrix
+from scipy.sparse.csgraph import breadth_first_order, maximum_flow
 from torch import Tensor
 
 from ...errors import LumigraphError
-from .colours import Mixture
-from .cut import MAX_COST, cut
-from .region import GRID_SIDE, Region, find_region
-from .view import ObjectView
+from .view import GRID_SIDE, ObjectView, Region, find_region
 
 MAX_DISAGREEMENTS = (0.35, 0.3, 0.25, 0.2, 0.15, 0.15)  # share of the views that may see past a cell, round by round
 CORE_RADIUS = 0.35  # of the region's radius: where colours are first learnt, without sparse points
@@ -37,6 +37,43 @@ MIN_OVERLAP = 0.75  # of a cut with the body, below which a warning names the ph
 
 
 Patches = np.ndarray  # bool: which superpixels of one picture; each picture has a number of its own
+COMPONENTS = 10  # Gaussians of a mixture
+MIN_PIXELS = 50  # per Gaussian
+MIN_DEVIATION = 2.0  # units of CIELAB by which colours of one surface differ at the least
+MAX_SAMPLES = 20_000  # pixels from which a mixture is learnt
+CAPACITY_SCALE = 1000  # of capacity to one of cost: the flow counts in whole numbers
+SMOOTHNESS = 3.0  # cost of an outline along one pixel where colours do not change
+MAX_COST = 30.0  # the largest of these costs
+
+
+@dataclass(frozen=True)
+class Mixture:
+    """A mixture of Gaussians over CIELAB colours."""
+
+    weights: Float[np.ndarray, " kind"]
+    means: Float[np.ndarray, "kind 3"]
+    roots: Float[np.ndarray, "kind 3 3"]  # of the inverse covariances
+
+    @staticmethod
+    def of(colours: Float[np.ndarray, "pixel 3"]) -> Mixture:
+        """The mixture that k-means finds in some colours."""
+        chance = np.random.default_rng(0)
+        some = colours[chance.permutation(len(colours))[:MAX_SAMPLES]].astype(np.float64)
+        count = int(np.clip(len(some) // MIN_PIXELS, 1, COMPONENTS))
+        means, kinds = kmeans2(some, count, minit="++", seed=0)
+        found = [k for k in range(count) if (kinds == k).sum() > 3]
+        weights = np.array([(kinds == k).mean() for k in found])
+        spreads = [np.cov(some[kinds == k].T) + MIN_DEVIATION**2 * np.eye(3) for k in found]
+        roots = np.stack([np.linalg.cholesky(np.linalg.inv(spread)) for spread in spreads])
+        return Mixture(weights, means[found], roots)
+
+    def log_likelihood(self, colours: Float[np.ndarray, "*pixel 3"]) -> Float[np.ndarray, "*pixel"]:
+        """Natural logarithm of the density of each colour."""
+        likely = np.zeros(colours.shape[:-1])
+        for weight, mean, root in zip(self.weights, self.means, self.roots, strict=True):
+            away = (colours - mean) @ root
+            likely += weight * np.linalg.det(root) * np.exp(-0.5 * np.square(away).sum(-1))
+        return np.log(likely / (2 * np.pi) ** 1.5 + 1e-12)
 
 
 @dataclass(frozen=True)
@@ -171,3 +208,31 @@ def overlap(view: ObjectView, a: Bool[np.ndarray, " patch"], b: Bool[np.ndarray,
     """Intersection over union of two sets of superpixels, by pixels; 1 where both are empty."""
     union = view.sizes[a | b].sum()
     return float(view.sizes[a & b].sum() / union) if union else 1.0
+
+
+def cut(view: ObjectView, costs: Float[np.ndarray, " patch"]) -> Bool[np.ndarray, " patch"]:
+    """Mask of the superpixels that belong to the object.
+
+    costs: of taking each into it, in logarithms of likelihood; negative ones speak for it. They count by the width of a
+           superpixel rather than its area, for the pixels of one are no independent witnesses
+    An outline costs less where colours change: exp(-|a - b|^2 / 2 mean) to a pixel of its length.
+    """
+    count = len(costs)
+    weighed = np.clip(costs, -MAX_COST, MAX_COST) * np.sqrt(view.sizes)
+    a, b = view.edges.T
+    apart = np.square(view.colours[a] - view.colours[b]).sum(-1)
+    along = SMOOTHNESS * view.lengths * np.exp(-apart / (2 * apart.mean() + 1e-9))
+    source, sink = count, count + 1
+    every = np.arange(count)
+    tails = np.concatenate([np.full(count, source), every, a, b])
+    heads = np.concatenate([every, np.full(count, sink), b, a])
+    capacity = np.concatenate([np.maximum(-weighed, 0), np.maximum(weighed, 0), along, along])
+    whole = np.minimum(capacity * CAPACITY_SCALE, 2**30).astype(np.int32)
+    graph = csr_matrix((whole, (tails, heads)), (count + 2, count + 2))
+    left = graph - maximum_flow(graph, source, sink).flow
+    left.data = np.maximum(left.data, 0)
+    left.eliminate_zeros()
+    reached = breadth_first_order(left, source, return_predecessors=False)
+    inside = np.zeros(count + 2, bool)
+    inside[reached] = True
+    return inside[:count]

@@ -14,7 +14,7 @@ from ...errors import LumigraphError
 from ...files import read_json, replacing, write_json
 from ...geometry.choice import evenly
 from ..raw import RAW_FILE, Developed, RawPhoto, Remembered, exif_of, open_raw
-from .track import Track
+from .photo import Track
 from .upright import JPEG_QUALITY, is_current
 
 PROBE_VIEWS = 8  # photographs that set the common brightness

@@ -22,8 +22,7 @@ from . import upright
 from .developed import develop
 from .exif import read_facts
 from .judge import Judgement, blurred, duplicates, judge
-from .photo import Intake, Photo
-from .track import Track, untracked
+from .photo import Intake, Photo, Track, untracked
 from .video import extract, is_video
 
 HEIC_SUFFIXES = (".heic", ".heif")

@@ -15,8 +15,7 @@ from PIL import ExifTags, Image
 
 from ...errors import LumigraphError
 from ..numbers import check_pixels
-from .demosaic import Pattern
-from .photo import RawPhoto, srgb_from_camera
+from .photo import Pattern, RawPhoto, srgb_from_camera
 
 RAW_SUFFIXES = (
     ".dng", ".nef", ".nrw", ".cr2", ".cr3", ".crw", ".arw", ".srf", ".sr2", ".raf", ".orf", ".rw2", ".pef", ".srw",

@@ -20,13 +20,22 @@ from ...files.ranges import Name, between
 from ..capture import Capture, PixelPlane, Shot
 from ..masks import inner_names
 from ..pictures import same_shape, stat
-from .demosaic import repeated
-from .opening import is_raw, open_raw
-from .photo import RawPhoto
+from . import library, mosaic_folder
+from .photo import RawPhoto, repeated
 
 RAW_FILE, RAW_FOLDER = "raw.json", "raw"
 FILTERS = ("red", "green", "blue")
 UNKNOWN_VALUE = -1
+
+
+def is_raw(path: Path) -> bool:
+    """True if a file is a camera's raw file by its name, or listed as a mosaic in its folder."""
+    return path.suffix.lower() in library.RAW_SUFFIXES or mosaic_folder.is_listed(path)
+
+
+def open_raw(path: Path) -> RawPhoto:
+    """A raw photograph, its pixels not yet read. Raises LumigraphError for what cannot be read, and why."""
+    return library.open_file(path) if path.suffix.lower() in library.RAW_SUFFIXES else mosaic_folder.open_mosaic(path)
 
 
 @dataclass(frozen=True)
