@@ -2,21 +2,25 @@
 
 from __future__ import annotations
 
+import contextlib
+import os
 from collections import deque
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Int, UInt8
+from PIL import Image
 from torch import Tensor
 
 from ...errors import LumigraphError
 from ...geometry.choice import evenly
 from ...system.memory import memory_for_images
-from .cache import MARK_FILE, cache_folder, free_space
-from .kept import kept
+from .cache import MARK_FILE, cache_folder, free_space, key
 from .store import ImageSource, ImageStore, PixelBatch, name_of
 
 DISK_SHARE = 0.5  # of the free space that a file of photographs may take
@@ -29,6 +33,7 @@ READING_COPIES = 3  # of a photograph in memory, while it is read
 ALPHA_PROBES = 4  # photographs that are tested for alpha
 
 Some = tuple[UInt8[np.ndarray, "kept 4"], Int[np.ndarray, " kept"]]  # pixels of a photograph, and where they lie in it
+PICTURES_FOLDER = "pictures"  # inside the cache
 
 
 def load(
@@ -176,3 +181,35 @@ def whole(picture: ImageSource) -> tuple[UInt8[np.ndarray, "height width 4"], Bo
 
 def see_through(pixels: UInt8[np.ndarray, "height width 4"]) -> bool:
     return bool((pixels[..., 3] < 255).any())
+
+
+def kept(picture: ImageSource, cache: Path) -> ImageSource:
+    """The same picture, which reads its file in `cache` where there is one and leaves one otherwise; as it is if
+    nothing says what it depends on."""
+    if picture.identity is None:
+        return picture
+    return replace(picture, read=partial(read_or_make, picture, cache / PICTURES_FOLDER))
+
+
+def read_or_make(picture: ImageSource, folder: Path) -> tuple[np.ndarray, np.ndarray | None]:
+    path = folder / f"{key([f'{picture.size} {picture.identity}'])}.png"
+    with contextlib.suppress(OSError, SyntaxError, ValueError), Image.open(path) as file:
+        pixels = np.asarray(file)
+        if pixels.shape[1::-1] == picture.size:
+            return pixels, None
+    pixels, mask = picture.read()
+    if mask is None:
+        leave(path, pixels)
+    return pixels, mask
+
+
+def leave(path: Path, pixels: np.ndarray) -> None:
+    """Write a picture, whole or not at all. A disk that is full or may not be written keeps nothing."""
+    part = path.with_name(f"{path.stem}.{os.getpid()}.part")
+    with contextlib.suppress(OSError):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            Image.fromarray(pixels).save(part, "png", compress_level=1)
+            os.replace(part, path)
+        finally:
+            part.unlink(missing_ok=True)

@@ -18,9 +18,9 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from ...errors import LumigraphError
-from ...files.ranges import Tally, typed
-from . import undistortion
+from ..errors import LumigraphError
+from ..files.ranges import Tally, typed
+from . import loops
 
 FOLD_SAMPLES = 1024  # angles from the axis at which a distortion is tested for folding over
 MAX_FLAT_ANGLE = math.radians(
@@ -262,14 +262,14 @@ class OpenCV(Lens):
         which = NO_INDEX if index is None else index
         inputs = (pixels, which, self.focal, self.centre, self.distortion, self.fold)
         # Each ray stops by itself here, so one beside a fold, where steps merely halve, gets no company's extra steps.
-        undistortion.undistort(*(x.numpy() for x in inputs), NEWTON_STEPS, 0.03 * CONVERGED_STEP, directions.numpy())
+        loops.undistort(*(x.numpy() for x in inputs), NEWTON_STEPS, 0.03 * CONVERGED_STEP, directions.numpy())
         return directions
 
     def _solid_angle_by_loop(self, directions: Tensor, index: Tensor | None) -> Tensor:
         angle = torch.empty(len(directions))
         which = NO_INDEX if index is None else index
         tensors = directions, which, self.focal, self.distortion, angle
-        undistortion.solid_angle(*(x.numpy() for x in tensors))
+        loops.solid_angle(*(x.numpy() for x in tensors))
         return angle
 
 

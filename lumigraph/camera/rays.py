@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from .midpoints import fill_midpoints
+from .loops import fill_midpoints
 
 
 @dataclass(frozen=True)
