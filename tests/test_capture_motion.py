@@ -373,10 +373,11 @@ def test_photographs_of_one_place_are_alike():
         np.clip(places[i % 3][chance.permutation(300)[:200]] + chance.normal(0, 4, (200, 128)), 0, 255).astype(np.uint8)
         for i in range(12)
     ]
-    similar = aggregated(photos)
+    similar = aggregated(photos.__getitem__, len(photos))
     assert all((i - j) % 3 == 0 for i, j in alike(similar, 3))
     assert all(abs(i - j) >= 6 for i, j in alike(similar, 3, apart=6))
-    assert np.isfinite(aggregated([np.zeros((0, 128), np.uint8), *photos])).all()
+    photos = [np.zeros((0, 128), np.uint8), *photos]
+    assert np.isfinite(aggregated(photos.__getitem__, len(photos))).all()
 
 
 def test_pairs_of_many_photographs_are_found_a_block_at_a_time(monkeypatch):

@@ -22,7 +22,7 @@ from ..geometry import RIGID_TOLERANCE
 from ..system.progress import counting
 from .beside import make_about, make_layers
 from .capture import Capture, Shot
-from .normalise import ScenePlacement, find_forward, find_place
+from .normalise import ScenePlacement, find_forward, find_place, similarity
 from .oddities import oddities
 from .pictures import Chosen, check_downscale, choose
 
@@ -88,11 +88,12 @@ def assemble(
 
     # Single precision is for what is near the origin: maps may put a capture hundreds of kilometres away.
     away = poses[:, :, 3].mean(0)
-    cameras = make_cameras(shots, moved(poses, translation(-away)), lenses, images.sizes)
-    upright = None if before is None else in_four(before.upright)
+    centred = similarity(np.eye(3), away, 1.0)
+    cameras = make_cameras(shots, moved(poses, centred), lenses, images.sizes)
+    upright = None if before is None else before.upright
     with counting("Looking for what the cameras look at"):
         place = find_place(shifted(capture, -away), cameras, images, splits["train"].tolist(), upright)
-    matrix = place.scene_from_source @ translation(-away)
+    matrix = place.scene_from_source @ centred
     cameras = make_cameras(shots, moved(poses, matrix), lenses, images.sizes)
     forward = None
     if place.reach > 1 and capture.around is None:
@@ -217,18 +218,6 @@ def moved(poses: Float[np.ndarray, "camera 3 4"], matrix: Float[np.ndarray, "4 4
     rotation = matrix[:3, :3] / np.cbrt(np.linalg.det(matrix[:3, :3])) @ poses[:, :, :3]
     position = poses[:, :, 3] @ matrix[:3, :3].T + matrix[:3, 3]
     return np.concatenate([rotation, position[:, :, None]], -1)
-
-
-def in_four(rotation: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "4 4"]:
-    matrix = np.eye(4)
-    matrix[:3, :3] = rotation
-    return matrix
-
-
-def translation(by: Float[np.ndarray, " 3"]) -> Float[np.ndarray, "4 4"]:
-    matrix = np.eye(4)
-    matrix[:3, 3] = by
-    return matrix
 
 
 def shifted(capture: Capture, by: Float[np.ndarray, " 3"]) -> Capture:

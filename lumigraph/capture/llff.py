@@ -31,10 +31,8 @@ def recognises(folder: Path) -> bool:
 
 
 def read(folder: Path) -> Capture:
-    """The capture in a folder.
-
-    Raises LumigraphError where the array is no such table or its rows are not as many as there are images.
-    """
+    """The capture in a folder. Raises LumigraphError where the array is no such table or its rows are not as many as
+    there are images."""
     path = folder / "poses_bounds.npy"
     try:
         table = np.array(load_array(path))

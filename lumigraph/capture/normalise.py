@@ -1,4 +1,5 @@
-"""Place a capture: the similarity that maps its box of interest into [-1, 1]^3, and the reach of the rest.
+"""The similarity that maps a capture's box of interest into [-1, 1]^3, the reach of the rest, and the plane in front of
+all that forward-facing cameras see.
 
 Three kinds of knowledge, best first: what the source says itself, silhouettes of an object, and sparse points together
 with where the cameras look. Nothing here depends on which program found the poses, nor on a user's numbers.
@@ -63,7 +64,7 @@ def find_place(
     cameras: Camera,
     images: ImageStore,
     views: list[int],
-    upright: Float[np.ndarray, "4 4"] | None = None,
+    upright: Float[np.ndarray, "3 3"] | None = None,
 ) -> ScenePlacement:
     """Placement of the capture.
 
@@ -75,7 +76,7 @@ def find_place(
     if capture.bounds is not None:
         return stated_place(capture, cameras, background)
     upright = upright_of(capture, cameras) if upright is None else upright
-    turned = cameras.transformed(torch.from_numpy(upright))
+    turned = cameras.transformed(torch.from_numpy(similarity(upright, np.zeros(3), 1.0)))
     if capture.around is not None:
         return part_place(capture, turned, upright, background)
     gaze = find_gaze(capture, turned, upright)
@@ -86,13 +87,13 @@ def find_place(
     return object_place(upright, box, turned, capture.background or found.background)
 
 
-def upright_of(capture: Capture, cameras: Camera) -> Float[np.ndarray, "4 4"]:
+def upright_of(capture: Capture, cameras: Camera) -> Float[np.ndarray, "3 3"]:
     """The rotation that brings up to +z in a capture's frame: none where it states bounds, which stand upright."""
     if capture.bounds is not None:
-        return np.eye(4)
+        return np.eye(3)
     if capture.up is not None:
         return upright_by(np.array(capture.up))
-    cloud = reliable_points(capture, np.eye(4))
+    cloud = reliable_points(capture, np.eye(3))
     return find_upright(cameras, None if cloud is None else cloud.points)
 
 
@@ -102,7 +103,7 @@ def part_place(capture: Capture, cameras: Camera, upright: np.ndarray, backgroun
     cameras: in the turned frame
     """
     assert capture.around is not None
-    centre, half = upright[:3, :3] @ np.array(capture.around[0]), capture.around[1]
+    centre, half = upright @ np.array(capture.around[0]), capture.around[1]
     cloud = reliable_points(capture, upright)
     depths = None if cloud is None else visible_depths(cameras, cloud)
     near = INDOOR_NEAR * half if depths is None else NEAR_SCALE * float(np.nanpercentile(depths[:, 0], 2))
@@ -125,7 +126,7 @@ def stated_place(capture: Capture, cameras: Camera, background: Vector) -> Scene
     bounds = box_in_scene(low, high, centre, half)
     reach = 1.0 if capture.reach is None else power_of_two(capture.reach / half)
     near = nearest_to_box(cameras, low, high) if capture.near is None else capture.near
-    return ScenePlacement(similarity(np.eye(4), centre, half), bounds, reach, max(near / half, MIN_NEAR), background)
+    return ScenePlacement(similarity(np.eye(3), centre, half), bounds, reach, max(near / half, MIN_NEAR), background)
 
 
 def object_place(
@@ -162,7 +163,6 @@ class Gaze:
 
     centre:     the middle of it
     distance:   typical, from the cameras
-    converging: whether their axes meet there
     half:       half-size of a box that holds what matters most
     nearest:    distance of the nearest thing any of them sees
     cloud:      sparse points, if there are any
@@ -170,7 +170,6 @@ class Gaze:
 
     centre: Float[np.ndarray, " 3"]
     distance: float
-    converging: bool
     half: float
     nearest: float
     cloud: WeightedPoints | None
@@ -197,7 +196,7 @@ def find_gaze(capture: Capture, cameras: Camera, upright: np.ndarray) -> Gaze:
         centre, distance = (position + middle * forward).mean(0), float(middle)
     around = not converging and np.linalg.norm(forward.mean(0)) < MIN_MEAN_DIRECTION
     half = distance if around else BOX_SHARE * distance  # from inside, all that is seen lies at that distance
-    return Gaze(centre, distance, converging, half, float(nearest), cloud)
+    return Gaze(centre, distance, half, float(nearest), cloud)
 
 
 def open_place(capture: Capture, upright: np.ndarray, gaze: Gaze, background: Vector) -> ScenePlacement:
@@ -238,14 +237,12 @@ def reliable_points(capture: Capture, upright: np.ndarray) -> WeightedPoints | N
     keep = np.isfinite(capture.points).all(-1) & (sightings >= 2)
     if keep.sum() < 16:
         return None
-    return WeightedPoints(capture.points[keep] @ upright[:3, :3].T, sightings[keep].astype(np.float64))
+    return WeightedPoints(capture.points[keep] @ upright.T, sightings[keep].astype(np.float64))
 
 
 def visible_depths(cameras: Camera, cloud: WeightedPoints) -> Float[np.ndarray, "camera 2"] | None:
-    """Distance to the nearest (2nd percentile) and the middle of the points inside each picture.
-
-    NaN for a picture that none are in, None if that is so for all.
-    """
+    """Distance to the nearest (2nd percentile) and the middle of the points inside each picture. NaN for a picture that
+    none are in, None if that is so for all."""
     chosen = evenly(range(len(cloud.points)), SAMPLED_POINTS)
     points, weights = cloud.points[chosen], cloud.weights[chosen]
     sampled = torch.from_numpy(points).float()
@@ -271,7 +268,7 @@ def where_axes_meet(position: np.ndarray, forward: np.ndarray) -> tuple[np.ndarr
 def similarity(upright: np.ndarray, centre: np.ndarray, half: float) -> Float[np.ndarray, "4 4"]:
     """Turn, then bring a centre to the origin and a half-size to 1."""
     matrix = np.eye(4)
-    matrix[:3, :3] = upright[:3, :3] / half
+    matrix[:3, :3] = upright / half
     matrix[:3, 3] = -np.asarray(centre) / half
     return matrix
 
@@ -310,7 +307,7 @@ def find_forward(
     standing = (cameras.position.double() - pose[:, 3]) @ pose[:, 2]
     unit = float(np.cbrt(np.linalg.det(scene_from_source[:3, :3])))
     stated = [shot.depths[0] * unit for shot in shots if shot.depths is not None]
-    cloud = reliable_points(capture, np.eye(4))
+    cloud = reliable_points(capture, np.eye(3))
     if len(stated) == len(shots):
         nearest = float((standing + torch.tensor(stated)).min())
     elif cloud is not None:

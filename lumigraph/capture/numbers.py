@@ -75,10 +75,8 @@ def check_pixels(size: tuple[int, int], each: int = 4) -> None:
 
 
 def load_array(path: Path) -> Any:
-    """Load a file by np.load without pickles, and within the memory of its bytes and of the machine.
-
-    Raises ValueError, and what np.load raises.
-    """
+    """Load a file by np.load without pickles, and within the memory of its bytes and of the machine. Raises ValueError,
+    and what np.load raises."""
     if not zipfile.is_zipfile(path):
         return np.load(path, mmap_mode="r", allow_pickle=False)
     with zipfile.ZipFile(path) as packed:

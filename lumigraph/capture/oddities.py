@@ -1,4 +1,4 @@
-"""Warn of captures that are well-formed but implausible, in a sentence each, before training begins."""
+"""Warnings of captures that are well-formed but implausible, in a sentence each, before training begins."""
 
 from __future__ import annotations
 
@@ -16,11 +16,7 @@ from .capture import Capture, Shot
 from .normalise import MIN_CONVERGENCE, SAMPLED_POINTS
 
 MIN_RELATIVE_SPREAD = 1e-9  # spread of cameras, as a share of their distance from the origin
-ZERO_SPREAD, MIN_SPREAD, MAX_SPREAD = (
-    1e-9,
-    1e-6,
-    1e6,
-)  # units between cameras: zero for computation, implausibly small, implausibly large
+ZERO_SPREAD, MIN_SPREAD, MAX_SPREAD = 1e-9, 1e-6, 1e6  # units between cameras: zero, and the plausible range
 MIN_FIELD_OF_VIEW, MAX_FIELD_OF_VIEW = 0.5, 175.0  # degrees of a flat picture, across its longer side
 MAX_AXIS_OFFSET = 0.1  # distance to an axis, as a share of the distance, at which axes still meet
 MIN_VISIBLE_SHARE = 0.1  # share of the points in front of the median camera, below which cameras look away from them

@@ -1,4 +1,4 @@
-"""Part of a capture: the photographs of one block of a large scene, which becomes a scene with a frame of its own."""
+"""Parts of a large capture, each of which becomes a scene with its own frame; and camera positions without pixels."""
 
 from __future__ import annotations
 
@@ -33,10 +33,8 @@ class CapturePart:
 
 
 def part_of(capture: Capture, part: CapturePart) -> Capture:
-    """The capture with these photographs alone, and a box of interest of that radius around that centre.
-
-    Raises LumigraphError where some of the photographs are not there.
-    """
+    """The capture with these photographs alone, and a box of interest of that radius around that centre. Raises
+    LumigraphError where some of the photographs are not there."""
     shots = {shot.name: shot for shot in with_splits(capture.shots)}
     if lost := [name for name in part.photographs if name not in shots]:
         raise LumigraphError(
@@ -91,10 +89,8 @@ class Places:
 
 
 def places_of(capture: Capture) -> Places:
-    """The places of a capture's photographs by name, 2 ahead of 10.
-
-    Raises LumigraphError for a capture without photographs, and for poses that are none.
-    """
+    """The places of a capture's photographs by name, 2 ahead of 10. Raises LumigraphError for a capture without
+    photographs, and for poses that are none."""
     shots = with_splits(in_order(capture.shots, None))
     if not shots:
         raise LumigraphError(f"{capture.source} has no photograph with a pose; add some")
@@ -108,5 +104,5 @@ def places_of(capture: Capture) -> Places:
         [shot.split for shot in shots],
         poses[:, :, 3],
         poses[:, :, 2],
-        upright_of(capture, cameras)[:3, :3],
+        upright_of(capture, cameras),
     )

@@ -1,4 +1,4 @@
-"""A scene with fewer photographs to learn from, to see how many a method needs; or with all that there are."""
+"""Scenes with other photographs to learn from: fewer, to see how many a method needs; all; or all at several sizes."""
 
 from __future__ import annotations
 
@@ -64,7 +64,8 @@ def distances(points: Float[Tensor, "point axis"], origin: Float[Tensor, " axis"
 
 
 def multiscale(scene: Scene, scales: int, memory: int | None = None, cache: Path | None = None) -> Scene:
-    """The scene with every photograph `scales` times, each half as large as the one before.
+    """The scene with every photograph `scales` times, each half as large as the one before, as if taken from further
+    away (Barron 2021, Mip-NeRF, section 4.1: trained on and tested together).
 
     Copies are means over squares of pixels, colours weighted by alpha; rows and columns that fill no square are left
     out. They are called NAME@1/2, NAME@1/4 and so on, share their photograph's split and image index, and follow behind

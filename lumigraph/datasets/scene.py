@@ -75,12 +75,7 @@ class Frame:
     background: tuple[Share, Share, Share] = (0.0, 0.0, 0.0)
     has_alpha: bool = False
     image_count: Annotated[int, between(0, 10**6)] = 0
-    source_from_scene: tuple[Row, ...] = (
-        (1.0, 0.0, 0.0, 0.0),
-        (0.0, 1.0, 0.0, 0.0),
-        (0.0, 0.0, 1.0, 0.0),
-        (0.0, 0.0, 0.0, 1.0),
-    )
+    source_from_scene: tuple[Row, ...] = Similarity.make(1.0).rows
     forward: Forward | None = None
     times: tuple[Coordinate, Coordinate] | None = None
 

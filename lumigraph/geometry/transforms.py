@@ -107,10 +107,8 @@ def multiply(a: Float[Tensor, "#rotation 4"], b: Float[Tensor, "#rotation 4"]) -
 
 @dataclass(frozen=True)
 class Similarity:
-    """A change of frame, x' = s R x + t, held as one 4x4 matrix in double precision.
-
-    A negative determinant mirrors; `scale` is then still positive.
-    """
+    """A change of frame, x' = s R x + t, held as one 4x4 matrix in double precision. A negative determinant mirrors;
+    `scale` is then still positive."""
 
     matrix: Float[Tensor, "4 4"]
 
@@ -166,9 +164,7 @@ def normals_from_depth(
     points: Float[Tensor, "height width 3"], depth: Float[Tensor, "height width"]
 ) -> Float[Tensor, "height width 3"]:
     """Unit normals of a surface from where each pixel sees it, in single precision; their side is not determined.
-
-    Differences are taken towards that neighbour which is nearer in depth, so that they do not reach across edges.
-    """
+    Differences are taken towards that neighbour which is nearer in depth, so that they do not reach across edges."""
     across, down = (_nearer_difference(points.double(), depth, axis) for axis in (1, 0))
     return torch.nn.functional.normalize(torch.linalg.cross(across, down), dim=-1).float()
 

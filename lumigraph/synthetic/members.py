@@ -93,26 +93,20 @@ def members_of(request: str) -> dict[str, str]:
 
 
 def member_stage(request: str) -> SyntheticStage:
-    """One object and the cameras around it."""
+    """One object and the cameras around it. Raises LumigraphError for a file of a mesh that holds no surface."""
     name, one = told(Member, request)
     if (path := path_of(request)) is not None:
-        stage, number = mesh_stage(path, one.size, one.views, one.seed), zlib.crc32(path.name.encode())
+        number = zlib.crc32(path.name.encode())
+        random = np.random.default_rng((one.seed, number))
+        stage = surrounded(tuple(plates(path)), BOUNDS, one.size, one.views, random)
     else:
         stage, number = categories.stage(name, one.member, one.size, one.views, one.seed), one.member
     return turned(stage, one.size, (one.seed, number)) if one.turned else stage
 
 
-def mesh_stage(path: Path, size: int, views: int, seed: int) -> SyntheticStage:
-    """Stage with one file's mesh, centred at the origin, photographed like members of categories. seed: of the cameras
-
-    Raises LumigraphError for a file that holds no surface.
-    """
-    random = np.random.default_rng((seed, zlib.crc32(path.name.encode())))
-    return surrounded(tuple(plates(path)), BOUNDS, size, views, random)
-
-
 def plates(path: Path) -> Iterator[Object]:
-    """Its triangles, in the mean colours of their corners."""
+    """Plates for the triangles of a mesh, centred at the origin, in the mean colours of their corners. Raises
+    LumigraphError for a file that holds no surface."""
     mesh = meshes.read_shape(path, path.stem).mesh
     if not len(mesh.faces):
         raise LumigraphError(f"{path} holds points and no surface, of which there is nothing to photograph")

@@ -1,4 +1,4 @@
-"""A stage: a world, and the cameras around it."""
+"""A stage: a world, and the cameras around it; and options behind its name: "still-life,size=400,seed=1"."""
 
 from __future__ import annotations
 

@@ -86,6 +86,11 @@ class Material:
     roughness: float = 0.4
     metal: float = 0.0
 
+    def describe(self):
+        texture, a, b, numbers = self.texture.describe()
+        numbers = (*numbers, 0.0, 0.0, 0.0, 0.0)[:4]
+        return texture, linear_from_srgb(a), linear_from_srgb(b), numbers, self.gloss, self.roughness, self.metal
+
 
 @dataclass(frozen=True)
 class Object:
@@ -124,7 +129,7 @@ class Lamp:
     colour: Colour = (1.0, 1.0, 1.0)
 
     def describe(self):
-        return 0, self.position, self.radius, _linear(self.colour) * self.power
+        return 0, self.position, self.radius, linear_from_srgb(self.colour) * self.power
 
     def moved(self, pose: Pose) -> Lamp:
         return replace(self, position=(pose @ Pose(self.position)).position)
@@ -146,7 +151,7 @@ class Sun:
 
     def describe(self):
         toward = np.array(self.direction) / np.linalg.norm(self.direction)
-        return 1, toward, self.radius, _linear(self.colour) * self.power
+        return 1, toward, self.radius, linear_from_srgb(self.colour) * self.power
 
     def moved(self, pose: Pose) -> Sun:
         return replace(self, direction=(Pose(rotation=pose.rotation) @ Pose(self.direction)).position)
@@ -177,7 +182,7 @@ class Sky:
     balance: Colour = (1.0, 1.0, 1.0)
 
     def describe(self):
-        colours = (_linear(c) * self.light for c in (self.zenith, self.horizon, self.ground))
+        colours = (linear_from_srgb(c) * self.light for c in (self.zenith, self.horizon, self.ground))
         exposure = self.exposure * np.array(self.balance)
         return int(self.visible), *colours, self.clouds, self.haze, self.reach, exposure
 
@@ -226,7 +231,7 @@ class World:
             row["material"], row["identity"] = materials[thing.material], names[thing.name]
         return Arrays(
             objects,
-            np.array([_material(m) for m in materials], MATERIAL),
+            np.array([material.describe() for material in materials], MATERIAL),
             np.array([x.describe() for x in self.lights], LIGHT),
             np.array([self.sky.describe()], SKY),
             hierarchy([o.bounds() for o in self.objects]),
@@ -269,27 +274,15 @@ def rotation_about(axis: Vector, degrees: float) -> np.ndarray:
     return np.eye(3) + math.sin(angle) * cross + (1 - math.cos(angle)) * cross @ cross
 
 
-def _material(material: Material):
-    texture, a, b, numbers = material.texture.describe()
-    numbers = (*numbers, 0.0, 0.0, 0.0, 0.0)[:4]
-    return texture, _linear(a), _linear(b), numbers, material.gloss, material.roughness, material.metal
-
-
-def _linear(colour: Colour) -> np.ndarray:
-    return linear_from_srgb(colour)
-
-
 def nested(matrix: np.ndarray):
     """The rows of a matrix, as `Pose.rotation` has them."""
     return tuple(tuple(row) for row in matrix.tolist())
 
 
 def hierarchy(boxes: list[tuple[np.ndarray, np.ndarray]]) -> np.ndarray:
-    """The tree over boxes (low, high), as an array of NODE.
-
-    Unbounded ones come first; the others are split again and again where a ray then has least to ask (surface area
-    heuristic, Goldsmith and Salmon 1987).
-    """
+    """The tree over boxes (low, high), as an array of NODE in depth-first order: where a ray misses a box, it goes on
+    at `skip`, past everything inside it; there is no stack. Unbounded ones come first; the others are split again and
+    again where a ray then has least to ask (surface area heuristic, Goldsmith and Salmon 1987)."""
     if not boxes:
         return np.zeros(0, NODE)
     low, high = (np.clip(np.array(x).reshape(-1, 3), -FAR_DISTANCE, FAR_DISTANCE) for x in zip(*boxes, strict=True))

@@ -39,10 +39,8 @@ NAMES = {
 
 
 def claim(folder: Path, sources: Sequence[Path]) -> Path:
-    """Make or recognise the folder of these photographs' scene; gives the folder to work in.
-
-    Raises LumigraphError for a folder that holds something else.
-    """
+    """Make or recognise the folder of these photographs' scene; gives the folder to work in. Raises LumigraphError for
+    a folder that holds something else."""
     work, wanted = folder / WORK_FOLDER, [str(path.resolve()) for path in sources]
     for path in sources:
         if (path / WORK_FOLDER / SOURCES_FILE).is_file():

@@ -1,11 +1,9 @@
-"""mask_object(): the object of a captured scene, as masks beside its photographs."""
+"""Masks of an object before a backdrop, found from the photographs of a capture themselves."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -18,6 +16,7 @@ from ...errors import LumigraphError
 from ...figures import Row, contact_sheet, fit_into, save_picture
 from ...files import claim, replacing_folder
 from ...geometry.choice import evenly
+from ...system.progress import track
 from ..assemble import assemble
 from ..capture import Capture
 from ..masks import OBJECT_MASKS, inner_names
@@ -32,8 +31,6 @@ MIN_SEPARATION = 0.8  # share of superpixels that colours separate, below which 
 MAX_FILLED_SHARE = 0.6  # share of the region that an object may fill
 BACKGROUND_BRIGHTNESS = 0.2  # factor on the background of the sheet
 
-Track = Callable[[Sequence[Any], str, int], Iterable[Any]]
-
 
 @dataclass(frozen=True)
 class Masked:
@@ -44,8 +41,8 @@ class Masked:
     doubts: list[str]
 
 
-def mask_object(folder: Path, capture: Capture, track: Track) -> Masked:
-    """Find the object that a scene's photographs look at, and write what of each shows it.
+def mask_object(folder: Path, capture: Capture) -> Masked:
+    """Find the object in the middle of a scene's photographs, and write its mask for each.
 
     folder:  of the scene; gets object_masks/ with image.jpg.png for image.jpg, and object.png to judge them by
     capture: what a reader found there
@@ -55,8 +52,11 @@ def mask_object(folder: Path, capture: Capture, track: Track) -> Masked:
         raise LumigraphError(f"{folder / OBJECT_MASKS} is there already; delete it, and masks will be made anew")
     claim(folder / SHEET_FILE, "masks")
     scene = assemble(replace(capture, shots=[replace(shot, mask=None, alpha=None) for shot in capture.shots]))
-    views = [view_of(scene, i) for i in track(range(len(scene)), "Dividing photographs", len(scene))]
-    found = segment(views, scene.points, track)
+    views = [
+        ObjectView.of(scene.names[i], scene.cameras[i], scene.photograph(i).rgb)
+        for i in track(range(len(scene)), "Dividing photographs", len(scene))
+    ]
+    found = segment(views, scene.points)
     tiles: dict[int, Image.Image] = {}
     shown = evenly(range(len(scene)), MAX_SHOWN)
     with replacing_folder(folder / OBJECT_MASKS) as partial:
@@ -71,10 +71,6 @@ def mask_object(folder: Path, capture: Capture, track: Track) -> Masked:
                 tiles[i] = fit_into(Image.fromarray((lit * 255).astype(np.uint8)), 320, 320)
     save_picture(folder / SHEET_FILE, sheet_of(scene, tiles), "masks")
     return Masked(len(scene), folder / SHEET_FILE, doubts(found))
-
-
-def view_of(scene: Scene, index: int) -> ObjectView:
-    return ObjectView.of(scene.names[index], scene.cameras[index], scene.photograph(index).rgb)
 
 
 def refined(
@@ -113,7 +109,8 @@ def sheet_of(scene: Scene, tiles: dict[int, Image.Image]) -> Image.Image:
 def guided(
     guide: Float[np.ndarray, "height width"], rough: Float[np.ndarray, "height width"], radius: int, noise: float = 1e-3
 ) -> Float[np.ndarray, "height width"]:
-    """a guide + b, whose a and b fit `rough` best in the windows around each pixel (eq. 5 to 8).
+    """A rough outline with its photograph's edges, by the guided filter (He, Sun and Tang 2010): a guide + b, whose
+    a and b fit `rough` best in the windows around each pixel (eq. 5 to 8).
 
     noise: variance of the guide that counts as none
     """

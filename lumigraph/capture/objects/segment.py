@@ -8,7 +8,7 @@ superpixels, and a table that sparse points show bounds the object from below.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,14 +21,13 @@ from scipy.sparse.csgraph import breadth_first_order, maximum_flow
 from torch import Tensor
 
 from ...errors import LumigraphError
+from ...system.progress import track
 from .view import GRID_SIDE, ObjectView, Region, find_region
 
 MAX_DISAGREEMENTS = (0.35, 0.3, 0.25, 0.2, 0.15, 0.15)  # share of the views that may see past a cell, round by round
 CORE_RADIUS = 0.35  # of the region's radius: where colours are first learnt, without sparse points
-MIN_SHADOW_SHARE, SHADOW_BRIGHTNESS = (
-    0.25,
-    0.35,
-)  # share of surrounding colours that also count as shaded; brightness of the darkest shadow
+SHADOW_SHARE = 0.25  # share of surrounding colours that also count as shaded
+SHADOW_BRIGHTNESS = 0.35  # of the darkest shadow
 PLAIN_SHARE, PLAIN_DISTANCE = 0.8, 3.0  # share of a plain backdrop within this CIELAB distance of its median
 BODY_LOG_LIKELIHOOD = 2.5  # log-likelihood added to the pixels that a body covers
 MAX_COLOUR_LOG_LIKELIHOOD = 4.0  # limit of the evidence of colours alone
@@ -48,7 +47,7 @@ MAX_COST = 30.0  # the largest of these costs
 
 @dataclass(frozen=True)
 class Mixture:
-    """A mixture of Gaussians over CIELAB colours."""
+    """A mixture of Gaussians over CIELAB colours; the object and its surroundings have one each (Rother 2004, 3.1)."""
 
     weights: Float[np.ndarray, " kind"]
     means: Float[np.ndarray, "kind 3"]
@@ -100,11 +99,7 @@ class Segmentation:
         return [view.name for view, overlap in zip(self.views, self.overlaps, strict=True) if overlap < MIN_OVERLAP]
 
 
-def segment(
-    views: Sequence[ObjectView],
-    points: Float[Tensor, "point 3"] | None,
-    track: Callable[[Sequence[float], str, int], Iterable[float]],
-) -> Segmentation:
+def segment(views: Sequence[ObjectView], points: Float[Tensor, "point 3"] | None) -> Segmentation:
     """Cut the object that the views look at out of all of them.
 
     points: sparse points, in the scene's frame
@@ -164,12 +159,9 @@ def learn_colours(views: Sequence[ObjectView], inside: Sequence[Patches]) -> tup
 
 def shaded(colours: Float[np.ndarray, "patch 3"]) -> Float[np.ndarray, "shaded 3"]:
     """Some colours as they are in the object's own shadow, which is seen nowhere else; none of a plain backdrop, which
-    is no surface that shadows fall on.
-
-    Of CIELAB all three numbers shrink together when light does.
-    """
+    is no surface that shadows fall on. Of CIELAB all three numbers shrink together when light does."""
     away = np.linalg.norm(colours - np.median(colours, 0), axis=-1)
-    some = colours[:: round(1 / MIN_SHADOW_SHARE)] if np.quantile(away, PLAIN_SHARE) > PLAIN_DISTANCE else colours[:0]
+    some = colours[:: round(1 / SHADOW_SHARE)] if np.quantile(away, PLAIN_SHARE) > PLAIN_DISTANCE else colours[:0]
     return some * np.random.default_rng(0).uniform(SHADOW_BRIGHTNESS, 1, (len(some), 1))
 
 
@@ -194,10 +186,8 @@ def carved(
     grid = np.zeros((GRID_SIDE,) * 3, bool)
     index = tuple(((region.cells.numpy() + 1) / region.size).astype(int).T)
     grid[index] = keep
-    pieces, count = ndimage.label(grid)
-    if not count:
-        raise LumigraphError("No body looks like the outlines found, so no object can be told from the rest")
-    largest = 1 + int(np.argmax(np.bincount(pieces.ravel())[1:]))
+    pieces, _ = ndimage.label(grid)
+    largest = 1 + int(np.argmax(np.bincount(pieces.ravel(), minlength=2)[1:]))
     body = region.cells[torch.from_numpy((pieces == largest)[index])]
     if len(body) < MIN_CELLS:
         raise LumigraphError("No body looks like the outlines found, so no object can be told from the rest")
@@ -211,7 +201,8 @@ def overlap(view: ObjectView, a: Bool[np.ndarray, " patch"], b: Bool[np.ndarray,
 
 
 def cut(view: ObjectView, costs: Float[np.ndarray, " patch"]) -> Bool[np.ndarray, " patch"]:
-    """Mask of the superpixels that belong to the object.
+    """Mask of the superpixels that belong to the object: the outline of least cost, a minimum cut through a picture's
+    superpixels (Boykov and Jolly 2001).
 
     costs: of taking each into it, in logarithms of likelihood; negative ones speak for it. They count by the width of a
            superpixel rather than its area, for the pixels of one are no independent witnesses

@@ -1,4 +1,4 @@
-"""One photograph as segmentation sees it: small, in patches of like colour."""
+"""Input of segmentation: small photographs in superpixels, and the region of space that an object may fill."""
 
 from __future__ import annotations
 

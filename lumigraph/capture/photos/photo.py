@@ -1,4 +1,4 @@
-"""Photo and Intake: pictures whose poses nobody knows yet."""
+"""Pictures without known poses, and the interface by which long work on them reports its progress."""
 
 from __future__ import annotations
 
@@ -64,5 +64,5 @@ class Intake:
 
 
 def untracked(items: Iterable[Any], description: str, total: int) -> Iterator[Any]:
-    """Tells nobody."""
+    """The items, without a report."""
     yield from items

@@ -1,9 +1,9 @@
-"""The frames of a video that are worth having: sharp, evenly spread over what the camera saw, no two the same.
+"""Selection of frames from a video: sharp, evenly spread over what the camera saw, no two the same.
 
-The film is watched twice. First every frame, or every second or fourth of a fast film, is judged small: how sharp it is
+The film is read twice. First every frame, or every second or fourth of a fast film, is judged small: how sharp it is
 and how far the picture has moved since the beginning. The film is then cut into as many stretches as frames are wanted,
 each with equal movement, so that a resting camera gives few frames and a quick turn many; a share of TIME goes by the
-clock, for what the eye does not see move. The sharpest frame of each stretch, rather in its middle, is written the
+clock, for movement that is not measured. The sharpest frame of each stretch, rather in its middle, is written the
 second time, unless it shows what a frame before it shows.
 """
 
@@ -27,9 +27,9 @@ from scipy.fft import irfft2, rfft2
 from ...errors import LumigraphError, LumigraphWarning
 from ...files import is_file, read_json, replacing_folder, write_json
 from ...files.ranges import Lasted
+from .copies import save
 from .judge import DUPLICATE_CORRELATION, JUDGED_SIDE, sharpness, signature
 from .photo import Track, untracked
-from .upright import save
 
 VIDEOS = {
     ".mp4", ".mov", ".m4v", ".mkv", ".webm", ".avi", ".mpg", ".mpeg", ".mts", ".m2ts", ".3gp", ".wmv", ".ogv", ".flv"
@@ -173,10 +173,8 @@ def opened(path: Path) -> Iterator[InputContainer]:
 
 
 def decoded(path: Path, film: InputContainer) -> Iterator[tuple[VideoFrame, float]]:
-    """Frames in order, and when each is shown, in seconds. What comes after damage is left out.
-
-    Raises LumigraphError where no frame can be decoded.
-    """
+    """Frames in order, and when each is shown, in seconds. What comes after damage is left out. Raises LumigraphError
+    where no frame can be decoded."""
     rate, count = speed(film), 0
     try:
         for frame in film.decode(video=0):
@@ -220,10 +218,10 @@ def why(fault: Exception) -> str:
 
 
 class Odometer:
-    """Adds up how far the picture moves, in pixels of small grey pictures that are shown to it one by one.
+    """Sum of the movement of a picture, in pixels of small grey pictures that are given one by one.
 
-    Each is compared with a reference, which is exchanged only once the picture has moved by STRIDE, so that noise does
-    not add up while the camera rests.
+    Each is compared with a reference, which is exchanged only once the picture has moved by REFERENCE_STRIDE, so that
+    noise does not add up while the camera rests.
     """
 
     def __init__(self) -> None:
@@ -254,9 +252,7 @@ def cut(picture: Float[np.ndarray, "height width"]) -> Float[np.ndarray, "tile r
 
 def moved(a: Float[np.ndarray, "tile row column"], b: Float[np.ndarray, "tile row column"]) -> float:
     """Mean length of the tiles' displacements, each where its cross-correlation peaks; 0 where nothing has texture.
-
-    Tiles are followed one by one, so that walking forward or turning about the line of sight counts as well.
-    """
+    Tiles are followed one by one, so that walking forward or turning about the line of sight counts as well."""
     textured = np.minimum(np.square(a).mean((1, 2)), np.square(b).mean((1, 2))) > MIN_VARIANCE * WINDOW_MEAN_SQUARE
     if not textured.any():
         return 0.0

@@ -32,11 +32,8 @@ _silenced, _stderr = 0, -1  # threads that are silent, and where the others' wor
 
 
 def open_file(path: Path) -> RawPhoto:
-    """A camera's raw file, of which only what is said of the pixels is read.
-
-    Raises LumigraphError where rawpy is not installed, for a camera that LibRaw does not know, a file cut short, and
-    filters that are not Bayer's.
-    """
+    """A camera's raw file, of which only what is said of the pixels is read. Raises LumigraphError where rawpy is not
+    installed, for a camera that LibRaw does not know, a file cut short, and filters that are not Bayer's."""
     with opened(path) as raw:
         width, height = raw.sizes.width, raw.sizes.height
         try:

@@ -1,4 +1,4 @@
-"""RawPhoto: one raw photograph, its pixels not read yet, and how it becomes a picture."""
+"""One raw photograph, its pixels not read yet, and its development: white balance, demosaicing, sRGB."""
 
 from __future__ import annotations
 
@@ -20,13 +20,9 @@ RED, GREEN, BLUE = range(3)
 Pattern = tuple[tuple[int, int], tuple[int, int]]  # the filters over each square of four pixels, row by row
 
 # Malvar 2004, figure 2: bilinear means, corrected by how the colour that was measured here curves.
-CROSS_FILTER = np.array([[0, 0, -1, 0, 0], [0, 0, 2, 0, 0], [-1, 2, 4, 2, -1], [0, 0, 2, 0, 0], [0, 0, -1, 0, 0]]) / 8
-BESIDE_FILTER = (
-    np.array([[0, 0, 1, 0, 0], [0, -2, 0, -2, 0], [-2, 8, 10, 8, -2], [0, -2, 0, -2, 0], [0, 0, 1, 0, 0]]) / 16
-)
-CORNERS_FILTER = (
-    np.array([[0, 0, -3, 0, 0], [0, 4, 0, 4, 0], [-3, 0, 12, 0, -3], [0, 4, 0, 4, 0], [0, 0, -3, 0, 0]]) / 16
-)
+CROSS_FILTER = np.array([[0, 0, -1, 0, 0], [0, 0, 2, 0, 0], [-1, 2, 4, 2, -1], [0, 0, 2, 0, 0], [0, 0, -1, 0, 0]])
+BESIDE_FILTER = np.array([[0, 0, 1, 0, 0], [0, -2, 0, -2, 0], [-2, 8, 10, 8, -2], [0, -2, 0, -2, 0], [0, 0, 1, 0, 0]])
+CORNERS_FILTER = np.array([[0, 0, -3, 0, 0], [0, 4, 0, 4, 0], [-3, 0, 12, 0, -3], [0, 4, 0, 4, 0], [0, 0, -3, 0, 0]])
 
 
 def demosaiced(light: Float[np.ndarray, "height width"], pattern: Pattern) -> Float[np.ndarray, "height width 3"]:
@@ -36,7 +32,7 @@ def demosaiced(light: Float[np.ndarray, "height width"], pattern: Pattern) -> Fl
     """
     green, along, across, corners = (
         convolve(light, kernel.astype(light.dtype), mode="mirror")
-        for kernel in (CROSS_FILTER, BESIDE_FILTER, BESIDE_FILTER.T, CORNERS_FILTER)
+        for kernel in (CROSS_FILTER / 8, BESIDE_FILTER / 16, BESIDE_FILTER.T / 16, CORNERS_FILTER / 16)
     )
     rgb = np.stack([light, green, light], -1)
     for colour in (RED, BLUE):

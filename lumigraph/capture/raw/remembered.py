@@ -1,4 +1,4 @@
-"""Raw file of each photograph of a scene, and the layers and facts that it adds to the scene.
+"""Raw files of a scene's photographs, and the layers and facts that they add to the scene.
 
 raw.json in a scene's folder names the files, as `lumigraph capture` writes it. Without it, a folder `raw` beside the
 photographs may hold them, each called as its photograph is (RawNeRF's published captures have it so).

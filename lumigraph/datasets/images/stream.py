@@ -21,7 +21,7 @@ from ...errors import LumigraphError
 from ...geometry.choice import evenly
 from ...system.memory import memory_for_images
 from .cache import MARK_FILE, cache_folder, free_space, key
-from .store import ImageSource, ImageStore, PixelBatch, name_of
+from .store import ImageSource, ImageStore, PixelBatch, name_of, see_through, whole
 
 DISK_SHARE = 0.5  # of the free space that a file of photographs may take
 KEPT_PIXELS = 1 << 16  # random pixels kept per photograph
@@ -170,22 +170,9 @@ class ImageStream(ImageStore):
         return rgba[chosen], chosen.astype(np.int32)
 
 
-def whole(picture: ImageSource) -> tuple[UInt8[np.ndarray, "height width 4"], Bool[np.ndarray, "height width"] | None]:
-    """A photograph's pixels, four bytes each, and which of them to trust; None for all."""
-    image, mask = picture.read()
-    assert image.shape[1::-1] == picture.size, f"promised {picture.size}, read {image.shape}"
-    four = np.full((*image.shape[:2], 4), 255, np.uint8)
-    four[..., : image.shape[2]] = image
-    return four, None if mask is None or mask.all() else mask.astype(bool)
-
-
-def see_through(pixels: UInt8[np.ndarray, "height width 4"]) -> bool:
-    return bool((pixels[..., 3] < 255).any())
-
-
 def kept(picture: ImageSource, cache: Path) -> ImageSource:
-    """The same picture, which reads its file in `cache` where there is one and leaves one otherwise; as it is if
-    nothing says what it depends on."""
+    """A picture that took long to make, made once for all scenes: it reads its file in `cache` where there is one, and
+    writes one otherwise. As it is if nothing says what it depends on."""
     if picture.identity is None:
         return picture
     return replace(picture, read=partial(read_or_make, picture, cache / PICTURES_FOLDER))

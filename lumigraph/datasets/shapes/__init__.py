@@ -1,4 +1,4 @@
-"""Shape: one mesh or cloud of points, and what is known of the space around it."""
+"""Shapes: meshes or clouds of points to learn from, and the distance and occupancy of the space around them."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from ...camera import Camera, ring
+from ...camera.camera import join
 from ...geometry import Similarity
 from ..mesh import Mesh
 from ..scene import Frame
@@ -21,10 +22,7 @@ from .triangles import Triangles
 HALF_SIDE = 0.9  # half of the longest side after normalisation
 BOX_MARGIN = 0.05  # scene units between the shape and the box of interest
 PROBE_POINTS, PROBE_SEED = 256, 0  # points at which a closed surface has an integer winding number
-INTEGER_TOLERANCE, MIN_CLOSED_SHARE = (
-    0.05,
-    0.97,
-)  # distance to an integer, and the required share of probe points within it
+INTEGER_TOLERANCE, MIN_CLOSED_SHARE = 0.05, 0.97  # distance to an integer, and the share of probe points within it
 CUBE = Frame(background=(1.0, 1.0, 1.0))  # of many shapes, each of which has a frame of its own
 
 
@@ -58,18 +56,9 @@ class PointBatch:
     @staticmethod
     def cat(parts: list[PointBatch]) -> PointBatch:
         """One batch from several; what one of them lacks, all lack."""
-
-        def join(values: list[Tensor | None]) -> Tensor | None:
-            found = [x for x in values if x is not None]
-            return torch.cat(found) if len(found) == len(values) else None
-
-        return PointBatch(
-            torch.cat([x.points for x in parts]),
-            torch.cat([x.member for x in parts]),
-            join([x.distance for x in parts]),
-            join([x.occupancy for x in parts]),
-            join([x.normals for x in parts]),
-        )
+        points, member = torch.cat([x.points for x in parts]), torch.cat([x.member for x in parts])
+        known = (join(getattr(x, name) for x in parts) for name in ("distance", "occupancy", "normals"))
+        return PointBatch(points, member, *known)
 
 
 @dataclass(frozen=True)
@@ -120,9 +109,7 @@ class Shape:
 
     def surface(self, count: int, generator: torch.Generator, member: int = 0) -> PointBatch:
         """Random points of the surface, evenly by its area, with their normals; of a cloud, random ones of its points.
-
-        Their distance is 0.
-        """
+        Their distance is 0."""
         members, zero = torch.full((count,), member), torch.zeros(count)
         if self.is_cloud:
             chosen = torch.randint(len(self.mesh.vertices), (count,), generator=generator).numpy()
@@ -142,10 +129,9 @@ class Shape:
         places = points.detach().cpu().double().numpy()
         if not self.is_cloud:
             return torch.from_numpy(self._facing[1][self._triangles.nearest(places)[1]]).float()
-        normals = (
-            np.array([[0.0, 0.0, 1.0]]).repeat(len(self.mesh.vertices), 0) if self.normals is None else self.normals
-        )
-        return torch.from_numpy(normals[self._cloud.query(places)[1]]).float()
+        if self.normals is None:
+            return torch.tensor([[0.0, 0.0, 1.0]]).repeat(len(points), 1)
+        return torch.from_numpy(self.normals[self._cloud.query(places)[1]]).float()
 
     @cached_property
     def _corners(self) -> Float[np.ndarray, "face 3 3"]:
@@ -184,7 +170,8 @@ def normalised(
     scale = 2 * HALF_SIDE / max(float((high - low).max()), 1e-12)
     scene_from_file = Similarity.make(scale, turn, torch.from_numpy(-scale * (low + high) / 2))
     made = mesh.transformed(scene_from_file.matrix.numpy())
-    if len(made.faces) and volume(made) < 0:  # it was inside out
+    a, b, c = made.vertices[made.faces].transpose(1, 0, 2)
+    if (a * np.cross(b, c)).sum() < 0:  # the enclosed volume: it was inside out
         made = replace(made, faces=made.faces[:, ::-1].copy())
     half = np.minimum(scale * (high - low) / 2 + BOX_MARGIN, 1.0)
     corner = (float(half[0]), float(half[1]), float(half[2]))
@@ -194,12 +181,6 @@ def normalised(
         source_from_scene=scene_from_file.inverse.rows,
     )
     return Shape(name, made, frame, None if normals is None else normals @ turn.numpy().T)
-
-
-def volume(mesh: Mesh) -> float:
-    """Volume that the mesh encloses; negative if its triangles face inwards."""
-    a, b, c = mesh.vertices[mesh.faces].transpose(1, 0, 2)
-    return float((a * np.cross(b, c)).sum() / 6)
 
 
 @dataclass(frozen=True)
