@@ -12,7 +12,7 @@ from PIL import Image
 from torch import Tensor
 
 from ..camera import Camera, dome, ring
-from ..camera.crop import Box
+from ..camera.crop import CropBox
 from ..datasets.mesh import Mesh
 from ..datasets.scene import Frame
 from ..datasets.shapes import Shape, Shapes
@@ -161,7 +161,7 @@ def surface_of(method: Method, frame: Frame, cells: int) -> Mesh:
     Raises LumigraphError where there is none."""
     if isinstance(method, HasMesh):
         return method.mesh()
-    box = Box(*frame.bounds)
+    box = CropBox(*frame.bounds)
     cell = max(b - a for a, b in zip(box.lower, box.upper, strict=True)) / cells
     if not can(method, HasDistance):
         return extract_mesh(method, dome(ring(frame.bounds)), cell=cell, smooth=0)
