@@ -108,6 +108,11 @@ class Camera:
         size = (self.size * factor).round().clamp_min(1).to(self.size.dtype)
         return replace(self, size=size, lens=self.lens.resized((size.double() / self.size).to(self.pose.dtype)))
 
+    def reduced(self, factor: int) -> Camera:
+        """Cameras of pictures a whole number of times smaller, without the rows and columns that fill no square."""
+        scale = torch.full((1, 2), 1 / factor, device=self.pose.device)
+        return replace(self, lens=self.lens.resized(scale), size=self.size // factor)
+
     def transformed(self, similarity: Float[Tensor, "4 4"]) -> Camera:
         """The cameras in another frame, x' = M x: positions and eyes' distances scale, rotations stay rotations."""
         similarity = similarity.to(self.pose)

@@ -165,16 +165,9 @@ def without_stray_points(capture: Capture) -> tuple[Capture, list[str]]:
     near = (np.abs(capture.points) <= MAX_COORDINATE).all(-1)
     if near.all():
         return capture, []
-    kept = replace(
-        capture,
-        points=capture.points[near],
-        point_colours=None if capture.point_colours is None else capture.point_colours[near],
-        sightings=None if capture.sightings is None else capture.sightings[near],
-    )
     stray = counted(int((~near).sum()), "point")
-    return kept, [
-        f"{capture.source} has {stray} that are not finite or {MAX_COORDINATE:g} units away; using the others"
-    ]
+    told = f"{capture.source} has {stray} that are not finite or {MAX_COORDINATE:g} units away; using the others"
+    return capture.with_points(near), [told]
 
 
 def fitted_lens(shot: Shot, chosen: Chosen) -> Lens:

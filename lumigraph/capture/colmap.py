@@ -63,8 +63,7 @@ def read(folder: Path) -> Capture:
             f"{folders[min(folders)]} holds none of the {len(names)} photographs that {place} lists, "
             f"such as {names[0]}; put them into {folder / 'images'}"
         )
-    cloud = read_points(place, model)
-    return Capture(str(folder), shots, cloud.positions, cloud.colours, cloud.sightings, missing)
+    return Capture(str(folder), shots, missing=missing, **vars(read_points(place, model)))
 
 
 def read_model(place: Path) -> pycolmap.Reconstruction:

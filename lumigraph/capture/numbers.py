@@ -209,11 +209,6 @@ def turned(values: np.ndarray, orientation: int | None) -> np.ndarray:
     return values[:, ::-1] if orientation in (2, 3, 6, 7) else values
 
 
-def colours(values: np.ndarray) -> np.ndarray:
-    """Grey as RGB; RGB and RGBA as they are."""
-    return np.repeat(values[..., None], 3, -1) if values.ndim == 2 else values
-
-
 def as_bytes(values: np.ndarray, encoding: str) -> np.ndarray:
     """RGB or RGBA of more than eight bits as sRGB-encoded bytes, colours not multiplied by alpha."""
     found = values.astype(np.float64)

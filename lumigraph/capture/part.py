@@ -48,13 +48,7 @@ def part_of(capture: Capture, part: CapturePart) -> Capture:
     found = replace(capture, shots=chosen, missing=[], bounds=None, reach=reach, around=(part.centre, part.radius))
     if capture.points is None:
         return found
-    near = np.linalg.norm(capture.points - part.centre, axis=-1) < MAX_POINT_RADII * part.radius
-    return replace(
-        found,
-        points=capture.points[near],
-        point_colours=None if capture.point_colours is None else capture.point_colours[near],
-        sightings=None if capture.sightings is None else capture.sightings[near],
-    )
+    return found.with_points(np.linalg.norm(capture.points - part.centre, axis=-1) < MAX_POINT_RADII * part.radius)
 
 
 def with_splits(shots: list[Shot]) -> list[Shot]:

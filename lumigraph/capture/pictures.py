@@ -18,7 +18,7 @@ from ..datasets.images import ImageSource, resized
 from ..errors import LumigraphError
 from ..files import is_file
 from .capture import PixelPlane, Shot
-from .numbers import TIFF_SUFFIXES, Kind, as_bytes, check_pixels, colours, kind_of, read_numbers, tiff_tags, turned
+from .numbers import TIFF_SUFFIXES, Kind, as_bytes, check_pixels, kind_of, read_numbers, tiff_tags, turned
 
 DEFAULT_MAX_SIDE = 1100  # pixels of the longer side of a photograph
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".JPG", ".JPEG", ".PNG", ".webp", ".tif", ".tiff", ".bmp", ".exr")
@@ -219,7 +219,8 @@ def deep(path: Path) -> Kind | None:
 def read_deep(path: Path, turn: bool) -> np.ndarray:
     """All bits of a photograph, RGB or RGBA, upright if asked."""
     with readable(path):
-        values = colours(read_numbers(path))
+        values = read_numbers(path)
+        values = np.repeat(values[..., None], 3, -1) if values.ndim == 2 else values
         return turned(values, measure(path)[1]) if turn else values
 
 

@@ -17,10 +17,10 @@ POSITION_TOLERANCE = 0.02  # of their spread, within which two sets of camera po
 
 @dataclass(frozen=True)
 class SparsePoints:
-    """Positions, colours, and how many photographs saw each."""
+    """Positions, colours, and how many photographs saw each; fields of `Capture`."""
 
-    positions: Float[np.ndarray, "point 3"]
-    colours: UInt8[np.ndarray, "point 3"]
+    points: Float[np.ndarray, "point 3"]
+    point_colours: UInt8[np.ndarray, "point 3"]
     sightings: np.ndarray
 
 

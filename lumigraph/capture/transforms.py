@@ -123,17 +123,8 @@ def read(folder: Path) -> Capture:
         reach = 0.5 * whole.aabb_scale / whole.scale
     if whole.up is not None and not any(whole.up):
         raise LumigraphError(f'{path}: "up" points nowhere; correct it or remove it')
-    return Capture(
-        str(folder),
-        shots,
-        None if points is None else points.positions,
-        None if points is None else points.colours,
-        None if points is None else points.sightings,
-        missing,
-        reach=reach,
-        up=whole.up,
-        notes=folded(folder),
-    )
+    cloud = {} if points is None else vars(points)
+    return Capture(str(folder), shots, missing=missing, reach=reach, up=whole.up, notes=folded(folder), **cloud)
 
 
 def folded(folder: Path) -> list[str]:
@@ -303,5 +294,5 @@ def find_points(folder: Path, whole: Whole, shots: list[Shot], missing: list[str
     matrix = similarity(np.array([found[k] for k in both]), np.array([positions[k] for k in both]))
     if matrix is None:
         return None
-    points = colmap.read_points(place, model)
-    return SparsePoints(points.positions @ matrix[:3, :3].T + matrix[:3, 3], points.colours, points.sightings)
+    cloud = colmap.read_points(place, model)
+    return replace(cloud, points=cloud.points @ matrix[:3, :3].T + matrix[:3, 3])

@@ -11,6 +11,9 @@ from jaxtyping import Float
 from ..camera import Camera
 from ..geometry import turning
 
+Direction = Float[np.ndarray, " 3"]
+Points = Float[np.ndarray, "point 3"]
+
 MIN_UP_COSINE = math.cos(math.radians(15))  # a source axis nearer to up than this is up
 MAX_ROW_TILT = 0.03  # mean square of image rows along up where cameras are held level: 10 degrees
 # Mean square of image rows across their main direction, if cameras turn about up: 8 degrees; and its ratio to the tilt.
@@ -25,13 +28,13 @@ PLANE_SPREAD = 0.2  # of the positions' extent: on a plane the smallest deviatio
 MIN_MAP_COSINE = 0.5  # between a map's plane and the view: drones look no flatter than that
 
 
-def find_upright(cameras: Camera, points: Float[np.ndarray, "point 3"] | None = None) -> Float[np.ndarray, "3 3"]:
+def find_upright(cameras: Camera, points: Points | None = None) -> Float[np.ndarray, "3 3"]:
     """The rotation that brings the cameras' common up to +z; none if the source already has an axis there."""
     up = common_up(cameras, points)
     return np.eye(3) if up is None else upright_by(up)
 
 
-def upright_by(up: Float[np.ndarray, " 3"]) -> Float[np.ndarray, "3 3"]:
+def upright_by(up: Direction) -> Float[np.ndarray, "3 3"]:
     """The rotation that brings a direction to +z, or the axis that is close to it."""
     up = unit(up)
     nearest = np.zeros(3)
@@ -41,7 +44,7 @@ def upright_by(up: Float[np.ndarray, " 3"]) -> Float[np.ndarray, "3 3"]:
     return turn_onto_z(up)
 
 
-def common_up(cameras: Camera, points: Float[np.ndarray, "point 3"] | None = None) -> Float[np.ndarray, " 3"] | None:
+def common_up(cameras: Camera, points: Points | None = None) -> Direction | None:
     """The direction that was up where the photographs were taken, unit length; None if nothing tells.
 
     Cameras are held level rather than straight ahead, by hand as by a drone's gimbal: up is the direction most at right
@@ -68,11 +71,8 @@ def common_up(cameras: Camera, points: Float[np.ndarray, "point 3"] | None = Non
 
 
 def from_above(
-    places: Float[np.ndarray, "camera 3"],
-    own: Float[np.ndarray, " 3"],
-    gaze: Float[np.ndarray, " 3"],
-    points: Float[np.ndarray, "point 3"] | None,
-) -> Float[np.ndarray, " 3"] | None:
+    places: Float[np.ndarray, "camera 3"], own: Direction, gaze: Direction, points: Points | None
+) -> Direction | None:
     """Up, unit length, of cameras that look one way, at a ground from above; None if they look at things ahead.
 
     They were above if they were turned about their axes, as a drone is that flies to and fro; or if they are spread
@@ -92,18 +92,16 @@ def from_above(
     return normal if sizes[1] / math.sqrt(len(places)) > MIN_MAP_SPREAD * distance > 0 else None
 
 
-def upwards(
-    axis: Float[np.ndarray, " 3"], own: Float[np.ndarray, " 3"], gaze: Float[np.ndarray, " 3"]
-) -> Float[np.ndarray, " 3"]:
+def upwards(axis: Direction, own: Direction, gaze: Direction) -> Direction:
     """Side of an axis with the pictures' own up; if that is undecided, the side that cameras look from."""
     side = axis @ own
     return axis * np.sign(side if abs(side) > MIN_USABLE_UP else -axis @ gaze)
 
 
-def unit(vector: Float[np.ndarray, " 3"]) -> Float[np.ndarray, " 3"]:
+def unit(vector: Direction) -> Direction:
     return vector / np.linalg.norm(vector)
 
 
-def turn_onto_z(up: Float[np.ndarray, " 3"]) -> Float[np.ndarray, "3 3"]:
+def turn_onto_z(up: Direction) -> Float[np.ndarray, "3 3"]:
     """The smallest rotation that takes a direction to +z."""
     return turning(torch.from_numpy(np.asarray(up)), torch.tensor([0.0, 0.0, 1.0])).numpy()

@@ -101,7 +101,7 @@ def multiscale(scene: Scene, scales: int, memory: int | None = None, cache: Path
                 f"{scene.source}: the mask trusts no whole pixel of {name}; give a smaller number of --scales"
             )
     splits = {split: torch.cat([index + k * count for k in range(scales)]) for split, index in scene.splits.items()}
-    cameras = Camera.cat([smaller(scene.cameras, f) for f in factors])
+    cameras = Camera.cat([scene.cameras.reduced(f) for f in factors])
     layers = {
         name: layer.like(images, [LayerSource(partial(layer.reduced, i, f)) for i, f in copies])
         for name, layer in scene.layers.items()
@@ -116,9 +116,3 @@ def reduced(scene: Scene, index: int, factor: int) -> tuple[np.ndarray, np.ndarr
     channels = [photograph.rgb] if photograph.alpha is None else [photograph.rgb, photograph.alpha[..., None]]
     pixels = torch.cat(channels, -1).mul(255).round().clamp(0, 255).byte().numpy()
     return pixels, None if photograph.mask is None else photograph.mask.numpy()
-
-
-def smaller(cameras: Camera, factor: int) -> Camera:
-    """The cameras of pictures reduced a whole number of times, as `Photograph.reduced` does."""
-    scale = torch.full((1, 2), 1 / factor)
-    return replace(cameras, lens=cameras.lens.resized(scale), size=cameras.size // factor)

@@ -39,6 +39,7 @@ JUDGED_PER_SECOND = 15.0  # frames per second that are judged, or
 CANDIDATES_PER_FRAME = 4  # for each selected frame, if that is more
 TIME_SHARE = 0.2  # weight of the clock in even spacing; the rest is movement
 EDGE_PENALTY = 0.3  # log sharpness that a frame at the end of its interval must have above one in the middle
+Row = Float[np.ndarray, " frame"]
 MIN_DURATION_SHARE = 0.9  # share of its length that a complete film must have
 MOVEMENT_SIDE = 192  # pixels, the longer side for measuring movement
 TILE_SIDE = 32  # pixels
@@ -66,7 +67,7 @@ def is_video(path: Path) -> bool:
 def extract(path: Path, folder: Path, frames: int | None = None, track: Track = untracked) -> list[tuple[Path, float]]:
     """Frames of a video as upright JPEGs in `folder`, in order, and when each was seen, in seconds from the first on.
 
-    frames: how many; None: PER_SECOND, but at least FEWEST and at most MOST. There are fewer where the film is shorter
+    frames: how many; None: FRAMES_PER_SECOND, from MIN_FRAMES to MAX_FRAMES. There are fewer where the film is shorter
             or shows the same again
     The folder is used as it is if it was made of the same file and with the same options; else it is replaced.
     Raises LumigraphError where the film cannot be read or has no frames.
@@ -86,18 +87,14 @@ def extract(path: Path, folder: Path, frames: int | None = None, track: Track = 
     return [(folder / name, seconds) for name, seconds in known.frames.items()]
 
 
-def judge(
-    path: Path, frames: int | None, track: Track
-) -> tuple[list[int], Float[np.ndarray, " frame"], Float[np.ndarray, " frame"], Float[np.ndarray, " frame"]]:
+def judge(path: Path, frames: int | None, track: Track) -> tuple[list[int], Row, Row, Row]:
     """Numbers of the judged frames, their seconds from the first on, sharpness, and how far the picture had moved."""
     rows: list[tuple[int, float, float, float]] = []
     odometer, end = Odometer(), 0.0
     with opened(path) as film:
         total = film.streams.video[0].frames or max(round(duration(film) * speed(film)), 1)
-        step = max(
-            int(min(speed(film) / JUDGED_PER_SECOND, total / (CANDIDATES_PER_FRAME * frames) if frames else math.inf)),
-            1,
-        )
+        most = total / (CANDIDATES_PER_FRAME * frames) if frames else math.inf
+        step = max(int(min(speed(film) / JUDGED_PER_SECOND, most)), 1)
         for number, (frame, end) in enumerate(track(decoded(path, film), f"Watching {path.name}", total)):
             if number % step == 0:
                 luminance = grey(frame, JUDGED_SIDE)
@@ -112,13 +109,7 @@ def judge(
     return numbers, times - times[0], sharp, travelled
 
 
-def choose(
-    numbers: Sequence[int],
-    seconds: Float[np.ndarray, " frame"],
-    sharp: Float[np.ndarray, " frame"],
-    travelled: Float[np.ndarray, " frame"],
-    frames: int | None = None,
-) -> list[int]:
+def choose(numbers: Sequence[int], seconds: Row, sharp: Row, travelled: Row, frames: int | None = None) -> list[int]:
     """The numbers of the sharpest frames of equal stretches, ascending. Other arguments are as `judge` gives them."""
     length = float(seconds[-1])
     count = frames or min(max(round(FRAMES_PER_SECOND * length), MIN_FRAMES), MAX_FRAMES)
