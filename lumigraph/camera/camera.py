@@ -137,7 +137,7 @@ def ring(
     size: int = 800,
     count: int = RING_CAMERAS,
 ) -> Camera:
-    """Cameras around a box that look at its middle, for what nobody has photographed.
+    """Cameras on a circle around a box, turned to its middle, for scenes without photographs.
 
     distance: from the middle, scene units
     angle:    of view, degrees

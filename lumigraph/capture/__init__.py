@@ -173,7 +173,7 @@ def read_capture(source: str | Path, reader: str | None = None) -> Capture:
 
 
 def choose_reader(folder: Path, name: str | None = None) -> ModuleType:
-    """The reader that knows what lies in a folder. Raises LumigraphError if none does."""
+    """The reader that recognises a folder. Raises LumigraphError if none does."""
     if not exists(folder):
         raise LumigraphError(f"{folder} does not exist; check the path")
     if not folder.is_dir():

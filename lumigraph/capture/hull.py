@@ -32,24 +32,19 @@ class Silhouette:
     inside: Bool[Tensor, "height width"]
 
 
-@dataclass(frozen=True)
-class Silhouettes:
-    """Outlines of an object, and the colour it stands before: the photographs' own, or white where they have alpha."""
-
-    outlines: list[Silhouette]
-    background: Vector
-
-
 def silhouettes(
     cameras: Camera, images: ImageStore, views: list[int], centre: Float[np.ndarray, " 3"]
-) -> Silhouettes | None:
+) -> tuple[list[Silhouette], Vector] | None:
     """Outlines of an object that has alpha or stands before one plain colour. None where the photographs show neither.
-    centre: what the cameras look at, roughly"""
+
+    centre: what the cameras look at, roughly
+    Returns also the colour behind the object: that of the photographs, or white where they have alpha.
+    """
     position = cameras.position[views].double().numpy() - centre
     position /= np.linalg.norm(position, axis=-1, keepdims=True).clip(min=1e-9)
     chosen = [views[i] for i in farthest(position, MAX_VIEWS)]
     if images.has_alpha:
-        return Silhouettes([Silhouette(cameras[i], images[i][..., 3] > MIN_OPACITY) for i in chosen], (1.0, 1.0, 1.0))
+        return [Silhouette(cameras[i], images[i][..., 3] > MIN_OPACITY) for i in chosen], (1.0, 1.0, 1.0)
     if not isinstance(cameras.lens, Pinhole | OpenCV):
         return None  # the black around a fisheye's circle is no background
     edges = torch.cat([border(images[i]) for i in chosen]).int()
@@ -57,7 +52,7 @@ def silhouettes(
     if not differs(edges, colour).float().mean() <= 1 - BORDER_SHARE:
         return None
     red, green, blue = (colour / 255).tolist()
-    return Silhouettes([Silhouette(cameras[i], filled(differs(images[i], colour))) for i in chosen], (red, green, blue))
+    return [Silhouette(cameras[i], filled(differs(images[i], colour))) for i in chosen], (red, green, blue)
 
 
 def differs(pixels: Tensor, colour: Tensor) -> Tensor:

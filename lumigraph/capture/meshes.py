@@ -111,7 +111,7 @@ def colours_of(part: Any) -> UInt8[np.ndarray, "vertex 3"]:
         found = np.asarray(visual.vertex_colors)[:, :3].astype(np.uint8)
         if part.visual.defined and len(found) == len(part.vertices):
             return found
-    except Exception:  # a picture that is missing should keep nobody from the shape
+    except Exception:  # a missing texture must not prevent reading the shape
         pass
     return np.full((len(part.vertices), 3), DEFAULT_GREY, np.uint8)
 
@@ -130,7 +130,7 @@ def normals_of(path: Path) -> Float[np.ndarray, "point 3"] | None:
         return None
     try:
         table = PlyData.read(path)["vertex"].data
-    except Exception:  # read by another library before, which knows of no normals either
+    except Exception:  # it was read by another library, which has no normals either
         return None
     if not {"nx", "ny", "nz"} <= set(table.dtype.names):
         return None

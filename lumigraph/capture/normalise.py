@@ -81,10 +81,10 @@ def find_place(
         return part_place(capture, turned, upright, background)
     gaze = find_gaze(capture, turned, upright)
     found = silhouettes(turned, images, views, gaze.centre)
-    box = None if found is None else hull_box(found.outlines, gaze.centre, gaze.distance)
+    box = None if found is None else hull_box(found[0], gaze.centre, gaze.distance)
     if found is None or box is None:
         return open_place(capture, upright, gaze, background)
-    return object_place(upright, box, turned, capture.background or found.background)
+    return object_place(upright, box, turned, capture.background or found[1])
 
 
 def upright_of(capture: Capture, cameras: Camera) -> Float[np.ndarray, "3 3"]:

@@ -50,7 +50,7 @@ def about_double(shots: list[Shot]) -> str | None:
 
 
 def about_places(poses: Float[np.ndarray, "camera 3 4"]) -> str | None:
-    """Cameras in one place, and units in which nothing is measured. LumigraphError where nobody can count in them."""
+    """Cameras in one place, and units in which nothing is measured. LumigraphError if too small to compute with."""
     place = poses[:, :, 3]
     spread = float(np.linalg.norm(place - place.mean(0), axis=-1).max())
     if spread <= MIN_RELATIVE_SPREAD * float(np.abs(place).max()):

@@ -128,7 +128,7 @@ def read(folder: Path) -> Capture:
 
 
 def folded(folder: Path) -> list[str]:
-    """Folds that `lumigraph capture` reported, if it made the folder: it knows the matches of photographs."""
+    """Folds that `lumigraph capture` reported, if it made the folder, from the matches of photographs."""
     path = folder / "capture.json"
     said = read_json(path, Made).warnings if path.is_file() else []
     return [f"{folder}: {warning}" for warning in said if "folded" in warning]

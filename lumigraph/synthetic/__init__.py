@@ -11,7 +11,7 @@
     open_scene("procedural:city,crossings=6")             scenes may have options of their own
 
     open_dataset("procedural:toys,count=200")             a Collection of objects, see `members`
-    open_dataset("procedural:toys,count=20,turned=1")     the same, each in a pose that nobody chose
+    open_dataset("procedural:toys,count=20,turned=1")     the same, each in a random pose
 
 A new scene is a new file in `scenes/`, a new category of objects one in `categories/`; nothing is compiled for it.
 """
@@ -70,7 +70,7 @@ def confirm(request: str) -> None:
 def read(request: str) -> Capture:
     """The capture that a name stands for, with options after commas: "still-life", "still-life,size=400,seed=1".
 
-    Pictures are traced when somebody reads them. Raises LumigraphError for a name or an option that does not exist.
+    Pictures are traced when they are read. Raises LumigraphError for a name or an option that does not exist.
     """
     if is_category(request):
         return capture(member_stage(request), f"procedural:{request}", kept=True)
@@ -123,7 +123,7 @@ def identity(stage: SyntheticStage, camera: Camera) -> str:
 
 
 def known_planes(stage: SyntheticStage, camera: Camera) -> dict[str, PixelPlane]:
-    """The layers of one photograph, of which nothing is traced before somebody asks."""
+    """The layers of one photograph, traced on request."""
 
     def plane(name: str, encoding: str, dtype: type, channels: int = 1, names: Sequence[str] = ()) -> PixelPlane:
         values = partial(known, stage, camera, name)
@@ -168,7 +168,7 @@ def taken_raw(stage: SyntheticStage, camera: Camera) -> RawPhoto:
 
 
 def without_passers_by(stage: SyntheticStage, camera: Camera) -> np.ndarray:
-    """The photograph as it would be in its own light with nobody there, bytes (height, width, 3)."""
+    """The photograph as it would be in its own light without passers-by, bytes (height, width, 3)."""
     assert stage.lasting is not None and camera.image_index is not None
     return eight_bits(*photograph(stage.lasting(int(camera.image_index)), camera), alpha=False)
 
@@ -242,8 +242,8 @@ def angle_across(cameras: Camera) -> float:
     """The field of view that all cameras share, radians: all that the format says about lenses."""
     lens = cameras.lens
     if not isinstance(lens, Pinhole):
-        raise ValueError(f"Blender's format knows pinhole cameras only, not {type(lens).__name__}")
+        raise ValueError(f"Blender's format has pinhole cameras only, not {type(lens).__name__}")
     focal, centre, size = lens.focal, lens.centre, cameras.size
     if not ((focal == focal[0, 0]).all() and (size == size[0]).all() and (2 * centre == size).all()):
-        raise ValueError("Blender's format wants all cameras alike, with square pixels and the centre in the middle")
+        raise ValueError("Blender's format requires all cameras alike, with square pixels and the centre in the middle")
     return 2 * math.atan(float(cameras.size[0, 0]) / (2 * float(focal[0, 0])))

@@ -79,7 +79,7 @@ def read_matches(database: Path) -> Matches:
 
 @dataclass(frozen=True)
 class Gap:
-    """Directions that nobody looked from: so many degrees, between two photographs."""
+    """Directions without a photograph: so many degrees, between two photographs."""
 
     degrees: float
     between: tuple[str, str]
@@ -95,7 +95,7 @@ class Coverage:
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """All that a capture found out about itself.
+    """Outcome of a capture.
 
     given:        how many files there were;  used: those that cameras were looked for
     registered:   names of the photographs whose cameras were found

@@ -94,7 +94,7 @@ def remove_copies(folder: Path, kept: Container[str]) -> None:
 
 
 def copy_masks(photos: Sequence[Photo], masks: Path, track: Track) -> Path | None:
-    """Masks as COLMAP wants them: image.jpg.png, black and white, of the photographs' size. None where there are none.
+    """Masks as COLMAP reads them: image.jpg.png, black and white, of the photographs' size. None where there are none.
 
     Raises LumigraphError for a mask that has not its photograph's shape.
     """

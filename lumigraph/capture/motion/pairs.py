@@ -97,7 +97,7 @@ def aggregated(
 
 
 def near(positions: Float[np.ndarray, "photo 3"], most: int = SEQUENTIAL_NEIGHBOURS) -> set[Pair]:
-    """Each photograph with the `most` taken nearest to it; NaN where nobody knows."""
+    """Each photograph with the `most` taken nearest to it; NaN where unknown."""
     known = np.flatnonzero(np.isfinite(positions).all(1))
     if len(known) < 2:
         return set()

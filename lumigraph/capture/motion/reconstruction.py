@@ -80,7 +80,7 @@ def reconstruct(
 
     sources: a folder, a list of image files, or one video; they are only read
     folder:  where the scene goes: images, sparse/0, transforms.json, points.ply, capture.json, two pictures, and a
-             folder `work` that nobody needs afterwards. What lies there of an earlier call for the same sources is used
+             folder `work`, not needed afterwards. What lies there of an earlier call for the same sources is used
     Raises LumigraphError if there are too few photographs, if none fit together, and for a folder of something else or
     that another process works in.
     """
@@ -95,7 +95,7 @@ def reconstruct(
         try:
             intake, photos = taken_in(sources, work, options, track)
         except LumigraphError:
-            if fresh:  # nothing in it is anybody's, and nothing can go on from there
+            if fresh:  # it holds nothing to keep or to go on from
                 shutil.rmtree(folder, ignore_errors=True)
             raise
         work_to_do = Reconstruction(sources, folder, work, options, intake, photos, track)
@@ -395,7 +395,7 @@ def copy_database(source: Path, target: Path) -> None:
 
 
 def keep_near(path: Path, names: Sequence[str], reach: int) -> None:
-    """Forget what photographs share that are more than so many places apart."""
+    """Delete the matches of photographs that are more than so many places apart."""
     place = {name: i for i, name in enumerate(names)}
     shared = read_matches(path).shared
     with closing(pycolmap.Database.open(path)) as database:

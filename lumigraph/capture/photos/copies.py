@@ -129,7 +129,7 @@ def name_of_copy(name: str, image: Image.Image) -> str:
 def copy_upright(image: Image.Image, source: Path, path: Path) -> None:
     """An upright copy of an opened image in 8 bits: JPEG, or PNG without loss, by the suffix of `path`.
 
-    A copy carries its source's date, by which `is_current` knows it again.
+    A copy carries its source's date, by which `is_current` recognises it.
     Raises LumigraphError where the disk refuses, and whatever Pillow raises for a damaged image.
     """
     upright = eight_bits(ImageOps.exif_transpose(image))

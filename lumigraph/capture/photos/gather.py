@@ -124,7 +124,7 @@ def nothing(source: str, unreadable: Mapping[str, str]) -> str:
 
 
 def is_bare(path: Path) -> bool:
-    """True for a video, or a folder with photographs but without poses that a reader knows."""
+    """True for a video, or a folder with photographs but without poses that a reader recognises."""
     from .. import READERS  # that package may import this one
 
     if not path.is_dir():

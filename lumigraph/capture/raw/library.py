@@ -68,7 +68,7 @@ def read_light(path: Path, turns: int) -> np.ndarray:
 
 
 def colours_of(raw: Any) -> np.ndarray:
-    """The way from white-balanced camera colours to linear sRGB: as the file says, else as LibRaw knows the camera."""
+    """Matrix from white-balanced camera colours to linear sRGB: the file's, else from LibRaw's table of cameras."""
     own = np.array(raw.color_matrix, np.float64)[:3, :3]
     if np.allclose(own.sum(-1), 1, atol=0.01):
         return own

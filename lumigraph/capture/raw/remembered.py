@@ -40,7 +40,7 @@ def open_raw(path: Path) -> RawPhoto:
 
 @dataclass(frozen=True)
 class Developed:
-    """The raw file of a picture, and the factor on its light with which it was developed; None where nobody knows."""
+    """The raw file of a picture, and the factor on its light with which it was developed; None where it is unknown."""
 
     file: Name
     brightness: Annotated[float, between(1e-9, 1e9)] | None = None

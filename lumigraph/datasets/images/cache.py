@@ -36,8 +36,8 @@ def cache_folder() -> Path:
 
 
 def key(parts: Iterable[str | None]) -> str:
-    """A name for files that are made of these parts; with a part that has no name, one that nobody else will ask
-    for."""
+    """A name for files that are made of these parts; with a part that has no name, a name that
+    is used once."""
     digest = hashlib.sha256(f"{CACHE_FORMAT} {sys.byteorder}".encode())
     for number, part in enumerate(parts):
         digest.update(f"\n{part or f'{os.getpid()} {time.time_ns()} {number}'}".encode())

@@ -100,7 +100,7 @@ class ImageSource:
 class PixelBatch:
     """Random pixels: which image, where (x, y), and their bytes (red, green, blue, alpha; 255 where there is none).
 
-    position: where they lie in the store, which is where they lie in every layer; None where nobody asked
+    position: where they lie in the store, which is where they lie in every layer; None where not requested
     """
 
     image: Int[Tensor, " pixel"]
@@ -178,10 +178,10 @@ class ImageStore:
         trusted = None
         if about.trusted:
             trusted = Runs(*map(torch.from_numpy, np.load(folder / "trusted.npz", allow_pickle=False).values()))
-        # Copy on write: PyTorch wants a writable array, and the file must stay as it is.
+        # Copy on write: PyTorch requires a writable array, and the file must stay as it is.
         rgba = np.memmap(folder / "pixels", np.int32, "c")
         if nameless:
-            shutil.rmtree(folder, ignore_errors=True)  # nobody can ask for it again; what is mapped stays
+            shutil.rmtree(folder, ignore_errors=True)  # it has no name to be found by; what is mapped stays
         name = None if nameless else f"{called} shuffled"
         return cls(torch.from_numpy(rgba), sizes, about.has_alpha, trusted, True, name, memory, cache)
 

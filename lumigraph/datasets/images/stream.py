@@ -46,7 +46,7 @@ def load(
     """Photographs in memory, else in a file, else, where that would take more than half of what is free on its disk,
     read again and again. Arguments and faults as of `ImageStore.load`.
 
-    keep: whether each picture goes to a file of the cache even if all fit, so that nobody makes it again
+    keep: whether each picture goes to a file of the cache even if all fit, so that it is made once
     """
     memory = memory_for_images() if memory is None else memory
     size = 4 * sum(width * height for width, height in (p.size for p in pictures))
@@ -64,8 +64,8 @@ class ImageStream(ImageStore):
 
     Readers go through all photographs in a random order, and then in another one, and leave KEPT random pixels of each;
     a batch is drawn from those that are there, of which the oldest makes room for the next. So each photograph is as
-    likely as any other in the long run, each of its trusted pixels as well, and nobody waits for a photograph that one
-    batch alone would need. What is drawn depends on the generator of the first batch, on all batches since, and on
+    likely as any other in the long run, each of its trusted pixels as well, and no batch waits for a photograph that it
+    alone would need. What is drawn depends on the generator of the first batch, on all batches since, and on
     nothing else; a run that is resumed begins anew.
 
     pictures: how to get each
