@@ -14,15 +14,15 @@ from torch import Tensor
 
 from ..camera import Camera
 from ..camera.lens import Equirectangular, Lens, Pinhole
-from ..datasets.images import ImageSource, ImageStore, in_parallel, load
-from ..datasets.scene import Forward, Frame, Scene
+from ..datasets.images import ImageSource, in_parallel, load
+from ..datasets.scene import Scene
 from ..errors import LumigraphError, LumigraphWarning
 from ..files.names import counted, natural
 from ..geometry import RIGID_TOLERANCE
 from ..system.progress import counting
 from .beside import make_about, make_layers
 from .capture import Capture, Shot
-from .normalise import ScenePlacement, find_forward, find_place, similarity
+from .normalise import find_forward, find_place, similarity
 from .oddities import oddities
 from .pictures import Chosen, check_downscale, choose
 
@@ -95,10 +95,17 @@ def assemble(
         place = find_place(shifted(capture, -away), cameras, images, splits["train"].tolist(), upright)
     matrix = place.scene_from_source @ centred
     cameras = make_cameras(shots, moved(poses, matrix), lenses, images.sizes)
-    forward = None
-    if place.reach > 1 and capture.around is None:
+    frame = replace(
+        place.frame,
+        has_alpha=images.has_alpha,
+        image_count=len(images),
+        source_from_scene=tuple((a, b, c, d) for a, b, c, d in np.linalg.inv(matrix).tolist()),
+        times=span(cameras.time),
+    )
+    if frame.is_open and capture.around is None:
         train = splits["train"]
-        forward = find_forward(capture, [shots[i] for i in train.tolist()], cameras[train], matrix, place.near)
+        seen = [shots[i] for i in train.tolist()]
+        frame = replace(frame, forward=find_forward(capture, seen, cameras[train], matrix, frame.near))
     layers, left_out = make_layers(shots, chosen, images, matrix)
     for warning in left_out:
         warnings.warn(warning, LumigraphWarning, stacklevel=3)
@@ -106,7 +113,7 @@ def assemble(
     return Scene(
         cameras,
         images,
-        make_frame(place, matrix, images, forward, cameras.time),
+        frame,
         splits,
         [shot.name for shot in shots],
         capture.source,
@@ -184,26 +191,10 @@ def make_cameras(
     return Camera(torch.from_numpy(poses).float(), Lens.cat(lenses), sizes, time, torch.arange(len(shots)))
 
 
-def make_frame(
-    place: ScenePlacement,
-    scene_from_source: np.ndarray,
-    images: ImageStore,
-    forward: Forward | None,
-    time: Float[Tensor, " camera"] | None,
-) -> Frame:
-    back = np.linalg.inv(scene_from_source)
-    first, last = (None, None) if time is None else (float(time.min()), float(time.max()))
-    return Frame(
-        bounds=place.bounds,
-        reach=place.reach,
-        near=place.near,
-        background=place.background,
-        has_alpha=images.has_alpha,
-        image_count=len(images),
-        source_from_scene=tuple((a, b, c, d) for a, b, c, d in back.tolist()),
-        forward=forward,
-        times=None if first is None or last is None or first == last else (first, last),
-    )
+def span(times: Float[Tensor, " camera"] | None) -> tuple[float, float] | None:
+    """First and last moment; None where there are none, or one alone."""
+    found = None if times is None else (float(times.min()), float(times.max()))
+    return None if found is None or found[0] == found[1] else found
 
 
 def moved(poses: Float[np.ndarray, "camera 3 4"], matrix: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "camera 3 4"]:

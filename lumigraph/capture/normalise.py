@@ -17,7 +17,7 @@ from torch import Tensor
 
 from ..camera import Camera
 from ..datasets.images import ImageStore
-from ..datasets.scene import Forward, Vector
+from ..datasets.scene import Forward, Frame, Vector
 from ..geometry.choice import evenly
 from .capture import Capture, Shot
 from .hull import hull_box, silhouettes
@@ -45,13 +45,10 @@ OUTLIER_SHARE = 0.005  # of the sparse points may lie nearer
 
 @dataclass(frozen=True)
 class ScenePlacement:
-    """The frame of a scene: scene_from_source is the similarity x_scene = M x_source; the rest as in `Frame`."""
+    """The similarity x_scene = M x_source, and the scene's frame as far as it follows from its geometry."""
 
     scene_from_source: Float[np.ndarray, "4 4"]
-    bounds: tuple[Vector, Vector]
-    reach: float
-    near: float
-    background: Vector
+    frame: Frame
 
 
 UNIT_CUBE: tuple[Vector, Vector] = ((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0))
@@ -113,9 +110,8 @@ def part_place(capture: Capture, cameras: Camera, upright: np.ndarray, backgroun
     elif cloud is not None:
         reach = power_of_two(quantile(np.abs(cloud.points - centre).max(-1), cloud.weights, REACH_QUANTILE) / half)
     near = near if capture.near is None else capture.near
-    return ScenePlacement(
-        similarity(upright, centre, half), UNIT_CUBE, max(2.0, reach), max(near / half, MIN_NEAR), background
-    )
+    frame = Frame(UNIT_CUBE, max(2.0, reach), max(near / half, MIN_NEAR), background)
+    return ScenePlacement(similarity(upright, centre, half), frame)
 
 
 def stated_place(capture: Capture, cameras: Camera, background: Vector) -> ScenePlacement:
@@ -126,7 +122,8 @@ def stated_place(capture: Capture, cameras: Camera, background: Vector) -> Scene
     bounds = box_in_scene(low, high, centre, half)
     reach = 1.0 if capture.reach is None else power_of_two(capture.reach / half)
     near = nearest_to_box(cameras, low, high) if capture.near is None else capture.near
-    return ScenePlacement(similarity(np.eye(3), centre, half), bounds, reach, max(near / half, MIN_NEAR), background)
+    frame = Frame(bounds, reach, max(near / half, MIN_NEAR), background)
+    return ScenePlacement(similarity(np.eye(3), centre, half), frame)
 
 
 def object_place(
@@ -137,9 +134,8 @@ def object_place(
     centre, half = 0.5 * (low + high), 0.5 * BOX_MARGIN * float((high - low).max())
     low, high = centre - 0.5 * BOX_MARGIN * (high - low), centre + 0.5 * BOX_MARGIN * (high - low)
     near = max(nearest_to_box(cameras, low, high) / half, MIN_NEAR)
-    return ScenePlacement(
-        similarity(upright, centre, half), box_in_scene(low, high, centre, half), 1.0, near, background
-    )
+    frame = Frame(box_in_scene(low, high, centre, half), 1.0, near, background)
+    return ScenePlacement(similarity(upright, centre, half), frame)
 
 
 def nearest_to_box(cameras: Camera, low: np.ndarray, high: np.ndarray) -> float:
@@ -213,7 +209,8 @@ def open_place(capture: Capture, upright: np.ndarray, gaze: Gaze, background: Ve
     if capture.reach is not None:
         reach = power_of_two(capture.reach / half)
     near = NEAR_SCALE * gaze.nearest if capture.near is None else capture.near
-    return ScenePlacement(similarity(upright, centre, half), UNIT_CUBE, reach, max(near / half, MIN_NEAR), background)
+    frame = Frame(UNIT_CUBE, reach, max(near / half, MIN_NEAR), background)
+    return ScenePlacement(similarity(upright, centre, half), frame)
 
 
 def settle(cloud: WeightedPoints, centre: np.ndarray, half: float) -> tuple[np.ndarray, float]:

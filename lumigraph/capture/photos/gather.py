@@ -201,8 +201,8 @@ def take(name: str, path: Path, copies: Path) -> Candidate | str:
         if path.suffix.lower() in HEIC_SUFFIXES and isinstance(fault, UnidentifiedImageError):
             return "HEIC can be read once pillow-heif is installed (pip install pillow-heif)"
         return describe(fault)
-    seen = {"sharpness": found.sharpness, "brightness": found.brightness, "mask": mask_beside(path)}
-    photo = Photo(name, upright_file, size, facts.device, facts.focal, facts.gps, facts.time, **seen)
+    known = facts.device, facts.focal, facts.gps, facts.time
+    photo = Photo(name, upright_file, size, *known, found.sharpness, found.brightness, mask_beside(path))
     return Candidate(photo, found.signature, path.stat().st_size)
 
 
