@@ -141,7 +141,7 @@ def with_safe_names(intake: Intake) -> Intake:
 def intake_identity(intake: Intake) -> list[Any]:
     """All of the intake that the result depends on, as JSON."""
     photos = [[p.name, *stamp(p.path), p.device, p.focal, p.gps, round(p.brightness, 3)] for p in intake.photos]
-    raw = [Remembered(intake.raw).to_json()] if intake.raw else []
+    raw = [asdict(Remembered(intake.raw))] if intake.raw else []
     return [photos, intake.in_order, intake.blurred, intake.duplicates, intake.unreadable, *raw]
 
 
@@ -324,7 +324,7 @@ class Reconstruction:
         diagnosis = replace(diagnosis, warnings=[*diagnosis.warnings, *told])
         write_model(self.folder, model, self.photos, z_up=known)
         if self.intake.raw:
-            write_json(self.folder / RAW_FILE, Remembered(self.intake.raw).to_json(), "capture")
+            write_json(self.folder / RAW_FILE, asdict(Remembered(self.intake.raw)), "capture")
         capture_sheet, photograph_sheet = (self.folder / name for name in DRAWING_FILES)
         draw_capture(capture_sheet, model, diagnosis, known)
         draw_photographs(photograph_sheet, self.intake, diagnosis)

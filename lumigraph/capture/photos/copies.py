@@ -8,6 +8,7 @@ import os
 import statistics
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import asdict
 from pathlib import Path
 
 from PIL import Image, ImageOps
@@ -59,7 +60,8 @@ def develop(files: Mapping[str, Path], folder: Path, track: Track) -> dict[str, 
         except BaseException:
             pool.shutdown(wait=False, cancel_futures=True)
             raise
-    write_json(record, Remembered({k: v for k, v in made.items() if isinstance(v, Developed)}).to_json(), ours=True)
+    developed = Remembered({name: one for name, one in made.items() if isinstance(one, Developed)})
+    write_json(record, asdict(developed), ours=True)
     return {name: made.get(name, opened[name]) for name in files}
 
 

@@ -52,9 +52,6 @@ class Remembered:
 
     photographs: dict[Name, Developed] = field(default_factory=dict)
 
-    def to_json(self) -> dict[str, Any]:
-        return {"photographs": {k: {"file": v.file, "brightness": v.brightness} for k, v in self.photographs.items()}}
-
 
 def with_raw(capture: Capture, folder: Path) -> Capture:
     """The capture with the raw files of its photographs, if it has some.
