@@ -19,7 +19,7 @@ from ..datasets.images import ImageStore, Layer, LayerSource, in_parallel, resiz
 from ..datasets.images.layer import known
 from ..depth_maps import back_project
 from ..errors import LumigraphError
-from ..geometry.choice import evenly
+from ..geometry import evenly
 from .capture import Capture, PixelPlane, Shot
 from .numbers import kind_of, read_numbers
 from .photos.exif import exposure

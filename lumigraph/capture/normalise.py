@@ -18,7 +18,7 @@ from torch import Tensor
 from ..camera import Camera
 from ..datasets.images import ImageStore
 from ..datasets.scene import Forward, Frame, Vector
-from ..geometry.choice import evenly
+from ..geometry import evenly
 from .capture import Capture, Shot
 from .hull import hull_box, silhouettes
 from .up import find_upright, upright_by

@@ -19,7 +19,7 @@ from ..datasets.shapes import Shape, Shapes
 from ..errors import LumigraphError
 from ..export.mesh import POINTS_PER_CHUNK, TRUNCATION_CELLS, extract_mesh, find_surface, make_grid
 from ..figures import Row, contact_sheet
-from ..geometry.choice import evenly
+from ..geometry import evenly
 from ..method import Method
 from ..method.capabilities import HasDistance, HasMesh, can
 from ..metrics import Score

@@ -12,7 +12,7 @@ from jaxtyping import Float
 from scipy.cluster.vq import kmeans2, vq
 from scipy.spatial import cKDTree
 
-from ...geometry.choice import evenly
+from ...geometry import evenly
 from ...system.library import pycolmap
 
 Matching = Literal["auto", "exhaustive", "sequential", "retrieval"]

@@ -15,7 +15,7 @@ from ...datasets.scene import Scene
 from ...errors import LumigraphError
 from ...figures import Row, contact_sheet, fit_into, save_picture
 from ...files import claim, replacing_folder
-from ...geometry.choice import evenly
+from ...geometry import evenly
 from ...system.progress import track
 from ..assemble import assemble
 from ..capture import Capture

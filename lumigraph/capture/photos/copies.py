@@ -15,7 +15,7 @@ from PIL import Image, ImageOps
 
 from ...errors import LumigraphError
 from ...files import read_json, replacing, write_json
-from ...geometry.choice import evenly
+from ...geometry import evenly
 from ..pictures import EXIF_ORIENTATION, EXIF_UPRIGHT, eight_bits
 from ..raw import RAW_FILE, Developed, RawPhoto, Remembered, exif_of, open_raw
 from .photo import Track

@@ -11,7 +11,7 @@ from torch.nn.functional import max_pool2d
 
 from ...camera import PIXEL_RADIUS, Camera
 from ...datasets.scene import Scene
-from ...geometry.choice import evenly
+from ...geometry import evenly
 
 VIEWS = 24  # photographs asked at most: more cut little further
 

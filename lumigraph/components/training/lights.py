@@ -8,7 +8,7 @@ from torch import Tensor
 
 from ...camera import Camera
 from ...datasets.scene import Scene
-from ...geometry.choice import evenly
+from ...geometry import evenly
 from ..clouds.flat_view import FlatView, flat_view
 
 LOOKED_AT = 32  # photographs, each beside its neighbour

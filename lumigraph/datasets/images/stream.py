@@ -18,7 +18,7 @@ from PIL import Image
 from torch import Tensor
 
 from ...errors import LumigraphError
-from ...geometry.choice import evenly
+from ...geometry import evenly
 from ...system.memory import memory_for_images
 from .cache import MARK_FILE, cache_folder, free_space, key
 from .store import ImageSource, ImageStore, PixelBatch, name_of, see_through, whole
