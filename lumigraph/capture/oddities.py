@@ -12,6 +12,7 @@ from jaxtyping import Float
 from PIL import Image
 
 from ..errors import LumigraphError
+from ..files.names import counted
 from .capture import Capture, Shot
 from .normalise import MIN_CONVERGENCE, SAMPLED_POINTS
 
@@ -30,7 +31,7 @@ ORDER_SHARE = 0.5  # distance of neighbours, as a share of that of any two, up t
 
 
 def oddities(capture: Capture, shots: list[Shot], poses: Float[np.ndarray, "camera 3 4"]) -> list[str]:
-    """Sentences about a capture that its source says nothing of; none where it says where everything is."""
+    """Warnings of a capture; none where its source states the bounds."""
     if capture.bounds is not None:
         return []
     found = [about_double(shots), about_places(poses), about_gaze(capture, poses), about_angles(shots)]
@@ -45,7 +46,7 @@ def about_double(shots: list[Shot]) -> str | None:
     double = [name for name, count in Counter(files).items() if count > 1]
     if not double:
         return None
-    number = f"{len(double)} photograph{'' if len(double) == 1 else 's'}"
+    number = counted(len(double), "photograph")
     return f"lists {number} more than once, such as {Path(double[0]).name}; keep one frame of each"
 
 
@@ -136,11 +137,8 @@ def about_fold(shots: Sequence[Shot], poses: Float[np.ndarray, "photo 3 4"]) -> 
     Those of each published split are a list of their own. Photographs are looked at only where cameras leap.
     """
     groups = [[i for i, shot in enumerate(shots) if shot.split == split] for split in {shot.split for shot in shots}]
-    leaps = [
-        (times, group[i : i + 2])
-        for group in groups
-        for i, times in leaps_alike([shots[k] for k in group], poses[group])
-    ]
+    found = [(group, leaps_alike([shots[k] for k in group], poses[group])) for group in groups]
+    leaps = [(times, group[i : i + 2]) for group, own in found for i, times in own]
     if not leaps:
         return None
     times, (before, after) = max(leaps)
@@ -175,9 +173,8 @@ def thumbnail(shot: Shot) -> Float[np.ndarray, "row column"] | None:
     try:
         with Image.open(shot.image[max(shot.image)]) as image:
             image.draft("L", (4 * THUMBNAIL_SIDE, 4 * THUMBNAIL_SIDE))
-            grey = np.asarray(
-                image.convert("L").resize((THUMBNAIL_SIDE, THUMBNAIL_SIDE), Image.Resampling.BOX), np.float64
-            )
+            small = image.convert("L").resize((THUMBNAIL_SIDE, THUMBNAIL_SIDE), Image.Resampling.BOX)
+            grey = np.asarray(small, np.float64)
     except OSError:  # said where it is read
         return None
     return (grey - grey.mean()) / max(float(grey.std()), 1.0)

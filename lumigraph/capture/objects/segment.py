@@ -1,8 +1,8 @@
-"""An object cut out of all its photographs at once, by its colours and by what one solid body can look like.
+"""Segmentation of an object in all its photographs at once, by its colours and as the silhouette of one solid body.
 
 After Campbell, Vogiatzis, Hernández and Cipolla 2010 ("Automatic object segmentation from calibrated images"): cameras
-that fixate on an object tell where it is; colours are learnt from there and from around; each photograph is cut; the
-cuts carve cells of space; what is left of these says where colours are learnt from next. Here cuts go through
+that fixate on an object determine its place; colours are learnt from there and from around; each photograph is cut;
+the cuts carve cells of space; colours are learnt from what is left of these next. Here cuts go through
 superpixels, and a table that sparse points show bounds the object from below.
 """
 
@@ -33,8 +33,6 @@ BODY_LOG_LIKELIHOOD = 2.5  # log-likelihood added to the pixels that a body cove
 MAX_COLOUR_LOG_LIKELIHOOD = 4.0  # limit of the evidence of colours alone
 MIN_CELLS = 20  # of a body
 MIN_OVERLAP = 0.75  # of a cut with the body, below which a warning names the photograph
-
-
 Patches = np.ndarray  # bool: which superpixels of one picture; each picture has a number of its own
 COMPONENTS = 10  # Gaussians of a mixture
 MIN_PIXELS = 50  # per Gaussian
