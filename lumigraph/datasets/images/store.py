@@ -188,9 +188,12 @@ class ImageStore:
     @classmethod
     def from_arrays(cls, images: Sequence[np.ndarray], masks: Sequence[np.ndarray | None] | None = None) -> ImageStore:
         """Pictures that are already here: uint8 (height, width, 3 or 4), and optionally which pixels to trust."""
+
+        def source(image: np.ndarray, mask: np.ndarray | None) -> ImageSource:
+            return ImageSource((image.shape[1], image.shape[0]), lambda: (image, mask))
+
         pairs = zip(images, masks or [None] * len(images), strict=True)
-        sources = [ImageSource((i.shape[1], i.shape[0]), lambda i=i, m=m: (i, m)) for i, m in pairs]
-        return cls.load(sources, memory=sys.maxsize)
+        return cls.load([source(*pair) for pair in pairs], memory=sys.maxsize)
 
     def __len__(self) -> int:
         return len(self.sizes)
