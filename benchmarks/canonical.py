@@ -30,7 +30,7 @@ from lumigraph.derive.canonical import PRESETS, Instance, Solution, canonicalise
 from lumigraph.derive.canonical.learning import found_rotations
 from lumigraph.derive.canonical.mean_shape import best_alignment, best_rotations, described
 from lumigraph.files import write_json
-from lumigraph.geometry.choice import evenly
+from lumigraph.geometry import evenly
 from lumigraph.run.canonicalised import Canonicalised
 from lumigraph.synthetic import signed_distance
 from lumigraph.synthetic.members import member_stage

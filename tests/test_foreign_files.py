@@ -19,7 +19,7 @@ from PIL import Image
 from lumigraph import methods
 from lumigraph.capture.motion.folder import WRITTEN_FILES, claim_results, copy_photographs
 from lumigraph.capture.photos import Photo
-from lumigraph.capture.photos.track import untracked
+from lumigraph.capture.photos.photo import untracked
 from lumigraph.commands.cli import COMMANDS, main
 from lumigraph.errors import LumigraphError
 from lumigraph.files import atomic as files

@@ -104,7 +104,7 @@ def test_arrows_point_one_way():
 @pytest.mark.parametrize(
     ("module", "line"),
     [
-        ("lumigraph.geometry.choice", "from ..camera import Camera"),
+        ("lumigraph.geometry", "from .camera import Camera"),
         ("lumigraph.kernels.march.cpu", "from ...datasets.scene import Scene"),
         ("lumigraph.kernels.march.cpu", "from ... import datasets"),
         ("lumigraph.capture.colmap", "import lumigraph.methods.instant_ngp"),

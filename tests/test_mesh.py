@@ -19,7 +19,7 @@ from scipy.spatial import cKDTree
 from solids import SOLID, Seen, Solid, around, ball, painted, shell, together, torus
 
 from lumigraph.camera import Camera
-from lumigraph.camera.crop import Box, Sphere
+from lumigraph.camera.crop import CropBox, Sphere
 from lumigraph.camera.rays import Rendering
 from lumigraph.commands.cli import main
 from lumigraph.datasets.mesh import Mesh
@@ -142,7 +142,7 @@ def test_a_crop_is_all_that_is_meshed(kind):
 def test_the_box_may_be_larger_or_smaller_and_grows_in_the_open():
     frame = Frame(bounds=((-0.4,) * 3, (0.4,) * 3), near=0.1, reach=4.0)
     assert meshed_box(frame, None).upper == pytest.approx((0.6,) * 3)
-    assert meshed_box(frame, 100.0) == Box((-4.0,) * 3, (4.0,) * 3)
+    assert meshed_box(frame, 100.0) == CropBox((-4.0,) * 3, (4.0,) * 3)
     assert meshed_box(replace(frame, reach=1.0), None).upper == pytest.approx((0.4,) * 3)
     mesh = extract_mesh(Seen(ball(), frame), around(), cell=CELL, extent=2.0)
     assert as_trimesh(mesh).is_watertight and as_trimesh(mesh).extents.min() > 1.1

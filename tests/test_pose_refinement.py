@@ -16,7 +16,7 @@ from lumigraph.camera import Camera
 from lumigraph.camera.lens import Pinhole
 from lumigraph.capture import open_scene
 from lumigraph.capture.capture import Shot
-from lumigraph.capture.folds import about_fold
+from lumigraph.capture.oddities import about_fold
 from lumigraph.components.fields.encodings import FrequencyEncoding
 from lumigraph.components.training.pose_refinement import PoseRefinement, seen_places
 from lumigraph.components.training.schedules import BEGINS, ENDS, FIRST, band_weights

@@ -22,7 +22,7 @@ from budgets import budget
 from torch import nn
 from viewer_client import Client
 
-from lumigraph.camera.crop import Box
+from lumigraph.camera.crop import CropBox
 from lumigraph.camera.rays import Rendering
 from lumigraph.commands.cli import main
 from lumigraph.errors import LumigraphError, LumigraphWarning
@@ -259,7 +259,7 @@ def test_a_crop_begins_where_rays_enter_the_box(learnt):
     camera = scene.cameras[0]  # on the side of positive x
     method = Walls(scene.frame)
     assert (method.render(camera).rgb[..., 0] == 1).all()
-    seen = render_inside(method, camera, Box((-0.5, -1.0, -1.0), (0.0, 1.0, 1.0)))
+    seen = render_inside(method, camera, CropBox((-0.5, -1.0, -1.0), (0.0, 1.0, 1.0)))
     inside = seen.opacity == 1
     assert inside.sum() > 50
     assert (seen.rgb[inside] == torch.tensor([0.0, 0.0, 1.0])).all()
@@ -278,7 +278,7 @@ def test_a_crop_keeps_extras_even_of_bands_beside_the_box(learnt):
             return seen.with_extra(wall=1 + (seen.rgb[:, 2] > 0).long(), where=rays.origins)
 
     bands = [
-        render_inside(Numbered(scene.frame), rows(camera, a, b), Box((-0.5, -1.0, -0.1), (0.0, 1.0, 0.1)))
+        render_inside(Numbered(scene.frame), rows(camera, a, b), CropBox((-0.5, -1.0, -0.1), (0.0, 1.0, 0.1)))
         for a, b in ((0, 1), (1, tiny.SIZE))
     ]
     assert (bands[0].opacity == 0).all() and (bands[0].extra["wall"] == 0).all()
@@ -292,7 +292,7 @@ def test_a_crop_keeps_extras_even_of_bands_beside_the_box(learnt):
 def test_a_crop_of_other_methods_goes_by_depth(learnt):
     scene, _ = learnt
     camera = scene.cameras[0]
-    seen = render_inside(Wall(scene.frame, None), camera, Box((-0.1, -0.3, -1.0), (0.1, 0.3, 1.0)))
+    seen = render_inside(Wall(scene.frame, None), camera, CropBox((-0.1, -0.3, -1.0), (0.1, 0.3, 1.0)))
     y = camera.rays(camera.pixels()).at(seen.depth.reshape(-1).nan_to_num(0, 0))[:, 1].view_as(seen.depth)
     inside = seen.opacity == 1
     assert 0 < inside.sum() < inside.numel()
@@ -302,7 +302,7 @@ def test_a_crop_of_other_methods_goes_by_depth(learnt):
 
 def test_a_crop_of_a_cloud_picks_centres():
     cloud = some_cloud(50)
-    box = Box((-0.5, -1.0, -1.0), (0.5, 0.2, 1.0))
+    box = CropBox((-0.5, -1.0, -1.0), (0.5, 0.2, 1.0))
     kept = cleaned(cloud, box).means
     assert 0 < len(kept) < 50
     assert (kept[:, 0].abs() <= 0.5).all() and (kept[:, 1] <= 0.2).all()

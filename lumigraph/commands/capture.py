@@ -71,12 +71,11 @@ def tell_masks(folder: Path, onward: str) -> None:
     from ..capture import choose_reader
     from ..capture.masks import OBJECT_MASKS
     from ..capture.objects import mask_object
-    from ..system.progress import track
 
     if (folder / OBJECT_MASKS).exists():
         show({"masks": f"{folder / OBJECT_MASKS}, as they are; delete them to have them made anew", "next": onward})
         return
-    masked = mask_object(folder, choose_reader(folder).read(folder), track)
+    masked = mask_object(folder, choose_reader(folder).read(folder))
     show(
         {
             "masks": f"{masked.photographs} in {folder / OBJECT_MASKS}",

@@ -66,7 +66,7 @@ def before_and_after(opened: Any, gaussians: Any, gone: Any) -> Any:
     from ..camera import ring
     from ..composition import PickedCloud
     from ..figures import Row, contact_sheet
-    from ..geometry.choice import evenly
+    from ..geometry import evenly
     from ..system.progress import track
 
     clouds = [PickedCloud(opened.frame, some) for some in (gaussians, gaussians[~gone], gaussians[gone])]

@@ -46,7 +46,7 @@ class Compose:
     def run(self) -> int:
         import torch
 
-        from ..camera.crop import Box
+        from ..camera.crop import CropBox
         from ..composition import standing
         from ..geometry import Similarity
         from ..run import open_any
@@ -63,7 +63,7 @@ class Compose:
             spot = None if self.at is None else torch.tensor(self.at, dtype=torch.float64)
             place = standing(part.frame, lead.frame, spot, self.scale or 1.0, self.turn or 0.0)
         named = [CompositionPart(relative(self.lead, self.output), Similarity.make(1.0))]
-        named.append(CompositionPart(relative(self.part, self.output), place, self.box and Box(*self.box)))
+        named.append(CompositionPart(relative(self.part, self.output), place, self.box and CropBox(*self.box)))
         write_composition(self.output, named)
         opened = open_any(self.output)
         low, high = opened.frame.bounds

@@ -15,7 +15,7 @@ from ..errors import LumigraphError
 from ..exchange import size_of
 from ..files.names import natural
 from ..gaussians import Gaussians
-from ..geometry.choice import evenly
+from ..geometry import evenly
 from ..large import BlockRun
 from ..metrics import scores_of
 from ..run import Run

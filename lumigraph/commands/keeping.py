@@ -58,11 +58,11 @@ class Keeping:
 
     def crop(self, frame: Any) -> Any:
         """The Crop, in the scene's frame; None where there is none."""
-        from ..camera.crop import Box, Crop, Sphere
+        from ..camera.crop import Crop, CropBox, Sphere
 
         crop: Crop
         if self.box is not None:
-            crop = Box(self.box[:3], self.box[3:])
+            crop = CropBox(self.box[:3], self.box[3:])
         elif self.sphere is not None:
             crop = Sphere(self.sphere[:3], self.sphere[3])
         else:

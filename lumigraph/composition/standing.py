@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from ..camera.crop import Box
+from ..camera.crop import CropBox
 from ..datasets.scene import Frame
 from ..geometry import Similarity
 
@@ -43,7 +43,7 @@ def foot(frame: Frame) -> Float[Tensor, " 3"]:
     return torch.tensor([x, y, float(lower[2])], dtype=torch.float64)
 
 
-def frame_around(lead: Frame, others: Sequence[tuple[Frame, Similarity, Box | None]]) -> Frame:
+def frame_around(lead: Frame, others: Sequence[tuple[Frame, Similarity, CropBox | None]]) -> Frame:
     """The lead's frame, with bounds and reach that hold other parts as well: their frames, places in it, and boxes.
 
     Its box of interest may then be larger than [-1, 1]^3, unlike that of any single scene.
@@ -51,9 +51,9 @@ def frame_around(lead: Frame, others: Sequence[tuple[Frame, Similarity, Box | No
     corners = [torch.tensor(lead.bounds)]
     farthest = lead.reach
     for frame, place, box in others:
-        interest = box or Box(*frame.bounds)
+        interest = box or CropBox(*frame.bounds)
         corners.append(interest.moved(place).corners.float())
-        all_of_it = interest if box or not frame.is_open else Box((-frame.reach,) * 3, (frame.reach,) * 3)
+        all_of_it = interest if box or not frame.is_open else CropBox((-frame.reach,) * 3, (frame.reach,) * 3)
         farthest = max(farthest, float(all_of_it.moved(place).corners.abs().max()))
     points = torch.cat(corners)
     lower, upper = ((x, y, z) for x, y, z in (points.amin(0).tolist(), points.amax(0).tolist()))

@@ -11,8 +11,7 @@ from torch import Tensor
 from ..camera import Camera
 from ..camera.rays import Rendering
 from ..errors import LumigraphError
-from ..geometry import Vector
-from ..geometry.choice import evenly
+from ..geometry import Vector, evenly
 from ..system.progress import track
 from .depth_map import DepthMap, SurfacePoints, Tolerance
 

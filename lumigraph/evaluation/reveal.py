@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from ..capture.fewer import with_fewer_views
+from ..capture.views import with_fewer_views
 from ..datasets.dataset import Dataset
 from ..datasets.scene import Scene
 from ..method import Method

@@ -12,14 +12,14 @@ from PIL import Image
 from torch import Tensor
 
 from ..camera import Camera, dome, ring
-from ..camera.crop import Box
+from ..camera.crop import CropBox
 from ..datasets.mesh import Mesh
 from ..datasets.scene import Frame
 from ..datasets.shapes import Shape, Shapes
 from ..errors import LumigraphError
 from ..export.mesh import POINTS_PER_CHUNK, TRUNCATION_CELLS, extract_mesh, find_surface, make_grid
 from ..figures import Row, contact_sheet
-from ..geometry.choice import evenly
+from ..geometry import evenly
 from ..method import Method
 from ..method.capabilities import HasDistance, HasMesh, can
 from ..metrics import Score
@@ -161,7 +161,7 @@ def surface_of(method: Method, frame: Frame, cells: int) -> Mesh:
     Raises LumigraphError where there is none."""
     if isinstance(method, HasMesh):
         return method.mesh()
-    box = Box(*frame.bounds)
+    box = CropBox(*frame.bounds)
     cell = max(b - a for a, b in zip(box.lower, box.upper, strict=True)) / cells
     if not can(method, HasDistance):
         return extract_mesh(method, dome(ring(frame.bounds)), cell=cell, smooth=0)

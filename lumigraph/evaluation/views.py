@@ -18,7 +18,7 @@ from ..camera.rays import Rendering
 from ..datasets.scene import Photograph, Scene
 from ..errors import LumigraphError
 from ..figures import ERROR_GAIN, Row, colour_depth, colour_error, contact_sheet, depth_range
-from ..geometry.choice import evenly
+from ..geometry import evenly
 from ..method import Method
 from ..metrics import WINDOW, Score, psnr, scores_of, ssim_map
 from ..metrics.lpips import DEFINITION, Lpips

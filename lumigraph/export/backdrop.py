@@ -11,7 +11,7 @@ from torch import Tensor
 
 from ..camera import Camera
 from ..datasets.scene import Vector
-from ..geometry.choice import evenly
+from ..geometry import evenly
 from ..method import Method
 
 VIEWS, SIZE = 12, 96  # pictures that are looked at, and the longer side of each in pixels

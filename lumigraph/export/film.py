@@ -14,7 +14,7 @@ from PIL import Image
 from ..camera import Camera
 from ..figures import Range, colour_depth, depth_range, to_bytes
 from ..files import claim, claim_folder, replacing_folder, write_json
-from ..geometry.choice import evenly
+from ..geometry import evenly
 from ..method import Method
 from ..method.controls import Value
 from ..system.memory import ask_for_picture

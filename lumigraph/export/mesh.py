@@ -14,7 +14,7 @@ from torch import Tensor
 from torch.nn.functional import grid_sample
 
 from ..camera import Camera
-from ..camera.crop import Box, Crop
+from ..camera.crop import Crop, CropBox
 from ..datasets.mesh import Mesh
 from ..datasets.scene import Frame
 from ..depth_maps import TSDF, DepthMap, Tolerance, fused_colours, hidden, render_depth_maps
@@ -104,7 +104,7 @@ def extract_mesh(
     return Mesh(vertices, triangles, (rgb * 255).round().to(torch.uint8).numpy())
 
 
-def meshed_box(frame: Frame, times: float | None) -> Box:
+def meshed_box(frame: Frame, times: float | None) -> CropBox:
     """The frame's box of interest, larger or smaller about its middle, within the cube that holds everything."""
     low, high = torch.tensor(frame.bounds)
     half = 0.5 * (high - low) * ((1.0 if not frame.is_open else OPEN_BOX) if times is None else times)
@@ -112,7 +112,7 @@ def meshed_box(frame: Frame, times: float | None) -> Box:
     return upright(torch.stack([middle - half, middle + half]).clamp(-frame.reach, frame.reach))
 
 
-def within_reach(frame: Frame, crop: Crop) -> Box:
+def within_reach(frame: Frame, crop: Crop) -> CropBox:
     """The upright box around a crop, within the cube that holds everything. Raises LumigraphError for one outside."""
     corners = torch.tensor(crop.bounds).clamp(-frame.reach, frame.reach)
     if not (corners[1] > corners[0]).all():
@@ -122,12 +122,12 @@ def within_reach(frame: Frame, crop: Crop) -> Box:
     return upright(corners)
 
 
-def upright(corners: Float[Tensor, "2 3"]) -> Box:
+def upright(corners: Float[Tensor, "2 3"]) -> CropBox:
     (a, b, c), (d, e, f) = corners.tolist()
-    return Box((a, b, c), (d, e, f))
+    return CropBox((a, b, c), (d, e, f))
 
 
-def make_grid(box: Box, cell: float | None) -> Grid:
+def make_grid(box: CropBox, cell: float | None) -> Grid:
     """Cubes over a box and a little around it. Raises LumigraphError for cubes too small or too large."""
     longest = max(b - a for a, b in zip(box.lower, box.upper, strict=True))
     if cell is None:

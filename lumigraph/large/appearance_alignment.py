@@ -13,7 +13,7 @@ from ..camera import Camera
 from ..components.fields.appearance import Appearance, Patches
 from ..composition import Placed
 from ..datasets.scene import Batch
-from ..geometry.choice import evenly
+from ..geometry import evenly
 from ..method.capabilities import HasAppearance, can, needs
 from ..system.progress import track
 from .block_cache import Nearby

@@ -26,7 +26,7 @@ from ..components.training.schedules import falling
 from ..datasets.scene import Batch, Frame, Scene
 from ..exchange.packing import Stored, most_important
 from ..files.ranges import Layers, LearningRate, NonNegative, PositiveShare, Seed, Share, Steps, Width, between
-from ..geometry.choice import evenly
+from ..geometry import evenly
 from ..kernels.spherical_harmonics import K00
 from ..method import Field, FieldMethod
 from ..method.field import Colours, Densities, Directions, Points

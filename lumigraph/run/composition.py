@@ -31,7 +31,7 @@ import torch
 
 from .. import files
 from ..camera import Camera
-from ..camera.crop import Box
+from ..camera.crop import CropBox
 from ..composition import Placed, compose, frame_around
 from ..errors import LumigraphError
 from ..files.ranges import Name, Point, Row, between, typed
@@ -48,7 +48,7 @@ class CompositionPart:
 
     source: str
     place: Similarity
-    box: Box | None = None
+    box: CropBox | None = None
 
 
 class Composition(Opened):
@@ -181,13 +181,13 @@ def part_to_json(part: CompositionPart) -> dict[str, Any]:
     return said
 
 
-def box_of(corners: tuple[Vector, Vector], where: Path | str) -> Box:
+def box_of(corners: tuple[Vector, Vector], where: Path | str) -> CropBox:
     """Raises LumigraphError, naming `where`, for corners that hold nothing."""
     if not all(a < b for a, b in zip(*corners, strict=True)):
         raise LumigraphError(
             f"{where}: the box {corners} has nothing between its lower and its upper corner; correct it"
         )
-    return Box(*corners)
+    return CropBox(*corners)
 
 
 def place_from_json(said: Any, where: Path | str = "a composition") -> Similarity:

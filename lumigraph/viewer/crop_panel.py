@@ -10,7 +10,7 @@ from typing import Any, cast
 import numpy as np
 from jaxtyping import Float
 
-from ..camera.crop import Box, Crop, Sphere
+from ..camera.crop import Crop, CropBox, Sphere
 from ..datasets.scene import Frame, Vector
 from ..errors import LumigraphError
 from ..gaussians.cleaning import ISOLATION, MAX_SCALE, MIN_OPACITY
@@ -90,7 +90,7 @@ class CropPanel:
         """The chosen crop in the scene's frame; `None` for the whole scene."""
         if self._shape.value == BOX:
             a, b = self._lower.value, self._upper.value
-            return Box(vector(np.minimum(a, b)), vector(np.maximum(a, b)))
+            return CropBox(vector(np.minimum(a, b)), vector(np.maximum(a, b)))
         if self._shape.value == SPHERE:
             return Sphere(vector(self._middle.value), max(float(self._radius.value), NUMBER_STEP))
         return None
@@ -160,7 +160,7 @@ class CropPanel:
             if "outline" in self._nodes:
                 self._nodes.pop("outline").remove()
             return
-        lines = edges(crop) if isinstance(crop, Box) else circles(cast(Sphere, crop))
+        lines = edges(crop) if isinstance(crop, CropBox) else circles(cast(Sphere, crop))
         if "outline" in self._nodes:
             self._nodes["outline"].points = lines
         else:
@@ -187,7 +187,7 @@ def vector(values: Any) -> Vector:
     return x, y, z
 
 
-def edges(box: Box) -> Float[np.ndarray, "12 2 3"]:
+def edges(box: CropBox) -> Float[np.ndarray, "12 2 3"]:
     """The two ends of each of a box's twelve edges."""
     corners = np.array(list(itertools.product((0, 1), repeat=3)))
     ends = [(a, b) for a, b in itertools.combinations(corners, 2) if abs(a - b).sum() == 1]

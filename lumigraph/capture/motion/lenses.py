@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
+from contextlib import closing
 from pathlib import Path
 from typing import Literal
 
@@ -62,8 +63,7 @@ def model_for(group: Sequence[Photo]) -> str:
 
 def write_database(path: Path, groups: Sequence[Sequence[Photo]]) -> None:
     """A new database with a camera for each group and an image for each photograph."""
-    database = pycolmap.Database.open(path)
-    try:
+    with closing(pycolmap.Database.open(path)) as database:
         for group in groups:
             focal, known = prior(group)
             camera = pycolmap.Camera.create_from_model_name(1, model_for(group), focal, *group[0].size)
@@ -79,5 +79,3 @@ def write_database(path: Path, groups: Sequence[Sequence[Photo]]) -> None:
                 frame.rig_id = rig_id
                 frame.add_data_id(image.data_id)
                 database.write_frame(frame)
-    finally:
-        database.close()

@@ -1,8 +1,8 @@
 """One stage of COLMAP in a process of its own, so that Ctrl-C ends it at once and its memory and chatter stay outside.
 
-Run as a script, with what to do as JSON in its only argument. It knows nothing of the house, so it starts in half a
+Run as a script, with what to do as JSON in its only argument. It imports nothing of the package, so it starts in half a
 second. It writes how much is done to standard output, a number to a line; whatever COLMAP says goes to standard error.
-It ends when its standard input does: nobody is left to hear of the result.
+It ends when its standard input does, as the process that started it has then ended.
 """
 
 from __future__ import annotations

@@ -108,7 +108,7 @@ class BenchViews(Cells):
         from ...benchmark.cell import MEMBERS
         from ...capture import kind_of, open_dataset, sources_of
         from ...datasets.collection import Collection
-        from ...geometry.choice import evenly
+        from ...geometry import evenly
 
         if kind_of(source) is not Collection:
             yield Place(source, scene_name(source))

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from ... import kernels
 from ...datasets.scene import Scene
-from ...geometry.choice import evenly
+from ...geometry import evenly
 from ...system.progress import track
 from .flat_view import FlatView, flat_view
 

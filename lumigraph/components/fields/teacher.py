@@ -18,8 +18,7 @@ from torch import Tensor
 
 from ...camera import Camera
 from ...depth_maps import DEPTH_EDGE, TSDF, DepthMap, SurfacePoints, Tolerance, free, render_depth_maps, surface_points
-from ...geometry import unit
-from ...geometry.choice import evenly
+from ...geometry import evenly, unit
 from ...kernels import spherical_harmonics
 from ...method.capabilities import HasDensity, HasField, can
 from ...method.field import Colours, Densities, Directions, Points

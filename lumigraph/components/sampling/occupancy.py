@@ -17,7 +17,7 @@ from ...camera import PIXEL_RADIUS, Camera
 from ...camera.rays import Rays, Samples
 from ...datasets.scene import Scene
 from ...files.ranges import Cells, NonNegative
-from ...geometry.choice import evenly
+from ...geometry import evenly
 from ...method import Part
 from .spaces import Space
 

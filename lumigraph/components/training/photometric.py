@@ -15,7 +15,7 @@ from ...camera import Camera
 from ...camera.rays import Rendering
 from ...datasets.scene import Batch, Photograph, Scene
 from ...errors import LumigraphWarning
-from ...geometry.choice import evenly
+from ...geometry import evenly
 from ...method import Part
 from ...method.controls import Control, Value
 from ..clouds.flat_view import FlatView, flat_view

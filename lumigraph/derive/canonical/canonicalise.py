@@ -18,8 +18,7 @@ from ...datasets.scene import Vector
 from ...errors import LumigraphError, LumigraphWarning
 from ...figures import Row, contact_sheet, save_picture
 from ...files.names import natural
-from ...geometry import Similarity
-from ...geometry.choice import evenly
+from ...geometry import Similarity, evenly
 from ...method import Method
 from ...method.capabilities import HasDensity, can, needs
 from ...run import Run

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from jaxtyping import Float
 from torch import Tensor
 
-from ...geometry.choice import evenly
+from ...geometry import evenly
 from .grids import Instance
 from .learning import Config, found_rotations, learn
 from .mean_shape import best_alignment, best_rotations, described

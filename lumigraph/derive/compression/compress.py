@@ -14,7 +14,7 @@ from ... import files
 from ...budget import Budget
 from ...errors import LumigraphError
 from ...evaluation import evaluate
-from ...geometry.choice import evenly
+from ...geometry import evenly
 from ...method import Method
 from ...method.capabilities import CanCompress, needs
 from ...run import Run, check_new

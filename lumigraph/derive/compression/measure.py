@@ -15,7 +15,7 @@ from ...datasets.images import ImageStore
 from ...datasets.scene import Scene
 from ...errors import LumigraphError
 from ...evaluation import evaluate
-from ...geometry.choice import evenly
+from ...geometry import evenly
 from ...method import Method
 from ...run import Run
 from ...system.progress import track

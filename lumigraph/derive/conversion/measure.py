@@ -13,7 +13,7 @@ from ...camera.rays import Rendering
 from ...datasets.scene import Scene
 from ...evaluation import evaluate
 from ...evaluation.views import warm_up
-from ...geometry.choice import evenly
+from ...geometry import evenly
 from ...method import Method
 from ...metrics import psnr
 from ...system.progress import track

@@ -10,8 +10,7 @@ import torch
 from ...camera import Camera
 from ...datasets.images import ImageStore
 from ...datasets.scene import Scene
-from ...geometry import look_at
-from ...geometry.choice import evenly
+from ...geometry import evenly, look_at
 from ...method import Method
 from ...system.progress import track
 from ..compression.measure import bytes_of

@@ -15,7 +15,7 @@ from torch.nn.functional import softplus
 from ...budget import Effort, Efforts
 from ...camera import Camera
 from ...camera.rays import Look, Rays, Samples
-from ...capture.fewer import spread_out
+from ...capture.views import spread_out
 from ...components.fields.encodings import FrequencyEncoding
 from ...components.fields.kept_photographs import KeptPhotographs, chance, padded, photographed, rays_through
 from ...components.fields.layers import in_chunks

@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from .midpoints import fill_midpoints
+from .loops import fill_midpoints
 
 
 @dataclass(frozen=True)
@@ -44,10 +44,8 @@ class Rays:
         return self.origins + t[:, None] * self.directions
 
     def through_box(self, box: Float[Tensor, "2 3"]) -> tuple[Float[Tensor, " ray"], Float[Tensor, " ray"]]:
-        """Distances at which each ray enters and leaves a box (the slab test of Kay & Kajiya 1986).
-
-        It leaves before it enters where it misses.
-        """
+        """Distances at which each ray enters and leaves a box (the slab test of Kay & Kajiya 1986). It leaves before it
+        enters where it misses."""
         slow = self.directions.abs() < 1e-9
         inverse = 1 / torch.where(slow, 1e-9, self.directions)
         a, b = (box[0] - self.origins) * inverse, (box[1] - self.origins) * inverse

@@ -1,16 +1,19 @@
-"""Geometry that every room shares: unit vectors, rotations, similarities, cameras that look at something, normals.
+"""Vectors, rotations, similarities, and choosing some of many evenly.
 
 Quaternions are (w, x, y, z). Poses are camera-to-world, (3, 4), with +x right, +y down, +z forward.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TypeVar
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
+T = TypeVar("T")
 Vector = tuple[float, float, float]
 Rows = tuple[tuple[float, float, float, float], ...]  # of a 4x4 matrix, as plain numbers
 SIMILARITY_TOLERANCE = 1e-3  # by which a matrix may fail to be a similarity
@@ -107,10 +110,8 @@ def multiply(a: Float[Tensor, "#rotation 4"], b: Float[Tensor, "#rotation 4"]) -
 
 @dataclass(frozen=True)
 class Similarity:
-    """A change of frame, x' = s R x + t, held as one 4x4 matrix in double precision.
-
-    A negative determinant mirrors; `scale` is then still positive.
-    """
+    """A change of frame, x' = s R x + t, held as one 4x4 matrix in double precision. A negative determinant mirrors;
+    `scale` is then still positive."""
 
     matrix: Float[Tensor, "4 4"]
 
@@ -166,9 +167,7 @@ def normals_from_depth(
     points: Float[Tensor, "height width 3"], depth: Float[Tensor, "height width"]
 ) -> Float[Tensor, "height width 3"]:
     """Unit normals of a surface from where each pixel sees it, in single precision; their side is not determined.
-
-    Differences are taken towards that neighbour which is nearer in depth, so that they do not reach across edges.
-    """
+    Differences are taken towards that neighbour which is nearer in depth, so that they do not reach across edges."""
     across, down = (_nearer_difference(points.double(), depth, axis) for axis in (1, 0))
     return torch.nn.functional.normalize(torch.linalg.cross(across, down), dim=-1).float()
 
@@ -195,3 +194,11 @@ def is_similarity(matrix: Tensor) -> bool:
     if size <= 0:
         return False
     return bool((linear @ linear.T / size ** (2 / 3) - one).abs().max() <= SIMILARITY_TOLERANCE)
+
+
+def evenly(items: Sequence[T], count: int) -> list[T]:
+    """So many of the items at most, evenly spread, in order; the first and the last among them."""
+    count = min(count, len(items))
+    if count == 1:
+        return [items[0]]
+    return [items[round(i * (len(items) - 1) / (count - 1))] for i in range(count)]

@@ -1,6 +1,7 @@
-"""OpenCV's distortion undone on the CPU, one ray at a time, in single precision and without gradients (Numba).
+"""Loops over rays and samples on the CPU, in single precision and without gradients (Numba).
 
-The equations are those of `OpenCV`, without a tensor's memory traffic for each term. Every batch of rays needs them.
+Every batch of rays needs them. They follow the equations of `OpenCV` and `Samples.along`, without a tensor's memory
+traffic for each term.
 """
 
 import math
@@ -63,3 +64,15 @@ def solid_angle(directions, index, focal, distortion, angle):
         z = directions[i, 2]
         _, _, xx, xy, yy = distort(directions[i, 0] / z, directions[i, 1] / z, distortion[c])
         angle[i] = z * z * z / (max(xx * yy - xy * xy, 1e-3) * focal[c, 0] * focal[c, 1])
+
+
+@njit(parallel=True, cache=True, error_model="numpy")
+def fill_midpoints(origins, directions, t_start, t_end, ray_starts, positions, sample_directions):
+    """Fill in the position of each sample's middle and the direction of its ray, as `Samples.along` returns them."""
+    half = origins.dtype.type(0.5)
+    for ray in prange(len(origins)):
+        for i in range(ray_starts[ray], ray_starts[ray + 1]):
+            t = half * (t_start[i] + t_end[i])
+            for axis in range(3):
+                positions[i, axis] = origins[ray, axis] + t * directions[ray, axis]
+                sample_directions[i, axis] = directions[ray, axis]

@@ -18,14 +18,12 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from ...errors import LumigraphError
-from ...files.ranges import Tally, typed
-from . import undistortion
+from ..errors import LumigraphError
+from ..files.ranges import Tally, typed
+from . import loops
 
 FOLD_SAMPLES = 1024  # angles from the axis at which a distortion is tested for folding over
-MAX_FLAT_ANGLE = math.radians(
-    89.0
-)  # largest angle from the axis on a flat image plane: tan is still harmless in float32
+MAX_FLAT_ANGLE = math.radians(89.0)  # from the axis, on a flat image plane: tan is still harmless in float32
 NEWTON_STEPS = 20  # usually three are enough; more only beside a fold
 CONVERGED_STEP = 3e-5  # after a Newton step this small the remaining error is about its square
 # What the numbers of lenses that exist lie between; in pixels, but for distortion and for the offset of an eye.
@@ -51,10 +49,8 @@ class MixedParts:
 
 
 class Lens(ABC):
-    """Base class of lenses. Subclasses are frozen dataclasses of tensors with leading axis camera.
-
-    In every method `index` names the camera of each pixel or point; None means camera 0 for all.
-    """
+    """Base class of lenses. Subclasses are frozen dataclasses of tensors with leading axis camera. In every method
+    `index` names the camera of each pixel or point; None means camera 0 for all."""
 
     kinds: ClassVar[dict[str, type[Lens]]] = {}
     in_pixels: ClassVar[tuple[str, ...]] = ("focal", "centre")  # what scales with the picture
@@ -222,7 +218,11 @@ class OpenCV(Lens):
 
     def unproject(self, pixels, index=None):
         if self._by_loop(pixels):
-            return self._unproject_by_loop(pixels, index)
+            directions = torch.empty(len(pixels), 3)
+            inputs = (pixels, NO_INDEX if index is None else index, self.focal, self.centre, self.distortion, self.fold)
+            # Each ray stops by itself here, so one beside a fold, where steps merely halve, costs the others no steps.
+            loops.undistort(*(x.numpy() for x in inputs), NEWTON_STEPS, 0.03 * CONVERGED_STEP, directions.numpy())
+            return directions
         target = (pixels - rows(self.centre, index)) / rows(self.focal, index)
         target_x, target_y = target.T.contiguous()
         distortion, (limit,) = columns(self.distortion, index), columns(self.fold, index)
@@ -247,7 +247,10 @@ class OpenCV(Lens):
 
     def solid_angle(self, pixels, directions, index=None):
         if self._by_loop(directions):
-            return self._solid_angle_by_loop(directions, index)
+            angle = torch.empty(len(directions))
+            tensors = directions, NO_INDEX if index is None else index, self.focal, self.distortion, angle
+            loops.solid_angle(*(x.numpy() for x in tensors))
+            return angle
         x, y, z = directions.T.contiguous()
         _, (xx, xy, yy) = bend(x / z, y / z, columns(self.distortion, index))
         return z * z * z / ((xx * yy - xy * xy).clamp_min(1e-3) * area(self.focal, index))
@@ -256,21 +259,6 @@ class OpenCV(Lens):
         """True if the faster CPU loops apply: single precision, no gradients."""
         tensors = (given, *self._numbers().values())
         return all(x.is_cpu and x.dtype == torch.float32 and not x.requires_grad for x in tensors)
-
-    def _unproject_by_loop(self, pixels: Tensor, index: Tensor | None) -> Tensor:
-        directions = torch.empty(len(pixels), 3)
-        which = NO_INDEX if index is None else index
-        inputs = (pixels, which, self.focal, self.centre, self.distortion, self.fold)
-        # Each ray stops by itself here, so one beside a fold, where steps merely halve, gets no company's extra steps.
-        undistortion.undistort(*(x.numpy() for x in inputs), NEWTON_STEPS, 0.03 * CONVERGED_STEP, directions.numpy())
-        return directions
-
-    def _solid_angle_by_loop(self, directions: Tensor, index: Tensor | None) -> Tensor:
-        angle = torch.empty(len(directions))
-        which = NO_INDEX if index is None else index
-        tensors = directions, which, self.focal, self.distortion, angle
-        undistortion.solid_angle(*(x.numpy() for x in tensors))
-        return angle
 
 
 @dataclass(frozen=True)
