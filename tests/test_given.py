@@ -435,7 +435,7 @@ def test_an_export_shows_what_was_told(trained, tmp_path):
 
 def test_photographs_are_named(tmp_path):
     """A control that wants a photograph takes its name as well as its number."""
-    from lumigraph.commands.controls import open_method
+    from lumigraph.commands.options import open_method
 
     scene = tiny.scene()
     made = ngp(scene, exposure_correction="yes", refine_cameras=True)

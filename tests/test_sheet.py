@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from lumigraph.figures import Row, contact_sheet
-from lumigraph.figures.sheet import SCREEN, Layout
+from lumigraph.figures.pictures import SCREEN, Layout
 
 
 def rows(count: int, height: int, width: int, columns: int = 4) -> list[Row]:

@@ -126,4 +126,4 @@ def test_next_commands_name_the_run(tmp_path):
 
 
 def test_what_is_known_by_heart_is_said():
-    assert "by heart" in beside_training(25.0, 19.0) and beside_training(25.0, 24.0) == "25.00 dB while training"
+    assert "memorised" in beside_training(25.0, 19.0) and beside_training(25.0, 24.0) == "25.00 dB while training"

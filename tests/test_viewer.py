@@ -33,16 +33,13 @@ from lumigraph.method import Method, RayMethod
 from lumigraph.run import Run
 from lumigraph.training import fit
 from lumigraph.viewer import Subject, Viewer, choose_address
-from lumigraph.viewer.cameras import angle_for, angles, pose_of, rows
-from lumigraph.viewer.crop import render_inside
-from lumigraph.viewer.extras import PALETTE
+from lumigraph.viewer.cameras import ViewRequest, angle_for, angles, pose_of, rows
 from lumigraph.viewer.flight import upwards
-from lumigraph.viewer.modes import along_axis, extra_modes, normals, picture
-from lumigraph.viewer.pace import Pace
-from lumigraph.viewer.painter import Painter
-from lumigraph.viewer.splats import UNIT_SCALE, splats
+from lumigraph.viewer.modes import PALETTE, along_axis, extra_modes, normals, picture
+from lumigraph.viewer.painter import Pace, Painter
+from lumigraph.viewer.shared import render_inside
 from lumigraph.viewer.turns import IDLE_RENDER_SHARE, RENDER_SHARE, NotWantedError, Turns
-from lumigraph.viewer.view_request import ViewRequest
+from lumigraph.viewer.visitor import UNIT_SCALE, splats
 
 WHITE = (1.0, 1.0, 1.0)
 # A client may leave at any moment; viser warns of what was still on its way.

@@ -11,7 +11,8 @@ from tyro.conf import Positional
 from ..errors import LumigraphError
 from ..files import claim_folder
 from ..files.ranges import Seed, Steps, between
-from .common import choose_device, needed, option, show, typed
+from .common import choose_device, show, typed
+from .options import needed, option
 
 
 @dataclass(frozen=True)

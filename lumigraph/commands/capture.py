@@ -11,16 +11,10 @@ from tyro.conf import Positional
 
 from ..errors import LumigraphError
 from ..files.ranges import Count, between
-from .common import needed, option, say, scene_name, show, typed
+from .common import say, scene_name, show, typed
+from .options import needed, option
 
-GENERIC_FOLDERS = (
-    "images",
-    "photos",
-    "photographs",
-    "pictures",
-    "input",
-    "frames",
-)  # folders named after what is in them
+GENERIC_FOLDERS = "images", "photos", "photographs", "pictures", "input", "frames"  # named after their contents
 MAX_NAMED = 12  # photographs at most that a list names; all are in capture.json and photographs.png
 INDENT = " " * 13
 

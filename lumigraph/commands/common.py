@@ -1,4 +1,4 @@
-"""Parts of several commands: the format of options, devices, scenes, output paths."""
+"""Parts of several commands: devices, budgets, output."""
 
 from __future__ import annotations
 
@@ -7,47 +7,14 @@ import shlex
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
-
-import tyro
+from typing import Any
 
 from .. import methods
 from ..budget import MEANS, Budget, Quality
 from ..errors import LumigraphError
 from ..files import scene_name as scene_name
-from ..files.readers import LISTED, NAMES
 from ..system.console import console, dim
 from ..system.signals import exit_code as exit_code
-
-if TYPE_CHECKING:
-    Reader = str
-else:
-    Reader = Literal[NAMES]
-
-
-def option(metavar: str, default: str | None = None, about: str | None = None) -> Any:
-    """An option in --help: its placeholder, its default in words, its description."""
-    return tyro.conf.arg(metavar=metavar, help_behavior_hint=default and f"(default: {default})", help=about)
-
-
-def needed(metavar: str) -> Any:
-    """An argument without a default in --help."""
-    return tyro.conf.arg(metavar=metavar, help_behavior_hint="")
-
-
-ReaderOption = Annotated[
-    Reader | None,
-    tyro.conf.arg(metavar="NAME", help_behavior_hint="(default: detected)", help=f"Layout of the folder: {LISTED}."),
-]
-
-
-Overwrite = Annotated[
-    bool,
-    tyro.conf.arg(
-        help="Replace existing files of other origin too. Unchanged files that Lumigraph wrote are replaced "
-        "anyway; folders with other files in them never are."
-    ),
-]
 
 
 def choose_device(name: str) -> Any:

@@ -6,14 +6,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from tyro.conf import Positional, arg
+from tyro.conf import Positional
 
 from ..budget import Quality
 from ..errors import LumigraphError
-from ..files.ranges import Count, Seconds, Seed, Steps
+from ..files.ranges import Count, Seconds
 from ..system.console import console
-from .common import about_quality, choose_device, method_config, option, show, told_budget, typed
+from .common import about_quality, choose_device, method_config, show, told_budget, typed
 from .compress import size
+from .options import DeviceOption, PhotographsOption, SeedOption, StepsOption, needed, option
 
 DEFAULT_SECONDS = 30.0
 TABLE_WIDTH = 4096  # letters; a table cuts its lines where the console ends
@@ -30,31 +31,27 @@ class Convert:
     same command continues. `lumigraph convert RUN METHOD --help` adds the method's own options.
     """
 
-    source: Annotated[Positional[Path | None], arg(metavar="RUN_OR_FILE", help_behavior_hint="")] = None
+    source: Annotated[Positional[Path | None], needed("RUN_OR_FILE")] = None
     """Folder of a run, which does not change, or a splat file."""
-    method: Annotated[Positional[str | None], arg(metavar="METHOD", help_behavior_hint="")] = None
+    method: Annotated[Positional[str | None], needed("METHOD")] = None
     """Method to convert to, for example plenoxels."""
-    output: Annotated[Path | None, arg(metavar="NEW", help_behavior_hint="")] = None
+    output: Annotated[Path | None, needed("NEW")] = None
     """New folder for the run."""
     list: bool = False
     """Print the table of possible conversions, and exit."""
     seconds: Annotated[Seconds | None, option("S", f"{DEFAULT_SECONDS:.0f}")] = None
     """Training time in seconds after initialisation; longer improves the new method."""
-    steps: Annotated[Steps | None, option("N", "as long as --seconds")] = None
-    """Train for this number of steps instead."""
+    steps: StepsOption = None
     quality: Annotated[Quality | None, option("draft|good|best", "as long as --seconds", about_quality() + ABOUT)] = (
         None
     )
     distil: bool = False
     """Train on renderings of the old method, even if photographs are available."""
-    scene: Annotated[str | None, option("SCENE", "the path used in training")] = None
-    """Path of the photographs, if they were moved since training."""
+    scene: PhotographsOption = None
     views: Annotated[Count, option("N")] = 8
     """Compare at most this number of held-out views, evenly spread."""
-    seed: Annotated[Seed, option("N")] = 0
-    """Seed of all random choices."""
-    device: Annotated[str, option("NAME")] = "auto"
-    """Device to compute on: auto (a GPU if there is one), cpu, cuda, cuda:1."""
+    seed: SeedOption = 0
+    device: DeviceOption = "auto"
     preset: Literal["auto", "laptop", "paper"] = "auto"
     """Defaults of the method's options: the paper's, or those tuned for a CPU; auto decides by --device."""
 

@@ -10,7 +10,8 @@ from tyro.conf import Positional
 
 from ..errors import LumigraphError
 from ..files.ranges import Count, Downscale, Seed
-from .common import ReaderOption, choose_device, needed, next_free, option, scene_name, show
+from .common import choose_device, next_free, scene_name, show
+from .options import DeviceOption, ReaderOption, needed, option
 
 
 @dataclass(frozen=True)
@@ -37,8 +38,7 @@ class Infer:
     downscale: Annotated[Downscale | None, option("N", "to at most about 1000 pixels")] = None
     """Reduce photographs by this whole number; a larger one is faster and loses detail."""
     reader: ReaderOption = None
-    device: Annotated[str, option("NAME")] = "auto"
-    """Device to compute on: auto (a GPU if there is one), cpu, cuda, cuda:1."""
+    device: DeviceOption = "auto"
 
     def run(self) -> int:
         from ..method.prior import Prior

@@ -10,8 +10,8 @@ from tyro.conf import Positional
 
 from ..errors import LumigraphError
 from ..files.ranges import Count, FramesPerSecond, Pixels
-from .common import Overwrite, needed, option, show
-from .controls import Animate, Set, animate, open_method
+from .common import show
+from .options import Animate, DeviceOption, Overwrite, Set, animate, needed, open_method, option
 
 # As in `paths.film`, which help must not import.
 PATH_KINDS = ("orbit", "sweep", "spiral", "interpolate", "held-out")
@@ -49,8 +49,7 @@ class Render:
     overwrite: Overwrite = False
     settings: Set = ()
     animated: Animate = ()
-    device: Annotated[str, option("NAME")] = "auto"
-    """Device to compute on: auto (a GPU if there is one), cpu, cuda, cuda:1."""
+    device: DeviceOption = "auto"
 
     def run(self) -> int:
         from ..export.film import claim_film, film

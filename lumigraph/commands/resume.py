@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Annotated, Any
-
-from tyro.conf import Positional
 
 from ..budget import Budget, Quality
 from ..errors import LumigraphError
 from ..files.ranges import Port, Seconds, Steps
-from .common import choose_device, exit_code, needed, option, quality_budget, told_budget, typed
+from .common import choose_device, exit_code, quality_budget, told_budget, typed
+from .options import RunOption, option
 
 
 @dataclass(frozen=True)
@@ -22,8 +20,7 @@ class Resume:
     decay again, and clouds may grow; coarse stages at the beginning of a run are not repeated.
     """
 
-    run_folder: Annotated[Positional[Path], needed("RUN")]
-    """Folder of the run."""
+    run_folder: RunOption
     seconds: Annotated[Seconds | None, option("S", "unchanged")] = None
     """New total training time in seconds, including the time already trained."""
     steps: Annotated[Steps | None, option("N", "unchanged")] = None

@@ -11,17 +11,14 @@ from tyro.conf import Fixed, OmitArgPrefixes, Positional, Suppress
 
 from .. import methods
 from ..budget import Budget, Quality
-from ..files.ranges import Count, Downscale, Port, Scales, Seconds, Seed, Steps
+from ..files.ranges import Count, Downscale, Port, Scales, Seconds, Steps
 from .capture import posed
 from .common import (
-    ReaderOption,
     about_quality,
     choose_device,
     exit_code,
     method_config,
-    needed,
     next_free,
-    option,
     option_group,
     preset_device,
     quality_budget,
@@ -29,7 +26,8 @@ from .common import (
     told_budget,
     value_of,
 )
-from .train_blocks import Blocks
+from .options import DeviceOption, ReaderOption, SeedOption, StepsOption, needed, option
+from .train_blocks import BlockOptions
 
 DEFAULT_SECONDS = 60.0
 
@@ -52,8 +50,7 @@ class Train:
     """New folder for the run."""
     seconds: Annotated[Seconds | None, option("S", f"{DEFAULT_SECONDS:.0f}")] = None
     """Training time in seconds; longer gives a higher PSNR. Compiling kernels on first use is not counted."""
-    steps: Annotated[Steps | None, option("N", "as long as --seconds")] = None
-    """Train for this number of steps instead."""
+    steps: StepsOption = None
     quality: Annotated[Quality | None, option("draft|good|best", "as long as --seconds", about_quality())] = None
     downscale: Annotated[Downscale | None, option("N", "to at most about 1000 pixels")] = None
     """Reduce photographs by this whole number; a larger one trains faster and loses detail."""
@@ -62,10 +59,8 @@ class Train:
     """Train on only this number of photographs, spread evenly over the cameras."""
     scales: Annotated[Scales, option("N")] = 1
     """Number of resolutions of every photograph, each half of the one before; evaluation averages over all."""
-    seed: Annotated[Seed, option("N")] = 0
-    """Seed of all random choices."""
-    device: Annotated[str, option("NAME")] = "auto"
-    """Device to compute on: auto (a GPU if there is one), cpu, cuda, cuda:1."""
+    seed: SeedOption = 0
+    device: DeviceOption = "auto"
     preset: Literal["auto", "laptop", "paper"] = "auto"
     """Defaults of the method's options: the paper's, or those tuned for a CPU; auto decides by --device."""
     pause_at: Annotated[Steps | None, option("STEP", "never")] = None
@@ -85,7 +80,7 @@ class Train:
         from .outcome import tell_outcome
         from .view import keep_showing, watching
 
-        blocks: Blocks | None = getattr(self, "blocks", None)
+        blocks: BlockOptions | None = getattr(self, "blocks", None)
         if blocks is not None and (code := blocks.run(self)) is not None:
             return code
         budget = told_budget(self.steps, self.seconds, self.quality)
@@ -118,7 +113,7 @@ class Train:
 
 def with_options_of(name: str, arguments: Sequence[str], command: type = Train) -> type[Any]:
     """A command, `train` or one like it, with a method's own numbers among its options. Where the method is trained in
-    blocks, `train` has the options of `Blocks` too, and the numbers of the method that --field names for each block."""
+    blocks, `train` also has `BlockOptions`, and the numbers of the method that --field names for each block."""
     in_blocks = command is Train and methods.find(name).in_blocks
     if in_blocks and (field := value_of("--field", arguments, "").replace("_", "-")) in methods.available():
         name = field
@@ -127,7 +122,7 @@ def with_options_of(name: str, arguments: Sequence[str], command: type = Train) 
     asked = option("draft|good|best", "as long as --seconds", about_quality(kind))
     extra: dict[str, tuple[Any, Any]] = {"quality": (Annotated[Quality | None, asked], None)}
     if in_blocks:
-        blocks = derived(Blocks, kind.Config, {})
+        blocks = derived(BlockOptions, kind.Config, {})
         extra["blocks"] = Annotated[blocks, OmitArgPrefixes], blocks()
     extra[option_group(name)] = Annotated[kind.Config, OmitArgPrefixes], kind.preset(preset_device(device, preset))
     return derived(command, kind.Config, extra)

@@ -15,25 +15,15 @@ from ..errors import LumigraphError
 from ..files.names import counted
 from ..files.ranges import Count
 from .capture import posed
-from .common import (
-    choose_device,
-    exit_code,
-    method_config,
-    next_free,
-    option,
-    say,
-    scene_name,
-    show,
-    told_budget,
-    typed,
-)
+from .common import choose_device, exit_code, method_config, next_free, say, scene_name, show, told_budget, typed
+from .options import option
 
 MEMORY_BYTES = 2 << 30  # bytes that a block asks of its machine
 OPTIONS = "downscale", "reader", "scales"  # of `open_dataset`, for the whole scene
 
 
 @dataclass(frozen=True)
-class Blocks:
+class BlockOptions:
     """A large scene is trained in blocks, each a run of its own; from few photographs one block, an ordinary run.
 
     --steps and --seconds are for all blocks together and divided evenly; the default is a minute for each block. After

@@ -1,4 +1,4 @@
-"""The numbers of Gaussians as few bits: what the compact formats have in common."""
+"""Common parts of the formats of Gaussians: numbers in few bits, Morton's order, axes."""
 
 from __future__ import annotations
 
@@ -14,6 +14,19 @@ _ALPHA = np.clip(np.arange(256) / 255, 0.5 / 255, 254.5 / 255)
 LOGITS = np.log(_ALPHA / (1 - _ALPHA)).astype(np.float32)
 OTHERS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])  # the components beside the i-th
 MIN_SCALE, MAX_SCALE = np.finfo(np.float32).tiny, np.finfo(np.float32).max  # what a scale can be and have a logarithm
+
+
+LEVEL_COUNT, PASSES = 256, 12  # of `levels`: one level for each byte; passes of Lloyd's algorithm
+# From the axes of PLY files and the scene (y down, z forward) to those of .spz and glTF (y up, z back), and back: half
+# a turn around x, which negates y, z and the harmonics that are odd in y and z together.
+TURN_MEAN = np.array([1, -1, -1])
+TURN_ROTATION = np.array([1, 1, -1, -1])  # of (w, x, y, z)
+# y, z, x | xy, yz, z^2, xz, x^2 - y^2 | and so on
+TURN_HARMONICS = np.array([1, -1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1], np.float32)[:, None]
+
+BITS = 21  # of Morton's order per axis; three times as many fit into 64
+GAPS = [(32, 0x1F00000000FFFF), (16, 0x1F0000FF0000FF), (8, 0x100F00F00F00F00F), (4, 0x10C30C30C30C30C3)]
+GAPS += [(2, 0x1249249249249249)]
 
 
 def array(tensor: Float[Tensor, "*shape"]) -> Float[np.ndarray, "*shape"]:
@@ -86,3 +99,45 @@ def with_largest(
     missing = np.sqrt(np.maximum(0, 1 - (rest**2).sum(-1)))
     np.put_along_axis(quaternions, largest[:, None], missing[:, None], -1)
     return quaternions
+
+
+def morton_order(points: Float[np.ndarray, "point 3"]) -> Int[np.ndarray, " point"]:
+    """Indices that sort points along a Z-curve through their bounding box (Morton 1966); equals keep their order."""
+    if not len(points):
+        return np.arange(0)
+    low, extent = points.min(0).astype(float), np.ptp(points.astype(float), axis=0)
+    cells = (points - low) / np.where(extent > 0, extent, 1) * (2**BITS - 1)
+    spread = cells.astype(np.uint64)
+    for shift, mask in GAPS:  # two zeros between any two bits, by halving blocks of bits
+        spread = (spread | spread << np.uint64(shift)) & np.uint64(mask)
+    x, y, z = spread.T
+    return np.argsort(x | y << np.uint64(1) | z << np.uint64(2), kind="stable")
+
+
+def levels(values: Float[np.ndarray, "*shape"]) -> Float[np.ndarray, " level"]:
+    """256 numbers in rising order, to which `values` are to be rounded; values of fewer kinds stay what they are.
+
+    The best levels lie as densely as the cube root of the values' density (Panter and Dite 1951). Between neighbours a
+    gap apart, who occur c times, that is c / gap, so (c / gap)^(1/3) gap of a level belongs there. They begin so, and
+    each then moves to the mean of what is nearest to it (Lloyd 1982).
+    """
+    values = np.sort(values.astype(np.float64), axis=None)
+    kinds, counts = np.unique(values, return_counts=True)
+    if len(kinds) <= LEVEL_COUNT:
+        return np.pad(kinds, (0, LEVEL_COUNT - len(kinds)), mode="edge")
+    parts = np.cbrt((counts[1:] + counts[:-1]) / 2 * np.diff(kinds) ** 2)
+    shares = np.concatenate([[0], np.cumsum(parts)])
+    book = np.interp((np.arange(LEVEL_COUNT) + 0.5) / LEVEL_COUNT * shares[-1], shares, kinds)
+    sums = np.concatenate([[0], np.cumsum(values)])
+    for _ in range(PASSES):
+        ends = np.searchsorted(values, [-np.inf, *(book[1:] + book[:-1]) / 2, np.inf])
+        held = np.diff(ends)
+        book = np.where(held > 0, np.diff(sums[ends]) / np.maximum(held, 1), book)
+    return book
+
+
+def nearest_level(
+    values: Float[np.ndarray, "*shape"], book: Float[np.ndarray, " level"]
+) -> UInt8[np.ndarray, "*shape"]:
+    """The index of the level nearest to each value."""
+    return np.searchsorted((book[1:] + book[:-1]) / 2, values).astype(np.uint8)

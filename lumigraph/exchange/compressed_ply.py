@@ -25,10 +25,8 @@ from ..errors import LumigraphError
 from ..gaussians import Gaussians
 from ..kernels.spherical_harmonics import K00
 from .checks import check_room
-from .codes import LOGITS, alpha_to_byte, array, cloud, to_byte, with_largest, without_largest
-from .morton import morton_order
-from .ply import by_channel, by_coefficient, rest_names, save
-from .ply_header import Header, columns, read_header, read_rows
+from .codes import LOGITS, alpha_to_byte, array, cloud, morton_order, to_byte, with_largest, without_largest
+from .ply import Header, by_channel, by_coefficient, columns, read_header, read_rows, rest_names, save
 
 CHUNK = 256
 PACKED = ["packed_position", "packed_rotation", "packed_scale", "packed_color"]

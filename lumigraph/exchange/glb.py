@@ -28,9 +28,8 @@ from ..gaussians import Gaussians
 from ..geometry import is_similarity, to_matrix
 from ..kernels.spherical_harmonics import K00
 from . import gltf
-from .axes import TURN_HARMONICS, TURN_MEAN, TURN_ROTATION
 from .checks import check_room
-from .codes import array, cloud, from_scales, to_scales, unit
+from .codes import TURN_HARMONICS, TURN_MEAN, TURN_ROTATION, array, cloud, from_scales, to_scales, unit
 
 EXTENSION = "KHR_gaussian_splatting"
 ROTATION, SCALE, OPACITY = (f"{EXTENSION}:{name}" for name in ("ROTATION", "SCALE", "OPACITY"))
@@ -46,11 +45,10 @@ def recognises(path: Path) -> bool:
     """True if a .glb file has Gaussians, not meshes: its JSON names the extension."""
     with open(path, "rb") as file:
         head = file.read(gltf.HEADER.size + gltf.CHUNK.size)
-        return head[:4] == gltf.MAGIC and f'"{EXTENSION}"'.encode() in file.read(min(MAX_JSON_BYTES, _length(head)))
-
-
-def _length(head: bytes) -> int:
-    return gltf.CHUNK.unpack_from(head, gltf.HEADER.size)[0] if len(head) >= gltf.HEADER.size + gltf.CHUNK.size else 0
+        if head[:4] != gltf.MAGIC or len(head) < gltf.HEADER.size + gltf.CHUNK.size:
+            return False
+        length, _ = gltf.CHUNK.unpack_from(head, gltf.HEADER.size)
+        return f'"{EXTENSION}"'.encode() in file.read(min(MAX_JSON_BYTES, length))
 
 
 def read(path: Path) -> Gaussians:

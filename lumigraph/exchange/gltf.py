@@ -31,7 +31,7 @@ Index = Annotated[int, between(0, 1 << 32)]
 Matrix = tuple[Coordinate, ...]  # of 16, column after column
 
 
-class View(msgspec.Struct, rename="camel"):
+class BufferView(msgspec.Struct, rename="camel"):
     """A part of the buffer."""
 
     buffer: Index
@@ -64,7 +64,7 @@ class Primitive(msgspec.Struct, rename="camel"):
     extras: Any = None
 
 
-class Mesh(msgspec.Struct, rename="camel"):
+class GltfMesh(msgspec.Struct, rename="camel"):
     primitives: list[Primitive]
 
 
@@ -79,7 +79,7 @@ class Node(msgspec.Struct, rename="camel"):
     translation: tuple[Coordinate, ...] = (0.0, 0.0, 0.0)
 
 
-class Scene(msgspec.Struct, rename="camel"):
+class GltfScene(msgspec.Struct, rename="camel"):
     nodes: list[Index] = []
 
 
@@ -87,11 +87,11 @@ class About(msgspec.Struct, rename="camel"):
     """The used parts of the JSON chunk."""
 
     accessors: list[Accessor] = []
-    buffer_views: list[View] = []
+    buffer_views: list[BufferView] = []
     buffers: list[Buffer] = []
-    meshes: list[Mesh] = []
+    meshes: list[GltfMesh] = []
     nodes: list[Node] = []
-    scenes: list[Scene] = []
+    scenes: list[GltfScene] = []
     scene: Index = 0
     extensions_used: list[str] = []
     extensions_required: list[str] = []

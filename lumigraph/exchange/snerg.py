@@ -37,7 +37,7 @@ from ..files.ranges import Coordinate, Positive, Row, between, typed
 from ..system.memory import free_memory, gigabytes
 from ..system.progress import track
 from .baked import Atlas, ViewNetwork
-from .bundle import Bundle
+from .checks import Bundle
 
 META, INDICES = "scene_params.json", "atlas_indices.png"
 EMPTY_INDEX = 255  # in atlas_indices.png

@@ -33,18 +33,24 @@ from ..errors import LumigraphError
 from ..files import from_json, replacing_folder, write_bytes
 from ..files.ranges import Coordinate, Name, Tally, between, shown, typed
 from ..gaussians import Gaussians
-from .bundle import Bundle, zipped
-from .checks import check_room
-from .codes import LOGITS, alpha_to_byte, array, cloud, to_byte, with_largest, without_largest
-from .levels import levels, nearest_level
-from .morton import morton_order
-from .packing.clusters import clustered
+from .checks import Bundle, check_room, zipped
+from .codes import (
+    LOGITS,
+    alpha_to_byte,
+    array,
+    cloud,
+    levels,
+    morton_order,
+    nearest_level,
+    to_byte,
+    with_largest,
+    without_largest,
+)
+from .packing.forms import clustered
 
 VERSION = 2
 META = "meta.json"
-LARGEST_COMPONENT_ALPHA = (
-    252  # alpha of a rotation's pixel, and one more for each of w, x, y, z that is the largest component
-)
+LARGEST_COMPONENT_ALPHA = 252  # alpha of a rotation's pixel if w is the largest component; 253 to 255 for x, y, z
 PALETTE_ROW = 64  # palette entries side by side
 WIDTHS = 3, 8, 15  # coefficients of one, for degrees 1, 2 and 3
 MIN_ENTRIES, MAX_ENTRIES = 1024, 65536  # palette entries
@@ -74,7 +80,7 @@ class Quats:
 
 
 @dataclass(frozen=True)
-class Coded:
+class CodebookImage:
     codebook: Book
     files: One
 
@@ -95,20 +101,17 @@ class Meta:
 
     count: Tally
     means: Means
-    scales: Coded
+    scales: CodebookImage
     quats: Quats
-    sh0: Coded
+    sh0: CodebookImage
     shN: Palette | None = None  # noqa: N815
     model: str | None = None
     antialias: bool = False
 
 
 @dataclass(frozen=True)
-class OldMeans:
+class OldMeans(Means):
     shape: tuple[Tally, ...]
-    mins: Ends
-    maxs: Ends
-    files: Two
 
 
 @dataclass(frozen=True)
@@ -212,9 +215,7 @@ class _Pictures:
 
     def __init__(self, bundle: Bundle, count: int, harmonics: int):
         if not count:
-            raise LumigraphError(
-                f"{bundle.path} says that it holds no Gaussians, as no such file does; export it again"
-            )
+            raise LumigraphError(f"{bundle.path} declares that it holds no Gaussians; export it again")
         self.bundle, self.count, self.harmonics = bundle, count, harmonics
         check_room(bundle.path, count, harmonics, bundle.size, 20 * count)
 
@@ -238,10 +239,12 @@ class _Pictures:
             why = "it does not begin like one" if isinstance(fault, UnidentifiedImageError) else fault
             raise LumigraphError(f"{path}: {shown(name)} cannot be read as a picture ({why}); get it again") from fault
 
-    def means(self, about: Means | OldMeans) -> Float[np.ndarray, "gaussian 3"]:
+    def means(self, about: Means) -> Float[np.ndarray, "gaussian 3"]:
         low, high = (self.of(name)[:, :3].astype(np.int64) for name in about.files)
         shares = (high << 8 | low) / 65535
-        return _unfolded(np.array(about.mins) + shares * (np.array(about.maxs) - np.array(about.mins)))
+        folded = np.array(about.mins) + shares * (np.array(about.maxs) - np.array(about.mins))
+        with np.errstate(over="ignore"):  # infinite positions are found later
+            return np.sign(folded) * np.expm1(np.abs(folded))
 
     def rotations(self, name: str) -> Float[np.ndarray, "gaussian 4"]:
         pixels = self.of(name)
@@ -288,7 +291,7 @@ def encode(gaussians: Gaussians, ordered: bool = False) -> dict[str, bytes]:
     count, files = len(gaussians), dict[str, bytes]()
 
     def picture(name: str, *channels: np.ndarray, width: int = 4 * math.ceil(math.sqrt(count) / 4)) -> str:
-        """Note a lossless WebP of pixels in a multiple of four rows; what nobody says of them is 255."""
+        """Note a lossless WebP of pixels in a multiple of four rows; other values are 255."""
         pixels = np.concatenate([part.reshape(len(part), -1) for part in channels], 1)
         rgba = np.full((4 * math.ceil(len(pixels) / width / 4) * width, 4), 255, np.uint8)
         rgba[: len(pixels), : pixels.shape[1]] = pixels
@@ -297,7 +300,8 @@ def encode(gaussians: Gaussians, ordered: bool = False) -> dict[str, bytes]:
         files[name] = held.getvalue()
         return name
 
-    folded = _folded(array(gaussians.means))
+    means = array(gaussians.means)
+    folded = np.sign(means) * np.log1p(np.abs(means.astype(np.float64)))
     low, high = folded.min(0), folded.max(0)
     steps = np.rint(65535 * (folded - low) / np.where(high > low, high - low, 1)).astype(np.int64)
     largest, rest = without_largest(array(gaussians.quaternions))
@@ -358,14 +362,3 @@ def _palette(
     rows = torch.from_numpy(np.ascontiguousarray(harmonics))
     entries, codes = clustered(rows, torch.ones(len(rows)), size, torch.Generator().manual_seed(0))
     return entries.numpy(), codes.numpy()
-
-
-def _folded(x: Float[np.ndarray, "gaussian 3"]) -> Float[np.ndarray, "gaussian 3"]:
-    """sign(x) log(1 + |x|)"""
-    return np.sign(x) * np.log1p(np.abs(x.astype(np.float64)))
-
-
-def _unfolded(v: Float[np.ndarray, "gaussian 3"]) -> Float[np.ndarray, "gaussian 3"]:
-    """The inverse."""
-    with np.errstate(over="ignore"):  # what becomes infinite is found later
-        return np.sign(v) * np.expm1(np.abs(v))

@@ -32,9 +32,19 @@ from jaxtyping import Float, UInt8
 from ..errors import LumigraphError
 from ..files import write_bytes
 from ..gaussians import Gaussians
-from .axes import TURN_HARMONICS, TURN_MEAN, TURN_ROTATION
 from .checks import check_room
-from .codes import LOGITS, alpha_to_byte, array, cloud, to_byte, with_largest, without_largest
+from .codes import (
+    LOGITS,
+    TURN_HARMONICS,
+    TURN_MEAN,
+    TURN_ROTATION,
+    alpha_to_byte,
+    array,
+    cloud,
+    to_byte,
+    with_largest,
+    without_largest,
+)
 from .packing.streams import MAX_ZSTD_RATIO, take
 
 HEADER = struct.Struct("<4sIIBBBB")  # magic, version, count, degree, bits behind the point, flags, reserved
@@ -175,13 +185,17 @@ def _widths(path: Path, version: int, degree: int) -> list[int]:
 def _cloud(columns: list[np.ndarray], version: int, bits: int, flags: int) -> Gaussians:
     positions, alphas, colours, scales, rotations, rest = columns
     means = positions.view("<f2").astype(np.float64) if version == 1 else _fixed_point(positions) / 2.0**bits
+    if version >= 3:
+        quaternions = _from_smallest_three(rotations)
+    else:  # x, y, z, and w not negative
+        quaternions = with_largest(np.zeros(len(rotations), np.int64), rotations / 127.5 - 1)
     plain = (colours / 255 - 0.5) / COLOUR_SCALE
     harmonics = np.concatenate(
         [plain[:, None], (rest.reshape(*rest.shape[:1], rest.shape[1] // 3, 3) - 128.0) / 128], 1
     )
     return cloud(
         means * TURN_MEAN,
-        (_from_smallest_three(rotations) if version >= 3 else _from_first_three(rotations)) * TURN_ROTATION,
+        quaternions * TURN_ROTATION,
         scales / 16 - 10,
         LOGITS[alphas[:, 0]],
         harmonics * TURN_HARMONICS[: harmonics.shape[1]],
@@ -194,11 +208,6 @@ def _fixed_point(positions: UInt8[np.ndarray, "gaussian 9"]) -> Float[np.ndarray
     wide = np.zeros((3 * len(positions), 4), np.uint8)
     wide[:, 1:] = positions.reshape(-1, 3)
     return (wide.view("<i4").reshape(-1, 3) >> 8).astype(np.float64)
-
-
-def _from_first_three(rotations: UInt8[np.ndarray, "gaussian 3"]) -> Float[np.ndarray, "gaussian 4"]:
-    """Versions 1 and 2: x, y, z, and w not negative."""
-    return with_largest(np.zeros(len(rotations), np.int64), rotations / 127.5 - 1)
 
 
 def _from_smallest_three(rotations: UInt8[np.ndarray, "gaussian 4"]) -> Float[np.ndarray, "gaussian 4"]:

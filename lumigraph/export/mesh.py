@@ -22,8 +22,7 @@ from ..errors import LumigraphError
 from ..method import Method
 from ..method.capabilities import HasDensity, can, needs
 from ..system.progress import counting, track
-from .polygons import BLOCK, Grid, zero_level
-from .surface import larger_pieces, simplified, smoothed, vertex_normals
+from .surface import BLOCK, Grid, larger_pieces, simplified, smoothed, vertex_normals, zero_level
 
 DEFAULT_CELLS = 256  # along the longest side of what is meshed, if nobody asks for more
 OPEN_BOX = 1.5  # times the box of interest, which holds the middle of what is looked at in a room or the open

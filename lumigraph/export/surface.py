@@ -1,14 +1,168 @@
-"""Postprocessing of triangle meshes: removal of small pieces, smoothing, simplification."""
+"""Marching cubes in blocks, only where the zero level can be (Lorensen and Cline 1987); and postprocessing of triangle
+meshes: removal of small pieces, smoothing, simplification.
+
+The topology of ambiguous cubes is that of Lewiner et al. (2003), from scikit-image.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import dataclass
+
 import fast_simplification
 import numpy as np
+import torch
 from jaxtyping import Bool, Float, Int
 from scipy import sparse
 from scipy.sparse.csgraph import connected_components
+from skimage.measure import marching_cubes
+from torch import Tensor
 
-from .polygons import compact
+from ..system.progress import track
+
+BLOCK = 16  # corners of a block along each axis
+BLOCKS_PER_BATCH = 64  # blocks whose corners are asked about together
+MIN_ABS_VALUE = 0.01  # no corner's value is nearer to zero, so that no two vertices fall together
+
+Values = Callable[[Float[Tensor, "point 3"]], Float[Tensor, " point"]]
+
+
+@dataclass(frozen=True)
+class Grid:
+    """Corners of cubes: number (i, j, k) lies at low + cell (i, j, k).
+
+    low:   scene units
+    cell:  side of a cube, scene units
+    shape: corners along each axis
+    """
+
+    low: tuple[float, float, float]
+    cell: float
+    shape: tuple[int, int, int]
+
+    @staticmethod
+    def around(low: tuple[float, ...], high: tuple[float, ...], cell: float, margin: float) -> Grid:
+        """The grid whose cubes cover a box and a margin of that many cubes around it."""
+        first = np.array(low) - margin * cell
+        corners = np.ceil((np.array(high) - np.array(low)) / cell - 1e-6 + 2 * margin).astype(int) + 1
+        x, y, z = first.tolist()
+        i, j, k = corners.tolist()
+        return Grid((x, y, z), cell, (i, j, k))
+
+    def points(self, corners: Int[Tensor, "corner 3"]) -> Float[Tensor, "corner 3"]:
+        return torch.tensor(self.low) + self.cell * corners.float()
+
+    def every(self, step: int) -> Int[Tensor, "i j k 3"]:
+        """Each step-th corner along each axis, one beyond the last included."""
+        ranges = [torch.arange(0, n + step, step) for n in self.shape]
+        return torch.stack(torch.meshgrid(*ranges, indexing="ij"), -1)
+
+
+def zero_level(
+    grid: Grid, values: Values, active: Bool[np.ndarray, "i j k"], elsewhere: Float[np.ndarray, "i j k"]
+) -> tuple[Float[np.ndarray, "vertex 3"], Int[np.ndarray, "face 3"]]:
+    """Triangles where a function is zero, anticlockwise seen from where it is negative; vertices in scene units.
+
+    values:    the function, about -1 to 1; NaN where nobody knows it, and there the surface has a border
+    active:    blocks of BLOCK^3 corners to look at; each corner is looked at once
+    elsewhere: value of all corners of the other blocks
+    """
+    held = np.full(active.shape, -1)
+    where = np.argwhere(active)
+    held[active] = np.arange(len(where))
+    blocks = evaluate(grid, values, where)
+    held, elsewhere = np.pad(held, (0, 1), constant_values=-1), np.pad(elsewhere, (0, 1), constant_values=np.nan)
+    keys, places, faces, count = [], [], [], 0
+    marched = np.argwhere(touched(active))
+    for block in track(marched, "Marching through cubes", len(marched)):
+        cube = with_neighbours(block, blocks, held, elsewhere)
+        known = np.isfinite(cube)
+        cube = np.where(known, cube, -1.0)
+        if not cube.min() < 0 < cube.max():
+            continue
+        vertices, triangles, _, _ = marching_cubes(cube, 0.0, gradient_direction="ascent")
+        key, sure = edges(vertices, known)
+        keys.append(key + (block * BLOCK) @ STRIDES)
+        places.append(vertices + block * BLOCK)
+        faces.append(triangles[sure[triangles].all(-1)] + count)
+        count += len(vertices)
+    if not count:
+        return np.zeros((0, 3)), np.zeros((0, 3), int)
+    _, first, same = np.unique(np.concatenate(keys), return_index=True, return_inverse=True)
+    vertices = np.array(grid.low) + grid.cell * np.concatenate(places)[first].astype(np.float64)
+    return compact(vertices, same[np.concatenate(faces)])
+
+
+def evaluate(
+    grid: Grid, values: Values, where: Int[np.ndarray, "block 3"]
+) -> Float[np.ndarray, "block BLOCK BLOCK BLOCK"]:
+    """The function at all corners of some blocks, never nearer to zero than MIN_ABS_VALUE."""
+    inside = torch.from_numpy(np.stack(np.meshgrid(*[np.arange(BLOCK)] * 3, indexing="ij"), -1).reshape(-1, 3))
+    out = np.empty((len(where), BLOCK, BLOCK, BLOCK), np.float32)
+    batches = range(0, len(where), BLOCKS_PER_BATCH)
+    for first in track(batches, "Looking at cells near the surface", len(batches)):
+        some = torch.from_numpy(where[first : first + BLOCKS_PER_BATCH])
+        corners = (some[:, None] * BLOCK + inside).reshape(-1, 3)
+        out[first : first + len(some)] = values(grid.points(corners)).reshape(-1, BLOCK, BLOCK, BLOCK).numpy()
+    return np.where(np.abs(out) < MIN_ABS_VALUE, np.where(out < 0, -MIN_ABS_VALUE, MIN_ABS_VALUE), out)
+
+
+def touched(active: Bool[np.ndarray, "i j k"]) -> Bool[np.ndarray, "i j k"]:
+    """Blocks whose cubes have a corner in an active block: these, and their neighbours on the lower sides."""
+    out = active.copy()
+    for axis in range(3):
+        ahead = np.roll(out, -1, axis)
+        ahead[(slice(None),) * axis + (-1,)] = False
+        out |= ahead
+    return out
+
+
+def with_neighbours(
+    block: Int[np.ndarray, " 3"],
+    blocks: Float[np.ndarray, "block BLOCK BLOCK BLOCK"],
+    held: Int[np.ndarray, "i j k"],
+    elsewhere: Float[np.ndarray, "i j k"],
+) -> Float[np.ndarray, "side side side"]:
+    """A block's corners, and the first ones of its neighbours on the upper sides."""
+    cube = np.empty((BLOCK + 1,) * 3, np.float32)
+    for step in np.ndindex(2, 2, 2):
+        target = tuple(slice(BLOCK, BLOCK + 1) if s else slice(0, BLOCK) for s in step)
+        part = tuple(slice(0, 1) if s else slice(0, BLOCK) for s in step)
+        x, y, z = block + step
+        cube[target] = blocks[held[x, y, z]][part] if held[x, y, z] >= 0 else elsewhere[x, y, z]
+    return cube
+
+
+STRIDES = np.array(
+    [1 << 44, 1 << 24, 1 << 4], np.int64
+)  # of a key: 20 bits an axis, 4 for the direction, 3 in a cube's middle
+
+
+def edges(
+    vertices: Float[np.ndarray, "vertex 3"], known: Bool[np.ndarray, "side side side"]
+) -> tuple[Int[np.ndarray, " vertex"], Bool[np.ndarray, " vertex"]]:
+    """A number for the grid's edge that each vertex lies on, and whether the function is known at its ends.
+
+    Neighbouring blocks find the same vertex to the last bits but one; its edge is the same to the last.
+    """
+    nearest = np.rint(vertices)
+    between = np.abs(vertices - nearest) > 0.4 * MIN_ABS_VALUE
+    corner = np.where(between, np.floor(vertices), nearest).astype(np.int64)
+    kind = np.where(between.sum(-1) == 1, between.argmax(-1), 3)
+    sure = np.ones(len(vertices), bool)
+    for step in np.ndindex(2, 2, 2):
+        x, y, z = (corner + np.where(between, step, 0)).T
+        sure &= known[x, y, z]
+    return corner @ STRIDES + kind, sure
+
+
+def compact(
+    vertices: Float[np.ndarray, "vertex 3"], faces: Int[np.ndarray, "face 3"]
+) -> tuple[Float[np.ndarray, "used 3"], Int[np.ndarray, "face 3"]]:
+    """A mesh without the vertices that no face has."""
+    used, faces = np.unique(faces, return_inverse=True)
+    return vertices[used], faces.reshape(-1, 3)
+
 
 LAMBDA, MU = 0.5, -0.53  # of Taubin's two steps: the second undoes the first one's shrinking
 

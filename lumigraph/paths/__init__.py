@@ -8,6 +8,6 @@ from .automatic import camera_path as camera_path
 from .automatic import film_size as film_size
 from .automatic import fitting as fitting
 from .film import PATH_KINDS as PATH_KINDS
+from .film import best_centred as best_centred
 from .film import film_cameras as film_cameras
-from .opening import best_centred as best_centred
-from .opening import pivot as pivot
+from .film import pivot as pivot

@@ -21,8 +21,9 @@ from ..files.names import natural
 from ..geometry import to_quaternion
 from ..paths.keyframes import CameraPath, Keyframe
 from .cameras import pose_of
+from .controls import MethodControls
 from .flight import Flight
-from .subject import NAME, NAME_RULE, Subject
+from .shared import NAME, NAME_RULE, Shared
 
 COLOUR = (200, 60, 150)
 POINTS_PER_LEG = 24  # points of the drawn path between two keyframes
@@ -39,32 +40,23 @@ class Stop:
 
 
 class PathPanel:
-    """The keyframes of one client.
-
-    size: of a frustum, in scene units
-    tell: says a title and a text to the client
-    time: gives the moment of a moving scene that the client sees, which a keyframe keeps
-    show_time: shows the client a moment
-    """
+    """The keyframes of one client. tell: shows the client a title and a text."""
 
     def __init__(
         self,
         client: Any,
-        tab: Any,
-        subject: Subject,
+        shared: Shared,
         flight: Flight,
-        size: float,
+        controls: MethodControls,
         tell: Callable[[str, str], None],
-        time: Callable[[], float | None],
-        show_time: Callable[[float], None],
     ):
-        self._time, self._show_time = time, show_time
-        self._client, self._subject, self._flight, self._size, self._tell = client, subject, flight, size, tell
+        self._client, self._subject, self._size = client, shared.subject, shared.scenery.size
+        self._flight, self._controls, self._tell = flight, controls, tell
         self._stops: list[Stop] = []
         self._nodes: list[Any] = []
         self._filling = False  # while what the panel shows is set from here
         gui = client.gui
-        with tab:
+        with shared.tabs[2]:
             gui.add_button("Add keyframe here").on_click(lambda _: self._add())
             self._chosen = gui.add_dropdown("Keyframe", [NONE])
             self._actions = gui.add_button_group("This one", ("Go", "Set", "◀", "▶", "✕"))
@@ -113,7 +105,7 @@ class PathPanel:
         pose = torch.tensor([pose_of(camera.wxyz, camera.position)], dtype=torch.double)
         (rows,) = moved(pose, source_from_scene(self._subject.frame)).tolist()
         a, b, c = (tuple(row) for row in rows)
-        return Keyframe((a, b, c), math.degrees(angle), 0.0, self._time())
+        return Keyframe((a, b, c), math.degrees(angle), 0.0, self._controls.time)
 
     def _add(self) -> None:
         at = self._index + 1
@@ -151,7 +143,7 @@ class PathPanel:
             key = self._stops[self._index].key
             poses, angles, _ = self._views(CameraPath((key,)), 1)
             if key.time is not None:
-                self._show_time(key.time)
+                self._controls.show_time(key.time)
             self._flight.fly(poses[0], self._distance, angles[0])
 
     def _play(self) -> None:
@@ -165,7 +157,7 @@ class PathPanel:
 
         def shown(frame: int) -> None:
             if moments is not None:
-                self._show_time(moments[frame])
+                self._controls.show_time(moments[frame])
 
         self._flight.play(poses, self._distance, angles, seconds, shown)
 

@@ -21,8 +21,7 @@ from websockets.http11 import Request, Response
 
 from ..errors import LumigraphError
 from .address import Address
-from .frames import MAX_MESSAGE_BYTES, understood
-from .guard import Answers, Guard
+from .guard import MAX_MESSAGE_BYTES, Answers, Guard, understood
 
 PAGE = "scene.html"  # where a scene that browsers draw by themselves is
 _patching = threading.Lock()

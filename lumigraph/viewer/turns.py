@@ -41,7 +41,7 @@ class Turns:
         with self._condition:
             self._waiting.append(ticket)
             try:
-                while not self._free_for(ticket):
+                while self._busy or self._waiting[0] is not ticket or (self.training and not self._open):
                     self._condition.wait(POLL_SECONDS)
                     if not wanted():
                         raise NotWantedError
@@ -59,9 +59,6 @@ class Turns:
                 self._open = self._open and self.paused  # the next one has to wait until training gives way again
                 self._own_until = end + (end - begin) * (1 / RENDER_SHARE - 1)
                 self._condition.notify_all()
-
-    def _free_for(self, ticket: object) -> bool:
-        return not self._busy and (self._open or not self.training) and self._waiting[0] is ticket
 
     @property
     def asked(self) -> bool:

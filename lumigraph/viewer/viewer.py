@@ -2,24 +2,47 @@
 
 from __future__ import annotations
 
+import json
 import threading
 import time
 from collections.abc import Callable
+from html import escape
 from typing import Any
 
 from ..camera import Camera
 from ..method import Method
 from ..method.capabilities import HasGaussians, can
-from . import window
 from .address import Address
 from .cameras import angles
 from .scenery import Scenery
 from .serving import quiet, start_server
-from .shared import Shared
-from .subject import Subject
+from .shared import Shared, Subject
 from .training_panel import TrainingPanel
 from .turns import Turns
 from .visitor import Visitor
+
+NARROW_WINDOW_PIXELS = 576  # pixels: viser's panel is a sheet at the bottom of windows up to this width
+
+# A click on the sheet's handle folds it; what is clicked is the text of the title, inside the handle. The mark keeps it
+# from folding again when somebody opens it, for that makes the picture anew.
+SCRIPT = """
+document.title = {title};
+const sheet = this.closest(".mantine-Paper-root");
+if (innerWidth <= {narrow} && sheet && !window.sheetFolded) {{
+  window.sheetFolded = true;
+  const texts = [...sheet.querySelectorAll("*")].filter((part) => part.childElementCount === 0);
+  texts.find((part) => part.textContent === {title})?.click();
+}}
+"""
+
+
+def prepare_window(gui: Any, title: str) -> None:
+    """Name the tab after the scene, and fold the panel of small windows once. gui: viser's, of the server.
+
+    viser has no option for either. A hidden picture that fails to load runs a line of JavaScript instead.
+    """
+    script = SCRIPT.format(title=json.dumps(title), narrow=NARROW_WINDOW_PIXELS)
+    gui.add_html(f'<img hidden alt="" src="data:," onerror="{escape(script)}">', order=1e9)
 
 
 class Viewer:
@@ -53,7 +76,7 @@ class Viewer:
         """Set the look of the page, and the camera that every client begins with."""
         server, subject = self._server, self.subject
         server.gui.configure_theme(show_logo=False, show_share_button=False, control_width="medium")
-        window.prepare(server.gui, subject.title)
+        prepare_window(server.gui, subject.title)
         pose, distance = subject.first.pose[0].double().numpy(), subject.distance(subject.first)
         server.initial_camera.position = pose[:, 3]
         server.initial_camera.look_at = pose[:, 3] + distance * pose[:, 2]

@@ -7,31 +7,32 @@ import sys
 import time
 import traceback
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import UInt8
+from jaxtyping import Float, UInt8
+from torch import Tensor
 
+from .. import kernels
 from ..camera import Camera
 from ..camera.crop import Crop
 from ..camera.rays import Rendering
 from ..datasets.scene import Vector
 from ..errors import LumigraphError
 from ..figures import to_bytes
-from .cameras import angle_for, angles, pose_of, rows
-from .controls import Controls
+from ..gaussians import Gaussians
+from ..geometry import to_matrix, unit
+from .cameras import ViewRequest, angle_for, angles, pose_of, rows
+from .controls import Controls, MethodControls
 from .crop_panel import CropPanel
 from .flight import Flight
-from .method_controls import MethodControls
 from .modes import along_axis, extra_modes, picture
-from .pace import Pace
-from .painter import MOVING_SECONDS, Painter
+from .painter import MOVING_SECONDS, Pace, Painter
 from .path_panel import PathPanel
 from .shared import Shared
-from .splats import UNIT_SCALE, colours, splats
 from .turns import NotWantedError
-from .view_request import ViewRequest
 
 DEPTH_SIZE = 320  # pixels along the longer side of the depth that goes with a picture
 DEPTH_STEP = 256e-5  # scene units, to which that depth is rounded so that it packs well
@@ -56,43 +57,18 @@ class Visitor:
         self._hidden: dict[str, Any] = {}  # frusta that are too near to the eye, and what hides each
         self.painter = Painter(self._draw, shared.turns, self._tell_fault, lambda: shared.step)
         self.flight = Flight(client)
-        view_tab, crop_tab, path_tab = shared.tabs
-        self.controls = Controls(
-            client,
-            view_tab,
-            shared.subject.frame,
-            shared.is_cloud,
-            self.painter.ask,
-            shared.subject.page is not None,
-        )
-        self.method_controls = MethodControls(client, view_tab, shared.method, self.painter.ask)
-        self.crop = CropPanel(
-            client,
-            crop_tab,
-            shared.subject.frame,
-            shared.is_cloud,
-            self.painter.ask,
-            self._keep if shared.is_cloud and shared.subject.keep is not None else None,
-            f"{shared.subject.title.partition('.')[0]}-part.ply",
-            self.tell,
-        )
-        self.path = PathPanel(
-            client,
-            path_tab,
-            shared.subject,
-            self.flight,
-            shared.scenery.size,
-            self.tell,
-            lambda: self.method_controls.time,
-            self.method_controls.show_time,
-        )
+        self.controls = Controls(client, shared, self.painter.ask)
+        self.method_controls = MethodControls(client, shared, self.painter.ask)
+        keep = self._keep if shared.is_cloud and shared.subject.keep is not None else None
+        self.crop = CropPanel(client, shared, self.painter.ask, keep, self.tell)
+        self.path = PathPanel(client, shared, self.flight, self.method_controls, self.tell)
         self._seen: tuple[Any, ...] = ()
         client.camera.on_update(self._moved)
         first = shared.subject.first
         angle, wide = angles(first)[1], angle_for(first, client.camera.aspect)
         if wide > angle + FIELD_OF_VIEW_TOLERANCE:  # a narrow window shows the whole photograph too
             client.camera.fov = angle = wide
-        self.controls.tell_angle(angle)  # what the client's camera says may be from before it was told any
+        self.controls.show_angle(angle)  # the client's camera may still have the angle from before this
         if shared.scenery.has_points:
             self.controls.offer_points()
         self.painter.ask()
@@ -127,7 +103,7 @@ class Visitor:
         seen = *camera.wxyz, *camera.position, camera.fov, camera.image_width, camera.image_height
         if seen != self._seen:
             self._seen = seen
-            self.controls.tell_angle(camera.fov)
+            self.controls.show_angle(camera.fov)
             self.painter.ask()
 
     def request(self) -> ViewRequest:
@@ -259,3 +235,42 @@ class Visitor:
         if os.environ.get("LUMIGRAPH_DEBUG"):
             traceback.print_exception(error)
         self.tell("This could not be drawn", text)
+
+
+# The browser's covariances are half-precision numbers: in units this much smaller, what is fine keeps its shape.
+UNIT_SCALE = 16.0
+MAX_SCALE = 250.0  # standard deviation in those units; its square still is a half-precision number
+
+
+@dataclass(frozen=True)
+class BrowserSplats:
+    """Arrays that viser sends to the browser, with lengths multiplied by UNIT_SCALE."""
+
+    centres: Float[np.ndarray, "gaussian 3"]
+    covariances: Float[np.ndarray, "gaussian 3 3"]
+    colours: Float[np.ndarray, "gaussian 3"]
+    opacities: Float[np.ndarray, "gaussian 1"]
+
+
+@torch.no_grad()
+def splats(cloud: Gaussians, eye: Float[Tensor, " 3"]) -> BrowserSplats:
+    """A cloud for the browser, coloured as seen from an eye; both in the scene's frame.
+
+    The browser takes one colour for each Gaussian and no harmonics; `colours` are sent again when the camera rests.
+    """
+    deviations = (UNIT_SCALE * cloud.log_scales.detach().exp()).clamp_max(MAX_SCALE)
+    axes = to_matrix(cloud.quaternions.detach()) * deviations[:, None, :]
+    return BrowserSplats(
+        (UNIT_SCALE * cloud.means.detach()).cpu().numpy(),
+        (axes @ axes.mT).cpu().numpy(),
+        colours(cloud, eye).cpu().numpy(),
+        cloud.opacities.detach().sigmoid()[:, None].cpu().numpy(),
+    )
+
+
+@torch.no_grad()
+def colours(cloud: Gaussians, eye: Float[Tensor, " 3"]) -> Float[Tensor, "gaussian 3"]:
+    """Colour of each Gaussian seen from one place, in [0, 1] (Kerbl 2023; the constant is that of `Gaussians`)."""
+    directions = unit(cloud.means.detach() - eye.to(cloud.means))
+    values = kernels.spherical_harmonics(directions, cloud.degree + 1)
+    return (0.5 + torch.einsum("nk,nkc->nc", values, cloud.harmonics.detach())).clamp(0, 1)

@@ -44,7 +44,10 @@ def packed(array: Shaped[np.ndarray, "*shape"]) -> tuple[Stream, bytes]:
     """An array as a stream, whichever way is smaller."""
     ways = (False, True) if array.dtype.kind in "ui" and array.ndim else (False,)
     coder = zstandard.ZstdCompressor(level=ZSTD_LEVEL)
-    found = [(delta, coder.compress(_bytes(_differences(array) if delta else array))) for delta in ways]
+    found = []
+    for delta in ways:
+        values = np.diff(array, axis=0, prepend=np.zeros_like(array[:1])) if delta else array
+        found.append((delta, coder.compress(_bytes(values))))
     delta, data = min(found, key=lambda pair: len(pair[1]))
     return Stream(kind_of(array), array.shape, len(data), delta), data
 
@@ -81,10 +84,6 @@ def take(stream: Any, size: int) -> bytes:
         pieces.append(piece)
         size -= len(piece)
     return b"".join(pieces)
-
-
-def _differences(array: Shaped[np.ndarray, "*shape"]) -> Shaped[np.ndarray, "*shape"]:
-    return np.diff(array, axis=0, prepend=np.zeros_like(array[:1]))
 
 
 def _bytes(array: Shaped[np.ndarray, "*shape"]) -> bytes:

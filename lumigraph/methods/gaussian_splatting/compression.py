@@ -10,7 +10,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from ...camera import Camera
-from ...exchange.morton import morton_order
+from ...exchange.codes import morton_order
 from ...exchange.packing import most_important
 from ...gaussians import Gaussians
 from ...gaussians.splatting import splat, view_of
