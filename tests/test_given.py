@@ -400,7 +400,7 @@ def test_info_lists_controls(trained, capsys):
     ("command", "fault"),
     [
         (["eval", "--set", "contrast=1"], "no control 'contrast'; there are: brightness, ink, time"),
-        (["render", "--set", "brightness"], "--set brightness does not say what a control should be"),
+        (["render", "--set", "brightness"], "--set brightness gives no value for a control"),
         (["render", "--set", "brightness=9"], "brightness=9 cannot be; give a number from 0 to 2"),
         (["render", "--animate", "time=3"], "--animate time=3 goes nowhere"),
         (["render", "--animate", "time=3:9"], "time=9 cannot be"),

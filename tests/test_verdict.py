@@ -96,7 +96,7 @@ def test_advice_follows_what_was_measured():
     assert "fewer steps than a draft" in advice(FLAT, False, more, True) and more in advice(None, False, more, True)
     assert advice(FLAT, True, more, True) == "it has settled; more photographs would help more than time"
     assert "photographs" not in advice(FLAT, True, more, False) and more not in advice(FLAT, True, more, False)
-    assert "cannot be told" in advice(None, True, more, True)
+    assert "it is unknown" in advice(None, True, more, True)
 
 
 @pytest.mark.parametrize(

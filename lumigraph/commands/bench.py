@@ -172,9 +172,9 @@ class BenchViews(Cells):
     """Train priors for this number of steps instead."""
 
     def run(self) -> int:
-        (budget,) = budgets(said(self.seconds), said(self.steps))
+        (budget,) = budgets(given(self.seconds), given(self.steps))
         longer = self.prior_seconds is not None or self.prior_steps is not None
-        (of_priors,) = budgets(said(self.prior_seconds), said(self.prior_steps)) if longer else (budget,)
+        (of_priors,) = budgets(given(self.prior_seconds), given(self.prior_steps)) if longer else (budget,)
         settings = self.checked()
         sources = list(map(place_of, self.scenes))
         names = [methods.check(name) for name in self.methods]
@@ -267,7 +267,7 @@ def learns_across(name: str) -> bool:
     return methods.find(name).learns_from is Collection
 
 
-def said(value: float | int | None) -> tuple:
+def given(value: float | int | None) -> tuple:
     return () if value is None else (value,)
 
 

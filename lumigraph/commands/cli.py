@@ -141,7 +141,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 0
     settle_memory()
     try:
-        with listening(), told_warnings(), considerate():
+        with listening(), printed_warnings(), considerate():
             return parse(arguments).run()
     except LumigraphError as error:
         return refuse(str(error))
@@ -162,7 +162,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 @contextlib.contextmanager
-def told_warnings() -> Iterator[None]:
+def printed_warnings() -> Iterator[None]:
     """Print each of our own warnings on one line; suppress those of libraries."""
     debugging = bool(os.environ.get("LUMIGRAPH_DEBUG"))
     with warnings.catch_warnings():

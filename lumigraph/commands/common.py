@@ -46,7 +46,7 @@ def method_config(command: Any, name: str) -> Any:
 
 
 def preset_device(device: str, preset: str) -> Any:
-    """The kind of machine whose defaults are wanted; it need not be here."""
+    """The kind of machine for the defaults of a method; this machine need not have it."""
     import torch
 
     return choose_device(device) if preset == "auto" else torch.device("cuda" if preset == "paper" else "cpu")
@@ -62,10 +62,10 @@ def value_of(name: str, arguments: Sequence[str], default: str) -> str:
     return default
 
 
-def told_budget(steps: int | None, seconds: float | None, quality: Quality | None = None) -> Budget | None:
+def given_budget(steps: int | None, seconds: float | None, quality: Quality | None = None) -> Budget | None:
     """The Budget of --steps or --seconds; `None` without them. Raises LumigraphError, before anything is opened, for an
     impossible value, and for more than one of these options."""
-    if sum(told is not None for told in (steps, seconds, quality)) > 1:
+    if sum(given is not None for given in (steps, seconds, quality)) > 1:
         raise LumigraphError("--steps, --seconds and --quality are ways to say how long; give one of them")
     return None if steps is None and seconds is None else Budget(steps, seconds)
 
@@ -77,8 +77,8 @@ def quality_budget(quality: Quality, method: Any, data: Any) -> Budget:
 
 def about_quality(kind: Any = None) -> str:
     """Help text of --quality; with the numbers of a kind of method, if given."""
-    told = "Choose the steps by method, number of photographs and their size. "
-    return told + "; ".join(f"{name}, {means}{numbers(kind, name)}" for name, means in MEANS.items()) + "."
+    about = "Choose the steps by method, number of photographs and their size. "
+    return about + "; ".join(f"{name}, {means}{numbers(kind, name)}" for name, means in MEANS.items()) + "."
 
 
 def numbers(kind: Any, quality: Quality) -> str:

@@ -58,7 +58,7 @@ class Compose:
             raise LumigraphError("The box holds nothing; give --box its lower corner first, then its upper one")
         lead, part = open_any(self.lead), open_any(self.part)
         place = Similarity.make(1.0)
-        if any(told is not None for told in (self.at, self.scale, self.turn)):
+        if any(given is not None for given in (self.at, self.scale, self.turn)):
             spot = None if self.at is None else torch.tensor(self.at, dtype=torch.float64)
             place = standing(part.frame, lead.frame, spot, self.scale or 1.0, self.turn or 0.0)
         named = [CompositionPart(relative(self.lead, self.output), Similarity.make(1.0))]

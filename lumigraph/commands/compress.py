@@ -58,7 +58,7 @@ class Compress:
         from ..derive.compression import CompressionTarget, compress
         from ..run import Run
 
-        if sum(told is not None for told in (self.to, self.quality, self.max_loss)) > 1:
+        if sum(given is not None for given in (self.to, self.quality, self.max_loss)) > 1:
             raise LumigraphError("--to, --quality and --max-loss are ways to say how small; give one of them")
         if self.steps is not None and self.seconds is not None:
             raise LumigraphError("--steps and --seconds are two ways to say how long; give one of them")

@@ -12,7 +12,7 @@ from ..budget import Quality
 from ..errors import LumigraphError
 from ..files.ranges import Count, Seconds
 from ..system.console import console
-from .common import about_quality, choose_device, method_config, show, told_budget, typed
+from .common import about_quality, choose_device, given_budget, method_config, show, typed
 from .compress import size
 from .options import DeviceOption, PhotographsOption, SeedOption, StepsOption, needed, option
 
@@ -65,7 +65,7 @@ class Convert:
             return 0
         if self.source is None or self.method is None or self.output is None:
             raise LumigraphError("Name a run, a method and a new folder: lumigraph convert RUN METHOD --output NEW")
-        told_budget(self.steps, self.seconds, self.quality)
+        given_budget(self.steps, self.seconds, self.quality)
         name, device = methods.check(self.method), choose_device(self.device)
         counted = self.steps is not None or self.quality is not None
         aim = ConversionTarget(

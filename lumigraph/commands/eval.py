@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal
 from ..files.ranges import Count
 from ..system.console import bold
 from .common import choose_device, show
-from .options import DeviceOption, Overwrite, RunOption, Set, option, tell
+from .options import DeviceOption, Overwrite, RunOption, Set, controlled, option
 
 MEMORISED_DB = 4.0  # dB by which training photographs are better than held-out ones if they are memorised
 
@@ -57,9 +57,9 @@ class Eval:
         device = choose_device(self.device)
         if isinstance(run, BlockRun):  # by the exposures of the photographs that it will be given
             data: Any = run.dataset(self.scene, self.split)
-            method = tell(run, run.method(device, data.about.get("exposure")), self.settings)
+            method = controlled(run, run.method(device, data.about.get("exposure")), self.settings)
         else:
-            method = tell(run, run.method(device), self.settings)
+            method = controlled(run, run.method(device), self.settings)
             data = run.dataset(self.scene)
         result = evaluate_run(run, method, data, self.split, self.save_images, self.views, lpips, self.right_halves)
         rows: dict[str, Any] = {score.name: bold(score) for score in scores_of(result)}

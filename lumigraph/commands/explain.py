@@ -11,7 +11,7 @@ from tyro.conf import OmitArgPrefixes, OmitSubcommandPrefixes, Positional, subco
 from ..errors import LumigraphError
 from ..files.ranges import Downscale, Steps, between
 from .common import choose_device, say, scene_name, show
-from .options import DeviceOption, Overwrite, PhotographsOption, RunOption, SeedOption, Set, needed, option, tell
+from .options import DeviceOption, Overwrite, PhotographsOption, RunOption, SeedOption, Set, controlled, needed, option
 
 Place = Annotated[int, between(0, 1_000_000)]  # along one side of a picture
 OCTAVES = tuple(2.0**octave for octave in range(8))  # scales of encodings, 1 to 128
@@ -38,7 +38,7 @@ class ExplainActivation:
         from ..system.progress import counting
 
         claim(self.output, "figure", self.overwrite)
-        with counting("Learning an edge in three orders"):
+        with counting("Fitting an edge in three orders"):
             found = fits(self.cells, self.steps)
         draw(self.output, found, self.cells)
         show({fit.name: f"{fit.psnr:.2f} dB" for fit in found} | {"picture": str(self.output)})
@@ -116,7 +116,7 @@ class ExplainRay:
 
     def run(self) -> int:
         if self.output and self.output.suffix != ".svg":
-            raise LumigraphError(f"{self.output} does not say that it is a figure; give --output a name ending in .svg")
+            raise LumigraphError(f"{self.output} has no ending of a figure; give --output a name ending in .svg")
         from ..evaluation import file_name
         from ..explain.ray import along_ray
         from ..explain.ray_figure import ray_figure
@@ -131,9 +131,9 @@ class ExplainRay:
         output = self.output or run.folder / "rays" / f"{file_name(name)}-{x}-{y}.svg"
         for file in (output, output.with_suffix(".json")):
             claim(file, "figure", self.overwrite)
-        method = tell(run, run.method(choose_device(self.device)), self.settings)
+        method = controlled(run, run.method(choose_device(self.device)), self.settings)
         camera = method.refined(camera)
-        with counting("Looking along the ray"):
+        with counting("Sampling the ray"):
             sight = along_ray(method, camera, pixel)
         sight = sight.beside(self._photograph(run, name))
         title = f"{run.method_name}: pixel ({x}, {y}) of {name}"
@@ -145,7 +145,7 @@ class ExplainRay:
         return 0
 
     def _photograph(self, run: Any, name: str) -> Any:
-        """The photograph before the run's background, or None if it is gone and nobody said where to."""
+        """The photograph before the run's background, or None if it was moved and --scene is not given."""
         try:
             scene = run.scene(self.scene)
             photograph = scene.photograph(scene.names.index(name))

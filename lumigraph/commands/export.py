@@ -14,7 +14,7 @@ from ..files import claim
 from ..files.ranges import CloudSize, Coordinate, Count, Pixels, Positive, Share, SphereSize, between
 from .common import show
 from .export_web import ExportWeb
-from .options import DeviceOption, Keeping, Overwrite, Set, SourceOption, needed, open_method, option, tell
+from .options import DeviceOption, Keeping, Overwrite, Set, SourceOption, controlled, needed, open_method, option
 
 FOR_PHONES = 100_000  # triangles that a phone shows with ease
 
@@ -129,8 +129,8 @@ class Levels:
 
     @property
     def given(self) -> dict[str, Any]:
-        said = {name: getattr(self, name) for name in ("levels", "ratio", "chunk")}
-        return {name: value for name, value in said.items() if value is not None}
+        values = {name: getattr(self, name) for name in ("levels", "ratio", "chunk")}
+        return {name: value for name, value in values.items() if value is not None}
 
 
 @dataclass(frozen=True)
@@ -171,7 +171,7 @@ class ExportSplats:
                 written = self.part.of_gaussians(written, crop and crop.moved(frame.to_source))
         else:
             opened = open_any(self.source)
-            method = tell(opened, opened.method(), self.settings)
+            method = controlled(opened, opened.method(), self.settings)
             gaussians = needs(method, HasGaussians).gaussians()
             gaussians = self.part.of_gaussians(gaussians, self.part.crop(method.frame))
             written = gaussians.transformed(method.frame.to_source.matrix)
@@ -213,13 +213,13 @@ class ExportOctree:
         from ..run import open_any
 
         opened = open_any(self.source)
-        octree = needs(tell(opened, opened.method(), self.settings), HasOctree).octree(self.depth)
+        octree = needs(controlled(opened, opened.method(), self.settings), HasOctree).octree(self.depth)
         in_source = write_octree(self.output, octree, opened.frame)
         show(
             {
                 "file": str(self.output),
                 "nodes": f"{len(octree.child):,}",
-                "frame": "of the photographs" if in_source else "of the scene, for the format knows no rotation",
+                "frame": "of the photographs" if in_source else "of the scene, for the format has no rotation",
                 "size": f"{self.output.stat().st_size / 1e6:.1f} MB",
             }
         )
@@ -289,7 +289,7 @@ class SphereExport:
     settings: Set = ()
     device: DeviceOption = "auto"
 
-    def stand(self) -> tuple[Any, Any, Any, Any, str]:
+    def opened(self) -> tuple[Any, Any, Any, Any, str]:
         """Open the source and find the standpoint: the source, its method, place and heading in the scene's frame, and
         the place in words."""
         from ..export.panorama import picture_format, sphere_size, standpoint
@@ -305,13 +305,13 @@ class SphereExport:
 class ExportPanorama(SphereExport):
     """All that is seen from one place, as an equirectangular picture that viewers and headsets show as a sphere.
 
-    The horizon is level, the photographs' main direction in the middle. The ending says which format: .png or .jpg.
+    The horizon is level, the photographs' main direction in the middle. The ending chooses the format: .png or .jpg.
     """
 
     def run(self) -> int:
         from ..export.panorama import panorama, save_sphere
 
-        _, method, place, heading, where = self.stand()
+        _, method, place, heading, where = self.opened()
         save_sphere(self.output, panorama(method, place, heading, self.size).rgb, whole=True)
         show({"panorama": str(self.output), "size": f"{self.size}x{self.size // 2}", "from": where})
         return 0
@@ -373,7 +373,7 @@ class ExportStereo(SphereExport):
     def run(self) -> int:
         from ..export.panorama import EYE_DISTANCE_SHARE, save_sphere, stereo_pair, surrounding_distances, top_bottom
 
-        opened, method, place, heading, where = self.stand()
+        opened, method, place, heading, where = self.opened()
         unit = opened.frame.to_source.scale
         near, middle = surrounding_distances(method, place, heading)
         apart = EYE_DISTANCE_SHARE * middle if self.interpupillary is None else self.interpupillary / unit

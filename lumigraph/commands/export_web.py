@@ -69,19 +69,19 @@ class ExportWeb:
         claim(self.output, "page", self.overwrite, [self.source])
         opened, method, cameras = open_method(self.source, self.device, self.settings)
         kind = self._kind(opened, method)
-        told: dict[str, str] = {}
+        rows: dict[str, str] = {}
         if kind == "volume":
-            method, told = self._baked(opened, method)
+            method, rows = self._baked(opened, method)
         behind = backdrop(method, cameras["train"]) if kind != "views" and not self.part.crops else None
         title = self.title or opened.title
         opening = opening_of_scene(title, cameras["train"], opened.frame, background, behind)
         held = self._write(kind, method, cameras["train"], opening)
         size = f"{self.output.stat().st_size / 1e6:.1f} MB"
-        show(told | {"page": str(self.output), "holds": held, "size": size})
+        show(rows | {"page": str(self.output), "holds": held, "size": size})
         return 0
 
     def _write(self, kind: str, method: Any, cameras: Any, opening: Any) -> str:
-        """Write the page, and say what it holds."""
+        """Write the page. Returns its contents in words."""
         from ..export.mesh import extract_mesh
         from ..export.page import mesh_page, splats_page, views_page, volume_page
         from ..method.capabilities import HasGaussians, needs
@@ -119,7 +119,7 @@ class ExportWeb:
         if is_baked(method):
             return method, {}
         if self.settings:
-            raise LumigraphError("What is converted is told nothing; leave out --set, or give --as views")
+            raise LumigraphError("A conversion has no controls; leave out --set, or give --as views")
         about = f"to an octree, which then learns on for {self.seconds:.0f} s; --as views is quicker"
         show({"converts": about})
         made, took = converted(opened, self.seconds, choose_device(self.device))

@@ -28,14 +28,14 @@ MAX_MEMBERS = 12  # shapes that are listed
 
 
 def run_tree(run: Run) -> Tree:
-    said = run.settings
+    settings = run.settings
     tree = Tree(bold(run.folder) + f"  a run of {run.method_name}")
-    options = dict(said.scene.options)
+    options = dict(settings.scene.options)
     if (part := options.get("part")) is not None:  # of a block
         options["part"] = f"{len(part['photographs'])} photographs of a larger scene"
-    branch(tree, "scene", {"source": said.scene.source, **said.splits, **options})
+    branch(tree, "scene", {"source": settings.scene.source, **settings.splits, **options})
     branch(tree, "frame", frame_rows(run.frame))
-    branch(tree, "config", said.config)
+    branch(tree, "config", settings.config)
     if controls := control_rows(run):
         branch(tree, "controls, by --set", controls)
     if run.has_state:
@@ -44,15 +44,20 @@ def run_tree(run: Run) -> Tree:
         branch(
             tree,
             "trained",
-            rows | {"budget": said.budget and str(Budget.from_json(said.budget)), "seed": said.seed, "on": said.device},
+            rows
+            | {
+                "budget": settings.budget and str(Budget.from_json(settings.budget)),
+                "seed": settings.seed,
+                "on": settings.device,
+            },
         )
-    if run.has_state and said.config.get("refine_cameras"):
+    if run.has_state and settings.config.get("refine_cameras"):
         if moved := cameras_moved(run.method("cpu"), run.cameras()["train"]):
             branch(tree, "cameras", {"moved by": str(moved)})
     if made := Compressed.read(run.folder):
         smaller = f"{made.times:.1f} times smaller, {made.bytes_after / 1e6:.3g} MB of {made.bytes_before / 1e6:.3g} MB"
         branch(tree, "compressed", {"from": made.source, "model": smaller, "dB": f"{made.psnr_after:.2f}"})
-    if inferred := Inferred.of(said, run.folder / "config.json"):
+    if inferred := Inferred.of(settings, run.folder / "config.json"):
         seen = f"{inferred.views} photographs" if inferred.seed is None else f"seed {inferred.seed}"
         branch(tree, "inferred", {"by": inferred.prior, "of": seen})
     if converted := Converted.read(run.folder):

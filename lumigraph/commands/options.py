@@ -54,29 +54,29 @@ ANIMATE = "Change a control from A to B over the film, or on to C with A:B:C. Ca
 Animate = UseAppendAction[Annotated[tuple[str, ...], needed("NAME=A:B", ANIMATE, "animate")]]
 
 
-def open_method(source: Any, device: str, told: Iterable[str] = ()) -> tuple[Any, Any, Any]:
+def open_method(source: Any, device: str, settings: Iterable[str] = ()) -> tuple[Any, Any, Any]:
     """The opened run or file, its method with the controls of --set, and the cameras of its photographs by split, as
     the method has refined them."""
     from ..run import open_any
     from .common import choose_device
 
     opened = open_any(source)
-    method = tell(opened, opened.method(choose_device(device)), told)
+    method = controlled(opened, opened.method(choose_device(device)), settings)
     return opened, method, {split: method.refined(cameras) for split, cameras in opened.cameras().items()}
 
 
-def tell(opened: Any, method: Any, told: Iterable[str]) -> Any:
+def controlled(opened: Any, method: Any, settings: Iterable[str]) -> Any:
     """The method with the controls of --set. Raises LumigraphError for controls that it does not have."""
-    values = dict(parted("--set", "NAME=VALUE", text) for text in told)
+    values = dict(parted("--set", "NAME=VALUE", text) for text in settings)
     return method.given(**{name: by_number(opened, method, name, value) for name, value in values.items()})
 
 
-def animate(opened: Any, method: Any, told: Iterable[str], frames: int) -> Any:
+def animate(opened: Any, method: Any, settings: Iterable[str], frames: int) -> Any:
     """The method of each frame of a film by --animate; the method itself without --animate."""
     from ..export.film import animated
 
     stations = {}
-    for name, text in (parted("--animate", "NAME=A:B", text) for text in told):
+    for name, text in (parted("--animate", "NAME=A:B", text) for text in settings):
         if name in method.settings:
             raise LumigraphError(f"{name} is both set and animated; leave out --set {name} or --animate {name}")
         if ":" not in text:
@@ -89,20 +89,20 @@ def parted(option: str, form: str, text: str) -> tuple[str, str]:
     """The two sides of NAME=VALUE."""
     name, equals, value = text.partition("=")
     if not (name.strip() and equals and value.strip()):
-        raise LumigraphError(f"{option} {text} does not say what a control should be; write {option} {form}")
+        raise LumigraphError(f"{option} {text} gives no value for a control; write {option} {form}")
     return name.strip().replace("-", "_"), value.strip()
 
 
 def by_number(opened: Any, method: Any, name: str, value: str) -> str:
-    """The value, or the number of the photograph that it names where the control wants one; in a blend, A:B:0.5, the
+    """The value, or the number of the photograph that it names if the control takes one; in a blend, A:B:0.5, the
     numbers of both."""
     control = next((control for control in method.controls if control.name == name), None)
     if control is None or not control.of_photographs:
         return value
-    known = numbers(opened)
-    if value in known or not control.blends:
-        return known.get(value, value)
-    return ":".join(known.get(part, part) for part in value.split(":"))
+    by_name = numbers(opened)
+    if value in by_name or not control.blends:
+        return by_name.get(value, value)
+    return ":".join(by_name.get(part, part) for part in value.split(":"))
 
 
 def numbers(opened: Any) -> dict[str, str]:
@@ -179,19 +179,19 @@ class Keeping:
         reasons = unwanted(gaussians, crop, **self.floaters)
         if len(gaussians) and gone(reasons).all():
             raise LumigraphError(
-                "No Gaussian is left; give --box or --sphere where the scene is (`lumigraph info` tells its bounds), "
+                "No Gaussian is left; give --box or --sphere where the scene is (`lumigraph info` shows its bounds), "
                 "or clean less"
             )
         return reasons
 
     def of_gaussians(self, gaussians: Any, crop: Any) -> Any:
-        """The Gaussians that are wanted. Raises LumigraphError if that is none."""
+        """Gaussians to keep. Raises LumigraphError if that is none."""
         from ..gaussians.cleaning import gone
 
         return gaussians[~gone(self.unwanted(gaussians, crop))]
 
     def of_method(self, method: Any) -> Any:
-        """The part of a method that is wanted, ready to render. Raises LumigraphError where it can have no floaters."""
+        """The cropped method without floaters, ready to render. Raises LumigraphError where it can have no floaters."""
         from ..composition import PickedCloud, cropped
         from ..method.capabilities import HasGaussians, can, needs
 

@@ -18,7 +18,7 @@ PATH_KINDS = ("orbit", "sweep", "spiral", "interpolate", "held-out")
 DEFAULT_SIZE, AUTO = 480, "auto"
 CHOSEN = {
     "orbit": "orbit, for the photographs go round",
-    "sweep": "sweep, for the photographs look the same way; --path orbit goes to and fro",
+    "sweep": "sweep, for all cameras have about the same direction; --path orbit goes to and fro",
 }
 
 
@@ -84,7 +84,7 @@ class Render:
 
 
 def read_path(name: str, fps: float | None) -> Any:
-    """The CameraPath in a file, at another speed of frames if asked. Raises LumigraphError if it is none."""
+    """The CameraPath in a file, with other frames per second if given. Raises LumigraphError if it is none."""
     from ..paths.keyframes import CameraPath
 
     file = Path(name)

@@ -17,13 +17,13 @@ from .common import (
     about_quality,
     choose_device,
     exit_code,
+    given_budget,
     method_config,
     next_free,
     option_group,
     preset_device,
     quality_budget,
     scene_name,
-    told_budget,
     value_of,
 )
 from .options import DeviceOption, ReaderOption, SeedOption, StepsOption, needed, option
@@ -77,13 +77,13 @@ class Train:
         from ..datasets.dataset import check_kind
         from ..run import Run, build, check_new
         from ..training import fit
-        from .outcome import tell_outcome
+        from .outcome import show_outcome
         from .view import keep_showing, watching
 
         blocks: BlockOptions | None = getattr(self, "blocks", None)
         if blocks is not None and (code := blocks.run(self)) is not None:
             return code
-        budget = told_budget(self.steps, self.seconds, self.quality)
+        budget = given_budget(self.steps, self.seconds, self.quality)
         kind, device = methods.find(self.method), choose_device(self.device)
         if self.output is not None:
             check_new(self.output)
@@ -106,7 +106,7 @@ class Train:
         with watching(self.view, method, data, run, self.host, self.port) as watch:
             with run.kept_if_learnt():
                 outcome = fit(method, data, run, budget=budget, seed=seed, pause_at=self.pause_at, watch=watch)
-            tell_outcome(run, outcome, method, data)
+            show_outcome(run, outcome, method, data)
             keep_showing(watch, outcome.signal)
         return exit_code(outcome.signal)
 
@@ -130,7 +130,7 @@ def with_options_of(name: str, arguments: Sequence[str], command: type = Train) 
 
 def derived(base: type, config: type, extra: dict[str, tuple[Any, Any]]) -> type[Any]:
     """A dataclass of options with further ones, annotation and default by name. Options that a method's Config has too
-    are hidden, for the Config's are asked for."""
+    are hidden in favour of the Config's."""
     names = {x.name for x in dataclasses.fields(config) if not dataclasses.is_dataclass(x.default)}  # --steps stays
     hidden = {x.name: (Annotated[Any, Fixed, Suppress], x.default) for x in dataclasses.fields(base) if x.name in names}
     options = [(name, kind, dataclasses.field(default=default)) for name, (kind, default) in (hidden | extra).items()]

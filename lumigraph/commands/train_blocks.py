@@ -15,7 +15,7 @@ from ..errors import LumigraphError
 from ..files.names import counted
 from ..files.ranges import Count
 from .capture import posed
-from .common import choose_device, exit_code, method_config, next_free, say, scene_name, show, told_budget, typed
+from .common import choose_device, exit_code, given_budget, method_config, next_free, say, scene_name, show, typed
 from .options import option
 
 MEMORY_BYTES = 2 << 30  # bytes that a block asks of its machine
@@ -76,7 +76,7 @@ class BlockOptions:
         from ..system.memory import free_memory
 
         here = self.address is None
-        budget = told_budget(train.steps, train.seconds, train.quality)
+        budget = given_budget(train.steps, train.seconds, train.quality)
         if here or train.device == "auto":
             device = choose_device(train.device)
         else:  # of the cluster's machines
@@ -91,7 +91,7 @@ class BlockOptions:
         cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
         cpus = max(1, cores // self.workers) if self.workers else 1
         plan = begin(output, plan, places, None if here and self.workers is None else cpus)
-        tell_plan(output, plan, budget)
+        show_plan(output, plan, budget)
         gpus = 1.0 if device.type == "cuda" else 0.0
         memory = min(MEMORY_BYTES, free_memory() // (2 * self.workers)) if here and self.workers else MEMORY_BYTES
         found = conduct(output, plan, Workers(self.workers, self.address, cpus, gpus, memory))
@@ -105,7 +105,7 @@ class BlockOptions:
                 f"{why}; the others are kept, and the same command tries again"
             )
         finish(output)
-        tell_done(output, found)
+        show_done(output, found)
         return 0
 
     def _again(self, train: Any, run: Path) -> int:
@@ -114,7 +114,7 @@ class BlockOptions:
 
         if self.blocks is None or not self.blocks.isdigit():
             raise LumigraphError("--into needs the name of the block to learn again; give it as --blocks 3")
-        source, budget = posed(train.scene), told_budget(train.steps, train.seconds, train.quality)
+        source, budget = posed(train.scene), given_budget(train.steps, train.seconds, train.quality)
         options = {name: getattr(train, name) for name in OPTIONS}
         ended = update(run, self.blocks, source, survey(source, train.reader), options, budget)
         if ended.done is None:
@@ -139,7 +139,7 @@ def unfinished(prefix: str, plan: Any) -> Path:
     return free
 
 
-def tell_plan(output: Path, plan: Any, budget: Any) -> None:
+def show_plan(output: Path, plan: Any, budget: Any) -> None:
     """Print the plan before training."""
     counts = [len(block.photographs) for block in plan.blocks]
     each = " ".join(
@@ -151,7 +151,7 @@ def tell_plan(output: Path, plan: Any, budget: Any) -> None:
     say(f"{counted(len(counts), 'block')} of {many}, each learnt for {each}{total}; {output / 'blocks.png'} shows them")
 
 
-def tell_done(output: Path, found: Any) -> None:
+def show_done(output: Path, found: Any) -> None:
     """Print the cost of all blocks."""
     done = list(found.done.values())
     rows = {"run": str(output), "blocks": f"{len(done)}, {sum(x.bytes for x in done) / 1e6:.1f} MB of weights"}

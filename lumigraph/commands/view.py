@@ -42,7 +42,7 @@ class ViewCommand:
         subject = subject_of(opened, cameras, page=page_of(opened, method, cameras))
         address = choose_address(self.host, self.port)
         with until_interrupted(), Viewer(method, subject, address) as viewer:
-            tell(viewer)
+            show_address(viewer)
             viewer.serve()
         return 0
 
@@ -123,7 +123,7 @@ def watching(wanted: bool, method: Any, data: Any, run: Any, host: str, port: in
     if run.photographed:
         subject = dataclasses.replace(subject, open_scene=lambda: data)
     with Viewer(method, subject, choose_address(host, port), training=True) as viewer:
-        tell(viewer)
+        show_address(viewer)
         yield viewer
 
 
@@ -135,5 +135,5 @@ def keep_showing(viewer: Any, signal: int | None) -> None:
             viewer.serve()
 
 
-def tell(viewer: Any) -> None:
+def show_address(viewer: Any) -> None:
     show({"view": f"{viewer.address.url} (Ctrl-C ends it)"})

@@ -24,7 +24,7 @@ WRITERS = {
 }
 READERS = {".splat": splat.read, ".spz": spz.read, ".sog": sog.read, ".glb": glb.read}  # and two kinds of .ply
 SUFFIXES = tuple(WRITERS)
-FOLDERS = {streamed_sog.META: streamed_sog, sog.META: sog}  # by the name of the file that says what is in them
+FOLDERS = {streamed_sog.META: streamed_sog, sog.META: sog}  # by the name of their index
 REORDERED = ".compressed.ply", ".sog"  # formats that keep the set of Gaussians and not their order
 
 
@@ -54,9 +54,9 @@ def read_gaussians(path: Path | str) -> Gaussians:
 
 def write_gaussians(path: Path | str, gaussians: Gaussians, detail: streamed_sog.Detail | None = None) -> None:
     """Write a cloud in the format that the ending names, whole or not at all; to FOLDER/meta.json, a folder of SOG; to
-    FOLDER/lod-meta.json, a streamed one, with levels as `detail` says.
+    FOLDER/lod-meta.json, a streamed one, with the levels of `detail`.
 
-    `.ply` keeps every number as it is; what the others round is said in their files. Those of REORDERED keep the set of
+    `.ply` keeps every number as it is; docstrings of the others give their rounding. Those of REORDERED keep the set of
     Gaussians and not their order, `.splat` neither harmonics beyond the plain colour nor `antialiased`. Raises
     LumigraphError where the ending is none of SUFFIXES, the cloud is not sound or the disk refuses.
     """

@@ -65,7 +65,7 @@ def checked(gaussians: Gaussians, subject: str, way_out: str) -> Gaussians:
     )
 
 
-DATE = (1980, 1, 1, 0, 0, 0)  # the earliest that an archive can say, so that like files have like bytes
+DATE = (1980, 1, 1, 0, 0, 0)  # the earliest of the format, constant so that equal files have equal bytes
 
 
 class Bundle:

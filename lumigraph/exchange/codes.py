@@ -9,7 +9,7 @@ from torch import Tensor
 
 from ..gaussians import Gaussians
 
-# The logit that a byte of opacity stands for. 0 and 1 have no finite one: the outer bytes mean half a step less.
+# Logit of each byte of opacity. 0 and 1 have no finite one: the outer bytes mean half a step less.
 _ALPHA = np.clip(np.arange(256) / 255, 0.5 / 255, 254.5 / 255)
 LOGITS = np.log(_ALPHA / (1 - _ALPHA)).astype(np.float32)
 OTHERS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])  # the components beside the i-th
@@ -48,7 +48,7 @@ def cloud(
 
 
 def _tensor(values: Float[np.ndarray, "*shape"]) -> Float[Tensor, "*shape"]:
-    with np.errstate(over="ignore", invalid="ignore"):  # what becomes infinite is found by whoever checks
+    with np.errstate(over="ignore", invalid="ignore"):  # infinite values are found by `checks.checked`
         return torch.from_numpy(np.array(values, np.float32, order="C"))
 
 
@@ -63,7 +63,7 @@ def alpha_to_byte(logits: Float[np.ndarray, "*shape"]) -> UInt8[np.ndarray, "*sh
 
 
 def to_scales(log_scales: Float[np.ndarray, "gaussian 3"]) -> Float[np.ndarray, "gaussian 3"]:
-    """Standard deviations, in double precision and within what float32 can say."""
+    """Standard deviations, in double precision and within the range of float32."""
     with np.errstate(over="ignore"):
         return np.exp(log_scales.astype(np.float64)).clip(MIN_SCALE, MAX_SCALE)
 
@@ -118,7 +118,7 @@ def levels(values: Float[np.ndarray, "*shape"]) -> Float[np.ndarray, " level"]:
     """256 numbers in rising order, to which `values` are to be rounded; values of fewer kinds stay what they are.
 
     The best levels lie as densely as the cube root of the values' density (Panter and Dite 1951). Between neighbours a
-    gap apart, who occur c times, that is c / gap, so (c / gap)^(1/3) gap of a level belongs there. They begin so, and
+    gap apart, with c occurrences, that is c / gap, so (c / gap)^(1/3) gap of a level belongs there. They begin so, and
     each then moves to the mean of what is nearest to it (Lloyd 1982).
     """
     values = np.sort(values.astype(np.float64), axis=None)

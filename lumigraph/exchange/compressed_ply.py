@@ -1,13 +1,13 @@
 """PlayCanvas's compressed PLY, as SuperSplat and splat-transform write it: 16 bytes per Gaussian, and 0.3 of its chunk.
 
 https://developer.playcanvas.com/user-manual/gaussian-splatting/formats/ply. Each 256 Gaussians make a chunk, which
-notes the least and the greatest position, scale and colour, and a Gaussian says in a few bits where between them it
-lies: positions and logarithms of scales in 11, 10 and 11 bits, colours in 8 each, so that half a step is 1/4094, 1/2046
+notes the least and the greatest position, scale and colour, and a Gaussian has its place between them in a few
+bits: positions and logarithms of scales in 11, 10 and 11 bits, colours in 8 each, so that half a step is 1/4094, 1/2046
 and 1/510 of the chunk's range. Opacities are within 1/510; components of a rotation other than the largest have 10 bits
 and are within 0.0007. Harmonics take 1 byte each, within 1/64 from -3.97 to 3.97, and 0 itself becomes 1/64. Scales are
 cut to exp(±20).
 
-Chunks are small where neighbours stand together, so the Gaussians are written along Morton's curve: the set of them
+Chunks are small where neighbours are together, so the Gaussians are written along Morton's curve: the set of them
 is kept, and not their order.
 """
 

@@ -2,7 +2,7 @@
 
 https://github.com/KhronosGroup/glTF/tree/main/extensions/2.0/Khronos/KHR_gaussian_splatting. A primitive of points has
 an attribute for each quantity, float32: POSITION, ROTATION (x, y, z, w), SCALE (no logarithm), OPACITY (after the
-sigmoid) and SH_DEGREE_l_COEF_n. COLOR_0, in linear light, is for programs that know points and not the extension.
+sigmoid) and SH_DEGREE_l_COEF_n. COLOR_0, in linear light, is for programs that draw points and lack the extension.
 glTF has y up and z back, so all is turned half around x.
 
 Nothing is rounded but by float32, so opacities beyond 1 - 2^-24 become 1. `antialiased`, for which the extension has no
@@ -110,15 +110,15 @@ def _matrix(file: gltf.File, node: gltf.Node) -> Float[np.ndarray, "4 4"]:
 def _bands(file: gltf.File, primitive: gltf.Primitive) -> int:
     """Number of bands of harmonics of a primitive. Raises LumigraphError if the primitive is of another kind,
     compressed or incomplete."""
-    said = primitive.extensions[EXTENSION]
-    said = said if isinstance(said, dict) else {}
-    if primitive.mode != POINTS or any(said.get(name) != value for name, value in KERNEL_PROPERTIES.items()):
-        found = f"mode {primitive.mode}, kernel {shown(said.get('kernel'))}, colours {shown(said.get('colorSpace'))}"
+    about = primitive.extensions[EXTENSION]
+    about = about if isinstance(about, dict) else {}
+    if primitive.mode != POINTS or any(about.get(name) != value for name, value in KERNEL_PROPERTIES.items()):
+        found = f"mode {primitive.mode}, kernel {shown(about.get('kernel'))}, colours {shown(about.get('colorSpace'))}"
         raise LumigraphError(
             f"{file.path} has Gaussians of another kind ({found}), where points, ellipse and srgb_rec709_display are "
             "read; export it as those"
         )
-    if inner := said.get("extensions"):
+    if inner := about.get("extensions"):
         by = ", ".join(inner) if isinstance(inner, dict) else inner
         raise LumigraphError(f"{file.path} packs its Gaussians by {shown(by)}; export it without compression")
     bands = 1 + math.isqrt(max((i for i, name in enumerate(HARMONICS) if name in primitive.attributes), default=0))

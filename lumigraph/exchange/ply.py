@@ -1,8 +1,8 @@
 """The layout in which the first release of 3-D Gaussian splatting wrote its clouds (Kerbl 2023), known to all programs.
 
-One row of float32 per Gaussian: x y z, a normal that nobody reads (zeros), f_dc_0..2, f_rest_* with all of red's
+One row of float32 per Gaussian: x y z, an unused normal (zeros), f_dc_0..2, f_rest_* with all of red's
 coefficients before green's and blue's, opacity (logit), scale_0..2 (logarithms), rot_0..3 (w, x, y, z). Nothing is
-lost. A Gaussian takes 56 + 12 K bytes, 248 at degree 3. That it is antialiased is said in two comments (`ply_header`).
+lost. A Gaussian takes 56 + 12 K bytes, 248 at degree 3. Two comments state that it is antialiased (ANTIALIASED).
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ MAX_HEADER_BYTES = 1 << 20  # bytes; headers of Gaussians have about 1500
 END = re.compile(rb"(?<=[\r\n])end_header(\r\n|\r|\n)")
 COUNT = re.compile(rb"(?<=[\r\n])(element[ \t]+[^ \t\r\n]+[ \t]+)([0-9]+)")
 
-# How programs say that opacities are meant for the filter of Mip-Splatting: Postshot and Brush, each in its way. Both
-# are written, either is understood, and the last one counts.
+# Comments of Postshot and of Brush that opacities are for the filter of Mip-Splatting. Both are written, either is
+# read, and the last one counts.
 ANTIALIASED = ["antialiased 1", "SplatRenderMode: mip"]
 
 
@@ -42,15 +42,15 @@ class Header:
 
     @property
     def antialiased(self) -> bool:
-        said = [" ".join(line.split()) for line in self.comments]
-        said = [line for line in said if re.fullmatch(r"antialiased [01]|SplatRenderMode: \w+", line)]
-        return bool(said) and said[-1] in ANTIALIASED
+        lines = [" ".join(line.split()) for line in self.comments]
+        lines = [line for line in lines if re.fullmatch(r"antialiased [01]|SplatRenderMode: \w+", line)]
+        return bool(lines) and lines[-1] in ANTIALIASED
 
 
 def read_header(path: Path) -> Header:
-    """Raises LumigraphError if the file is no PLY file, or ends before all that it promises could have come.
+    """Raises LumigraphError if the file is no PLY file, or is shorter than its header declares.
 
-    The rows of text are counted at two characters a number: what is promised beyond that cannot be there either.
+    The rows of text are counted at two characters a number: more rows than that cannot be there.
     """
     with open(path, "rb") as file:
         data = file.read(MAX_HEADER_BYTES)
@@ -62,7 +62,7 @@ def read_header(path: Path) -> Header:
         raise LumigraphError(f"{path} ends within its header; copy or download it again")
     head = data[: end.end()]
     try:
-        # plyfile understands the header of a file without rows; how many rows there should be is noted aside.
+        # plyfile parses the header with the row counts replaced by 0; the counts are kept here
         counts = [int(match[2]) for match in COUNT.finditer(head)]
         empty = plyfile.PlyData.read(io.BytesIO(COUNT.sub(rb"\g<1>0", head)))
         names = [element.name for element in empty]

@@ -159,17 +159,17 @@ def recognises(folder: Path) -> bool:
 def read(path: Path) -> Gaussians:
     """A .sog file or a folder. Raises LumigraphError where pictures are missing, cut, too small or too large."""
     bundle = Bundle(path)
-    said = from_json(bundle.read(META), f"{META} of {path}")
-    version = said.get("version", 1) if isinstance(said, dict) else None
+    fields = from_json(bundle.read(META), f"{META} of {path}")
+    version = fields.get("version", 1) if isinstance(fields, dict) else None
     if version not in (1, VERSION):
         raise LumigraphError(
             f"{path} is of version {shown(version)} of SOG, of which 1 and {VERSION} are read; save it as {VERSION}"
         )
-    return _read(bundle, said) if version == VERSION else _read_old(bundle, said)
+    return _read(bundle, fields) if version == VERSION else _read_old(bundle, fields)
 
 
-def _read(bundle: Bundle, said: Any) -> Gaussians:
-    meta = typed(Meta, said, f"{META} of {bundle.path}")
+def _read(bundle: Bundle, fields: Any) -> Gaussians:
+    meta = typed(Meta, fields, f"{META} of {bundle.path}")
     count, palette = meta.count, meta.shN
     pictures = _Pictures(bundle, count, (palette.bands + 1) ** 2 if palette else 1)
     sh0 = pictures.of(meta.sh0.files[0])
@@ -187,9 +187,9 @@ def _read(bundle: Bundle, said: Any) -> Gaussians:
     )
 
 
-def _read_old(bundle: Bundle, said: Any) -> Gaussians:
+def _read_old(bundle: Bundle, fields: Any) -> Gaussians:
     """Version 1, where a byte is a share of a range, and opacities are logits."""
-    meta = typed(OldMeta, said, f"{META} of {bundle.path}")
+    meta = typed(OldMeta, fields, f"{META} of {bundle.path}")
     count, palette = meta.means.shape[0] if meta.means.shape else 0, meta.shN
     pictures = _Pictures(bundle, count, 16 if palette else 1)
     colours = _between(pictures.of(meta.sh0.files[0]), meta.sh0.mins, meta.sh0.maxs)
@@ -284,7 +284,7 @@ def write(path: Path, gaussians: Gaussians) -> None:
 
 
 def encode(gaussians: Gaussians, ordered: bool = False) -> dict[str, bytes]:
-    """The files of version 2 by name, meta.json first. ordered: keep the order, which somebody has chosen well."""
+    """The files of version 2 by name, meta.json first. ordered: keep the order of the cloud."""
     gaussians = gaussians.to("cpu")
     if not ordered:
         gaussians = gaussians[torch.from_numpy(morton_order(array(gaussians.means)))]

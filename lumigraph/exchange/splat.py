@@ -48,7 +48,7 @@ def read(path: Path) -> Gaussians:
 
 
 def write(path: Path, gaussians: Gaussians) -> None:
-    """Raises LumigraphError for a cloud of none, which nobody could tell from a file that was lost."""
+    """Raises LumigraphError for a cloud of none, whose file would be empty."""
     if not len(gaussians):
         raise LumigraphError(f"{path} cannot hold a cloud of no Gaussians; write it as .ply")
     records = np.empty(len(gaussians), RECORD)

@@ -1,7 +1,7 @@
 """Niantic's compact format, https://github.com/nianticlabs/spz: a header and one stream of bytes per quantity.
 
 Versions 1 to 3 have gzip around all of it, version 4 a table of streams, each packed by zstd. All four are read, and 4,
-the current one, is written; pages hold 3, which unpacks where there is no zstd and says the same. Both give a rotation
+the current one, is written; pages hold 3, which unpacks where there is no zstd and is the same. Both give a rotation
 three components of 10 bits. Version 2 is within 1/255 a component, so that a half turn, whose w is near 0, can come
 back turned by 13 degrees.
 
@@ -67,7 +67,7 @@ def read(path: Path) -> Gaussians:
     data = path.read_bytes()
     stream: io.BufferedIOBase
     if data[:8] == MAGIC + struct.pack("<I", NEWEST_VERSION):
-        with _told(path):
+        with _damage_reported(path):
             return _decode_tabled(path, data)
     if data[:4] == MAGIC:  # earlier ones, before gzip
         stream = io.BytesIO(data)
@@ -75,12 +75,12 @@ def read(path: Path) -> Gaussians:
         stream = gzip.GzipFile(fileobj=io.BytesIO(data))
     else:
         raise LumigraphError(f"{path} is no .spz file, for it does not begin like one; name another one")
-    with _told(path):
+    with _damage_reported(path):
         return _decode(path, stream, MAX_DEFLATE_RATIO * len(data))
 
 
 @contextlib.contextmanager
-def _told(path: Path) -> Iterator[None]:
+def _damage_reported(path: Path) -> Iterator[None]:
     """Raise faults of unpacking as a LumigraphError of one sentence."""
     try:
         yield
@@ -89,7 +89,7 @@ def _told(path: Path) -> Iterator[None]:
 
 
 def write(path: Path, gaussians: Gaussians) -> None:
-    """Version 4. Raises LumigraphError if the cloud is wider than 24 bits can say."""
+    """Version 4. Raises LumigraphError if the cloud is too wide for 24 bits."""
     (bits, flags), streams = _streams(gaussians, str(path), HARMONICS_STEPS)
     raw = [stream.tobytes() for stream in streams if stream.shape[1]]
     packed = [zstandard.ZstdCompressor(ZSTD_LEVEL).compress(stream) for stream in raw]

@@ -36,7 +36,7 @@ from .codes import array, morton_order
 VERSION = 1
 META = "lod-meta.json"
 MIN_LEAVES_PER_FILE = 4  # leaves in a file of the finest level, at least
-EXTENT_QUANTILE = 0.9  # of Gaussians tell how long a side is; the rest may be far out
+EXTENT_QUANTILE = 0.9  # of Gaussians determine the length of a side; the rest may be far out
 MAX_LEVELS = 64
 
 Bounds = tuple[Float[np.ndarray, " 3"], Float[np.ndarray, " 3"]]

@@ -1,4 +1,4 @@
-"""The page of `lumigraph explain encodings`: two charts, a sheet of pictures, and what they say."""
+"""The page of `lumigraph explain encodings`: two charts, a sheet of pictures, and their explanation."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def header(name: str, comparison: EncodingComparison) -> str:
 
 
 def side_by_side(*charts: tuple[str, str]) -> str:
-    """Charts, each with what it says below."""
+    """Charts, each with a caption below."""
     figures = (f"<figure>{chart}<figcaption>{caption}</figcaption></figure>" for chart, caption in charts)
     return f"<div class='charts'>{''.join(figures)}</div>"
 

@@ -168,7 +168,7 @@ def curve(points: list[tuple[float, float]], x: Axis, y: Axis, kind: str) -> str
 
 
 def bar(x: Axis, y: Axis, i: int, each: RayPass) -> str:
-    """A weight, which tells its numbers on hovering."""
+    """A weight, with its numbers on hovering."""
     a, b, weight = columns(each, "weight")[i]
     return (
         f"<rect class='edge' x='{x(a):.2f}' y='{y(weight):.1f}' width='{x(b) - x(a):.2f}' "
@@ -196,10 +196,10 @@ def expected_depth(sight: Sight, x: Axis, spans: list[tuple[float, float]]) -> s
     if not math.isfinite(sight.depth):
         return ""
     at = x(sight.depth)
-    said = min(max(at, LEFT + 260), RIGHT - 70)
+    label = min(max(at, LEFT + 260), RIGHT - 70)
     return (
         f"<path class='depth' d='{''.join(f'M{at:.1f} {top - 4}V{bottom + 4}' for top, bottom in spans)}'/>"
-        f"<text class='label' x='{said:.1f}' y='{spans[0][0] - 9}' text-anchor='middle'>"
+        f"<text class='label' x='{label:.1f}' y='{spans[0][0] - 9}' text-anchor='middle'>"
         f"expected depth {sight.depth:.4g}</text>"
     )
 

@@ -31,7 +31,7 @@ from .surface import vertex_normals
 
 ALIGNMENT_BYTES = 64  # of every file's data in the archive (Usdz File Format Specification 1.3, "Layout")
 ZIP_HEADER_BYTES = 30  # bytes of a zip file's header before the name
-PADDING = b"\x19\x86"  # who an extra field belongs to; nobody reads it
+PADDING = b"\x19\x86"  # id of an extra field, which readers ignore
 PICTURE = "colours.png"
 
 # Light of its own and no other: the light of the scene is in its colours already. Phones take emission for sRGB.
@@ -178,7 +178,7 @@ Z = np.array([0.0, 0.0, 1.0])
 def write_mesh(path: Path, mesh: Mesh, up: Float[np.ndarray, " 3"] = Z) -> None:
     """Write in the format that the ending names, whole or not at all.
 
-    .ply and .obj, which have no custom of what is up, are in the frame that the mesh is in. The other two stand
+    .ply and .obj, which have no convention for up, are in the frame of the mesh. The other two are
     upright, +y up; a .glb by a node that turns the vertices, which are in the mesh's own frame there too.
 
     up: in the mesh's frame

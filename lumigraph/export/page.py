@@ -39,7 +39,7 @@ from ..method import Method
 from ..paths import Surroundings, angle_of_view, camera_path, film_size, pivot
 from ..system.progress import counting, track
 
-VIEWS, SIZE = 12, 96  # pictures that are looked at, and the longer side of each in pixels
+VIEWS, SIZE = 12, 96  # pictures for the backdrop, and the longer side of each in pixels
 MIN_OPAQUE_SHARE = 0.97  # share of them that must be opaque, or the scene's background is part of what it shows
 HORIZON_BAND = math.sin(math.radians(10))  # of the horizon, above and below
 MIN_SEEN_SHARE = 0.02  # share of pixels from which on something counts as seen
@@ -108,7 +108,7 @@ def floor(places: Float[Tensor, "point 3"], bounds: Float[Tensor, "2 3"]) -> flo
 
 
 WEB = Path(__file__).parent / "web"
-MIN_DISTANCE, MAX_DISTANCE = 0.1, 3.0  # times the first distance to what is looked at: how far zooming goes
+MIN_DISTANCE, MAX_DISTANCE = 0.1, 3.0  # limits of zooming, times the first distance to the target
 MAX_OPEN_DISTANCE = 1.5  # likewise, where the ground ends somewhere: from far outside it would be an island
 DEGREES_BELOW, DEGREES_BELOW_OPEN = 20.0, 5.0  # limit of the camera below the lowest photograph; for open scenes
 ARC_SHARE = 0.8  # of the arc that photographs cover is shown
@@ -126,7 +126,7 @@ class Opening:
     """Camera, limits and colours with which a page begins: lengths in scene units, angles in degrees.
 
     background: colour behind everything, sRGB in [0, 1]
-    position, target: where the camera stands, and what it looks at and turns about
+    position, target: of the camera, and the point that it looks at and turns about
     angle:      of view, across the window's smaller side
     near, far:  distances along the optical axis between which the scene is drawn
     nearest, farthest: distances from the target that zooming keeps to
@@ -160,7 +160,7 @@ def opening_of_scene(
     background: Vector | None = None,
     behind: Backdrop | None = None,
 ) -> Opening:
-    """An opening from where photographs were typically taken, looking at what they look at.
+    """An opening from a typical position of the photographs, in their viewing direction.
 
     cameras:    of the photographs
     background: instead of the frame's
@@ -213,7 +213,7 @@ def mesh_page(path: Path, mesh: Mesh, opening: Opening) -> None:
 
 
 def volume_page(path: Path, volume: Browsable, opening: Opening) -> None:
-    """A baked volume in the scene's frame, which a browser's graphics look at along the ray of each pixel.
+    """A baked volume in the scene's frame, which the browser marches along the ray of each pixel.
 
     Raises LumigraphError if the page would have MAX_PAGE_BYTES bytes or more.
     """

@@ -34,7 +34,7 @@ from ..paths import Surroundings
 from ..system.memory import ask_for_picture
 from ..system.progress import track
 
-PIXELS_PER_CHUNK = 1 << 18  # pixels rendered between two looks at the progress
+PIXELS_PER_CHUNK = 1 << 18  # pixels rendered between two updates of the progress bar
 BANDS = 3  # of rows, each seen by flat pictures that are pitched towards it
 COLUMNS = 8  # flat pictures around the horizon, where one place sees all
 OVERSAMPLING = 1.25  # pixels of a flat picture's middle for one of the panorama's equator
@@ -110,7 +110,7 @@ def fading(
 def flat_camera(camera: Camera, pixels: Float[Tensor, "pixel 2"]) -> tuple[Camera, Float[Tensor, "pixel 2"]]:
     """A pinhole camera that looks where some neighbouring pixels of a sphere look, and where on its picture they are.
 
-    It stands where the ray in the middle of them begins.
+    Its position is the origin of the ray in the middle of them.
     """
     assert isinstance(camera.lens, Equirectangular)
     middle = (pixels.amin(0) + pixels.amax(0))[None] / 2
@@ -157,7 +157,7 @@ def sphere_size(width: int) -> Float[Tensor, "1 2"]:
 
 
 def level_camera(place: Float[Tensor, " 3"], heading: Float[Tensor, " 3"], lens: Equirectangular) -> Camera:
-    """A camera that stands upright and faces a heading."""
+    """An upright camera that faces a heading."""
     level = torch.stack([heading[0], heading[1], torch.zeros_like(heading[0])])
     pose = look_at(place[None], level[None], torch.tensor([0.0, 0.0, 1.0]))
     return Camera(pose, lens, lens.size.long())
@@ -177,7 +177,7 @@ def standpoint(cameras: Camera, frame: Frame, source: Vector | None = None) -> t
     else:
         given = torch.tensor(source, dtype=torch.double)
         if not given.isfinite().all():
-            raise LumigraphError("Nobody can stand at a place that is not finite; give --from three numbers")
+            raise LumigraphError("A position that is not finite has no panorama; give --from three numbers")
         place = frame.to_source.inverse.points(given)
         words = "as asked"
     heading = around.axes[0] if not around.inward else around.focus - place - 1e-6 * around.axes[0]
@@ -187,7 +187,7 @@ def standpoint(cameras: Camera, frame: Frame, source: Vector | None = None) -> t
 def save_sphere(path: Path, rgb: Float[Tensor, "height width 3"], whole: bool) -> None:
     """Write a PNG or a JPEG, whole or not at all.
 
-    whole: whether this is one panorama, which then says so in its metadata (Google's GPano), so that viewers show it
+    whole: whether this is one panorama, which is declared in its metadata (Google's GPano), so that viewers show it
            as a sphere
     Raises LumigraphError for another ending.
     """
@@ -206,7 +206,7 @@ def save_sphere(path: Path, rgb: Float[Tensor, "height width 3"], whole: bool) -
 
 
 def picture_format(path: Path) -> str:
-    """Pillow's name for what an ending stands for."""
+    """Pillow's name of the format of an ending."""
     found = {".png": "PNG", ".jpg": "JPEG", ".jpeg": "JPEG"}.get(path.suffix.lower())
     if found is None:
         raise LumigraphError(f"{path} should end in .png or .jpg, the kinds of picture there are; rename it")
@@ -227,20 +227,20 @@ def gpano(width: int, height: int) -> str:
         "PosePitchDegrees": 0,
         "PoseRollDegrees": 0,
     }
-    said = "\n".join(f"   <GPano:{name}>{value}</GPano:{name}>" for name, value in numbers.items())
+    tags = "\n".join(f"   <GPano:{name}>{value}</GPano:{name}>" for name, value in numbers.items())
     return (
         '<?xpacket begin="\ufeff" id="W5M0MpCehiHzreSzNTczkc9d"?>\n'
         '<x:xmpmeta xmlns:x="adobe:ns:meta/">\n'
         ' <rdf:RDF xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#">\n'
         '  <rdf:Description rdf:about="" xmlns:GPano="http://ns.google.com/photos/1.0/panorama/">\n'
-        f"{said}\n"
+        f"{tags}\n"
         "  </rdf:Description>\n </rdf:RDF>\n</x:xmpmeta>\n"
         '<?xpacket end="r"?>'
     )
 
 
 EYE_DISTANCE_SHARE = 1 / 50  # of the distance to what is around: 64 mm in a room of some three metres
-PROBE_SIZE = 256  # pixels of the small panorama that tells distances
+PROBE_SIZE = 256  # pixels of the small panorama for distances
 MAX_SHIFT_PIXELS = 0.1  # pixels by which a flat picture may be off at its edge, at what is near
 MAX_COLUMNS = 32
 MIN_OPACITY = 0.5  # opacity from which on something is there

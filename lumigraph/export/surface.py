@@ -21,7 +21,7 @@ from torch import Tensor
 from ..system.progress import track
 
 BLOCK = 16  # corners of a block along each axis
-BLOCKS_PER_BATCH = 64  # blocks whose corners are asked about together
+BLOCKS_PER_BATCH = 64  # blocks whose corners are evaluated together
 MIN_ABS_VALUE = 0.01  # no corner's value is nearer to zero, so that no two vertices fall together
 
 Values = Callable[[Float[Tensor, "point 3"]], Float[Tensor, " point"]]
@@ -63,8 +63,8 @@ def zero_level(
 ) -> tuple[Float[np.ndarray, "vertex 3"], Int[np.ndarray, "face 3"]]:
     """Triangles where a function is zero, anticlockwise seen from where it is negative; vertices in scene units.
 
-    values:    the function, about -1 to 1; NaN where nobody knows it, and there the surface has a border
-    active:    blocks of BLOCK^3 corners to look at; each corner is looked at once
+    values:    the function, about -1 to 1; NaN where it is unknown, where the surface has a border
+    active:    blocks of BLOCK^3 corners to evaluate; each corner once
     elsewhere: value of all corners of the other blocks
     """
     held = np.full(active.shape, -1)
@@ -175,7 +175,7 @@ def larger_pieces(
     share: float,
     seen: Bool[np.ndarray, " vertex"],
 ) -> Triangles:
-    """The mesh without connected pieces whose area is less than a share of the largest one's, or that nobody sees."""
+    """The mesh without connected pieces whose area is less than a share of the largest one's, or unseen."""
     _, piece = connected_components(adjacency(len(vertices), faces), directed=False)
     areas = np.bincount(piece[faces[:, 0]], np.linalg.norm(face_normals(vertices, faces), axis=-1), piece.max() + 1)
     visible = np.bincount(piece[seen], minlength=len(areas)) > 0

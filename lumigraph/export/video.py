@@ -1,4 +1,4 @@
-"""Films, their kind said by their ending: H.264 in MP4, which plays everywhere; GIF and WebP, moving pictures."""
+"""Films, with the format of their ending: H.264 in MP4, which plays everywhere; GIF and WebP, moving pictures."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from ..system.progress import counting, track
 
 CRF = 17  # x264's constant rate factor: 0 is lossless, 18 looks it, 28 is small
 WEBP_QUALITY = 85  # of 100
-GIF_COLOURS = 255  # of a GIF; its 256th says "as before"
+GIF_COLOURS = 255  # of a GIF; its 256th means "as before"
 PALETTE_SAMPLES = 400_000  # pixels of all frames together that choose a GIF's colours
 MAX_GIF_FPS = 50  # per second, of a GIF: browsers slow quicker ones down to 10
 

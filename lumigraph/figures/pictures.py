@@ -105,7 +105,7 @@ TITLE_SIZE, SMALL_SIZE = 17, 13  # sizes of letters
 
 @dataclass(frozen=True)
 class Row:
-    """A line of a contact sheet: pictures of one size, and what to say of them all, or of each."""
+    """A line of a contact sheet: pictures of one size, and a label for all, or for each."""
 
     label: str | Sequence[str]
     pictures: Sequence[Float[Tensor, "height width 3"]]

@@ -11,8 +11,8 @@ from ..errors import LumigraphError
 from .automatic import Surroundings, camera_path, film_size
 from .keyframes import CameraPath
 
-DEFAULT_SIZE = 480  # pixels of a film, if nobody asks for more
-DEFAULT_FRAMES = 120  # of a film along a path that does not say how long it is
+DEFAULT_SIZE = 480  # pixels of a film by default
+DEFAULT_FRAMES = 120  # of a film along a path without a length
 OUTWARD_FOCUS_DISTANCE = 0.02  # scene units from an outward-looking camera to its pivot, so that it turns on the spot
 MIN_FOCUS_SHARE = 0.1  # of the typical distance to the focus: smallest distance of a pivot
 PATH_KINDS = ("orbit", "sweep", "spiral", "interpolate", "held-out")
@@ -29,7 +29,7 @@ def film_cameras(
 
     cameras: of the photographs by split, as `Run.cameras` gives them; frame: theirs
     path:   one of PATH_KINDS, or a CameraPath
-    frames: as many as the path says if None: 120, every held-out view, as long as keyframes last
+    frames: None for the default of the path: 120, every held-out view, as long as keyframes last
     size:   longer side; None as the photographs, up to a limit
     Raises LumigraphError for held-out views where there are none, or of several sizes.
     """

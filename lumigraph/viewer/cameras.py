@@ -68,8 +68,8 @@ class ViewRequest:
     exact:      whether Gaussians are rendered here rather than by the browser
     crop:       what is shown of the scene; None for all of it
     depth:      whether the browser needs depth, because it draws something beside the scene
-    settings:       names and values of the method's controls that the client has turned
-    floaters:   names and numbers of what `cleaned` is told of them; nothing if they stay
+    settings:   names and values of the method's controls that the client has turned
+    floaters:   arguments of `cleaned` for them, names and numbers; none if they stay
     """
 
     pose: tuple[tuple[float, ...], ...]

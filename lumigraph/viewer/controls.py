@@ -15,7 +15,7 @@ from .scenery import CAMERAS, POINTS
 from .serving import PAGE
 from .shared import Shared
 
-DEFAULT_RESOLUTION = 1024  # pixels along the longer side, unless the client wants another
+DEFAULT_RESOLUTION = 1024  # pixels along the longer side, at first
 CLIENT_SIDE_LINK = f'<a href="{PAGE}" target="_blank">Drawn by this browser, in a tab of its own</a>'
 MIN_DEGREES, MAX_DEGREES = 10.0, 120.0  # degrees
 

@@ -38,7 +38,7 @@ class CropPanel:
 
     changed: called when the crop or the floaters change
     keep:    saves the rest under a name and returns its path; None where nothing can be saved
-    tell:    shows the client a title and a text
+    notify:  shows the client a title and a text
     """
 
     def __init__(
@@ -47,9 +47,9 @@ class CropPanel:
         shared: Shared,
         changed: Callable[[], None],
         keep: Keep | None,
-        tell: Callable[[str, str], None],
+        notify: Callable[[str, str], None],
     ):
-        self._client, self._changed, self._keep, self._tell = client, changed, keep, tell
+        self._client, self._changed, self._keep, self._notify = client, changed, keep, notify
         self._nodes: dict[str, Any] = {}  # handles to drag, and the outline
         self._following = False  # while numbers are set from a handle
         (lower, upper), gui = shared.subject.frame.bounds, client.gui
@@ -163,12 +163,12 @@ class CropPanel:
         assert self._keep is not None
         name = self._name.value.strip()
         if not NAME.fullmatch(name):
-            self._tell("Not saved", NAME_RULE)
+            self._notify("Not saved", NAME_RULE)
             return
         try:
             where = self._keep(name, self.crop, dict(self.floaters))
         except LumigraphError as error:
-            self._tell("Not saved", str(error))
+            self._notify("Not saved", str(error))
             return
         self._about.content = f"Saved as {code(where)}"
 

@@ -63,7 +63,7 @@ class Flight:
     ) -> bool:
         """Move the camera along a path in a time, skipping frames if need be; returns whether it came to the end.
 
-        shown: told the number of each frame that is not skipped
+        shown: called with the number of each frame that is not skipped
         """
         self._number += 1
         number, begin = self._number, time.perf_counter()

@@ -30,7 +30,7 @@ from websockets.http11 import Request, Response
 from .address import Address, is_wildcard
 
 LOOPBACK = ("localhost", "127.0.0.1", "::1")
-# What pages of ours tell a browser: nobody frames them, reads them from another site, or learns their address.
+# Headers of our pages: no page may frame them, read them from another site, or get their address.
 ISOLATION_HEADERS = {
     "Content-Security-Policy": "frame-ancestors 'self'",
     "Cross-Origin-Resource-Policy": "same-origin",
@@ -59,7 +59,7 @@ class Guard:
             return "This is no address of the viewer; open the one that it printed"
         if any(origin != f"http://{hosts[0]}" for origin in origins):
             return "Another page may not use the viewer"
-        if self.token and not self.knows_token(request):
+        if self.token and not self.has_token(request):
             return "Open the address that the viewer printed, with its token"
         return None
 
@@ -75,11 +75,11 @@ class Guard:
             return False
         return name in self._names or (bool(self.token) and is_ip_address(name))
 
-    def knows_token(self, request: Request) -> bool:
-        said = parse_qs(urlsplit(request.path).query).get("token", [])
+    def has_token(self, request: Request) -> bool:
+        tokens = parse_qs(urlsplit(request.path).query).get("token", [])
         for line in request.headers.get_all("Cookie"):
-            said += cookies(line, self._cookie)
-        return any(hmac.compare_digest(one.encode(), self.token.encode()) for one in said)
+            tokens += cookies(line, self._cookie)
+        return any(hmac.compare_digest(one.encode(), self.token.encode()) for one in tokens)
 
     def answering(self, answer: Answers) -> Answers:
         """Another server's answers, for those who may have them; 403 for the rest."""
@@ -144,11 +144,11 @@ Pixels = Annotated[int, msgspec.Meta(ge=0, le=16_384)]
 Text = Annotated[str, msgspec.Meta(max_length=MAX_TEXT_LENGTH)]
 
 
-class Said(msgspec.Struct, tag_field="type", forbid_unknown_fields=True):
+class Message(msgspec.Struct, tag_field="type", forbid_unknown_fields=True):
     """A message; the name of each kind below is viser's."""
 
 
-class ViewerCameraMessage(Said, tag=True):
+class ViewerCameraMessage(Message, tag=True):
     wxyz: Quaternion
     position: Triple
     fov: Annotated[float, msgspec.Meta(gt=0, lt=math.pi)]
@@ -160,12 +160,12 @@ class ViewerCameraMessage(Said, tag=True):
     up_direction: Triple
 
 
-class GuiUpdateMessage(Said, tag=True):
+class GuiUpdateMessage(Message, tag=True):
     uuid: Text
     updates: dict[Literal["value"], Any]
 
 
-class SceneNodeClickMessage(Said, tag=True):
+class SceneNodeClickMessage(Message, tag=True):
     name: Text
     instance_index: Annotated[int, msgspec.Meta(ge=0, le=1 << 31)] | None
     ray_origin: Triple
@@ -175,19 +175,19 @@ class SceneNodeClickMessage(Said, tag=True):
     owner: Text = ""
 
 
-class TransformControlsUpdateMessage(Said, tag=True):
+class TransformControlsUpdateMessage(Message, tag=True):
     name: Text
     wxyz: Quaternion
     position: Triple
     owner: Text = ""
 
 
-class TransformControlsDragStartMessage(Said, tag=True):
+class TransformControlsDragStartMessage(Message, tag=True):
     name: Text
     owner: Text = ""
 
 
-class TransformControlsDragEndMessage(Said, tag=True):
+class TransformControlsDragEndMessage(Message, tag=True):
     name: Text
     owner: Text = ""
 
@@ -203,27 +203,27 @@ DECODER = msgspec.msgpack.Decoder(
 
 
 def understood(frame: bytes | str, handle: Callable[[str], Any]) -> bytes | None:
-    """A message as viser may have it; None for what our page does not say.
+    """A message as viser may have it; None for messages that our page does not send.
 
     handle: viser's handle of a part of a panel by its number, None where there is none
     """
     if not isinstance(frame, bytes):
         return None
     try:
-        said = DECODER.decode(frame)
+        message = DECODER.decode(frame)
     except (msgspec.MsgspecError, ValueError, RecursionError):
         return None
-    if not is_finite(msgspec.structs.astuple(said)):
+    if not is_finite(msgspec.structs.astuple(message)):
         return None
-    if isinstance(said, GuiUpdateMessage):
-        part = handle(said.uuid)
-        if part is None or not fits(part, said.updates.get("value")):
+    if isinstance(message, GuiUpdateMessage):
+        part = handle(message.uuid)
+        if part is None or not fits(part, message.updates.get("value")):
             return None
-    elif isinstance(said, (ViewerCameraMessage, TransformControlsUpdateMessage)) and not (
-        abs(math.hypot(*said.wxyz) - 1) < 1e-2
+    elif isinstance(message, (ViewerCameraMessage, TransformControlsUpdateMessage)) and not (
+        abs(math.hypot(*message.wxyz) - 1) < 1e-2
     ):
         return None
-    return msgspec.msgpack.encode(said)
+    return msgspec.msgpack.encode(message)
 
 
 def is_finite(value: Any) -> bool:

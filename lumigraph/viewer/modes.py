@@ -64,7 +64,7 @@ def along_axis(rendering: Rendering, camera: Camera) -> Float[Tensor, "height wi
     return rendering.depth * (directions @ camera.forward[0]).view(rendering.depth.shape)
 
 
-# Twenty colours that are told apart easily; labels beyond begin again at the first.
+# Twenty distinct colours; labels beyond begin again at the first.
 PALETTE = (
     *("e6194b", "3cb44b", "ffe119", "4363d8", "f58231", "911eb4", "46f0f0", "f032e6", "bcf60c", "fabebe"),
     *("008080", "e6beff", "9a6324", "fffac8", "800000", "aaffc3", "808000", "ffd8b1", "000075", "a9a9a9"),

@@ -40,7 +40,7 @@ class Stop:
 
 
 class PathPanel:
-    """The keyframes of one client. tell: shows the client a title and a text."""
+    """The keyframes of one client. notify: shows the client a title and a text."""
 
     def __init__(
         self,
@@ -48,10 +48,10 @@ class PathPanel:
         shared: Shared,
         flight: Flight,
         controls: MethodControls,
-        tell: Callable[[str, str], None],
+        notify: Callable[[str, str], None],
     ):
         self._client, self._subject, self._size = client, shared.subject, shared.scenery.size
-        self._flight, self._controls, self._tell = flight, controls, tell
+        self._flight, self._controls, self._notify = flight, controls, notify
         self._stops: list[Stop] = []
         self._nodes: list[Any] = []
         self._filling = False  # while what the panel shows is set from here
@@ -150,7 +150,7 @@ class PathPanel:
         try:
             path = self.path()
         except LumigraphError as error:
-            self._tell("Nothing to play", str(error))
+            self._notify("Nothing to play", str(error))
             return
         seconds = max(path.duration, 0.1)
         poses, angles, moments = self._views(path, max(2, round(30 * seconds)))
@@ -233,13 +233,13 @@ class PathPanel:
     def _save(self) -> None:
         name = self._name.value.strip()
         if not NAME.fullmatch(name):
-            self._tell("Not saved", NAME_RULE)
+            self._notify("Not saved", NAME_RULE)
             return
         file = self._subject.paths / f"{name}.json"
         try:
             self.path().save(file)
         except LumigraphError as error:
-            self._tell("Not saved", str(error))
+            self._notify("Not saved", str(error))
             return
         self._saved.options = self._names()
         self._saved.value = name
@@ -247,13 +247,13 @@ class PathPanel:
 
     def _open(self) -> None:
         self._saved.options, name = self._names(), self._saved.value
-        if name == NONE or name not in self._saved.options:  # a browser may say anything
-            self._tell("Nothing to open", f"No such path lies in {self._subject.paths}")
+        if name == NONE or name not in self._saved.options:  # a browser may send any name
+            self._notify("Nothing to open", f"No such path lies in {self._subject.paths}")
             return
         try:
             path = CameraPath.load(self._subject.paths / f"{name}.json")
         except LumigraphError as error:  # the keyframes that are set stay as they are
-            self._tell("Not opened", str(error))
+            self._notify("Not opened", str(error))
             return
         times = [key.seconds for key in path.keyframes]
         legs = [b - a for a, b in zip(times, times[1:], strict=False)]

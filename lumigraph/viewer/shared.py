@@ -26,7 +26,7 @@ from .cameras import ViewRequest
 from .scenery import Scenery
 from .turns import Turns
 
-NAME = re.compile(r"\w[\w .-]{0,80}")  # of what somebody saves
+NAME = re.compile(r"\w[\w .-]{0,80}")  # of a saved file or folder
 NAME_RULE = "A name is made of letters, digits, spaces, dots and dashes"
 Keep = Callable[[str, Crop | None, Mapping[str, float]], str]
 
@@ -41,7 +41,7 @@ class Subject:
     render_command: command line that renders films of the scene, without `--path`
     open_scene:     opens the photographs, for thumbnails and sparse points; None if there are none
     rows:           of metrics.jsonl, as far as the method has been trained
-    keep:           saves what a crop and cleaning leave of the cloud under a name, and says where; None where nothing
+    keep:           saves the cropped and cleaned cloud under a name, and returns its path; None where nothing
                     can be saved
     page:           makes a page (HTML) that draws the scene in the browser; None where only we can render it
     """
@@ -92,10 +92,10 @@ class Shared:
     scenery: Scenery
     step: int = 0
     stopped: bool = False
-    _picked: tuple[Any, Gaussians] | None = None  # what was wanted last of part of the cloud, and that part
+    _picked: tuple[Any, Gaussians] | None = None  # the last part of the cloud, after the settings that it depends on
 
     def cloud(self, request: ViewRequest) -> Gaussians:
-        """The Gaussians of the method as a client told it, of which its crop and cleaning leave these. Raises
+        """Gaussians of the method with the controls, crop and cleaning of a client. Raises
         LumigraphError if it has none. Call it inside `turns.turn`."""
         if not request.part:
             return needs(self._given(request), HasGaussians).gaussians()
@@ -118,7 +118,7 @@ class Shared:
     def _given(self, request: ViewRequest) -> Method:
         return self.method.given(**dict(request.settings)) if request.settings else self.method
 
-    def knows(self, client: Any) -> bool:
+    def connected(self, client: Any) -> bool:
         """True if a client is still connected."""
         return not self.stopped and client.client_id in self.server.get_clients()
 
@@ -163,17 +163,19 @@ def kept(values: Shaped[Tensor, "*all"], where: Bool[Tensor, "*pixels"]) -> Shap
 def from_entry(method: RayMethod, rays: Rays, crop: Crop) -> Rendering:
     """Rendering along rays from their entry into a crop; depth is measured from their origins."""
     enter, hits = crop.entered(rays)
-    asked = hits.clone()
-    asked[0] = True  # so that a picture beside the crop has the method's extras too
-    begin = torch.where(hits, enter - method.frame.near, 0).clamp_min(0)[asked]  # no method looks nearer than near
-    moved = replace(rays[asked], origins=rays[asked].at(begin))
+    chosen = hits.clone()
+    chosen[0] = True  # so that a picture beside the crop has the method's extras too
+    begin = torch.where(hits, enter - method.frame.near, 0).clamp_min(0)[
+        chosen
+    ]  # methods take no samples nearer than near
+    moved = replace(rays[chosen], origins=rays[chosen].at(begin))
     background = torch.tensor(method.frame.background)
     behind = background.to(method.device)[None]
     chunks = [slice(i, i + method.rays_per_chunk) for i in range(0, len(moved), method.rays_per_chunk)]
     seen = Rendering.cat([method.render_rays(moved[c].to(method.device), behind).cpu() for c in chunks])
 
     def spread(values: Tensor) -> Tensor:
-        return kept(values.new_zeros(len(rays), *values.shape[1:]).index_put((asked,), values), hits)
+        return kept(values.new_zeros(len(rays), *values.shape[1:]).index_put((chosen,), values), hits)
 
     return Rendering(
         torch.where(hits[:, None], spread(seen.rgb), background),

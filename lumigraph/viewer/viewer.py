@@ -24,7 +24,7 @@ from .visitor import Visitor
 NARROW_WINDOW_PIXELS = 576  # pixels: viser's panel is a sheet at the bottom of windows up to this width
 
 # A click on the sheet's handle folds it; what is clicked is the text of the title, inside the handle. The mark keeps it
-# from folding again when somebody opens it, for that makes the picture anew.
+# from folding again when a user opens it, which makes the picture anew.
 SCRIPT = """
 document.title = {title};
 const sheet = this.closest(".mantine-Paper-root");
@@ -112,7 +112,7 @@ class Viewer:
         if self._panel is not None:
             self._panel.end()
         for visitor in self._everyone():
-            visitor.painter.ask()
+            visitor.painter.request()
 
     # Coming and going
 
@@ -145,7 +145,7 @@ class Viewer:
             visitor = Visitor(self._shared, client)
         with self._lock:
             self._visitors[client.client_id] = visitor
-        if not self._shared.knows(client):  # it left while its panel was being made
+        if not self._shared.connected(client):  # it left while its panel was being made
             self._farewell(client)
 
     def _farewell(self, client: Any) -> None:
@@ -163,6 +163,6 @@ class Viewer:
     def _filled(self, fault: str | None) -> None:
         for visitor in self._everyone():
             if fault is not None:
-                visitor.tell("Without photographs", fault)
+                visitor.notify("Without photographs", fault)
             elif self._scenery.has_points:
                 visitor.controls.offer_points()

@@ -55,13 +55,13 @@ class Visitor:
         self._eye = torch.zeros(3)  # towards which their colours are
         self._flat: Vector | None = None  # the background behind splats
         self._hidden: dict[str, Any] = {}  # frusta that are too near to the eye, and what hides each
-        self.painter = Painter(self._draw, shared.turns, self._tell_fault, lambda: shared.step)
+        self.painter = Painter(self._draw, shared.turns, self._report_fault, lambda: shared.step)
         self.flight = Flight(client)
-        self.controls = Controls(client, shared, self.painter.ask)
-        self.method_controls = MethodControls(client, shared, self.painter.ask)
+        self.controls = Controls(client, shared, self.painter.request)
+        self.method_controls = MethodControls(client, shared, self.painter.request)
         keep = self._keep if shared.is_cloud and shared.subject.keep is not None else None
-        self.crop = CropPanel(client, shared, self.painter.ask, keep, self.tell)
-        self.path = PathPanel(client, shared, self.flight, self.method_controls, self.tell)
+        self.crop = CropPanel(client, shared, self.painter.request, keep, self.notify)
+        self.path = PathPanel(client, shared, self.flight, self.method_controls, self.notify)
         self._seen: tuple[Any, ...] = ()
         client.camera.on_update(self._moved)
         first = shared.subject.first
@@ -71,14 +71,14 @@ class Visitor:
         self.controls.show_angle(angle)  # the client's camera may still have the angle from before this
         if shared.scenery.has_points:
             self.controls.offer_points()
-        self.painter.ask()
+        self.painter.request()
         self.painter.start()
 
     def stop(self) -> None:
         self.flight.stop()
         self.painter.stop()
 
-    def tell(self, title: str, text: str = "") -> None:
+    def notify(self, title: str, text: str = "") -> None:
         """Show the client a notification."""
         if self._here:
             self._client.add_notification(title, text, auto_close_seconds=8.0)
@@ -96,18 +96,18 @@ class Visitor:
 
     @property
     def _here(self) -> bool:
-        return self._shared.knows(self._client)
+        return self._shared.connected(self._client)
 
     async def _moved(self, camera: Any) -> None:
-        """Ask for a picture from the camera's new place. It runs in the server's thread, so it must be quick."""
+        """Request a picture from the camera's new position. It runs in the server's thread, so it must be quick."""
         seen = *camera.wxyz, *camera.position, camera.fov, camera.image_width, camera.image_height
         if seen != self._seen:
             self._seen = seen
             self.controls.show_angle(camera.fov)
-            self.painter.ask()
+            self.painter.request()
 
     def request(self) -> ViewRequest:
-        """The view that the client asks for now."""
+        """The current view of the client."""
         camera, controls = self._client.camera, self.controls
         return ViewRequest(
             pose_of(camera.wxyz, camera.position),
@@ -229,12 +229,12 @@ class Visitor:
         if text != self._said and self._here:
             self._said = self.controls.status.content = text
 
-    def _tell_fault(self, error: Exception) -> None:
+    def _report_fault(self, error: Exception) -> None:
         text = str(error) if isinstance(error, LumigraphError) else f"{type(error).__name__}: {error}"
         print(f"lumigraph: a client's picture failed: {' '.join(text.split())}", file=sys.stderr, flush=True)
         if os.environ.get("LUMIGRAPH_DEBUG"):
             traceback.print_exception(error)
-        self.tell("This could not be drawn", text)
+        self.notify("This could not be drawn", text)
 
 
 # The browser's covariances are half-precision numbers: in units this much smaller, what is fine keeps its shape.

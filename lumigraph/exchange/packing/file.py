@@ -101,7 +101,7 @@ def write(tensors: dict[str, Tensor | Table]) -> bytes:
 
 
 def read(data: bytes, path: Path) -> dict[str, Tensor]:
-    """The tensors. path: what to name in a LumigraphError, for a file that is damaged or promises too much."""
+    """The tensors. path: named in the LumigraphError for a damaged file or one that declares too much."""
     magic, length = HEAD.unpack(data[: HEAD.size]) if len(data) >= HEAD.size else (b"", 0)
     if magic != MAGIC or HEAD.size + length > len(data):
         raise LumigraphError(f"{path} holds no packed tensors; restore it from a copy")
@@ -119,8 +119,10 @@ def read(data: bytes, path: Path) -> dict[str, Tensor]:
 
 def check_sizes(head: Head, there: int, path: Path) -> None:
     """Raise LumigraphError for streams that are not there, and for tensors that memory would not hold."""
-    if (said := sum(stream.bytes for stream in head.streams)) != there:
-        raise LumigraphError(f"{path} declares {said:,} bytes of tensors and holds {there:,}; restore it from a copy")
+    if (declared := sum(stream.bytes for stream in head.streams)) != there:
+        raise LumigraphError(
+            f"{path} declares {declared:,} bytes of tensors and holds {there:,}; restore it from a copy"
+        )
     sizes = [math.prod(entry.shape) * np.dtype(entry.dtype).itemsize for entry in head.tensors.values()]
     needed, free = UNPACKING_FACTOR * (sum(sizes) + sum(stream.size for stream in head.streams)), free_memory()
     if needed > free:

@@ -14,7 +14,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-MAX_TRAINING_ROWS = 1 << 17  # rows at most; each then counts as much as its weight says
+MAX_TRAINING_ROWS = 1 << 17  # rows at most; each then counts by its weight
 PASSES = 8  # over them; the error falls by less than 1 % in any further one
 CHUNK_ROWS = 1 << 13  # rows whose distances to the whole codebook are held at once, fewer if it is long
 MAX_DISTANCES = 1 << 26  # distances that are held at once

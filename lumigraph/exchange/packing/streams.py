@@ -1,4 +1,4 @@
-"""Streams: arrays of few kinds, entropy-coded with zstandard, and taken out again no larger than they said."""
+"""Streams: arrays of few kinds, entropy-coded with zstandard, and unpacked to the declared size at most."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def kind_of(array: Shaped[np.ndarray, "*shape"]) -> Number:
 
 
 def unpacked(stream: Stream, data: bytes) -> Shaped[np.ndarray, "*shape"]:
-    """The inverse. Raises ValueError, EOFError or ZstdError for what is not as the stream says."""
+    """The inverse. Raises ValueError, EOFError or ZstdError for data that contradicts the stream's declaration."""
     if stream.size > MAX_ZSTD_RATIO * max(len(data), 1):
         raise ValueError(f"{len(data)} bytes cannot hold {stream.size:,}")
     reader = zstandard.ZstdDecompressor().stream_reader(data)
@@ -75,7 +75,7 @@ def unpacked(stream: Stream, data: bytes) -> Shaped[np.ndarray, "*shape"]:
 
 
 def take(stream: Any, size: int) -> bytes:
-    """Exactly `size` bytes, in pieces, so that memory grows with what is there and not with what is promised."""
+    """Exactly `size` bytes, in pieces, so that memory grows with the data and not with the declared size."""
     pieces = []
     while size:
         piece = stream.read(min(size, CHUNK_BYTES))
@@ -87,7 +87,7 @@ def take(stream: Any, size: int) -> bytes:
 
 
 def _bytes(array: Shaped[np.ndarray, "*shape"]) -> bytes:
-    """Column by column, and of each number the first bytes, then the second ones: like stands beside like."""
+    """Column by column, and of each number the first bytes, then the second ones: similar bytes are together."""
     if array.dtype == bool:
         return np.packbits(array).tobytes()
     columns = np.ascontiguousarray(array.reshape(array.shape[0] if array.ndim else 1, -1).T) if array.size else array

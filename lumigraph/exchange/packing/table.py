@@ -38,7 +38,7 @@ class Stored:
     fill: float = 0.0
 
 
-MIN_ROWS_PER_CODE = 8  # rows for each code; with fewer a codebook would be no smaller than what it stands for
+MIN_ROWS_PER_CODE = 8  # rows for each code; with fewer a codebook would be no smaller than its rows
 MIN_BITS = 2
 
 
@@ -120,7 +120,7 @@ def packed(
     weights: Float[Tensor, " row"] | None,
     generator: torch.Generator,
 ) -> Table:
-    """A tensor in the form that its method says. weights: importance of each of its rows; None where all are alike"""
+    """A tensor in the form that its method declares. weights: importance of each of its rows; None if equal"""
     shape, bits = tuple(tensor.shape), max(how.bits - recipe.coarser, MIN_BITS)
     if how.how == "nothing":
         return Table(shape, how.layout, how.fill, None, dtype=kind_of(tensor.detach().cpu().numpy()))
