@@ -193,6 +193,5 @@ def parse(arguments: list[str]) -> Any:
         about = tyro.conf.subcommand(name, description=None if name == first else first_sentence)
         kinds.append(Annotated[kind, about])
     union: Any = functools.reduce(operator.or_, kinds)
-    return held(
-        tyro.cli(union, prog="lumigraph", description=DESCRIPTION, args=arguments or ["--help"], registry=RULES)
-    )
+    arguments = arguments or ["--help"]
+    return held(tyro.cli(union, prog="lumigraph", description=DESCRIPTION, args=arguments, registry=RULES))

@@ -18,7 +18,8 @@ from .options import DeviceOption, PhotographsOption, SeedOption, StepsOption, n
 
 DEFAULT_SECONDS = 30.0
 TABLE_WIDTH = 4096  # letters; a table cuts its lines where the console ends
-ABOUT = " A conversion from a field trains for half of these steps."
+ABOUT = about_quality() + " A conversion from a field trains for half of these steps."
+QUALITY = option("draft|good|best", "as long as --seconds", ABOUT)
 
 
 @dataclass(frozen=True)
@@ -42,9 +43,7 @@ class Convert:
     seconds: Annotated[Seconds | None, option("S", f"{DEFAULT_SECONDS:.0f}")] = None
     """Training time in seconds after initialisation; longer improves the new method."""
     steps: StepsOption = None
-    quality: Annotated[Quality | None, option("draft|good|best", "as long as --seconds", about_quality() + ABOUT)] = (
-        None
-    )
+    quality: Annotated[Quality | None, QUALITY] = None
     distil: bool = False
     """Train on renderings of the old method, even if photographs are available."""
     scene: PhotographsOption = None

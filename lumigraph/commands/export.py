@@ -47,8 +47,7 @@ class ExportMesh:
     smooth: Annotated[int, between(0, 1000), option("N")] = 10
     """Rounds of smoothing; more round off detail, 0 is none."""
     faces: Annotated[
-        Annotated[int, between(4, 1_000_000_000)] | None,
-        option("N", f"all, for phones {FOR_PHONES:,}"),
+        Annotated[int, between(4, 1_000_000_000)] | None, option("N", f"all, for phones {FOR_PHONES:,}")
     ] = None
     """Number of triangles after simplification; fewer make a smaller file."""
     keep: Annotated[Share, option("SHARE")] = 0.01

@@ -93,17 +93,14 @@ class Bundle:
         try:
             about = self._archive.getinfo(name)
             if about.file_size > max(SMALL_BYTES, MAX_RATIO * self.size):
-                raise LumigraphError(
-                    f"{self.path}: {shown(name)} would unpack to {about.file_size:,} bytes; get it anew"
-                )
+                size = f"{about.file_size:,} bytes"
+                raise LumigraphError(f"{self.path}: {shown(name)} would unpack to {size}; download it again")
             with self._archive.open(about) as stream:
                 return stream.read(about.file_size)  # no more, whatever is there
         except KeyError as fault:
             raise LumigraphError(f"{self.path} lacks the file {shown(name)}; copy or download it again") from fault
         except (zipfile.BadZipFile, zlib.error, EOFError, ValueError, NotImplementedError, RuntimeError) as fault:
-            raise LumigraphError(
-                f"{self.path}: {shown(name)} is damaged ({fault}); copy or download it again"
-            ) from fault
+            raise LumigraphError(f"{self.path}: {shown(name)} is damaged ({fault}); download it again") from fault
 
 
 def zipped(files: dict[str, bytes]) -> bytes:

@@ -9,6 +9,10 @@ from torch import Tensor
 
 from ..gaussians import Gaussians
 
+# One row for each Gaussian
+Vectors, Quaternions = Float[np.ndarray, "gaussian 3"], Float[np.ndarray, "gaussian 4"]
+Integers = Int[np.ndarray, " gaussian"]
+
 # Logit of each byte of opacity. 0 and 1 have no finite one: the outer bytes mean half a step less.
 _ALPHA = np.clip(np.arange(256) / 255, 0.5 / 255, 254.5 / 255)
 LOGITS = np.log(_ALPHA / (1 - _ALPHA)).astype(np.float32)
@@ -34,22 +38,18 @@ def array(tensor: Float[Tensor, "*shape"]) -> Float[np.ndarray, "*shape"]:
 
 
 def cloud(
-    means: Float[np.ndarray, "gaussian 3"],
-    quaternions: Float[np.ndarray, "gaussian 4"],
-    log_scales: Float[np.ndarray, "gaussian 3"],
+    means: Vectors,
+    quaternions: Quaternions,
+    log_scales: Vectors,
     opacities: Float[np.ndarray, " gaussian"],
     harmonics: Float[np.ndarray, "gaussian coefficient 3"],
     antialiased: bool = False,
 ) -> Gaussians:
     """Gaussians of arrays, in float32 and in memory of their own."""
-    return Gaussians(
-        _tensor(means), _tensor(quaternions), _tensor(log_scales), _tensor(opacities), _tensor(harmonics), antialiased
-    )
-
-
-def _tensor(values: Float[np.ndarray, "*shape"]) -> Float[Tensor, "*shape"]:
+    arrays = means, quaternions, log_scales, opacities, harmonics
     with np.errstate(over="ignore", invalid="ignore"):  # infinite values are found by `checks.checked`
-        return torch.from_numpy(np.array(values, np.float32, order="C"))
+        tensors = [torch.from_numpy(np.array(values, np.float32, order="C")) for values in arrays]
+    return Gaussians(*tensors, antialiased)
 
 
 def to_byte(x: Float[np.ndarray, "*shape"]) -> UInt8[np.ndarray, "*shape"]:
@@ -62,27 +62,25 @@ def alpha_to_byte(logits: Float[np.ndarray, "*shape"]) -> UInt8[np.ndarray, "*sh
     return to_byte(127.5 * (1 + np.tanh(logits / 2)))
 
 
-def to_scales(log_scales: Float[np.ndarray, "gaussian 3"]) -> Float[np.ndarray, "gaussian 3"]:
+def to_scales(log_scales: Vectors) -> Vectors:
     """Standard deviations, in double precision and within the range of float32."""
     with np.errstate(over="ignore"):
         return np.exp(log_scales.astype(np.float64)).clip(MIN_SCALE, MAX_SCALE)
 
 
-def from_scales(scales: Float[np.ndarray, "gaussian 3"]) -> Float[np.ndarray, "gaussian 3"]:
+def from_scales(scales: Vectors) -> Vectors:
     """Their logarithms: of 0 that of the least, and of negative ones none, which is found later."""
     with np.errstate(invalid="ignore"):
         return np.log(np.where(scales == 0, MIN_SCALE, scales.astype(np.float64)))
 
 
-def unit(quaternions: Float[np.ndarray, "gaussian 4"]) -> Float[np.ndarray, "gaussian 4"]:
+def unit(quaternions: Quaternions) -> Quaternions:
     """Quaternions of length 1, in double precision, which does not overflow for float32 input."""
     quaternions = quaternions.astype(np.float64)
     return quaternions / np.linalg.norm(quaternions, axis=-1, keepdims=True)
 
 
-def without_largest(
-    quaternions: Float[np.ndarray, "gaussian 4"],
-) -> tuple[Int[np.ndarray, " gaussian"], Float[np.ndarray, "gaussian 3"]]:
+def without_largest(quaternions: Quaternions) -> tuple[Integers, Vectors]:
     """Index of the largest component, and the other three, at most sqrt(1/2), signed to make the largest positive."""
     quaternions = unit(quaternions)
     largest = np.abs(quaternions).argmax(-1)
@@ -90,9 +88,7 @@ def without_largest(
     return largest, sign * np.take_along_axis(quaternions, OTHERS[largest], -1)
 
 
-def with_largest(
-    largest: Int[np.ndarray, " gaussian"], rest: Float[np.ndarray, "gaussian 3"]
-) -> Float[np.ndarray, "gaussian 4"]:
+def with_largest(largest: Integers, rest: Vectors) -> Quaternions:
     """The inverse: the length of 1 gives the fourth component."""
     quaternions = np.empty((len(rest), 4))
     np.put_along_axis(quaternions, OTHERS[largest], rest, -1)

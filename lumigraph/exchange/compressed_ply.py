@@ -19,13 +19,25 @@ from pathlib import Path
 import numpy as np
 import plyfile
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
 from ..errors import LumigraphError
 from ..gaussians import Gaussians
 from ..kernels.spherical_harmonics import K00
 from .checks import check_room
-from .codes import LOGITS, alpha_to_byte, array, cloud, morton_order, to_byte, with_largest, without_largest
+from .codes import (
+    LOGITS,
+    Integers,
+    Quaternions,
+    Vectors,
+    alpha_to_byte,
+    array,
+    cloud,
+    morton_order,
+    to_byte,
+    with_largest,
+    without_largest,
+)
 from .ply import Header, by_channel, by_coefficient, columns, read_header, read_rows, rest_names, save
 
 CHUNK = 256
@@ -113,29 +125,27 @@ def write(path: Path, gaussians: Gaussians) -> None:
     save(path, elements, gaussians.antialiased)
 
 
-def _between(
-    share: Float[np.ndarray, "gaussian 3"], low: Float[np.ndarray, "gaussian 3"], high: Float[np.ndarray, "gaussian 3"]
-) -> Float[np.ndarray, "gaussian 3"]:
+def _between(share: Vectors, low: Vectors, high: Vectors) -> Vectors:
     return low * (1 - share) + high * share
 
 
-def _pack(share: Float[np.ndarray, "gaussian 3"]) -> Int[np.ndarray, " gaussian"]:
+def _pack(share: Vectors) -> Integers:
     """Shares of [0, 1] in 11, 10 and 11 bits."""
     return (np.rint(share * STEPS).astype(np.int64) << SHIFTS).sum(-1)
 
 
-def _unpack(code: Int[np.ndarray, " gaussian"]) -> Float[np.ndarray, "gaussian 3"]:
+def _unpack(code: Integers) -> Vectors:
     return (code[:, None] >> SHIFTS & STEPS) / STEPS
 
 
-def _smallest_three(quaternions: Float[np.ndarray, "gaussian 4"]) -> Int[np.ndarray, " gaussian"]:
+def _smallest_three(quaternions: Quaternions) -> Integers:
     """2 bits name the largest of w, x, y, z; the others, within ±sqrt(1/2), have 10 bits each."""
     largest, rest = without_largest(quaternions)
     parts = np.rint(1023 * (rest * math.sqrt(0.5) + 0.5)).clip(0, 1023).astype(np.int64)
     return largest << 30 | (parts << np.array([20, 10, 0])).sum(-1)
 
 
-def _from_smallest_three(code: Int[np.ndarray, " gaussian"]) -> Float[np.ndarray, "gaussian 4"]:
+def _from_smallest_three(code: Integers) -> Quaternions:
     parts = code[:, None] >> np.array([20, 10, 0]) & 1023
     return with_largest(code >> 30, (parts / 1023 - 0.5) / math.sqrt(0.5))
 

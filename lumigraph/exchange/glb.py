@@ -133,9 +133,7 @@ def _count(file: gltf.File, primitive: gltf.Primitive) -> int:
     names = ["POSITION", ROTATION, SCALE, OPACITY, *(name for name in HARMONICS if name in primitive.attributes)]
     counts = {file.accessor(primitive.attributes[name]).count for name in names}
     if len(counts) > 1:
-        raise LumigraphError(
-            f"{file.path} has attributes of {sorted(counts)} rows where all are alike; export it again"
-        )
+        raise LumigraphError(f"{file.path} has attributes of {sorted(counts)} rows, not equally many; export it again")
     return counts.pop()
 
 

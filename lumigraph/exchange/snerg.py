@@ -105,7 +105,7 @@ class Params:
             or to_scene[:3, 3].any()
         ):
             raise LumigraphError(
-                "What is contracted fills the cube of [-2, 2]^3, and its grid does not; export it anew"
+                "A contracted scene fills the cube of [-2, 2]^3, and its grid does not; export it anew"
             )
         turn = to_scene[:3, :3]
         if sorted(np.abs(turn).ravel()) != [0] * 6 + [1] * 3 or np.linalg.det(turn) < 0:
@@ -262,9 +262,8 @@ def read(folder: Path) -> Atlas:
 def read_indices(bundle: Bundle, about: Params) -> np.ndarray:
     """Each block's number in the atlas, -1 where nothing is."""
     gx, gy, gz = about.grid_blocks
-    places = (
-        picture(bundle, INDICES, (gx, gz * gy), "RGB").reshape(gz, gy, gx, 3).transpose(2, 1, 0, 3).astype(np.int64)
-    )
+    places = picture(bundle, INDICES, (gx, gz * gy), "RGB").reshape(gz, gy, gx, 3)
+    places = places.transpose(2, 1, 0, 3).astype(np.int64)
     there = (places != EMPTY_INDEX).all(-1)
     if (places[there] >= np.array(about.atlas_blocks)).any():
         raise LumigraphError(f"{INDICES} of {bundle.path} names blocks beyond the atlas; copy the whole folder again")

@@ -36,6 +36,8 @@ from ..gaussians import Gaussians
 from .checks import Bundle, check_room, zipped
 from .codes import (
     LOGITS,
+    Quaternions,
+    Vectors,
     alpha_to_byte,
     array,
     cloud,
@@ -230,29 +232,27 @@ class _Pictures:
             with Image.open(io.BytesIO(data), formats=FORMATS) as image:
                 pixels = image.width * image.height
                 if pixels < least:
-                    raise LumigraphError(
-                        f"{path}: {shown(name)} has {pixels:,} pixels where {least:,} are needed; get it again"
-                    )
+                    found = f"{shown(name)} has {pixels:,} pixels where {least:,} are needed"
+                    raise LumigraphError(f"{path}: {found}; get it again")
                 check_room(path, self.count, self.harmonics, self.bundle.size, 4 * pixels)
                 return np.asarray(image.convert("RGBA"))
         except (OSError, ValueError, SyntaxError, EOFError, Image.DecompressionBombError) as fault:
             why = "it does not begin like one" if isinstance(fault, UnidentifiedImageError) else fault
             raise LumigraphError(f"{path}: {shown(name)} cannot be read as a picture ({why}); get it again") from fault
 
-    def means(self, about: Means) -> Float[np.ndarray, "gaussian 3"]:
+    def means(self, about: Means) -> Vectors:
         low, high = (self.of(name)[:, :3].astype(np.int64) for name in about.files)
         shares = (high << 8 | low) / 65535
         folded = np.array(about.mins) + shares * (np.array(about.maxs) - np.array(about.mins))
         with np.errstate(over="ignore"):  # infinite positions are found later
             return np.sign(folded) * np.expm1(np.abs(folded))
 
-    def rotations(self, name: str) -> Float[np.ndarray, "gaussian 4"]:
+    def rotations(self, name: str) -> Quaternions:
         pixels = self.of(name)
         if (pixels[:, 3] < LARGEST_COMPONENT_ALPHA).any():
             raise LumigraphError(f"{self.bundle.path}: {shown(name)} has pixels that are no rotations; export it again")
-        return with_largest(
-            pixels[:, 3].astype(np.int64) - LARGEST_COMPONENT_ALPHA, (pixels[:, :3] / 255 - 0.5) * math.sqrt(2)
-        )
+        largest = pixels[:, 3].astype(np.int64) - LARGEST_COMPONENT_ALPHA
+        return with_largest(largest, (pixels[:, :3] / 255 - 0.5) * math.sqrt(2))
 
     def palette(
         self, files: tuple[str, str], count: int | None = None, width: int | None = None
@@ -305,6 +305,7 @@ def encode(gaussians: Gaussians, ordered: bool = False) -> dict[str, bytes]:
     low, high = folded.min(0), folded.max(0)
     steps = np.rint(65535 * (folded - low) / np.where(high > low, high - low, 1)).astype(np.int64)
     largest, rest = without_largest(array(gaussians.quaternions))
+    components, alphas = to_byte(255 * (rest / math.sqrt(2) + 0.5)), alpha_to_byte(array(gaussians.opacities))
     scales, colours = array(gaussians.log_scales), array(gaussians.harmonics[:, 0])
     scale_book, colour_book = levels(scales), levels(colours)
     meta: dict[str, Any] = {
@@ -320,16 +321,10 @@ def encode(gaussians: Gaussians, ordered: bool = False) -> dict[str, bytes]:
             "codebook": scale_book.tolist(),
             "files": [picture("scales.webp", nearest_level(scales, scale_book))],
         },
-        "quats": {
-            "files": [
-                picture("quats.webp", to_byte(255 * (rest / math.sqrt(2) + 0.5)), LARGEST_COMPONENT_ALPHA + largest)
-            ],
-        },
+        "quats": {"files": [picture("quats.webp", components, LARGEST_COMPONENT_ALPHA + largest)]},
         "sh0": {
             "codebook": colour_book.tolist(),
-            "files": [
-                picture("sh0.webp", nearest_level(colours, colour_book), alpha_to_byte(array(gaussians.opacities)))
-            ],
+            "files": [picture("sh0.webp", nearest_level(colours, colour_book), alphas)],
         },
     }
     if gaussians.antialiased:
@@ -351,9 +346,7 @@ def encode(gaussians: Gaussians, ordered: bool = False) -> dict[str, bytes]:
     return {META: json.dumps(meta, allow_nan=False).encode(), **files}
 
 
-def _palette(
-    harmonics: Float[np.ndarray, "gaussian rest"],
-) -> tuple[Float[np.ndarray, "entry rest"], np.ndarray]:
+def _palette(harmonics: Float[np.ndarray, "gaussian rest"]) -> tuple[Float[np.ndarray, "entry rest"], np.ndarray]:
     """Entries, and which of them each Gaussian has: all that there are if they are few, else of k-means."""
     size = max(MIN_ENTRIES, min(MAX_ENTRIES, 2 ** int(math.log2(max(len(harmonics) / GAUSSIANS_PER_ENTRY, 1)))))
     kinds, labels = np.unique(harmonics, axis=0, return_inverse=True)

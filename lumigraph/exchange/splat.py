@@ -21,9 +21,8 @@ from ..kernels.spherical_harmonics import K00
 from .checks import check_room
 from .codes import LOGITS, alpha_to_byte, array, cloud, from_scales, to_byte, to_scales, unit
 
-RECORD = np.dtype(
-    [("mean", "<f4", 3), ("scale", "<f4", 3), ("colour", "u1", 3), ("alpha", "u1"), ("rotation", "u1", 4)]
-)
+FIELDS = [("mean", "<f4", 3), ("scale", "<f4", 3), ("colour", "u1", 3), ("alpha", "u1"), ("rotation", "u1", 4)]
+RECORD = np.dtype(FIELDS)
 
 
 def read(path: Path) -> Gaussians:

@@ -5,7 +5,7 @@ the current one, is written; pages hold 3, which unpacks where there is no zstd 
 three components of 10 bits. Version 2 is within 1/255 a component, so that a half turn, whose w is near 0, can come
 back turned by 13 degrees.
 
-Axes are x right, y up, z back: see `axes`.
+Axes are x right, y up, z back: see `codes.TURN_MEAN`.
 
 What is lost: positions are fixed-point numbers of 24 bits, within 2^-17 while all lie inside ±128, coarser for wider
 clouds. Scales are within 1/32 (3%) of their logarithm from -10 to 5.9. Opacities are within 1/510, plain colours within
@@ -38,6 +38,8 @@ from .codes import (
     TURN_HARMONICS,
     TURN_MEAN,
     TURN_ROTATION,
+    Quaternions,
+    Vectors,
     alpha_to_byte,
     array,
     cloud,
@@ -111,9 +113,7 @@ def _streams(
     """Bits behind the point and flags, and the bytes of each quantity."""
     extent = float(np.abs(array(gaussians.means)).max()) if len(gaussians) else 0.0
     if extent > MAX_FIXED:
-        raise LumigraphError(
-            f"{name} cannot hold positions beyond {MAX_FIXED}; scale the cloud down or write it as .ply"
-        )
+        raise LumigraphError(f"{name} cannot hold positions beyond {MAX_FIXED}; scale the cloud down or write a .ply")
     bits = min(MAX_BITS, math.floor(math.log2(MAX_FIXED / extent))) if extent > MAX_FIXED / 2**MAX_BITS else MAX_BITS
     flags = ANTIALIASED if gaussians.antialiased else 0
     fixed = np.rint(array(gaussians.means).astype(np.float64) * TURN_MEAN * 2**bits).clip(-MAX_FIXED, MAX_FIXED)
@@ -190,9 +190,8 @@ def _cloud(columns: list[np.ndarray], version: int, bits: int, flags: int) -> Ga
     else:  # x, y, z, and w not negative
         quaternions = with_largest(np.zeros(len(rotations), np.int64), rotations / 127.5 - 1)
     plain = (colours / 255 - 0.5) / COLOUR_SCALE
-    harmonics = np.concatenate(
-        [plain[:, None], (rest.reshape(*rest.shape[:1], rest.shape[1] // 3, 3) - 128.0) / 128], 1
-    )
+    rest = (rest.reshape(len(rest), rest.shape[1] // 3, 3) - 128.0) / 128
+    harmonics = np.concatenate([plain[:, None], rest], 1)
     return cloud(
         means * TURN_MEAN,
         quaternions * TURN_ROTATION,
@@ -203,14 +202,14 @@ def _cloud(columns: list[np.ndarray], version: int, bits: int, flags: int) -> Ga
     )
 
 
-def _fixed_point(positions: UInt8[np.ndarray, "gaussian 9"]) -> Float[np.ndarray, "gaussian 3"]:
+def _fixed_point(positions: UInt8[np.ndarray, "gaussian 9"]) -> Vectors:
     """Signed integers of 24 bits, read as the upper ones of 32."""
     wide = np.zeros((3 * len(positions), 4), np.uint8)
     wide[:, 1:] = positions.reshape(-1, 3)
     return (wide.view("<i4").reshape(-1, 3) >> 8).astype(np.float64)
 
 
-def _from_smallest_three(rotations: UInt8[np.ndarray, "gaussian 4"]) -> Float[np.ndarray, "gaussian 4"]:
+def _from_smallest_three(rotations: UInt8[np.ndarray, "gaussian 4"]) -> Quaternions:
     """Version 3: 2 bits name the largest of x, y, z, w; each of the others has a sign and 9 bits of sqrt(1/2)."""
     code = rotations.view("<u4").astype(np.int64)
     parts = code >> np.array([20, 10, 0])
@@ -218,7 +217,7 @@ def _from_smallest_three(rotations: UInt8[np.ndarray, "gaussian 4"]) -> Float[np
     return np.roll(with_largest((code >> 30)[:, 0], rest), 1, -1)
 
 
-def _smallest_three(quaternions: Float[np.ndarray, "gaussian 4"]) -> UInt8[np.ndarray, "gaussian 4"]:
+def _smallest_three(quaternions: Quaternions) -> UInt8[np.ndarray, "gaussian 4"]:
     largest, rest = without_largest(np.roll(quaternions, -1, -1))
     sizes = np.rint(np.abs(rest) * (511 / math.sqrt(0.5))).clip(0, 511).astype(np.int64)
     parts = (np.where(rest < 0, 512, 0) | sizes) << np.array([20, 10, 0])

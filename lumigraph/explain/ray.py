@@ -128,9 +128,8 @@ def along_ray(method: Method, camera: Camera, pixel: tuple[int, int]) -> Sight:
     width, height = camera.size[0].tolist()
     x, y = pixel
     if not (0 <= x < width and 0 <= y < height):
-        raise LumigraphError(
-            f"Pixel ({x}, {y}) lies outside of the picture; give --pixel from 0 0 to {width - 1} {height - 1}"
-        )
+        last = f"{width - 1} {height - 1}"
+        raise LumigraphError(f"Pixel ({x}, {y}) lies outside of the picture; give --pixel from 0 0 to {last}")
     rays = camera.rays(torch.tensor([[x + 0.5, y + 0.5]])).to(method.device)
     looks = needs(method, HasLooks).looks(rays)
     last = looks[-1]

@@ -8,7 +8,7 @@ from typing import Literal
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from scipy import ndimage
 from torch import Tensor
 from torch.nn.functional import grid_sample
@@ -22,7 +22,7 @@ from ..errors import LumigraphError
 from ..method import Method
 from ..method.capabilities import HasDensity, can, needs
 from ..system.progress import counting, track
-from .surface import BLOCK, Grid, larger_pieces, simplified, smoothed, vertex_normals, zero_level
+from .surface import BLOCK, Faces, Grid, Vertices, larger_pieces, simplified, smoothed, vertex_normals, zero_level
 
 DEFAULT_CELLS = 256  # default, along the longest side of the box
 OPEN_BOX = 1.5  # times the box of interest, for rooms and open scenes
@@ -213,9 +213,7 @@ def interpolated(value: Value, grid: Grid, step: int) -> Value:
     return between
 
 
-def find_surface(
-    grid: Grid, step: int, holds: Holds, value: Value, beyond: float
-) -> tuple[Float[np.ndarray, "vertex 3"], Int[np.ndarray, "face 3"]]:
+def find_surface(grid: Grid, step: int, holds: Holds, value: Value, beyond: float) -> tuple[Vertices, Faces]:
     """From coarse to fine: probes find the blocks that the surface may pass through, and those are marched through.
 
     step:   corners of the grid from one probe to the next

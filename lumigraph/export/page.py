@@ -154,11 +154,7 @@ class Opening:
 
 
 def opening_of_scene(
-    title: str,
-    cameras: Camera,
-    frame: Frame,
-    background: Vector | None = None,
-    behind: Backdrop | None = None,
+    title: str, cameras: Camera, frame: Frame, background: Vector | None = None, behind: Backdrop | None = None
 ) -> Opening:
     """An opening from a typical position of the photographs, in their viewing direction.
 

@@ -20,6 +20,7 @@ import torch
 from jaxtyping import Float, Int
 from PIL.PngImagePlugin import PngInfo
 from torch import Tensor
+from torch.nn.functional import grid_sample
 
 from ..camera import Camera
 from ..camera.lens import Equirectangular, OmnidirectionalStereo, Pinhole
@@ -43,9 +44,10 @@ JPEG_QUALITY = 95
 MIN_WIDTH, MAX_WIDTH = 64, 16_384  # pixels
 
 Vector = tuple[float, float, float]
+Point = Float[Tensor, " 3"]  # or a direction, in the scene's frame
 
 
-def panorama(method: Method, place: Float[Tensor, " 3"], heading: Float[Tensor, " 3"], width: int) -> Rendering:
+def panorama(method: Method, place: Point, heading: Point, width: int) -> Rendering:
     """Panorama from a point in the scene's frame, (width / 2, width) pixels; up is +z.
 
     heading: direction of the middle column, made level
@@ -134,9 +136,7 @@ def read(
     """Values of a picture at places (x, y) of it."""
     height, width = picture.shape[:2]
     share = 2 * at / torch.tensor([width, height]) - 1
-    found = torch.nn.functional.grid_sample(
-        picture.permute(2, 0, 1)[None], share[None, None], how, "border", align_corners=False
-    )
+    found = grid_sample(picture.permute(2, 0, 1)[None], share[None, None], how, "border", align_corners=False)
     return found[0, :, 0].T
 
 
@@ -156,7 +156,7 @@ def sphere_size(width: int) -> Float[Tensor, "1 2"]:
     return torch.tensor([[width, width / 2]])
 
 
-def level_camera(place: Float[Tensor, " 3"], heading: Float[Tensor, " 3"], lens: Equirectangular) -> Camera:
+def level_camera(place: Point, heading: Point, lens: Equirectangular) -> Camera:
     """An upright camera that faces a heading."""
     level = torch.stack([heading[0], heading[1], torch.zeros_like(heading[0])])
     pose = look_at(place[None], level[None], torch.tensor([0.0, 0.0, 1.0]))
@@ -247,12 +247,7 @@ MIN_OPACITY = 0.5  # opacity from which on something is there
 
 
 def stereo_pair(
-    method: Method,
-    place: Float[Tensor, " 3"],
-    heading: Float[Tensor, " 3"],
-    width: int,
-    interpupillary: float,
-    nearest: float,
+    method: Method, place: Point, heading: Point, width: int, interpupillary: float, nearest: float
 ) -> tuple[Rendering, Rendering]:
     """Panoramas of the left and the right eye, (width / 2, width) pixels each; up is +z.
 
@@ -274,9 +269,7 @@ def top_bottom(left: Rendering, right: Rendering) -> Float[Tensor, "height width
     return torch.cat([left.rgb, right.rgb])
 
 
-def surrounding_distances(
-    method: Method, place: Float[Tensor, " 3"], heading: Float[Tensor, " 3"]
-) -> tuple[float, float]:
+def surrounding_distances(method: Method, place: Point, heading: Point) -> tuple[float, float]:
     """Near (2nd percentile) and median distance of surfaces around a point, scene units.
 
     Directions are weighted by solid angle. Raises LumigraphError if no surface is around.

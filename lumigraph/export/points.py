@@ -47,12 +47,7 @@ class PointCloud:
 
 @torch.no_grad()
 def extract_points(
-    method: Method,
-    cameras: Camera,
-    count: int = 200_000,
-    size: int = 400,
-    views: int = 64,
-    crop: Crop | None = None,
+    method: Method, cameras: Camera, count: int = 200_000, size: int = 400, views: int = 64, crop: Crop | None = None
 ) -> PointCloud:
     """At most `count` points in the scene's frame, spread evenly over what the cameras see.
 

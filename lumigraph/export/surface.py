@@ -24,6 +24,7 @@ BLOCK = 16  # corners of a block along each axis
 BLOCKS_PER_BATCH = 64  # blocks whose corners are evaluated together
 MIN_ABS_VALUE = 0.01  # no corner's value is nearer to zero, so that no two vertices fall together
 
+Vertices, Faces = Float[np.ndarray, "vertex 3"], Int[np.ndarray, "face 3"]
 Values = Callable[[Float[Tensor, "point 3"]], Float[Tensor, " point"]]
 
 
@@ -60,7 +61,7 @@ class Grid:
 
 def zero_level(
     grid: Grid, values: Values, active: Bool[np.ndarray, "i j k"], elsewhere: Float[np.ndarray, "i j k"]
-) -> tuple[Float[np.ndarray, "vertex 3"], Int[np.ndarray, "face 3"]]:
+) -> tuple[Vertices, Faces]:
     """Triangles where a function is zero, anticlockwise seen from where it is negative; vertices in scene units.
 
     values:    the function, about -1 to 1; NaN where it is unknown, where the surface has a border
@@ -133,13 +134,12 @@ def with_neighbours(
     return cube
 
 
-STRIDES = np.array(
-    [1 << 44, 1 << 24, 1 << 4], np.int64
-)  # of a key: 20 bits an axis, 4 for the direction, 3 in a cube's middle
+# of a key: 20 bits an axis, 4 for the direction, 3 in a cube's middle
+STRIDES = np.array([1 << 44, 1 << 24, 1 << 4], np.int64)
 
 
 def edges(
-    vertices: Float[np.ndarray, "vertex 3"], known: Bool[np.ndarray, "side side side"]
+    vertices: Vertices, known: Bool[np.ndarray, "side side side"]
 ) -> tuple[Int[np.ndarray, " vertex"], Bool[np.ndarray, " vertex"]]:
     """A number for the grid's edge that each vertex lies on, and whether the function is known at its ends.
 
@@ -156,9 +156,7 @@ def edges(
     return corner @ STRIDES + kind, sure
 
 
-def compact(
-    vertices: Float[np.ndarray, "vertex 3"], faces: Int[np.ndarray, "face 3"]
-) -> tuple[Float[np.ndarray, "used 3"], Int[np.ndarray, "face 3"]]:
+def compact(vertices: Vertices, faces: Faces) -> tuple[Float[np.ndarray, "used 3"], Faces]:
     """A mesh without the vertices that no face has."""
     used, faces = np.unique(faces, return_inverse=True)
     return vertices[used], faces.reshape(-1, 3)
@@ -169,12 +167,7 @@ LAMBDA, MU = 0.5, -0.53  # of Taubin's two steps: the second undoes the first on
 Triangles = tuple[Float[np.ndarray, "some 3"], Int[np.ndarray, "few 3"]]
 
 
-def larger_pieces(
-    vertices: Float[np.ndarray, "vertex 3"],
-    faces: Int[np.ndarray, "face 3"],
-    share: float,
-    seen: Bool[np.ndarray, " vertex"],
-) -> Triangles:
+def larger_pieces(vertices: Vertices, faces: Faces, share: float, seen: Bool[np.ndarray, " vertex"]) -> Triangles:
     """The mesh without connected pieces whose area is less than a share of the largest one's, or unseen."""
     _, piece = connected_components(adjacency(len(vertices), faces), directed=False)
     areas = np.bincount(piece[faces[:, 0]], np.linalg.norm(face_normals(vertices, faces), axis=-1), piece.max() + 1)
@@ -184,9 +177,7 @@ def larger_pieces(
     return compact(vertices, faces[keep[piece[faces[:, 0]]]])
 
 
-def smoothed(
-    vertices: Float[np.ndarray, "vertex 3"], faces: Int[np.ndarray, "face 3"], times: int
-) -> Float[np.ndarray, "vertex 3"]:
+def smoothed(vertices: Vertices, faces: Faces, times: int) -> Vertices:
     """Vertices moved towards the mean of their neighbours and back again (Taubin 1995). Borders stay where they are."""
     if not times:
         return vertices
@@ -200,34 +191,29 @@ def smoothed(
     return vertices
 
 
-def simplified(vertices: Float[np.ndarray, "vertex 3"], faces: Int[np.ndarray, "face 3"], count: int) -> Triangles:
+def simplified(vertices: Vertices, faces: Faces, count: int) -> Triangles:
     """A mesh of about so many faces, kept where they matter most to the shape (Garland and Heckbert 1997)."""
     if len(faces) <= count:
         return vertices, faces
-    fewer, triangles = fast_simplification.simplify(
-        vertices.astype(np.float64), faces.astype(np.int32), target_count=count
-    )[:2]
+    pair = vertices.astype(np.float64), faces.astype(np.int32)
+    fewer, triangles = fast_simplification.simplify(*pair, target_count=count)[:2]
     return compact(np.asarray(fewer, np.float64), np.asarray(triangles, np.int64))
 
 
-def vertex_normals(
-    vertices: Float[np.ndarray, "vertex 3"], faces: Int[np.ndarray, "face 3"]
-) -> Float[np.ndarray, "vertex 3"]:
+def vertex_normals(vertices: Vertices, faces: Faces) -> Vertices:
     """Unit normals: the sum of those of the faces around, by area; zero where they cancel."""
     across = face_normals(vertices, faces)
     total = np.stack([np.bincount(faces.ravel(), np.repeat(across[:, k], 3), len(vertices)) for k in range(3)], -1)
     return total / np.maximum(np.linalg.norm(total, axis=-1, keepdims=True), 1e-30)
 
 
-def face_normals(
-    vertices: Float[np.ndarray, "vertex 3"], faces: Int[np.ndarray, "face 3"]
-) -> Float[np.ndarray, "face 3"]:
+def face_normals(vertices: Vertices, faces: Faces) -> Float[np.ndarray, "face 3"]:
     """Normals of faces: outward, as long as twice the area."""
     a, b, c = vertices[faces].swapaxes(0, 1)
     return np.cross(b - a, c - a)
 
 
-def adjacency(count: int, faces: Int[np.ndarray, "face 3"]) -> sparse.csr_array:
+def adjacency(count: int, faces: Faces) -> sparse.csr_array:
     """Adjacency matrix of vertices: 1 for each shared edge, symmetric."""
     a, b = np.concatenate([faces, np.roll(faces, 1, 1)]).ravel(), np.concatenate([np.roll(faces, 1, 1), faces]).ravel()
     matrix = sparse.coo_array((np.ones(len(a)), (a, b)), (count, count)).tocsr()
@@ -235,7 +221,7 @@ def adjacency(count: int, faces: Int[np.ndarray, "face 3"]) -> sparse.csr_array:
     return matrix
 
 
-def border(faces: Int[np.ndarray, "face 3"]) -> Int[np.ndarray, " vertex"]:
+def border(faces: Faces) -> Int[np.ndarray, " vertex"]:
     """The vertices of edges that only one face has."""
     edges = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), 1).astype(np.int64)
     found, count = np.unique(edges[:, 0] << 32 | edges[:, 1], return_counts=True)

@@ -19,11 +19,7 @@ PATH_KINDS = ("orbit", "sweep", "spiral", "interpolate", "held-out")
 
 
 def film_cameras(
-    cameras: dict[str, Camera],
-    frame: Frame,
-    path: str | CameraPath,
-    frames: int | None = None,
-    size: int | None = None,
+    cameras: dict[str, Camera], frame: Frame, path: str | CameraPath, frames: int | None = None, size: int | None = None
 ) -> Camera:
     """The cameras of a film, one for each frame.
 

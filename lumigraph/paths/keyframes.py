@@ -238,9 +238,8 @@ def check(key: Keyframe, name: str) -> None:
             "at right angles and right-handed"
         )
     if not MIN_DEGREES <= key.fov <= MAX_DEGREES:
-        raise LumigraphError(
-            f"{name} sees {key.fov:g} degrees; a flat picture shows from {MIN_DEGREES:g} to {MAX_DEGREES:g}"
-        )
+        limits = f"{MIN_DEGREES:g} to {MAX_DEGREES:g}"
+        raise LumigraphError(f"{name} sees {key.fov:g} degrees; a flat picture shows {limits}")
 
 
 def keys_of_film(film: Film, lens: Lens) -> tuple[Keyframe, ...]:

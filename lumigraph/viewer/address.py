@@ -71,9 +71,7 @@ def free_port(host: str, port: int) -> int | None:
             return listening.getsockname()[1]
     except (socket.gaierror, UnicodeError) as error:  # the latter for what is no name at all
         reason = getattr(error, "strerror", None) or "it is no name of a host"
-        raise LumigraphError(
-            f"Host {host[:60]!r} is not known ({reason}); give --host an address of this machine"
-        ) from error
+        raise LumigraphError(f"There is no host {host[:60]!r} ({reason}); give --host one of this machine") from error
     except PermissionError as error:
         raise LumigraphError(f"Port {port} may not be used by this user; give --port one from 1024 on") from error
     except OSError as error:

@@ -43,12 +43,7 @@ class PathPanel:
     """The keyframes of one client. notify: shows the client a title and a text."""
 
     def __init__(
-        self,
-        client: Any,
-        shared: Shared,
-        flight: Flight,
-        controls: MethodControls,
-        notify: Callable[[str, str], None],
+        self, client: Any, shared: Shared, flight: Flight, controls: MethodControls, notify: Callable[[str, str], None]
     ):
         self._client, self._subject, self._size = client, shared.subject, shared.scenery.size
         self._flight, self._controls, self._notify = flight, controls, notify

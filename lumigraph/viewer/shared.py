@@ -165,9 +165,7 @@ def from_entry(method: RayMethod, rays: Rays, crop: Crop) -> Rendering:
     enter, hits = crop.entered(rays)
     chosen = hits.clone()
     chosen[0] = True  # so that a picture beside the crop has the method's extras too
-    begin = torch.where(hits, enter - method.frame.near, 0).clamp_min(0)[
-        chosen
-    ]  # methods take no samples nearer than near
+    begin = torch.where(hits, enter - method.frame.near, 0).clamp_min(0)[chosen]  # not nearer
     moved = replace(rays[chosen], origins=rays[chosen].at(begin))
     background = torch.tensor(method.frame.background)
     behind = background.to(method.device)[None]

@@ -26,10 +26,8 @@ class TrainingPanel:
         self._measure = measure_of(rows)
         self._rows = [(row["seconds"], row[self._measure]) for row in rows if self._measure in row]
         self._next, self._last = 0.0, ""
-        last = rows[-1] if rows else None
-        self._status = self._gui.add_markdown(
-            "About to begin" if turns.training or not last else describe(last["step"], last)
-        )
+        begins = turns.training or not rows
+        self._status = self._gui.add_markdown("About to begin" if begins else describe(rows[-1]["step"], rows[-1]))
         self._plot = self._gui.add_uplot(
             curve(self._rows),
             series(self._measure),

@@ -182,9 +182,8 @@ class Coded(Form):
 
     def values(self) -> Float[Tensor, "row column"]:
         found = self.own.exact.new_empty(len(self.apart), self.width)
-        return found.index_put((self.apart,), self.own.values()).index_put(
-            (~self.apart,), self.book.values()[self.codes]
-        )
+        found = found.index_put((self.apart,), self.own.values())
+        return found.index_put((~self.apart,), self.book.values()[self.codes])
 
     def learning(self) -> list[tuple[Tensor, float]]:
         return [(self.book.exact, self.error), *self.own.learning()]
