@@ -33,8 +33,7 @@ from lumigraph.method import Method, RayMethod
 from lumigraph.run import Run
 from lumigraph.training import fit
 from lumigraph.viewer import Subject, Viewer, choose_address
-from lumigraph.viewer.cameras import ViewRequest, angle_for, angles, pose_of, rows
-from lumigraph.viewer.flight import upwards
+from lumigraph.viewer.cameras import ViewRequest, angle_for, angles, pose_of, rows, upwards
 from lumigraph.viewer.modes import PALETTE, along_axis, extra_modes, normals, picture
 from lumigraph.viewer.painter import Pace, Painter
 from lumigraph.viewer.shared import render_inside

@@ -71,13 +71,12 @@ def show_masks(folder: Path, onward: str) -> None:
         show({"masks": f"{folder / OBJECT_MASKS}, as they are; delete them to have them made anew", "next": onward})
         return
     masked = mask_object(folder, choose_reader(folder).read(folder), track)
-    show(
-        {
-            "masks": f"{masked.photographs} in {folder / OBJECT_MASKS}",
-            "look at": f"{masked.sheet}: bright is the object, dark is masked",
-            "next": onward,
-        }
-    )
+    found = {
+        "masks": f"{masked.photographs} in {folder / OBJECT_MASKS}",
+        "look at": f"{masked.sheet}: bright is the object, dark is masked",
+        "next": onward,
+    }
+    show(found)
     for doubt in masked.doubts:
         say(f"warning: {doubt}; look at {masked.sheet}, and correct or delete {folder / OBJECT_MASKS}")
 

@@ -66,11 +66,10 @@ class Compose:
         write_composition(self.output, named)
         opened = open_any(self.output)
         low, high = opened.frame.bounds
-        show(
-            {
-                "composition": str(self.output),
-                "bounds": f"({', '.join(f'{x:.3g}' for x in low)}) to ({', '.join(f'{x:.3g}' for x in high)})",
-                "next": typed("view", self.output),
-            }
-        )
+        rows = {
+            "composition": str(self.output),
+            "bounds": f"({', '.join(f'{x:.3g}' for x in low)}) to ({', '.join(f'{x:.3g}' for x in high)})",
+            "next": typed("view", self.output),
+        }
+        show(rows)
         return 0

@@ -63,12 +63,11 @@ class Demo:
         film(method, film_cameras(run.cameras(), run.frame, "orbit", self.frames), orbit)
         report = write_report(run)
         headline, what = scores_of(result)[0], "views" if "views" in result["protocol"] else "shapes"
-        show(
-            {
-                f"held-out {headline.name}": bold(headline) + f" over {result['protocol'][what]} {what}",
-                "film": str(orbit),
-                "report": str(report),
-                "run": str(run.folder),
-            }
-        )
+        rows = {
+            f"held-out {headline.name}": bold(headline) + f" over {result['protocol'][what]} {what}",
+            "film": str(orbit),
+            "report": str(report),
+            "run": str(run.folder),
+        }
+        show(rows)
         return 0

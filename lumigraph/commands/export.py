@@ -87,14 +87,13 @@ class ExportMesh:
         ).in_source(opened.frame)
         write_mesh(self.output, mesh, opened.frame.to_source.rotation[:, 2].numpy())
         low, high = mesh.vertices.min(0), mesh.vertices.max(0)
-        show(
-            {
-                "file": str(self.output),
-                "triangles": f"{len(mesh.faces):,}, {len(mesh.vertices):,} vertices",
-                "extent": " x ".join(f"{x:.4g}" for x in high - low) + " in the frame of the photographs",
-                "size": f"{self.output.stat().st_size / 1e6:.1f} MB",
-            }
-        )
+        rows = {
+            "file": str(self.output),
+            "triangles": f"{len(mesh.faces):,}, {len(mesh.vertices):,} vertices",
+            "extent": " x ".join(f"{x:.4g}" for x in high - low) + " in the frame of the photographs",
+            "size": f"{self.output.stat().st_size / 1e6:.1f} MB",
+        }
+        show(rows)
         return 0
 
     def check(self) -> None:
@@ -176,13 +175,12 @@ class ExportSplats:
             written = gaussians.transformed(method.frame.to_source.matrix)
         write_gaussians(output, written, detail)
         size = size_of(output)
-        show(
-            {
-                "file": str(output),
-                "Gaussians": f"{len(written):,}",
-                "size": f"{size / 1e6:.1f} MB, {size / max(len(written), 1):.1f} bytes each",
-            }
-        )
+        rows = {
+            "file": str(output),
+            "Gaussians": f"{len(written):,}",
+            "size": f"{size / 1e6:.1f} MB, {size / max(len(written), 1):.1f} bytes each",
+        }
+        show(rows)
         return 0
 
 
@@ -214,14 +212,13 @@ class ExportOctree:
         opened = open_any(self.source)
         octree = needs(controlled(opened, opened.method(), self.settings), HasOctree).octree(self.depth)
         in_source = write_octree(self.output, octree, opened.frame)
-        show(
-            {
-                "file": str(self.output),
-                "nodes": f"{len(octree.child):,}",
-                "frame": "of the photographs" if in_source else "of the scene, for the format has no rotation",
-                "size": f"{self.output.stat().st_size / 1e6:.1f} MB",
-            }
-        )
+        rows = {
+            "file": str(self.output),
+            "nodes": f"{len(octree.child):,}",
+            "frame": "of the photographs" if in_source else "of the scene, for the format has no rotation",
+            "size": f"{self.output.stat().st_size / 1e6:.1f} MB",
+        }
+        show(rows)
         return 0
 
 
@@ -257,13 +254,12 @@ class ExportPoints:
         method, crop = self.part.without_floaters(method), self.part.crop(opened.frame)
         points = extract_points(method, seers, self.count, self.size, self.views, crop).in_source(opened.frame)
         write_points(self.output, points)
-        show(
-            {
-                "file": str(self.output),
-                "points": f"{len(points.positions):,}",
-                "size": f"{self.output.stat().st_size / 1e6:.1f} MB",
-            }
-        )
+        rows = {
+            "file": str(self.output),
+            "points": f"{len(points.positions):,}",
+            "size": f"{self.output.stat().st_size / 1e6:.1f} MB",
+        }
+        show(rows)
         return 0
 
 
@@ -347,13 +343,12 @@ class ExportSnerg:
         if atlas.contracted:
             warnings.warn(CONTRACTED, LumigraphWarning, stacklevel=2)
         x, y, z = (n * atlas.block for n in atlas.index.shape)
-        show(
-            {
-                "folder": str(self.output),
-                "voxels": f"{x} x {y} x {z}, in {len(atlas.values):,} of {atlas.index.numel():,} blocks",
-                "size": f"{size_of(self.output) / 1e6:.1f} MB",
-            }
-        )
+        rows = {
+            "folder": str(self.output),
+            "voxels": f"{x} x {y} x {z}, in {len(atlas.values):,} of {atlas.index.numel():,} blocks",
+            "size": f"{size_of(self.output) / 1e6:.1f} MB",
+        }
+        show(rows)
         return 0
 
 
@@ -383,14 +378,13 @@ class ExportStereo(SphereExport):
             )
         pair = stereo_pair(method, place, heading, self.size, apart, near)
         save_sphere(self.output, top_bottom(*pair), whole=False)
-        show(
-            {
-                "stereo pair": f"{self.output}, the left eye on top",
-                "size": f"{self.size}x{self.size}",
-                "from": where,
-                "eyes": f"{apart * unit:.4g} apart; half of all is nearer than {middle * unit:.4g}",
-            }
-        )
+        rows = {
+            "stereo pair": f"{self.output}, the left eye on top",
+            "size": f"{self.size}x{self.size}",
+            "from": where,
+            "eyes": f"{apart * unit:.4g} apart; half of all is nearer than {middle * unit:.4g}",
+        }
+        show(rows)
         return 0
 
 

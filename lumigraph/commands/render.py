@@ -71,15 +71,14 @@ class Render:
         shown = animate(opened, method, self.animated, len(cameras))
         about = film(shown, cameras, output, fps, light=self.format == "exr")
         width, height = about["size"]
-        show(
-            {
-                "film": str(output),
-                **({"path": CHOSEN[path]} if self.path == AUTO else {}),
-                "depth": str(output.with_stem(f"{output.stem}-depth")),
-                "pictures": f"{output.with_suffix('')}/0000.{self.format} …",
-                "frames": f"{about['frames']} of {width}x{height}, {about['seconds_per_frame']:.3f} s each",
-            }
-        )
+        rows = {
+            "film": str(output),
+            **({"path": CHOSEN[path]} if self.path == AUTO else {}),
+            "depth": str(output.with_stem(f"{output.stem}-depth")),
+            "pictures": f"{output.with_suffix('')}/0000.{self.format} …",
+            "frames": f"{about['frames']} of {width}x{height}, {about['seconds_per_frame']:.3f} s each",
+        }
+        show(rows)
         return 0
 
 

@@ -14,7 +14,6 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -70,7 +69,9 @@ def read(path: Path) -> Gaussians:
     most = max(_bands(file, primitive) for primitive, _ in placed)
     check_room(path, sum(_count(file, primitive) for primitive, _ in placed), most**2)
     parts = [_cloud(file, primitive, most, matrix) for primitive, matrix in placed]
-    return parts[0] if len(parts) == 1 else _joined(parts)
+    names = "means", "quaternions", "log_scales", "opacities", "harmonics"
+    whole = [torch.cat([getattr(part, name) for part in parts]) for name in names]
+    return Gaussians(*whole, all(part.antialiased for part in parts))
 
 
 def _placed(file: gltf.File) -> Iterator[tuple[int, Float[np.ndarray, "4 4"]]]:
@@ -166,14 +167,6 @@ def _cloud(file: gltf.File, primitive: gltf.Primitive, most: int, matrix: Float[
         array(found.harmonics) * TURN_HARMONICS[: most**2],
         found.antialiased,
     )
-
-
-def _joined(parts: list[Gaussians]) -> Gaussians:
-    def of(name: str) -> Any:
-        return torch.cat([getattr(part, name) for part in parts])
-
-    alike = all(part.antialiased for part in parts)
-    return Gaussians(of("means"), of("quaternions"), of("log_scales"), of("opacities"), of("harmonics"), alike)
 
 
 def write(path: Path, gaussians: Gaussians) -> None:

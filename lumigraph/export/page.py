@@ -194,7 +194,7 @@ def splats_page(path: Path, gaussians: Gaussians, opening: Opening) -> None:
     settings = asdict(opening) | {"webgl": True, "packed": False, "antialiased": gaussians.antialiased}
     with counting(f"Packing {len(gaussians):,} Gaussians"):
         packed = spz.gzipped(gaussians, steps=HARMONICS_STEPS)
-    write_page(path, "splats", settings, packed)
+    write_bytes(path, page_bytes("splats", settings, packed), "page")
 
 
 def mesh_page(path: Path, mesh: Mesh, opening: Opening) -> None:
@@ -205,7 +205,7 @@ def mesh_page(path: Path, mesh: Mesh, opening: Opening) -> None:
     data = mesh.faces.astype("<u4").tobytes() + steps.tobytes() + mesh.colours.tobytes()
     held = {"vertices": len(steps), "faces": len(mesh.faces), "low": low.tolist(), "high": (low + size).tolist()}
     settings = asdict(opening) | {"webgl": True, "packed": True} | held
-    write_page(path, "mesh", settings, gzip.compress(data, 9, mtime=0))
+    write_bytes(path, page_bytes("mesh", settings, gzip.compress(data, 9, mtime=0)), "page")
 
 
 def volume_page(path: Path, volume: Browsable, opening: Opening) -> None:
@@ -253,7 +253,7 @@ def views_page(path: Path, method: Method, cameras: Camera, opening: Opening, co
         "pictures": list(zip(ends[:-1], ends[1:], strict=True)),
         "poses": seen_from.pose.tolist(),
     }
-    write_page(path, "views", settings, b"".join(pictures))
+    write_bytes(path, page_bytes("views", settings, b"".join(pictures)), "page")
 
 
 def views(around: Surroundings, count: int, size: tuple[int, int]) -> Camera:
@@ -272,13 +272,8 @@ def webp(rgb: Float[Tensor, "height width 3"]) -> bytes:
     return held.getvalue()
 
 
-def write_page(path: Path, program: str, settings: dict[str, Any], data: bytes) -> None:
-    """Put a program of web/, its settings and its data into the page."""
-    write_bytes(path, page_bytes(program, settings, data), "page")
-
-
 def page_bytes(program: str, settings: dict[str, Any], data: bytes) -> bytes:
-    """Bytes of the page of `write_page`."""
+    """A page with a program of web/, its settings and its data."""
     mouse, touch = ORBIT_HELP if settings["inward"] else LOOK_HELP
     bright = float(np.dot(settings["background"], (0.299, 0.587, 0.114))) > 0.5
     ink, edge = ("#16181c", "#ffffff") if bright else ("#ffffff", "#000000")

@@ -20,9 +20,8 @@ from ..errors import LumigraphError
 from ..files.names import natural
 from ..geometry import to_quaternion
 from ..paths.keyframes import CameraPath, Keyframe
-from .cameras import pose_of
+from .cameras import Flight, pose_of
 from .controls import MethodControls
-from .flight import Flight
 from .shared import NAME, NAME_RULE, Shared
 
 COLOUR = (200, 60, 150)

@@ -59,14 +59,18 @@ class Viewer:
         self._visitors: dict[int, Visitor] = {}
         self._lock = threading.Lock()  # around the visitors
         self._welcoming = threading.Lock()  # one at a time fills the tabs
-        is_cloud = can(method, HasGaussians)
         self._server = start_server(address, subject.title, subject.page)
         self._aim()
         tabs = self._server.gui.add_tab_group()
         own_tabs = tabs.add_tab("View"), tabs.add_tab("Crop"), tabs.add_tab("Path")
-        self._panel = self._add_training_panel(tabs)
+        self._panel: TrainingPanel | None = None
+        if subject.rows or training:
+            with tabs.add_tab("Training"):
+                self._panel = TrainingPanel(self._server, self.turns, subject.rows)
         self._scenery = Scenery(self._server, subject.cameras, self._clicked)
-        self._shared = Shared(method, is_cloud, subject, self.turns, self._server, own_tabs, self._scenery)
+        self._shared = Shared(
+            method, can(method, HasGaussians), subject, self.turns, self._server, own_tabs, self._scenery
+        )
         self._server.on_client_connect(self._welcome)
         self._server.on_client_disconnect(self._farewell)
         if subject.open_scene is not None:
@@ -81,13 +85,6 @@ class Viewer:
         server.initial_camera.position = pose[:, 3]
         server.initial_camera.look_at = pose[:, 3] + distance * pose[:, 2]
         server.initial_camera.fov = angles(subject.first)[1]
-
-    def _add_training_panel(self, tabs: Any) -> TrainingPanel | None:
-        """The tab `Training`; None where nothing has been or will be trained."""
-        if not (self.subject.rows or self.turns.training):
-            return None
-        with tabs.add_tab("Training"):
-            return TrainingPanel(self._server, self.turns, self.subject.rows)
 
     # What fit() calls
 

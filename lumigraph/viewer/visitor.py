@@ -24,10 +24,9 @@ from ..errors import LumigraphError
 from ..figures import to_bytes
 from ..gaussians import Gaussians
 from ..geometry import to_matrix, unit
-from .cameras import ViewRequest, angle_for, angles, pose_of, rows
+from .cameras import Flight, ViewRequest, angle_for, angles, pose_of, rows
 from .controls import Controls, MethodControls
 from .crop_panel import CropPanel
-from .flight import Flight
 from .modes import along_axis, extra_modes, picture
 from .painter import MOVING_SECONDS, Pace, Painter
 from .path_panel import PathPanel
@@ -184,9 +183,12 @@ class Visitor:
         if self._splats is None or (seconds > MOVING_SECONDS and self._sent != now):
             self._send_splats(request, eye, wanted)
             self._sent, self._eye = now, eye
-        elif seconds > MOVING_SECONDS and self._turned(eye):
-            self._recolour(request, eye, wanted)
-            self._eye = eye
+        elif seconds > MOVING_SECONDS:
+            middle = torch.tensor(self._shared.subject.frame.bounds).mean(0)
+            away = max(float((self._eye - middle).norm()), 0.1)
+            if float((eye - self._eye).norm()) > RECOLOUR_EYE_SHIFT * away:
+                self._recolour(request, eye, wanted)
+                self._eye = eye
         return seconds > MOVING_SECONDS
 
     def _send_splats(self, request: ViewRequest, eye: torch.Tensor, wanted: Wanted) -> None:
@@ -211,10 +213,6 @@ class Visitor:
             rgb = colours(cloud, eye).cpu().numpy()
         if self._here and len(rgb) == len(self._splats.buffer):
             self._splats.rgbs = rgb
-
-    def _turned(self, eye: torch.Tensor) -> bool:
-        middle = torch.tensor(self._shared.subject.frame.bounds).mean(0)
-        return float((eye - self._eye).norm()) > RECOLOUR_EYE_SHIFT * max(float((self._eye - middle).norm()), 0.1)
 
     def _step_out(self, eye: tuple[float, ...]) -> None:
         """Hide frusta that the eye is in, from this client alone, by nodes of its own in the same places."""
