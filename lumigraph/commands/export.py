@@ -300,7 +300,7 @@ class SphereExport:
 class ExportPanorama(SphereExport):
     """All that is seen from one place, as an equirectangular picture that viewers and headsets show as a sphere.
 
-    The horizon is level, the photographs' main direction in the middle. The ending chooses the format: .png or .jpg.
+    The horizon is level, the photographs' main direction in the middle. The ending says which format: .png or .jpg.
     """
 
     def run(self) -> int:

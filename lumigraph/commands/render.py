@@ -13,7 +13,7 @@ from ..files.ranges import Count, FramesPerSecond, Pixels
 from .common import show
 from .options import Animate, DeviceOption, Overwrite, Set, animate, needed, open_method, option
 
-# As in `paths.film`, which help must not import.
+# As in `paths`, which help must not import.
 PATH_KINDS = ("orbit", "sweep", "spiral", "interpolate", "held-out")
 DEFAULT_SIZE, AUTO = 480, "auto"
 CHOSEN = {

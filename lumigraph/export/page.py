@@ -39,7 +39,7 @@ from ..method import Method
 from ..paths import Surroundings, angle_of_view, camera_path, film_size, pivot
 from ..system.progress import counting, track
 
-VIEWS, SIZE = 12, 96  # pictures for the backdrop, and the longer side of each in pixels
+BACKDROP_VIEWS, BACKDROP_SIZE = 12, 96  # pictures for the backdrop, and the longer side of each in pixels
 MIN_OPAQUE_SHARE = 0.97  # share of them that must be opaque, or the scene's background is part of what it shows
 HORIZON_BAND = math.sin(math.radians(10))  # of the horizon, above and below
 MIN_SEEN_SHARE = 0.02  # share of pixels from which on something counts as seen
@@ -67,9 +67,9 @@ def backdrop(method: Method, cameras: Camera) -> Backdrop | None:
     if frame.has_alpha or not frame.is_open:
         return None
     colours, heights, opacities, places = [], [], [], []
-    for i in evenly(range(len(cameras)), VIEWS):
+    for i in evenly(range(len(cameras)), BACKDROP_VIEWS):
         camera = cameras[i].to("cpu")
-        camera = camera.resized(min(1.0, SIZE / int(camera.size.max())))
+        camera = camera.resized(min(1.0, BACKDROP_SIZE / int(camera.size.max())))
         seen, rays = method.render(camera), camera.rays(camera.pixels())
         depth = seen.depth.reshape(-1).cpu()
         solid = depth.isfinite()
