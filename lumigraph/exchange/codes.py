@@ -10,7 +10,8 @@ from torch import Tensor
 from ..gaussians import Gaussians
 
 # One row for each Gaussian
-Vectors, Quaternions = Float[np.ndarray, "gaussian 3"], Float[np.ndarray, "gaussian 4"]
+Vectors = Float[np.ndarray, "gaussian 3"]
+Quaternions = Float[np.ndarray, "gaussian 4"]
 Integers = Int[np.ndarray, " gaussian"]
 
 # Logit of each byte of opacity. 0 and 1 have no finite one: the outer bytes mean half a step less.

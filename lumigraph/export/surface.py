@@ -24,7 +24,8 @@ BLOCK = 16  # corners of a block along each axis
 BLOCKS_PER_BATCH = 64  # blocks whose corners are evaluated together
 MIN_ABS_VALUE = 0.01  # no corner's value is nearer to zero, so that no two vertices fall together
 
-Vertices, Faces = Float[np.ndarray, "vertex 3"], Int[np.ndarray, "face 3"]
+Vertices = Float[np.ndarray, "vertex 3"]
+Faces = Int[np.ndarray, "face 3"]
 Values = Callable[[Float[Tensor, "point 3"]], Float[Tensor, " point"]]
 
 
