@@ -18,7 +18,7 @@ from lumigraph.benchmark.curves import over_views
 from lumigraph.benchmark.pictures import draw_charts
 from lumigraph.benchmark.published import FEW_VIEW_FIGURES
 from lumigraph.budget import Budget
-from lumigraph.commands.benches.views import BenchViews
+from lumigraph.commands.bench import BenchViews
 from lumigraph.commands.cli import main
 
 pytestmark = budget("runs")

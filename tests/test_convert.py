@@ -22,7 +22,7 @@ from lumigraph.datasets.scene import Frame
 from lumigraph.derive.conversion import ConversionTarget, convert, ways
 from lumigraph.derive.conversion.renderings import between, rendered_scene
 from lumigraph.errors import LumigraphError
-from lumigraph.export.splats import export_splats
+from lumigraph.exchange import write_gaussians
 from lumigraph.geometry import to_matrix, unit
 from lumigraph.kernels import spherical_harmonics
 from lumigraph.method import RayMethod
@@ -268,7 +268,7 @@ def test_photographs_are_learnt_from_where_they_are(ball_folder, tmp_path, capsy
 
 def test_a_splat_file_is_a_teacher(made, tmp_path, monkeypatch):
     monkeypatch.setattr("lumigraph.run.splat_file.ring", partial(ring, size=48))
-    export_splats(made.method().gaussians(), made.frame, tmp_path / "cloud.ply")
+    write_gaussians(tmp_path / "cloud.ply", made.method().gaussians().transformed(made.frame.to_source.matrix))
     kind = methods.find("plenoxels")
     said = convert(
         open_any(tmp_path / "cloud.ply"),

@@ -30,8 +30,7 @@ from lumigraph.exchange import write_gaussians
 from lumigraph.export.mesh import extract_mesh, meshed_box
 from lumigraph.export.mesh_file import write_mesh
 from lumigraph.export.points import extract_points, thinned, write_points
-from lumigraph.export.polygons import BLOCK, Grid, zero_level
-from lumigraph.export.surface import simplified, smoothed
+from lumigraph.export.surface import BLOCK, Grid, simplified, smoothed, zero_level
 from lumigraph.gaussians import Gaussians
 from lumigraph.kernels.spherical_harmonics import K00
 from lumigraph.run import Run

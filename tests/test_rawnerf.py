@@ -16,8 +16,7 @@ from lumigraph.components.fields.development import decoded, encoded, exposed, t
 from lumigraph.datasets.scene import Batch
 from lumigraph.evaluation import evaluate
 from lumigraph.evaluation.light import in_light
-from lumigraph.export.exr import exr
-from lumigraph.export.film import film
+from lumigraph.export.film import exr, film
 from lumigraph.files.ranges import changed
 from lumigraph.methods.rawnerf import RawNeRF, layers_of, through_lens
 from lumigraph.training import fit

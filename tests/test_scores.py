@@ -28,7 +28,7 @@ from lumigraph.metrics import Score, named, scores_of
 from lumigraph.metrics.surfaces import chamfer_distance, intersection_over_union, normal_consistency
 from lumigraph.run import Run, build
 from lumigraph.training import fit
-from lumigraph.viewer.training_panel import describe, measure_of
+from lumigraph.viewer.viewer import describe, measure_of
 
 pytestmark = budget("runs", 10)
 

@@ -32,7 +32,7 @@ COMMANDS = {
     "export mesh RUN OUT.ply": "lumigraph.export.mesh.render_depth_maps",
     "export points RUN OUT.ply": "lumigraph.export.points.render_depth_maps",
     "export panorama RUN OUT.png": "lumigraph.export.panorama.panorama",
-    "export stereo RUN OUT.png": "lumigraph.export.stereo.stereo_pair",
+    "export stereo RUN OUT.png": "lumigraph.export.panorama.stereo_pair",
     "export web RUN OUT.html": "lumigraph.export.page.views_page",
     "export splats RUN OUT.ply": "lumigraph.run.open_any",
     "compose RUN RUN --output OUT.json": "lumigraph.run.open_any",

@@ -33,16 +33,12 @@ from lumigraph.method import Method, RayMethod
 from lumigraph.run import Run
 from lumigraph.training import fit
 from lumigraph.viewer import Subject, Viewer, choose_address
-from lumigraph.viewer.cameras import angle_for, angles, pose_of, rows
-from lumigraph.viewer.crop import render_inside
-from lumigraph.viewer.extras import PALETTE
-from lumigraph.viewer.flight import upwards
-from lumigraph.viewer.modes import along_axis, extra_modes, normals, picture
-from lumigraph.viewer.pace import Pace
-from lumigraph.viewer.painter import Painter
-from lumigraph.viewer.splats import UNIT_SCALE, splats
+from lumigraph.viewer.cameras import ViewRequest, angle_for, angles, pose_of, rows, upwards
+from lumigraph.viewer.modes import PALETTE, along_axis, extra_modes, normals, picture
+from lumigraph.viewer.painter import Pace, Painter
+from lumigraph.viewer.shared import render_inside
 from lumigraph.viewer.turns import IDLE_RENDER_SHARE, RENDER_SHARE, NotWantedError, Turns
-from lumigraph.viewer.view_request import ViewRequest
+from lumigraph.viewer.visitor import UNIT_SCALE, splats
 
 WHITE = (1.0, 1.0, 1.0)
 # A client may leave at any moment; viser warns of what was still on its way.
@@ -208,7 +204,7 @@ def test_extras_are_offered_once_a_rendering_has_them(learnt, tmp_path):
         assert visitor.request().mode == "colour"  # until another is chosen
         dropdown.value = "Labels"
         assert visitor.request().mode == "Labels"
-        visitor.painter.ask()
+        visitor.painter.request()
         label = 255 * hex_colour(PALETTE[3]).numpy()
         deadline = time.monotonic() + 20
         while np.abs(client.picture(width=120)[45, 90] - label).max() > 8:  # JPEG's loss
@@ -446,17 +442,17 @@ class Easel:
 def test_a_painter_refines_at_rest_and_drops_what_is_out_of_date():
     easel = Easel()
     easel.painter.start()
-    easel.painter.ask()
+    easel.painter.request()
     assert easel.painter.settled.wait(20)
     assert easel.done == [0.1, 0.5, math.inf]
     for held in (0.5, math.inf):
         easel.held = held
         easel.begun.clear()
         easel.done.clear()
-        easel.painter.ask()
+        easel.painter.request()
         while held not in easel.begun:
             time.sleep(0.005)
-        easel.painter.ask()
+        easel.painter.request()
         easel.held = None
         assert easel.painter.settled.wait(20)
         assert easel.begun == {0.5: [0.1, 0.5], math.inf: [0.1, 0.5, math.inf]}[held] + [0.1, 0.5, math.inf]
@@ -469,11 +465,11 @@ def test_a_painter_survives_a_fault():
     easel = Easel()
     good, easel.painter._draw = easel.painter._draw, lambda *_: 1 / 0
     easel.painter.start()
-    easel.painter.ask()
+    easel.painter.request()
     assert easel.painter.settled.wait(20)
     assert isinstance(easel.faults[0], ZeroDivisionError)
     easel.painter._draw = good
-    easel.painter.ask()
+    easel.painter.request()
     assert easel.painter.settled.wait(20)
     easel.painter.stop()
     assert easel.done[-1] == math.inf

@@ -6,11 +6,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
-from tyro.conf import OmitArgPrefixes, Positional, arg
+from tyro.conf import OmitArgPrefixes, Positional
 
 from ..files import claim
-from .common import Overwrite, choose_device, needed, option, show
-from .keeping import Keeping
+from .common import choose_device, show
+from .options import Keeping, Overwrite, needed, option
 
 SIZE = 400  # pixels of the longer side of the pictures that compare
 
@@ -26,7 +26,7 @@ class Clean:
 
     source: Annotated[Positional[Path], needed("RUN_OR_FILE")]
     """Folder of a run, a splat file, or a composition."""
-    output: Annotated[Path, arg(metavar="NEW", help_behavior_hint="")]
+    output: Annotated[Path, needed("NEW")]
     """New folder for a run, or new file: .ply, .compressed.ply, .spz, .splat, .sog, .glb."""
     overwrite: Overwrite = False
     part: OmitArgPrefixes[Keeping] = Keeping(clean=True)

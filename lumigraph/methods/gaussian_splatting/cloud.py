@@ -17,7 +17,7 @@ from torch.nn.functional import normalize
 from ...camera import Camera
 from ...components.training.row_optimizers import RowOptimizer, adam_moments, adam_rate, exchange
 from ...components.training.schedules import falling
-from ...exchange.morton import morton_order
+from ...exchange.codes import morton_order
 from ...exchange.packing import Stored, most_important
 from ...files.ranges import LearningRate, between
 from ...gaussians import Gaussians

@@ -3,19 +3,19 @@
 from __future__ import annotations
 
 import re
+import tempfile
+import time
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
-from ...errors import LumigraphError
-from ...files import claim
-from ...files.ranges import Seconds, between
-from ..common import Overwrite, choose_device, needed, option, show
-from ..controls import Set, open_method
-from ..keeping import Keeping
-from .volumes import browsable, can_be_baked, converted, is_baked
+from ..errors import LumigraphError
+from ..files import claim
+from ..files.ranges import Seconds, between
+from .common import choose_device, show
+from .options import DeviceOption, Keeping, Overwrite, Set, SourceOption, needed, open_method, option
 
 FACES = 300_000  # of a mesh in a page, at most: about 4 MB
 Kind = Literal["auto", "splats", "volume", "mesh", "views"]
@@ -30,8 +30,7 @@ class ExportWeb:
     around, or a coloured mesh.
     """
 
-    source: Annotated[Positional[Path], needed("RUN_OR_FILE")]
-    """Folder of a run, a splat file (.ply, .spz ...), or a composition (.json)."""
+    source: SourceOption
     output: Annotated[Positional[Path], needed("FILE.html")]
     """The page."""
     kind: Annotated[
@@ -59,12 +58,10 @@ class ExportWeb:
     overwrite: Overwrite = False
     part: OmitArgPrefixes[Keeping] = Keeping()
     settings: Set = ()
-    device: Annotated[str, option("NAME")] = "auto"
-    """Device to compute on: auto (a GPU if there is one), cpu, cuda, cuda:1."""
+    device: DeviceOption = "auto"
 
     def run(self) -> int:
-        from ...export.backdrop import backdrop
-        from ...export.page import opening_of_scene
+        from ..export.page import backdrop, opening_of_scene
 
         if self.output.suffix.lower() not in (".html", ".htm"):
             raise LumigraphError(f"{self.output} should end in .html, as pages do; rename it")
@@ -72,22 +69,22 @@ class ExportWeb:
         claim(self.output, "page", self.overwrite, [self.source])
         opened, method, cameras = open_method(self.source, self.device, self.settings)
         kind = self._kind(opened, method)
-        told: dict[str, str] = {}
+        rows: dict[str, str] = {}
         if kind == "volume":
-            method, told = self._baked(opened, method)
+            method, rows = self._baked(opened, method)
         behind = backdrop(method, cameras["train"]) if kind != "views" and not self.part.crops else None
         title = self.title or opened.title
         opening = opening_of_scene(title, cameras["train"], opened.frame, background, behind)
         held = self._write(kind, method, cameras["train"], opening)
         size = f"{self.output.stat().st_size / 1e6:.1f} MB"
-        show(told | {"page": str(self.output), "holds": held, "size": size})
+        show(rows | {"page": str(self.output), "holds": held, "size": size})
         return 0
 
     def _write(self, kind: str, method: Any, cameras: Any, opening: Any) -> str:
-        """Write the page, and say what it holds."""
-        from ...export.mesh import extract_mesh
-        from ...export.page import mesh_page, splats_page, views_page, volume_page
-        from ...method.capabilities import HasGaussians, needs
+        """Write the page. Returns its contents in words."""
+        from ..export.mesh import extract_mesh
+        from ..export.page import mesh_page, splats_page, views_page, volume_page
+        from ..method.capabilities import HasGaussians, needs
 
         if kind == "splats":
             gaussians = self.part.of_gaussians(needs(method, HasGaussians).gaussians(), self.part.crop(method.frame))
@@ -105,7 +102,7 @@ class ExportWeb:
         return f"{len(mesh.faces):,} triangles"
 
     def _kind(self, opened: Any, method: Any) -> str:
-        from ...method.capabilities import HasGaussians, can
+        from ..method.capabilities import HasGaussians, can
 
         if self.kind != "auto":
             return self.kind
@@ -122,14 +119,14 @@ class ExportWeb:
         if is_baked(method):
             return method, {}
         if self.settings:
-            raise LumigraphError("What is converted is told nothing; leave out --set, or give --as views")
+            raise LumigraphError("A conversion has no controls; leave out --set, or give --as views")
         about = f"to an octree, which then learns on for {self.seconds:.0f} s; --as views is quicker"
         show({"converts": about})
         made, took = converted(opened, self.seconds, choose_device(self.device))
         return made, {"converted": took}
 
     def _background(self) -> tuple[float, float, float] | None:
-        from ...figures import hex_colour
+        from ..figures import hex_colour
 
         if self.background is None:
             return None
@@ -137,3 +134,48 @@ class ExportWeb:
             raise LumigraphError(f"{self.background!r} is no colour; give --background one such as '#101114'")
         red, green, blue = hex_colour(self.background).tolist()
         return red, green, blue
+
+
+INTO = "plenoctrees"
+
+
+def is_baked(method: Any) -> bool:
+    from ..method.capabilities import HasAtlas, HasOctree, can
+
+    return can(method, HasOctree) or can(method, HasAtlas)
+
+
+def browsable(method: Any, degree: int = 3) -> tuple[Any, str]:
+    """A baked method's volume for browsers, and its description. degree: largest degree of an octree's harmonics"""
+    from ..exchange.baked import atlas_for_browser, octree_for_browser
+    from ..method.capabilities import HasAtlas, HasOctree, can, needs
+
+    if can(method, HasOctree):
+        volume = octree_for_browser(method.octree(), degree)
+        return volume, f"{volume.settings['leaves']:,} leaves of an octree, harmonics of degree {volume.degree}"
+    volume = atlas_for_browser(needs(method, HasAtlas).atlas())
+    return volume, f"{volume.settings['blocks']:,} blocks of {volume.settings['block']}^3 voxels"
+
+
+def can_be_baked(opened: Any, method: Any) -> bool:
+    """True if a method's field can be converted to an octree, which supports objects only."""
+    from ..derive.conversion.ways import check, way
+    from ..methods import find
+
+    try:
+        check(opened, find(INTO))
+    except LumigraphError:
+        return False
+    return not opened.frame.is_open and way(type(method), find(INTO)) == "field"
+
+
+def converted(opened: Any, seconds: float, device: Any) -> tuple[Any, str]:
+    """The opened method converted to an octree, and the cost as text. seconds: training time after initialisation"""
+    from ..derive.conversion import ConversionTarget, convert
+    from ..run import open_any
+
+    begin = time.monotonic()
+    with tempfile.TemporaryDirectory(prefix="lumigraph-") as folder:
+        made = convert(opened, INTO, Path(folder) / INTO, ConversionTarget(seconds=seconds), device, show=True)
+        method = open_any(Path(folder) / INTO).method(device)
+    return method, f"{time.monotonic() - begin:.0f} s, {made.psnr:.1f} dB to {made.teacher.method}"
