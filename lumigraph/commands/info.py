@@ -50,12 +50,12 @@ class Info:
             tree = cloud_tree(self.what, read_gaussians(self.what))
         elif self.what.lower().endswith(".json") and Path(self.what).is_file():
             from ..run import open_any
-            from ..run.canonicalised import Canonicalised
+            from ..run.composition import Canonicalised
 
             opened = open_any(self.what)
             tree = canonical_tree(opened) if isinstance(opened, Canonicalised) else composition_tree(opened)
         elif snerg.recognises(Path(self.what)):
-            from ..run.snerg_folder import SnergFolder
+            from ..run.opening import SnergFolder
 
             tree = atlas_tree(SnergFolder(self.what))
         else:

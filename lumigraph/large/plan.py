@@ -129,7 +129,7 @@ class Plan:
 
     @staticmethod
     def read(path: Path) -> Plan:
-        """The plan in a file. Raises LumigraphError, naming it, where it is none of ours or damaged."""
+        """The plan in a file. Raises LumigraphError, naming it, where it is foreign or damaged."""
         said = files.read_json(path)
         if not isinstance(said, dict) or said.get("format") != PLAN_FORMAT:
             raise LumigraphError(f"{path} was not written by this version of Lumigraph; open it with the one that did")
@@ -146,7 +146,7 @@ class Plan:
         )
 
     def block(self, name: str) -> Block:
-        """Raises LumigraphError, naming those there are, for a block that there is not."""
+        """The block of a name. Raises LumigraphError, naming all blocks, if there is none."""
         for block in self.blocks:
             if block.name == name:
                 return block

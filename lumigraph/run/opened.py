@@ -17,7 +17,7 @@ from ..gaussians import Gaussians
 from ..method import Method
 from ..method.capabilities import HasGaussians, needs
 from .checkpoint import State
-from .measured import read_evaluation
+from .records import read_evaluation
 from .settings import Settings, Source
 
 

@@ -11,7 +11,6 @@ from ..budget import Budget
 from ..capture import CapturePart
 from ..datasets.scene import Frame, Scene
 from ..errors import LumigraphError
-from ..files.plain import alike
 from ..files.ranges import Count, Downscale, Name, Scales, Tally, between, typed
 from ..method import Method
 
@@ -90,15 +89,7 @@ class Settings:
         parts = {"frame": self.frame.to_json(), "scene": self.scene.to_json()}
         return {"format": RUN_FORMAT} | self.said | own | parts
 
-    def with_budget(self, **budget: Any) -> Settings:
-        """The same with another budget."""
-        return replace(self, budget=budget)
-
     def method_config(self, kind: type[Method], file: Path) -> Any:
         """The numbers as the Config of a kind of method. file: to name where one is unknown, of another type, or beyond
         its range"""
         return typed(kind.Config, self.config, file, closed=True)
-
-    def agrees(self, frame: Frame) -> bool:
-        """True if a frame equals the run's, up to rounding."""
-        return alike(self.frame.to_json(), frame.to_json())

@@ -13,7 +13,7 @@ from jaxtyping import Float
 from ..camera.crop import Box, Crop, Sphere
 from ..datasets.scene import Frame, Vector
 from ..errors import LumigraphError
-from ..gaussians.cleaning import ISOLATION, MAX_SCALE, MIN_OPACITY
+from ..gaussians.cloud import ISOLATION, MAX_SCALE, MIN_OPACITY
 from .path_panel import code
 from .subject import NAME, NAME_RULE, Keep
 

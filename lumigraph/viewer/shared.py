@@ -8,7 +8,7 @@ from typing import Any
 from ..camera import Camera
 from ..camera.rays import Rendering
 from ..gaussians import Gaussians, splatting
-from ..gaussians.cleaning import cleaned
+from ..gaussians.cloud import cleaned
 from ..method import Method
 from ..method.capabilities import HasGaussians, needs
 from .crop import render_inside

@@ -16,7 +16,7 @@ from ..common import ReaderOption, choose_device, needed, option, say, show
 from ..train import DEFAULT_SECONDS
 
 if TYPE_CHECKING:
-    from ...benchmark.cell import Cell, Settings
+    from ...benchmark.cell import Cell, CellSettings
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,9 +45,9 @@ class Cells:
     preset: Literal["auto", "laptop", "paper"] = "auto"
     """Defaults of the methods' options: the papers', or those tuned for a CPU; auto decides by --device."""
 
-    def checked(self) -> Settings:
+    def checked(self) -> CellSettings:
         """Settings of all cells. Raises LumigraphError for impossible ones, before anything is opened or trained."""
-        from ...benchmark.cell import Settings
+        from ...benchmark.cell import CellSettings
         from ...metrics.lpips import load_lpips, named_files
 
         for name in self.methods:
@@ -56,9 +56,11 @@ class Cells:
         weights = tuple(path.resolve() for path in named_files(self.lpips))
         if weights:
             load_lpips(weights)
-        return Settings(self.downscale, self.reader, self.scales, self.preset, self.device, self.eval_views, weights)
+        return CellSettings(
+            self.downscale, self.reader, self.scales, self.preset, self.device, self.eval_views, weights
+        )
 
-    def conduct(self, cells: Sequence[Cell], settings: Settings) -> int:
+    def conduct(self, cells: Sequence[Cell], settings: CellSettings) -> int:
         """Train and compare all cells."""
         from ...benchmark.conduct import conduct
 
