@@ -266,7 +266,7 @@ def test_photographs_are_learnt_from_where_they_are(ball_folder, tmp_path, capsy
 
 
 def test_a_splat_file_is_a_teacher(made, tmp_path, monkeypatch):
-    monkeypatch.setattr("lumigraph.run.opening.ring", partial(ring, size=48))
+    monkeypatch.setattr("lumigraph.run.opened.ring", partial(ring, size=48))
     export_splats(made.method().gaussians(), made.frame, tmp_path / "cloud.ply")
     kind = methods.find("plenoxels")
     said = convert(

@@ -20,14 +20,15 @@ NONE = "–"
 def markdown(rows: Sequence[Row], pictures: Sequence[str] = ()) -> str:
     """The whole page of a benchmark. pictures: names of files beside it."""
     measured = [row for row in rows if not row["failed"]]
-    parts = ["# Methods side by side", few_photographs(measured), short_table(measured)]
-    parts += ["\n".join(f"![{name}]({name})" for name in pictures)]
-    parts += ["## Every cell", full_table(rows)]
+    charts = "\n".join(f"![{name}]({name})" for name in pictures)
+    parts = ["# Methods side by side", few_photographs(measured), short_table(measured), charts]
     parts += [
+        "## Every cell",
+        full_table(rows),
         "PSNR in dB and SSIM are means over held-out views, larger is better; LPIPS (AlexNet), smaller is better. "
         "Of shapes, IoU and normal consistency are better when larger, chamfer-L1 (tenths of the longest side) when "
         "smaller. Training is without compiling, which happens on first use. Memory is the training process's peak, "
-        "on a GPU that of its tensors. Published figures follow their own protocols and are no figures of ours."
+        "on a GPU that of its tensors. Published figures follow their own protocols and are no figures of ours.",
     ]
     return "\n\n".join(part for part in parts if part) + "\n"
 

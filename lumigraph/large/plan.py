@@ -147,11 +147,10 @@ class Plan:
 
     def block(self, name: str) -> Block:
         """The block of a name. Raises LumigraphError, naming all blocks, if there is none."""
-        for block in self.blocks:
-            if block.name == name:
-                return block
-        there = ", ".join(block.name for block in self.blocks)
-        raise LumigraphError(f"There is no block {name}; there are {there}")
+        blocks = {block.name: block for block in self.blocks}
+        if name not in blocks:
+            raise LumigraphError(f"There is no block {name}; there are {', '.join(blocks)}")
+        return blocks[name]
 
     def task(self, block: Block) -> Task:
         """The task of a block."""

@@ -26,7 +26,7 @@ from typing import Any
 import torch
 
 from .. import files, methods
-from ..camera import Camera, ring
+from ..camera import Camera
 from ..capture import KINDS, Before, open_dataset
 from ..datasets.dataset import Dataset
 from ..datasets.scene import Frame, Scene
@@ -39,10 +39,9 @@ from ..files.plain import alike, understood
 from ..files.ranges import check
 from ..method import Method
 from .checkpoint import PACKED_FILE, Checkpoints, State
-from .needs import check_memory
 from .opened import Trained
 from .records import cameras_json, cameras_of, read_cameras, read_rows
-from .settings import Settings, Source
+from .settings import Settings, Source, check_memory
 
 
 class Run(Trained):
@@ -203,9 +202,8 @@ class Run(Trained):
         return data
 
     def cameras(self) -> dict[str, Camera]:
-        """The photographs' cameras by split, in the run's frame; a ring around the bounds where there were none."""
         if not self.photographed:
-            return {"train": ring(self.frame.bounds)}
+            return super().cameras()
         return cameras_of(self._cameras, self.frame.image_count)
 
     def view_names(self) -> dict[str, list[str]]:

@@ -12,7 +12,6 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from .. import methods
-from ..camera import Camera, ring
 from ..datasets.scene import Frame
 from ..errors import LumigraphError
 from ..exchange import is_splat_file, place_of, read_gaussians, snerg
@@ -83,10 +82,6 @@ class SplatFile(Opened):
     def source_gaussians(self) -> Gaussians:
         return self.gaussians
 
-    def cameras(self) -> dict[str, Camera]:
-        """A ring of cameras around the middle, looking at it."""
-        return {"train": ring(self.frame.bounds)}
-
 
 def frame_of(gaussians: Gaussians) -> Frame:
     """The frame of a scene whose source are the axes of a file."""
@@ -136,10 +131,6 @@ class SnergFolder(Opened):
         method = kind(self.frame, replace(kind.smallest(), **numbers))
         method.take(self.atlas)
         return method.to(device).eval()
-
-    def cameras(self) -> dict[str, Camera]:
-        """A ring of cameras around the middle, looking at it."""
-        return {"train": ring(self.frame.bounds)}
 
 
 def reach_of(atlas: Atlas, places: Int[Tensor, "voxel 3"]) -> float:

@@ -70,9 +70,8 @@ def ask_for(size: int, device: torch.device, what: str, remedy: Callable[[], str
 
 def ask_for_picture(width: int, height: int, device: torch.device) -> None:
     """Raise LumigraphError unless a rendering of so many pixels may be had on a device."""
-    ask_for(
-        BYTES_PER_PIXEL * width * height, device, f"A picture of {width} x {height} pixels", "give a smaller --size"
-    )
+    what = f"A picture of {width} x {height} pixels"
+    ask_for(BYTES_PER_PIXEL * width * height, device, what, "give a smaller --size")
 
 
 def gigabytes(size: float) -> str:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import sys
 import time
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
@@ -23,7 +22,7 @@ from ..method import Lesson, Method
 from ..method.capabilities import HasGaussians, can
 from ..system import threads
 from ..system.console import console, is_live
-from ..system.progress import clock, short
+from ..system.progress import clock, short, tell
 
 REFRESH = 0.5  # seconds between looks at a bar
 FIRST_LINE_SECONDS = 3.0  # seconds to the first line with a time left
@@ -162,7 +161,7 @@ class TrainingDisplay:
         if self._live:
             self.console.print(line, soft_wrap=True)
         elif self.show:
-            print(line, file=sys.stderr, flush=True)
+            tell(line)
 
 
 def sizes(statistics: dict[str, float]) -> list[str]:

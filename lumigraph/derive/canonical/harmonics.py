@@ -42,10 +42,6 @@ def band(degree: int) -> slice:
     return slice(degree**2, (degree + 1) ** 2)
 
 
-def band_sizes(bands: int) -> list[int]:
-    return [2 * degree + 1 for degree in range(bands)]
-
-
 def turning(rotations: Float[Tensor, "*rotation 3 3"], bands: int) -> list[Float[Tensor, "*rotation _ _"]]:
     """Wigner's matrices D of each band: harmonics(R x) = D(R) harmonics(x), so that what has coefficients f has D f
     once it is turned. Found from directions, of which there are more than enough to determine them."""

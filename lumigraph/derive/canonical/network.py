@@ -19,7 +19,7 @@ from torch import Tensor, nn
 from ...files.ranges import LearningRate, NonNegative, Seed, Width, between
 from ...system.progress import track
 from .grids import Instance
-from .harmonics import band, band_sizes, directions_and_distances, harmonics, moments, nearest_rotation, random, shells
+from .harmonics import band, directions_and_distances, harmonics, moments, nearest_rotation, random, shells
 
 VECTORS = 4  # of degree one, of which frames and cross products are made
 
@@ -87,10 +87,10 @@ class BandMix(nn.Module):
     def __init__(self, inner: int, outer: int, bands: int):
         super().__init__()
         self.weight = nn.Parameter(torch.empty(bands, outer, inner))
-        self.sizes = band_sizes(bands)
+        self.bands = bands
 
     def forward(self, features: Float[Tensor, "some inner basis"]) -> Float[Tensor, "some outer basis"]:
-        parts = [self.weight[n] @ features[..., band(n)] for n in range(len(self.sizes))]
+        parts = [self.weight[n] @ features[..., band(n)] for n in range(self.bands)]
         parts = [part / part.square().sum((1, 2), keepdim=True).div(part.shape[1]).add(1e-12).sqrt() for part in parts]
         return torch.cat(parts, -1)
 

@@ -63,7 +63,8 @@ class Model:
     def tune(self, scene: Scene, steps: int | None, seconds: float | None) -> None:
         """Learn from photographs with the rows' codes as they are: codebooks, rows apart from them and scaled numbers
         descend together, through the rounding, at a pace that falls with progress."""
-        rates = [(latent.requires_grad_(), unit) for _, table in self.tuned for latent, unit in learning(table)]
+        forms = [form for _, table in self.tuned for form in table.forms]
+        rates = [(latent.requires_grad_(), unit) for form in forms for latent, unit in form.learning()]
         optimizer = torch.optim.Adam([{"params": [x], "lr": 0.0, "unit": unit} for x, unit in rates], betas=BETAS)
         generator, begin, taken = torch.Generator().manual_seed(self.steps), time.perf_counter(), 0
         self.method.train()
@@ -100,10 +101,6 @@ class Model:
         optimizer.zero_grad()
         torch.autograd.backward([some for some, _ in reached], [grad for _, grad in reached])
         optimizer.step()
-
-
-def learning(table: Table) -> list[tuple[Tensor, float]]:
-    return [pair for form in table.forms for pair in form.learning()]
 
 
 def progress(step: int, passed: float, steps: int | None, seconds: float | None) -> float:
