@@ -66,7 +66,6 @@ class Cell:
     """A method, what it learns, and for how long: seconds or steps.
 
     scene:      its short name, the same for all cells of the scene
-    source:     where it is
     views:      photographs to learn from; None for all
     collection: the name of the one whose member the scene is, with which it is averaged
     prior:      the run that makes the cell's out of so many photographs, which learns nothing; its budget is then that

@@ -58,7 +58,7 @@ def evaluate_on(
 ) -> Evaluated:
     """A method on a dataset, under the protocol for its kind.
 
-    keep: told each view's name and rendering, where views are compared
+    keep: receives each view's name and rendering, where views are compared
     most: so many views or shapes at most, evenly spread; None means all
     right_halves: of a Scene, compare those alone, whatever the method
     """
@@ -135,7 +135,7 @@ def evaluate_collection(
 ) -> Evaluation | ShapesEvaluation:
     """Evaluate each member of a split on its own held-out views or as a shape, and put all of it together.
 
-    keep:  told each view's name and rendering; names begin with the member's
+    keep:  receives each view's name and rendering; names begin with the member's
     views: of each member at most
     """
     scenes: dict[str, Evaluation] = {}

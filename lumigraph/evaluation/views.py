@@ -146,7 +146,7 @@ def evaluate(
 ) -> Evaluation:
     """Render the views of a split and compare them with their photographs.
 
-    keep:  told each view's name and rendering
+    keep:  receives each view's name and rendering
     views: so many of them at most, evenly spread over the split; None means all
     right_halves: compare those alone also where a method is given nothing of left ones
     Cameras are those that the method refined; held-out ones are then found as `held_out_poses` says. Pixels that the

@@ -15,7 +15,6 @@ class Nearby:
     """Parts by number, of which the most recently used are open.
 
     open:  opens a part by its number, on its device
-    count: number of parts
     most:  number of parts that stay open
     """
 

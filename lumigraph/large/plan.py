@@ -60,7 +60,7 @@ class Block:
 class Task:
     """task.json: all that a block is made of; nothing else says what becomes of its folder.
 
-    scene:   what `open_dataset` is told, with the block as a `Part`
+    scene:   source and options of `open_dataset`, with the block as `part`
     upright: the rotation from the source's frame that brings up to +z, the same for all blocks
     budget:  {"steps": n}, {"seconds": s} or {"quality": word}
     memory:  bytes of photographs that may stay in memory; a file holds what is more

@@ -42,7 +42,7 @@ def survey(source: str, reader: str | None = None) -> Places:
 class BlockRecipe:
     """Training of every block.
 
-    options: what `open_dataset` is told of the whole scene
+    options: of `open_dataset` for the whole scene
     budget:  of all blocks together, shared out evenly; None for a minute each, or a quality
     here:    whether the device is this machine's
     """

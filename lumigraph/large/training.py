@@ -115,7 +115,7 @@ def update(
     """Learn a block of a run again, put it into its place, and align it to its neighbours.
 
     source, places: of the new photographs, in the frame of the old ones
-    options: what `open_dataset` is told of them
+    options: of `open_dataset` for them
     budget:  None for the one that the block had
     The new block replaces the old one when it is done; an interrupted update continues. Files of other blocks stay.
     Raises LumigraphError for an unknown block, and where no photograph is of it.
@@ -161,7 +161,7 @@ class Workers:
 
     count:   blocks at a time on this machine, each in a process of its own; None for this process alone
     address: of a Ray cluster that is there already, HOST:PORT
-    cpus, gpus, memory: what a block asks of its machine: processors, GPUs, bytes
+    cpus, gpus, memory: demand of a block: processors, GPUs, bytes
     """
 
     count: int | None = None

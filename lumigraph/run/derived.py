@@ -74,8 +74,7 @@ class Compressed(Record):
     bytes_before, bytes_after: of the model's weights
     folder_before, folder_after: of the whole runs
     psnr_before, psnr_after: of held-out views in dB; before is None where there are renderings alone to compare with
-    compared_with: what held-out views were compared with, and what the model was tuned on
-    views:        how many
+    compared_with: reference of the held-out views and of the tuning
     pruned:       share of importance that went;  codebook, apart, coarser: see `packing.Recipe`
     steps, seconds: of tuning
     """
@@ -140,13 +139,10 @@ class MeasuredModel:
 class Converted(Record):
     """Teacher and student of a conversion.
 
-    source:  the run or file that was converted
+    source, learnt_from, taking_over: see `ConversionStart`
     how:     by the teacher's field, its Gaussians, the depth that it shows, or its pictures alone
-    learnt_from: what the student went on learning from
     psnr:    of the student's held-out views against the teacher's, in dB
-    views:   how many
-    taking_over: seconds that beginning as the teacher's field took
-    steps, seconds: of learning on
+    steps, seconds: of further training
     """
 
     file = "convert.json"
@@ -240,8 +236,8 @@ def check_output(opened: Opened, output: Path, overwrite: bool | None = None, re
 def save_picked(opened: Opened, keep: Bool[Tensor, " gaussian"], output: Path, why: dict[str, Any]) -> None:
     """Write the Gaussians that a mask picks of something that opens; the order is that of its method's `gaussians()`.
 
-    output: a splat file in the source's frame, or a folder for a run at the same step, for `resume`: its
-            settings, cameras and history, its optimizers' state of the Gaussians left
+    output: a splat file in the source's frame, or a folder for a run at the same step, for `resume`: its settings,
+            cameras and history, its optimizers' state of the Gaussians left
     why:    what the run's config.json says about it, under "cleaned"
     Raises LumigraphError as `check_output` does, and for a method that cannot learn on with fewer.
     """

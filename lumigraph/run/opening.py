@@ -33,8 +33,8 @@ WHITE_BACKGROUND = (1.0, 1.0, 1.0)  # the background of that viewer
 
 
 def open_any(path: Path | str, within: tuple[Path, ...] = ()) -> Opened:
-    """Open a path: a run's folder, one in blocks, a splat file (`exchange.SUFFIXES`, SOG, streamed or
-    not), a folder of SNeRG's viewer, a composition (.json), a run as `lumigraph canonicalise` placed it (.json).
+    """Open a path: a run's folder, one in blocks, a splat file (`exchange.SUFFIXES`, SOG, streamed or not), a folder of
+    SNeRG's viewer, a composition (.json), a run as `lumigraph canonicalise` placed it (.json).
 
     within: compositions that it is opened as a part of
     Raises LumigraphError, in one sentence, for anything else.
