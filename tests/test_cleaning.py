@@ -19,7 +19,7 @@ from lumigraph.commands import cli
 from lumigraph.composition import PickedCloud, cropped
 from lumigraph.exchange import read_gaussians, write_gaussians
 from lumigraph.gaussians import Gaussians
-from lumigraph.gaussians.cleaning import cleaned, extent, unwanted
+from lumigraph.gaussians.cloud import cleaned, extent, unwanted
 from lumigraph.geometry import Similarity, to_matrix
 from lumigraph.run import Run, open_any
 from lumigraph.training import fit

@@ -15,7 +15,7 @@ from lumigraph.camera.crop import CropBox
 from lumigraph.camera.rays import Look, Samples
 from lumigraph.commands import cli
 from lumigraph.composition import Placed, compose, frame_around, standing
-from lumigraph.composition.union import union
+from lumigraph.composition.composed import union
 from lumigraph.datasets.scene import Frame
 from lumigraph.errors import LumigraphError, LumigraphWarning
 from lumigraph.exchange import write_gaussians

@@ -15,7 +15,7 @@ from lumigraph.commands.cli import main
 from lumigraph.datasets.collection import Collection
 from lumigraph.datasets.images import ImageStore
 from lumigraph.datasets.scene import Scene
-from lumigraph.derive.conversion.ways import way
+from lumigraph.derive.conversion import way
 from lumigraph.errors import LumigraphError
 from lumigraph.files.ranges import changed
 from lumigraph.kernels import HashLevels

@@ -16,7 +16,7 @@ from lumigraph.datasets.images import ImageStore
 from lumigraph.datasets.scene import Scene
 from lumigraph.errors import LumigraphError
 from lumigraph.evaluation import evaluate
-from lumigraph.evaluation.halves import judged_by_halves, left_half
+from lumigraph.evaluation.views import judged_by_halves, left_half
 from lumigraph.files.ranges import changed
 from lumigraph.method.capabilities import HasDensity, HasField, HasLooks, can
 from lumigraph.method.controls import Control

@@ -19,10 +19,10 @@ from lumigraph.commands.cli import main
 from lumigraph.datasets.collection import MAX_OPEN, Collection
 from lumigraph.datasets.scene import Scene
 from lumigraph.errors import LumigraphError, LumigraphWarning
-from lumigraph.evaluation.reveal import reveal
+from lumigraph.evaluation.views import reveal
 from lumigraph.method.prior import Prior
 from lumigraph.run import Run, State, build
-from lumigraph.run.inferred import Inferred
+from lumigraph.run.derived import Inferred
 from lumigraph.system import memory
 
 pytestmark = budget("capture", 20)

@@ -28,7 +28,7 @@ from lumigraph.commands.cli import main
 from lumigraph.errors import LumigraphError, LumigraphWarning
 from lumigraph.figures import EMPTY_COLOUR, RAMP, hex_colour
 from lumigraph.gaussians import Gaussians, splatting
-from lumigraph.gaussians.cleaning import cleaned
+from lumigraph.gaussians.cloud import cleaned
 from lumigraph.method import Method, RayMethod
 from lumigraph.run import Run
 from lumigraph.training import fit

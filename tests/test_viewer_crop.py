@@ -16,7 +16,7 @@ from viewer_client import Client
 import lumigraph.methods
 from lumigraph.camera.crop import CropBox, Sphere
 from lumigraph.errors import LumigraphError
-from lumigraph.gaussians.cleaning import ISOLATION, MAX_SCALE, cleaned
+from lumigraph.gaussians.cloud import ISOLATION, MAX_SCALE, cleaned
 from lumigraph.viewer import Viewer, choose_address
 from lumigraph.viewer.crop_panel import BOX, SPHERE, circles, edges
 

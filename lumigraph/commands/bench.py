@@ -22,7 +22,7 @@ from .train import DEFAULT_SECONDS
 FEW_VIEW_METHODS = "nerf", "mip-nerf", "instant-ngp", "gaussian-splatting", "regnerf", "pixelnerf"
 
 if TYPE_CHECKING:
-    from ..benchmark.cell import Cell, Settings
+    from ..benchmark.cell import Cell, CellSettings
 
 
 @dataclass(frozen=True)
@@ -68,9 +68,9 @@ class Cells:
     preset: Literal["auto", "laptop", "paper"] = "auto"
     """Defaults of the methods' options: the papers', or those tuned for a CPU; auto decides by --device."""
 
-    def checked(self) -> Settings:
+    def checked(self) -> CellSettings:
         """Settings of all cells. Raises LumigraphError for impossible ones, before anything is opened or trained."""
-        from ..benchmark.cell import Settings
+        from ..benchmark.cell import CellSettings
         from ..metrics.lpips import load_lpips, named_files
 
         for name in self.methods:
@@ -79,9 +79,11 @@ class Cells:
         weights = tuple(path.resolve() for path in named_files(self.lpips))
         if weights:
             load_lpips(weights)
-        return Settings(self.downscale, self.reader, self.scales, self.preset, self.device, self.eval_views, weights)
+        return CellSettings(
+            self.downscale, self.reader, self.scales, self.preset, self.device, self.eval_views, weights
+        )
 
-    def conduct(self, cells: Sequence[Cell], settings: Settings) -> int:
+    def conduct(self, cells: Sequence[Cell], settings: CellSettings) -> int:
         """Train and compare all cells."""
         from ..benchmark.conduct import conduct
 

@@ -36,10 +36,10 @@ class Clean:
     def run(self) -> int:
         from ..exchange import names_splats, place_of
         from ..figures import save_picture
-        from ..gaussians.cleaning import gone
+        from ..gaussians.cloud import gone
         from ..method.capabilities import HasGaussians, needs
         from ..run import open_any
-        from ..run.picking import check_output, save_picked
+        from ..run.derived import check_output, save_picked
 
         opened, device = open_any(self.source), choose_device(self.device)
         check_output(opened, self.output, self.overwrite, [self.source])

@@ -153,7 +153,7 @@ class ExportSplats:
         from ..exchange.streamed_sog import Detail
         from ..method.capabilities import HasGaussians, needs
         from ..run import open_any
-        from ..run.splat_file import frame_of
+        from ..run.opening import frame_of
 
         output = self.detail.output(self.output)
         check_ending(output)

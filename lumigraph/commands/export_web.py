@@ -159,7 +159,7 @@ def browsable(method: Any, degree: int = 3) -> tuple[Any, str]:
 
 def can_be_baked(opened: Any, method: Any) -> bool:
     """True if a method's field can be converted to an octree, which supports objects only."""
-    from ..derive.conversion.ways import check, way
+    from ..derive.conversion import check, way
     from ..methods import find
 
     try:

@@ -43,7 +43,7 @@ class Infer:
     def run(self) -> int:
         from ..method.prior import Prior
         from ..run import Run, check_new
-        from ..run.inferred import draw
+        from ..run.derived import draw
         from .outcome import next_commands
 
         if (self.scene is None) == (self.seed is None):
@@ -70,7 +70,7 @@ class Infer:
         from ..datasets.collection import Collection
         from ..datasets.dataset import check_kind
         from ..datasets.scene import Scene
-        from ..run.inferred import infer
+        from ..run.derived import infer
 
         assert self.scene is not None
         name, path = made_by.method_name, Path(self.scene).expanduser()

@@ -42,13 +42,13 @@ class Info:
             tree = info_tree.cloud_tree(self.what, read_gaussians(self.what))
         elif self.what.lower().endswith(".json") and Path(self.what).is_file():
             from ..run import open_any
-            from ..run.canonicalised import Canonicalised
+            from ..run.composition import Canonicalised
 
             opened = open_any(self.what)
             made = info_tree.canonical_tree if isinstance(opened, Canonicalised) else info_tree.composition_tree
             tree = made(opened)
         elif snerg.recognises(Path(self.what)):
-            from ..run.snerg_folder import SnergFolder
+            from ..run.opening import SnergFolder
 
             tree = info_tree.atlas_tree(SnergFolder(self.what))
         else:

@@ -18,9 +18,7 @@ from ..geometry import evenly
 from ..large import BlockRun
 from ..metrics import scores_of
 from ..run import Run
-from ..run.compressed import Compressed
-from ..run.converted import Converted
-from ..run.inferred import Inferred
+from ..run.derived import Compressed, Converted, Inferred
 from ..system.console import bold, dim
 from ..training.verdict import cameras_moved
 

@@ -146,7 +146,7 @@ class Keeping:
     @property
     def floaters(self) -> Mapping[str, float]:
         """Arguments of `cleaned` for floaters: the given numbers, with --clean the defaults of the rest."""
-        from ..gaussians.cleaning import ISOLATION, MAX_SCALE, MIN_OPACITY
+        from ..gaussians.cloud import ISOLATION, MAX_SCALE, MIN_OPACITY
 
         usual = {"min_opacity": MIN_OPACITY, "max_scale": MAX_SCALE, "isolation": ISOLATION}
         given = {name: value for name in usual if (value := getattr(self, name)) is not None}
@@ -174,7 +174,7 @@ class Keeping:
 
     def unwanted(self, gaussians: Any, crop: Any) -> Any:
         """Masks of the Gaussians to remove, by reason. Raises LumigraphError if that is all of them."""
-        from ..gaussians.cleaning import gone, unwanted
+        from ..gaussians.cloud import gone, unwanted
 
         reasons = unwanted(gaussians, crop, **self.floaters)
         if len(gaussians) and gone(reasons).all():
@@ -186,7 +186,7 @@ class Keeping:
 
     def of_gaussians(self, gaussians: Any, crop: Any) -> Any:
         """Gaussians to keep. Raises LumigraphError if that is none."""
-        from ..gaussians.cleaning import gone
+        from ..gaussians.cloud import gone
 
         return gaussians[~gone(self.unwanted(gaussians, crop))]
 

@@ -53,7 +53,7 @@ class Resume:
             return self._go_on(run)
 
     def _go_on(self, run: Any) -> int:
-        from ..run.inferred import Inferred
+        from ..run.derived import Inferred
         from ..training import fit
         from .outcome import show_outcome
         from .view import keep_showing, watching

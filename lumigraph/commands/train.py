@@ -87,9 +87,8 @@ class BlockOptions:
     def _all(self, train: Any, source: str, places: Any) -> int:
         import torch
 
-        from ..large.on_ray import Workers
         from ..large.planning import BlockRecipe, begin, make_plan
-        from ..large.training import conduct, finish
+        from ..large.training import Workers, conduct, finish
         from ..system.memory import free_memory
 
         here = self.address is None
@@ -127,7 +126,7 @@ class BlockOptions:
 
     def _again(self, train: Any, run: Path) -> int:
         from ..large.planning import survey
-        from ..large.update import update
+        from ..large.training import update
 
         if self.blocks is None or not self.blocks.isdigit():
             raise LumigraphError("--into needs the name of the block to learn again; give it as --blocks 3")

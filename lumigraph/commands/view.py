@@ -92,9 +92,9 @@ def saver(opened: Any) -> Any:
     """A function that saves a part of a cloud of Gaussians, as `lumigraph clean` does: a splat file or a new run."""
 
     def save(name: str, crop: Any, floaters: Mapping[str, float]) -> str:
-        from ..gaussians.cleaning import gone, unwanted
+        from ..gaussians.cloud import gone, unwanted
         from ..method.capabilities import HasGaussians, needs
-        from ..run.picking import save_picked
+        from ..run.derived import save_picked
 
         output = opened.path.parent / name
         if os.path.lexists(output):

@@ -13,7 +13,7 @@ from jaxtyping import Float
 from ..camera.crop import Crop, CropBox, Sphere
 from ..datasets.scene import Vector
 from ..errors import LumigraphError
-from ..gaussians.cleaning import ISOLATION, MAX_SCALE, MIN_OPACITY
+from ..gaussians.cloud import ISOLATION, MAX_SCALE, MIN_OPACITY
 from .path_panel import code
 from .shared import NAME, NAME_RULE, Keep, Shared
 

@@ -18,7 +18,7 @@ from ..camera.crop import Crop
 from ..camera.rays import Rays, Rendering
 from ..datasets.scene import Frame, Scene
 from ..gaussians import Gaussians, splatting
-from ..gaussians.cleaning import cleaned
+from ..gaussians.cloud import cleaned
 from ..method import Method, RayMethod
 from ..method.capabilities import HasGaussians, needs
 from ..paths import Surroundings, best_centred, pivot

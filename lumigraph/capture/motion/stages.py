@@ -17,7 +17,7 @@ from typing import Any
 from ...errors import LumigraphError
 from ...files import read_json, write_json
 from ...files.ranges import Lasted
-from ...system.processes import start
+from ...system.signals import start
 
 WORKER = Path(__file__).with_name("worker.py")
 

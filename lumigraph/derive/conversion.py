@@ -1,4 +1,7 @@
-"""convert(): a method begins as what another one holds, learns on, and is compared with it."""
+"""Conversion: a method begins as what another one holds, learns on, and is compared with it.
+
+The way from one to the other follows from their capabilities, so that a new method needs no entry here.
+"""
 
 from __future__ import annotations
 
@@ -7,30 +10,43 @@ import time
 import warnings
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import torch
+from torch import Tensor
 
-from ... import files, methods
-from ...budget import Budget, Quality
-from ...camera import Camera
-from ...datasets.scene import Scene
-from ...errors import LumigraphError, LumigraphWarning
-from ...method import Method
-from ...method.capabilities import FromField, RefinesPoses, can, needs
-from ...run import Opened, Run, State, build, check_new
-from ...run.converted import ConversionStart, Converted, LearntFrom, MeasuredModel
-from ...system.signals import go_on_unless
-from ...training import fit
-from .measure import likeness, shown
-from .renderings import rendered_scene
-from .ways import check, way
+from .. import files, methods
+from ..budget import Budget, Quality
+from ..camera import Camera
+from ..camera.rays import Rendering
+from ..datasets.dataset import check_kind
+from ..datasets.images import ImageStore
+from ..datasets.scene import Scene
+from ..errors import LumigraphError, LumigraphWarning
+from ..evaluation import evaluate
+from ..evaluation.views import warm_up
+from ..geometry import evenly, look_at
+from ..method import Method
+from ..method.capabilities import FromField, HasDensity, HasField, HasGaussians, HasLooks, RefinesPoses, can, needs
+from ..metrics import psnr
+from ..run import Opened, Run, State, build, check_new
+from ..run.derived import ConversionStart, Converted, LearntFrom, MeasuredModel
+from ..system.progress import track
+from ..system.signals import go_on_unless
+from ..training import fit
+from .compression.compress import bytes_of
 
 INHERITED_PROGRESS = 0.5  # training progress at which schedules go on after a field was taken over
 RENDERING_SHARE = 0.5  # of the training time that rendering of training views may take in addition
 PHOTOGRAPHS: LearntFrom = "photographs"
 RENDERINGS: LearntFrom = "renderings of the source"
 COMPARED_VIEWS = 8  # held-out views that are compared
+Way = Literal["field", "gaussians", "depth", "pictures"]
+SPATIAL_CAPABILITIES = FromField, HasField, HasDensity, HasLooks, HasGaussians  # one of them is needed
+
+MAX_VIEWS, MIN_VIEWS = 80, 8  # pictures, and however short the time
+MAX_SIDE = 400  # pixels of their longer side
+NEIGHBOUR_SHARE = 1 / 3  # position of an additional camera, as a share of the way to the nearest neighbour
 
 
 @dataclass(frozen=True)
@@ -65,7 +81,7 @@ def convert(
 ) -> Converted:
     """A run of the method of that name in a new folder, made of whatever was opened; gives what its convert.json says.
 
-    output: a new or empty folder, or one in which the same conversion was interrupted, which goes on
+    output: a new or empty folder, or one in which the same conversion was interrupted, which continues
     show:   whether training is shown
     Raises LumigraphError for what cannot be converted, and Stopped after Ctrl-C, with the state saved.
     """
@@ -83,15 +99,16 @@ def convert(
         allowed = math.inf if aim.seconds is None else RENDERING_SHARE * aim.seconds
         learnt_from, data = RENDERINGS, rendered_scene(teacher, around, str(source.path), allowed)
     else:
-        learnt_from, data = PHOTOGRAPHS, seen_as(teacher, student, scene)
+        learnt_from, data = PHOTOGRAPHS, scene
+        if not can(student, RefinesPoses):  # which learns from the poses as its teacher refined them
+            data = replace(scene, cameras=teacher.refined(scene.cameras).to("cpu"))
     if going_on is None:
         seconds = take_over(teacher, student, data, around, as_taken=learnt_from == PHOTOGRAPHS)
         begun = ConversionStart(str(source.path.resolve()), learnt_from, round(seconds, 3))
-        going_on = (
-            created(source, student, scene or data, output, budget_of(student, data, aim), aim.seed, begun),
-            begun,
-        )
-    run, begun = going_on
+        budget = budget_of(student, data, aim)
+        run = created(source, student, scene or data, output, budget, aim.seed, begun)
+    else:
+        run, begun = going_on
     budget = Budget.from_json(run.settings.budget)
     outcome = fit(student, data, run, budget=budget, seed=run.settings.seed, show=show)
     go_on_unless(outcome.signal)
@@ -191,6 +208,105 @@ def photographs(source: Opened, where: str | None) -> Scene | None:
         return None
 
 
-def seen_as(teacher: Method, student: Method, scene: Scene) -> Scene:
-    """Photographs, from where the teacher has come to see them, unless the student learns that too."""
-    return scene if can(student, RefinesPoses) else replace(scene, cameras=teacher.refined(scene.cameras).to("cpu"))
+def way(teacher: type[Method], student: type[Method]) -> Way | None:
+    """Conversion of a teacher to a student: by the teacher's field at points, by its Gaussians as they are, by the
+    depth of what it renders, or by learning from its pictures alone; None if not at all."""
+    shows = issubclass(Scene, teacher.learns_from) or Scene in teacher.accepts  # a prior's runs are of scenes too
+    if not (shows and issubclass(Scene, student.learns_from)):
+        return None
+    if can(student, FromField):
+        if can(teacher, HasGaussians) and can(student, HasGaussians):
+            return "gaussians"
+        return "field" if can(teacher, HasField) else "depth"
+    return "pictures" if any(can(student, capability) for capability in SPATIAL_CAPABILITIES) else None
+
+
+def ways() -> dict[str, dict[str, Way | None]]:
+    """By the name of each installed method as teacher, the way into each as student."""
+    kinds = {name: methods.find(name) for name in methods.available()}
+    return {name: {other: way(teacher, student) for other, student in kinds.items()} for name, teacher in kinds.items()}
+
+
+def check(source: Opened, student: type[Method]) -> None:
+    """Raise LumigraphError, in one sentence, unless what was opened can become a student."""
+    name = methods.name_of(student)
+    if (reason := source.conversion_fault) is not None:
+        raise LumigraphError(f"{source.path} {reason}")
+    if source.frame.times is not None:
+        raise LumigraphError(f"{source.path} is of a scene that moves, and what is converted stands still")
+    check_kind(name, student.learns_from, Scene, str(source.path), methods.learning_from(Scene))
+    if not any(can(student, capability) for capability in SPATIAL_CAPABILITIES):
+        raise LumigraphError(
+            f"{name} holds pictures, and no scene in space; `lumigraph convert --list` says what goes into what"
+        )
+
+
+@dataclass(frozen=True)
+class Shown:
+    """A method's views by name, seconds for each, and their PSNR in dB where there are photographs."""
+
+    views: dict[str, Tensor]
+    seconds: float
+    psnr: float | None
+
+
+def shown(method: Method, scene: Scene | None, held_out: Camera, most: int) -> Shown:
+    """At most so many held-out views of a method: those of a scene with photographs, or, without one, of cameras."""
+    views: dict[str, Tensor] = {}
+
+    def keep(name: str, seen: Rendering) -> None:
+        views[name] = seen.rgb.clamp(0, 1).cpu()
+
+    if scene is not None:
+        split = "test" if len(scene.splits.get("test", ())) else "train"
+        found = evaluate(method, scene, split, keep, min(most, len(scene.splits[split])))
+        return Shown(views, found.seconds_per_view, found.psnr)
+    chosen = evenly(range(len(held_out)), most)
+    warm_up(method, held_out[chosen[0]])
+    begin = time.perf_counter()
+    for i in track(chosen, "Rendering held-out views", len(chosen)):
+        keep(str(i), method.render(method.refined(held_out[i])))
+    return Shown(views, (time.perf_counter() - begin) / len(chosen), None)
+
+
+def likeness(one: Shown, other: Shown) -> float:
+    """Mean PSNR in dB of each view of one method against the other's."""
+    found = [psnr(one.views[name], other.views[name]) for name in one.views]
+    return float(torch.tensor(found).mean())
+
+
+@torch.no_grad()
+def rendered_scene(teacher: Method, cameras: Camera, source: str, seconds: float) -> Scene:
+    """A Scene whose photographs are what a teacher shows from its cameras, and from others between them.
+
+    seconds: that rendering may take, about
+    """
+    some = evenly(range(len(cameras)), MAX_VIEWS // 2)
+    own = Camera.cat([cameras[i] for i in some])
+    both = own if len(own) < 2 else Camera.cat([own, between(own)])
+    both = both.resized(min(1.0, MAX_SIDE / int(both.size.max())))
+    affordable = MAX_VIEWS
+    if seconds < math.inf:
+        warm_up(teacher, both[0])
+        begin = time.perf_counter()
+        teacher.render(both[0])
+        affordable = int(seconds / max(time.perf_counter() - begin, 1e-6))
+    chosen = evenly(range(len(both)), max(affordable, MIN_VIEWS))
+    frame, pictures = teacher.frame, []
+    for i in track(chosen, "Rendering what to learn from", len(chosen)):
+        pictures.append(bytes_of(teacher.render(both[i]).cpu(), frame.background if frame.has_alpha else None))
+    index = torch.arange(len(chosen))
+    names = [f"{i:03d}" for i in chosen]
+    return Scene(both[torch.tensor(chosen)], ImageStore.from_arrays(pictures), frame, {"train": index}, names, source)
+
+
+def between(cameras: Camera) -> Camera:
+    """For each camera another one on the way to its nearest neighbour, which looks in between as well."""
+    apart = torch.cdist(cameras.position, cameras.position).fill_diagonal_(torch.inf)
+    other = apart.argmin(-1)
+
+    def mixed(values: torch.Tensor) -> torch.Tensor:
+        return torch.lerp(values, values[other], NEIGHBOUR_SHARE)
+
+    pose = look_at(mixed(cameras.position), mixed(cameras.forward), -mixed(cameras.pose[:, :, 1]))
+    return replace(cameras, pose=pose)
