@@ -50,7 +50,7 @@ def cloud(
     arrays = means, quaternions, log_scales, opacities, harmonics
     with np.errstate(over="ignore", invalid="ignore"):  # infinite values are found by `checks.checked`
         tensors = [torch.from_numpy(np.array(values, np.float32, order="C")) for values in arrays]
-    return Gaussians(*tensors, antialiased)
+    return Gaussians(*tensors, antialiased=antialiased)
 
 
 def to_byte(x: Float[np.ndarray, "*shape"]) -> UInt8[np.ndarray, "*shape"]:

@@ -240,8 +240,8 @@ def backward(ctx, *grads):
     out, noted = (totals, distance, lengths), (starts, steps, lights)
     given = (origins, directions, enter, leave), ctx.voxels, values, out, noted
     launch(_march, ctx.grid, *given, *ctx.sizes, ctx.stop, NOTE=True, **ctx.options)
-    given = grads, (origins, directions), ctx.voxels, values, noted, to_values
-    launch(_backward, ctx.grid, *given, *ctx.sizes, **ctx.options)
+    inputs = grads, (origins, directions), ctx.voxels, values, noted, to_values
+    launch(_backward, ctx.grid, *inputs, *ctx.sizes, **ctx.options)
     return None, None, None, None, None, to_values, None
 
 

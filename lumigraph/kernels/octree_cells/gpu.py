@@ -140,6 +140,6 @@ def run(origins, directions, tree, density, near, stop):
     launch(_walk, grid, *given, counts, ray_starts, out, *numbers, WRITE=False, **options)
     torch.cumsum(counts, 0, out=ray_starts[1:])
     total = int(ray_starts[-1])
-    out = *(empty(total, device=device) for _ in range(2)), torch.empty(total, dtype=torch.int64, device=device)
+    out = empty(total, device=device), empty(total, device=device), torch.empty(total, dtype=torch.int64, device=device)
     launch(_walk, grid, *given, counts, ray_starts, out, *numbers, WRITE=True, **options)
     return *out[:2], ray_starts, out[2]

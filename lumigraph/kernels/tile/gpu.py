@@ -102,8 +102,8 @@ def run(centres, conics, opacities, depths, size, side):
     launch(_tile, grid, *inputs, counts, ends, pairs, count, width, height, WRITE=False, **options)
     torch.cumsum(counts, 0, out=ends)
     total = int(ends[-1]) if count else 0
-    tiles, numbers = pairs = tuple(torch.empty(total, dtype=torch.int32, device=device) for _ in range(2))
-    launch(_tile, grid, *inputs, counts, ends, pairs, count, width, height, WRITE=True, **options)
+    tiles, numbers = (torch.empty(total, dtype=torch.int32, device=device) for _ in range(2))
+    launch(_tile, grid, *inputs, counts, ends, (tiles, numbers), count, width, height, WRITE=True, **options)
     tiles, places = tiles.sort(stable=True)
     every = torch.arange(-(-width // side) * -(-height // side) + 1, dtype=torch.int32, device=device)
     return numbers[places], torch.searchsorted(tiles, every)
