@@ -60,8 +60,8 @@ def run_tree(run: Run) -> Tree:
         branch(tree, "inferred", {"by": inferred.prior, "of": seen})
     if converted := Converted.read(run.folder):
         like = f"{converted.psnr:.2f} dB, of {converted.views} held-out views against the source's"
-        rows: dict[str, Any] = {"from": f"{converted.source}, a {converted.teacher.method}", "by": converted.how}
-        branch(tree, "converted", rows | {"alike": like, "then learnt from": converted.learnt_from})
+        origin: dict[str, Any] = {"from": f"{converted.source}, a {converted.teacher.method}", "by": converted.how}
+        branch(tree, "converted", origin | {"alike": like, "then learnt from": converted.learnt_from})
     if evaluation := run.evaluation():
         figures: dict[str, Any] = {score.name: str(score) for score in scores_of(evaluation)}
         figures["seconds per view"] = evaluation.get("seconds_per_view")

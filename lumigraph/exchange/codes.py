@@ -47,10 +47,11 @@ def cloud(
     antialiased: bool = False,
 ) -> Gaussians:
     """Gaussians of arrays, in float32 and in memory of their own."""
-    arrays = means, quaternions, log_scales, opacities, harmonics
+    named = {"means": means, "quaternions": quaternions, "log_scales": log_scales}
+    named |= {"opacities": opacities, "harmonics": harmonics}
     with np.errstate(over="ignore", invalid="ignore"):  # infinite values are found by `checks.checked`
-        tensors = [torch.from_numpy(np.array(values, np.float32, order="C")) for values in arrays]
-    return Gaussians(*tensors, antialiased=antialiased)
+        tensors = {name: torch.from_numpy(np.array(x, np.float32, order="C")) for name, x in named.items()}
+    return Gaussians(**tensors, antialiased=antialiased)
 
 
 def to_byte(x: Float[np.ndarray, "*shape"]) -> UInt8[np.ndarray, "*shape"]:

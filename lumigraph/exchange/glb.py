@@ -70,8 +70,8 @@ def read(path: Path) -> Gaussians:
     check_room(path, sum(_count(file, primitive) for primitive, _ in placed), most**2)
     parts = [_cloud(file, primitive, most, matrix) for primitive, matrix in placed]
     names = "means", "quaternions", "log_scales", "opacities", "harmonics"
-    whole = [torch.cat([getattr(part, name) for part in parts]) for name in names]
-    return Gaussians(*whole, antialiased=all(part.antialiased for part in parts))
+    whole = {name: torch.cat([getattr(part, name) for part in parts]) for name in names}
+    return Gaussians(**whole, antialiased=all(part.antialiased for part in parts))
 
 
 def _placed(file: gltf.File) -> Iterator[tuple[int, Float[np.ndarray, "4 4"]]]:
