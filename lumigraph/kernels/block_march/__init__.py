@@ -12,7 +12,7 @@ from .._dispatch import implementation
 from .._doors import door, require
 from .._facts import Facts
 
-FACTS = Facts(unit="rays", outputs=2, differentiable=(5,), typical=4, compiled=9, smooth=(2, 3, 7))
+FACTS = Facts(unit="rays", outputs=2, differentiable=(5,), typical=5, compiled=9, smooth=(2, 3, 7))
 
 CHANNELS = 8  # of a voxel: red, green, blue, alpha, four features
 ALPHA = 3
