@@ -18,7 +18,7 @@ from lumigraph.methods.instant_ngp import Config, InstantNGP
 from lumigraph.run import Run, build
 from lumigraph.training import fit
 
-pytestmark = budget("methods", 10)
+pytestmark = budget("methods", 15)
 
 SMALL = changed(
     Config(),
