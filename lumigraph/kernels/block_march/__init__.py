@@ -10,7 +10,7 @@ from torch import Tensor
 
 from .._operation import Facts, door, implementation, require
 
-FACTS = Facts(unit="rays", outputs=2, differentiable=(5,), typical=4, compiled=9, smooth=(2, 3, 7))
+FACTS = Facts(unit="rays", outputs=2, differentiable=(5,), typical=5, compiled=9, smooth=(2, 3, 7))
 
 CHANNELS = 8  # of a voxel: red, green, blue, alpha, four features
 ALPHA = 3
